@@ -1,0 +1,220 @@
+"""A batch of pixel environments, and when their episodes begin anew."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+
+from pixelbrax_jax.choices import check_choice
+from pixelbrax_jax.envs import observe
+from pixelbrax_jax.envs.pixel_env import PixelEnv, check_key
+from pixelbrax_jax.types import EnvParams, EnvState, Timestep
+
+AUTORESET_MODES = ("next_step", "same_step", "disabled")
+
+_BLOCK = 32
+"""Environments that begin an episode together; their number is rounded up to a multiple."""
+
+
+class VectorPixelEnv:
+    """``num_envs`` independent copies of a pixel environment that step together.
+
+    States, observations, rewards and flags have a leading axis N. Environment i draws from
+    ``fold_in(key, i)``, so that it is the same whatever N is.
+
+    An ended episode is followed by a fresh one as ``autoreset_mode`` says, with Gymnasium's
+    meanings:
+
+    * ``"next_step"``: the step that ends an episode returns its last observation. The next
+      step ignores that environment's action and returns the first observation of the next
+      episode, with reward 0.
+    * ``"same_step"``: the step that ends an episode returns the first observation of the
+      next one. The last observation is in ``info["final_obs"]`` and what ``info`` had been in
+      ``info["final_info"]``; both are meaningful where the episode ended.
+    * ``"disabled"``: nothing begins by itself; call ``reset_where``. Until then the
+      environment is stepped on, finite but without meaning.
+
+    Attributes:
+        env: the environment.
+        num_envs: N.
+        autoreset_mode: one of the three names.
+    """
+
+    def __init__(self, env: PixelEnv, num_envs: int, autoreset_mode: str = "next_step") -> None:
+        """Checks the options.
+
+        Args:
+            env: the environment.
+            num_envs: how many copies, at least 1.
+            autoreset_mode: ``"next_step"``, ``"same_step"`` or ``"disabled"``.
+
+        Raises:
+            ValueError: an option is out of range; the message says what is allowed.
+        """
+        if isinstance(num_envs, bool) or int(num_envs) != num_envs or num_envs < 1:
+            raise ValueError(f"num_envs must be a whole number of at least 1, got {num_envs!r}.")
+        self.env = env
+        self.num_envs = int(num_envs)
+        self.autoreset_mode = check_choice("autoreset_mode", autoreset_mode, AUTORESET_MODES)
+
+    @partial(jax.jit, static_argnums=0)
+    def reset(self, key: jax.Array, params: EnvParams) -> tuple[EnvState, Timestep]:
+        """Begins episode 0 everywhere.
+
+        Args:
+            key: a typed PRNG key, from which environment i gets ``fold_in(key, i)``; or (N,) keys,
+                one for each.
+            params: what may be randomised, the same for all.
+
+        Returns:
+            The states and the first timesteps.
+
+        Raises:
+            TypeError: ``key`` is neither.
+        """
+        keys = self._env_keys(key)
+        state = jax.vmap(self.env.begin)(keys, jnp.zeros(self.num_envs, jnp.uint32))
+        state = self._show(state, params, jnp.ones(self.num_envs, bool))
+        return state, self._timestep(state, jnp.zeros(self.num_envs))
+
+    @partial(jax.jit, static_argnums=0)
+    def reset_where(
+        self,
+        state: EnvState,
+        mask: jax.Array,
+        params: EnvParams,
+        key: jax.Array | None = None,
+    ) -> tuple[EnvState, Timestep]:
+        """Begins an episode in some environments and leaves the others as they are.
+
+        Args:
+            state: the present states.
+            mask: (N,) bool, where to begin.
+            params: what may be randomised.
+            key: None begins each environment's next episode; else a key or (N,) keys as in
+                ``reset``, of which episode 0 begins.
+
+        Returns:
+            The states and timesteps; reward 0 everywhere, and unmasked environments repeat their
+            present observation and flags.
+
+        Raises:
+            TypeError: ``key`` is of another kind.
+            ValueError: ``mask`` is not (N,) bool.
+        """
+        if mask.shape != (self.num_envs,) or mask.dtype != bool:
+            raise ValueError(
+                f"mask must be bool of shape ({self.num_envs},), got {mask.dtype} of shape "
+                f"{tuple(mask.shape)}."
+            )
+        episode = state.episode + 1
+        if key is not None:
+            keys = self._env_keys(key)
+            state = state.replace(key=jnp.where(mask, keys, state.key))
+            episode = jnp.zeros_like(state.episode)
+        state = self._begin_where(state, mask, episode, params)
+        return state, self._timestep(state, jnp.zeros(self.num_envs))
+
+    @partial(jax.jit, static_argnums=0)
+    def step(
+        self, state: EnvState, action: jax.Array, params: EnvParams
+    ) -> tuple[EnvState, Timestep]:
+        """Steps all environments, and begins episodes as ``autoreset_mode`` says.
+
+        Args:
+            state: the present states.
+            action: (N, A) float, clipped to [-1, 1].
+            params: what may be randomised.
+
+        Returns:
+            The next states and timesteps; ``info`` is that of ``PixelEnv.step``, and in mode
+            ``"same_step"`` has ``final_obs`` and ``final_info`` besides.
+
+        Raises:
+            ValueError: ``action`` has another shape.
+            TypeError: ``action`` is not floating point.
+        """
+        action = jnp.asarray(action)
+        expected = (self.num_envs, self.env.action_size)
+        if action.shape != expected:
+            raise ValueError(f"action must have shape {expected}, got {tuple(action.shape)}.")
+        begins = state.done
+        state, reward = jax.vmap(self.env.advance)(state, action)
+        if self.autoreset_mode == "next_step":
+            state = self._restart(state, begins, state.episode + 1)
+            state = self._show(state, params, begins)
+            return state, self._timestep(state, jnp.where(begins, 0.0, reward))
+        state = self._show(state, params, jnp.zeros(self.num_envs, bool))
+        timestep = self._timestep(state, reward)
+        if self.autoreset_mode == "disabled":
+            return state, timestep
+        state = self._begin_where(state, state.done, state.episode + 1, params)
+        first = self._timestep(state, reward)
+        info = {**first.info, "final_obs": timestep.obs, "final_info": timestep.info}
+        return state, timestep.replace(obs=first.obs, info=info)
+
+    def _env_keys(self, key: jax.Array) -> jax.Array:
+        if getattr(key, "shape", ()) == ():
+            check_key(key)
+            return jax.vmap(partial(jax.random.fold_in, key))(jnp.arange(self.num_envs))
+        check_key(key, (self.num_envs,))
+        return key
+
+    def _timestep(self, state: EnvState, reward: jax.Array) -> Timestep:
+        return jax.vmap(self.env.timestep)(state, reward)
+
+    def _show(self, state: EnvState, params: EnvParams, first: jax.Array) -> EnvState:
+        return jax.vmap(self.env.show, in_axes=(0, None, 0))(state, params, first)
+
+    def _restart(self, state: EnvState, mask: jax.Array, episode: jax.Array) -> EnvState:
+        """``state`` with fresh episodes where ``mask``, whose frames are not drawn yet."""
+
+        def begin(key: jax.Array, episode: jax.Array) -> EnvState:
+            # The key stays, and the frames are not ready: neither travels through the loop.
+            return self.env.begin(key, episode).replace(key=None, frames=None)
+
+        kept = state.replace(key=None, frames=None)
+        begun = _replace_rows(begin, (state.key, episode), mask, kept)
+        return begun.replace(key=state.key, frames=state.frames)
+
+    def _begin_where(
+        self, state: EnvState, mask: jax.Array, episode: jax.Array, params: EnvParams
+    ) -> EnvState:
+        """``state`` with fresh episodes where ``mask``, drawn; the others keep their frames."""
+        state = self._restart(state, mask, episode)
+        if self.env.obs_mode == "state":
+            return state
+        blank = jnp.zeros((self.num_envs, self.env.height, self.env.width), jnp.uint32)
+        newest = _replace_rows(
+            lambda physics: self.env.draw(physics, params), (state.physics,), mask, blank
+        )
+        first = jax.vmap(observe.push)(state.frames, newest, jnp.ones_like(mask))
+        # Environments that go on keep their stack as it is: nothing new was drawn for them.
+        return state.replace(frames=jnp.where(mask[:, None, None, None], first, state.frames))
+
+
+def _replace_rows(fn: Callable, arguments: tuple, mask: jax.Array, rows):
+    """``rows`` with ``fn`` of the arguments' rows in place of those where ``mask``.
+
+    The work is done in blocks and grows with the number of masked rows, not with N: most steps
+    end no episode, and a select over the whole batch would pay for all of them.
+    """
+    num_rows = mask.shape[0]
+    block = min(_BLOCK, num_rows)
+    padded = -(-num_rows // block) * block
+    # Out-of-range entries at the end: read as the last row, never written.
+    chosen = jnp.nonzero(mask, size=padded, fill_value=num_rows)[0]
+
+    def put(carry):
+        start, rows = carry
+        index = jax.lax.dynamic_slice(chosen, (start,), (block,))
+        inputs = jax.tree.map(lambda x: jnp.take(x, index, axis=0, mode="clip"), arguments)
+        outputs = jax.vmap(fn)(*inputs)
+        rows = jax.tree.map(lambda x, new: x.at[index].set(new, mode="drop"), rows, outputs)
+        return start + block, rows
+
+    count = jnp.sum(mask)
+    return jax.lax.while_loop(lambda carry: carry[0] < count, put, (jnp.int32(0), rows))[1]

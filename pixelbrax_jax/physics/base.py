@@ -1,0 +1,84 @@
+"""The interface between a physics engine and the rest of the package."""
+
+from __future__ import annotations
+
+from typing import Protocol, runtime_checkable
+
+import jax
+from flax import struct
+
+from pixelbrax_jax.types import Geoms, PhysicsState
+
+BACKENDS = ("generalized", "mjx", "positional", "spring")
+"""Names of Brax's engines."""
+
+
+@struct.dataclass
+class Kinematics:
+    """The readable part of an engine's state; what task formulas are written in.
+
+    Attributes:
+        q: (Q,) float32, joint positions in MuJoCo's order (metres, radians; a free joint is a
+            position and a quaternion).
+        qd: (V,) float32, joint velocities in MuJoCo's order, per second.
+        xpos: (L, 3) float32, metres, link origins in the world frame.
+        xquat: (L, 4) float32, unit, link orientations in the world frame.
+    """
+
+    q: jax.Array
+    qd: jax.Array
+    xpos: jax.Array
+    xquat: jax.Array
+
+
+@runtime_checkable
+class Physics(Protocol):
+    """A task's dynamics for ONE environment, as pure functions.
+
+    ``reset`` and ``step`` may be jitted, vmapped and scanned; every state they return has the
+    same tree, shapes and dtypes, so a jitted ``step`` is traced once. Whatever the engine does,
+    the fields of a ``PhysicsState`` other than ``engine`` are finite.
+
+    Attributes:
+        geoms: the visible shapes, each fixed in a link's frame.
+        dt: seconds of simulated time per control step.
+        action_size: A, number of actuators.
+        state_size: S, length of ``PhysicsState.obs``.
+        backend: name of the engine.
+        link_names: L names; ``link/index`` where the model has none. Row i of ``xpos`` and
+            ``xquat`` belongs to ``link_names[i]``.
+    """
+
+    geoms: Geoms
+    dt: float
+    action_size: int
+    state_size: int
+    backend: str
+    link_names: tuple[str, ...]
+
+    def reset(self, key: jax.Array) -> PhysicsState:
+        """A fresh draw of the task's initial state.
+
+        Args:
+            key: PRNG key, the only source of randomness.
+
+        Returns:
+            The first state of an episode, with reward 0 and ``terminated`` false. Should the
+            draw itself be non-finite, ``non_finite`` and ``terminated`` are true, the links
+            are at the world's origin and the observation is 0.
+        """
+        ...
+
+    def step(self, state: PhysicsState, action: jax.Array) -> PhysicsState:
+        """One control step.
+
+        Args:
+            state: what ``reset`` or ``step`` returned.
+            action: (A,) float32. Tasks are written for [-1, 1]; the caller clips.
+
+        Returns:
+            The next state. If the step diverged (see ``PhysicsState.non_finite``) it is the
+            given state with reward 0 and ``terminated`` and ``non_finite`` true. Stepping on
+            after a termination is allowed and continues the dynamics.
+        """
+        ...

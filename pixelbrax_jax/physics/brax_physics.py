@@ -1,0 +1,404 @@
+"""Brax's tasks and engines behind the ``Physics`` interface; the only file that imports Brax."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Collection, Mapping
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from flax import struct
+
+from pixelbrax_jax.physics.base import Kinematics
+from pixelbrax_jax.physics.compatibility import (
+    accept_old_clip,
+    import_silenced,
+    known_warnings_silenced,
+    loading_silenced,
+)
+from pixelbrax_jax.physics.geoms import VISIBLE_GROUPS, Color, read_geoms
+from pixelbrax_jax.spatial import quat_normalize
+from pixelbrax_jax.types import PhysicsState
+
+with import_silenced():
+    from brax import envs, fluid
+    from brax.envs.wrappers import training
+    from brax.io import mjcf
+
+if TYPE_CHECKING:
+    from pixelbrax_jax.physics.mjcf_task import MjcfTask
+
+RewardFn = Callable[[Kinematics, Kinematics, jax.Array], jax.Array]
+
+# MuJoCo calls a number bad beyond this magnitude (``mju_isBad``). It is well inside float32, so
+# that a picture of the scene can still be computed from it.
+_LARGEST = 1e10
+
+# These decide on batches, time limits and resets, which is the caller's business here.
+_TRAINING_WRAPPERS = (
+    training.AutoResetWrapper,
+    training.DomainRandomizationVmapWrapper,
+    training.EpisodeWrapper,
+    training.EvalWrapper,
+    training.VmapWrapper,
+)
+
+
+@struct.dataclass
+class BraxCarry:
+    """What Brax needs for the next step and ``PhysicsState`` does not hold already.
+
+    Attributes:
+        pipeline: the backend's state.
+        metrics: Brax's metrics of the last step.
+        info: Brax's info.
+    """
+
+    pipeline: Any
+    metrics: dict[str, Any]
+    info: dict[str, Any]
+
+
+class BraxPhysics:
+    """A Brax environment as ``Physics``. The given environment is never modified.
+
+    Two things differ from the environment itself. Quaternions of free and ball joints are
+    normalized before the first state is computed: Brax adds its reset noise to each of their
+    numbers. And a diverging step ends the episode instead of returning NaN: the step counts as
+    diverged if a joint or link position or velocity, the observation, the reward or the done
+    flag is not finite or larger than 1e10 in magnitude.
+    """
+
+    def __init__(
+        self,
+        env: envs.Env,
+        *,
+        colors: Mapping[str, Color] | None = None,
+        geom_groups: Collection[int] = VISIBLE_GROUPS,
+        unscale_actions: bool = False,
+        reward: RewardFn | None = None,
+    ):
+        """Reads the model and checks that the environment fits; compiles nothing.
+
+        Args:
+            env: a bare environment, such as ``brax.envs.get_environment("ant")``.
+            colors: replacements for colors by geom name, see ``read_geoms``.
+            geom_groups: MuJoCo's geom groups that are visible.
+            unscale_actions: for environments that map actions from [-1, 1] to the control
+                range: undo that map, so that costs and actuators see the action as given.
+            reward: replaces the environment's reward; called with the state before the step,
+                the state after it and the action, returns a scalar.
+
+        Raises:
+            ValueError: if ``env`` is wrapped for training, has no MuJoCo model, does not
+                observe one flat array, changes the tree of its state in ``step``, uses
+                features its backend lacks, or has geoms that cannot be drawn.
+        """
+        _check_env(env)
+        accept_old_clip(fluid)
+        model: mujoco.MjModel = env.unwrapped.sys.mj_model
+        self.geoms = read_geoms(model, colors=colors, geom_groups=geom_groups)
+        # Brax keeps the time step in float32; six digits give back the model's own number.
+        self.dt = float(f"{float(env.dt):.6g}")
+        self.action_size = int(env.action_size)
+        self.backend: str = env.backend
+        self.link_names = tuple(
+            model.body(i).name or f"link/{i - 1}" for i in range(1, model.nbody)
+        )
+        self._model = model
+        self._source = env
+        self._env = _replace_init(env, self._init)
+        self._reward = reward
+        self._control_range = _control_range(model) if unscale_actions else None
+        self._check_shapes()
+
+    def reset(self, key: jax.Array) -> PhysicsState:
+        """See ``Physics.reset``. ``key`` may be typed, or raw as Brax's own are."""
+        return self._first_state(self._env, key)
+
+    def from_qpos(
+        self, q: jax.Array, qd: jax.Array | None = None, *, key: jax.Array | None = None
+    ) -> PhysicsState:
+        """The first state of an episode, in a chosen pose.
+
+        Runs the environment's reset with its joint positions and velocities replaced, so the
+        observation and everything else agree with the pose. ``terminated`` is false even if
+        the task would end in this pose; the next step says so.
+
+        Args:
+            q: (Q,) float32, joint positions, see ``Kinematics``; quaternions of any length.
+            qd: (V,) float32, joint velocities, 0 if not given.
+            key: decides what the environment draws besides ``q`` and ``qd``; none of the
+                built-in tasks draws anything else.
+
+        Returns:
+            A state that ``step`` accepts.
+
+        Raises:
+            ValueError: for a wrong shape.
+        """
+        q = jnp.asarray(q, jnp.float32)
+        qd = jnp.zeros(self._model.nv) if qd is None else jnp.asarray(qd, jnp.float32)
+        if q.shape != (self._model.nq,) or qd.shape != (self._model.nv,):
+            raise ValueError(
+                f"q and qd must have shapes ({self._model.nq},) and ({self._model.nv},), "
+                f"got {q.shape} and {qd.shape}"
+            )
+
+        def init(_q: jax.Array, _qd: jax.Array, *args: Any, **kwargs: Any) -> Any:
+            return self._init(q, qd, *args, **kwargs)
+
+        key = jax.random.key(0) if key is None else key
+        return self._first_state(_replace_init(self._source, init), key)
+
+    def step(self, state: PhysicsState, action: jax.Array) -> PhysicsState:
+        """See ``Physics.step``.
+
+        Raises:
+            ValueError: when traced, if the action's shape is not ``(action_size,)``.
+        """
+        action = jnp.asarray(action, jnp.float32)
+        if action.shape != (self.action_size,):
+            raise ValueError(f"action must have shape ({self.action_size},), got {action.shape}")
+        carry = state.engine
+        # Brax updates these dicts in place.
+        metrics, info = jax.tree.map(lambda leaf: leaf, (carry.metrics, carry.info))
+        with known_warnings_silenced():
+            after = self._env.step(
+                envs.State(
+                    pipeline_state=carry.pipeline,
+                    obs=state.obs.astype(self._obs_dtype),
+                    reward=state.reward,
+                    done=state.terminated.astype(jnp.float32),
+                    metrics=metrics,
+                    info=info,
+                ),
+                self._unscale(action),
+            )
+        reward = after.reward
+        if self._reward is not None:
+            now = kinematics(after.pipeline_state)
+            reward = self._reward(kinematics(carry.pipeline), now, action)
+        finite = _is_finite(after, reward)
+        kept = (carry, state.xpos, state.xquat, state.obs)
+        engine, xpos, xquat, obs = _select(finite, self._outputs(after), kept)
+        return PhysicsState(
+            engine=engine,
+            xpos=xpos,
+            xquat=xquat,
+            obs=obs,
+            reward=jnp.where(finite, jnp.asarray(reward, jnp.float32), 0.0),
+            terminated=~finite | (jnp.asarray(after.done) > 0.5),
+            non_finite=~finite,
+        )
+
+    def _first_state(self, env: envs.Env, key: jax.Array) -> PhysicsState:
+        with known_warnings_silenced():
+            first = env.reset(key)
+        finite = _is_finite(first, jnp.zeros(()))
+        engine, xpos, xquat, obs = self._outputs(first)
+        nowhere = (
+            jnp.zeros_like(xpos),
+            quat_normalize(jnp.zeros_like(xquat)),
+            jnp.zeros_like(obs),
+        )
+        xpos, xquat, obs = _select(finite, (xpos, xquat, obs), nowhere)
+        return PhysicsState(
+            engine=engine,
+            xpos=xpos,
+            xquat=xquat,
+            obs=obs,
+            reward=jnp.zeros((), jnp.float32),
+            terminated=~finite,
+            non_finite=~finite,
+        )
+
+    def _outputs(
+        self, brax_state: envs.State
+    ) -> tuple[BraxCarry, jax.Array, jax.Array, jax.Array]:
+        carry = BraxCarry(
+            pipeline=brax_state.pipeline_state, metrics=brax_state.metrics, info=brax_state.info
+        )
+        # Brax writes Python numbers into some fields. Fixed dtypes keep a jitted step from
+        # being traced again for its own output.
+        carry = jax.tree.map(lambda leaf, dtype: jnp.asarray(leaf, dtype), carry, self._dtypes)
+        seen = kinematics(brax_state.pipeline_state)
+        return carry, seen.xpos, seen.xquat, jnp.asarray(brax_state.obs, jnp.float32)
+
+    def _init(self, q: jax.Array, qd: jax.Array, *args: Any, **kwargs: Any) -> Any:
+        """The environment's ``pipeline_init`` at a proper rotation."""
+        for kind, address in zip(self._model.jnt_type, self._model.jnt_qposadr, strict=True):
+            if kind == mujoco.mjtJoint.mjJNT_FREE:
+                rotation = slice(address + 3, address + 7)
+            elif kind == mujoco.mjtJoint.mjJNT_BALL:
+                rotation = slice(address, address + 4)
+            else:
+                continue
+            q = q.at[rotation].set(quat_normalize(q[rotation]))
+        return self._source.unwrapped.pipeline_init(q, qd, *args, **kwargs)
+
+    def _unscale(self, action: jax.Array) -> jax.Array:
+        if self._control_range is None:
+            return action
+        low, high = self._control_range
+        return (action - low) / (high - low) * 2 - 1
+
+    def _check_shapes(self) -> None:
+        key = jax.random.key(0)
+        try:
+            with known_warnings_silenced():
+                first = jax.eval_shape(self._env.reset, key)
+        except (AssertionError, NotImplementedError, RuntimeError) as error:
+            raise ValueError(
+                f"the {self.backend!r} backend cannot simulate this model: {error}"
+            ) from error
+        if not hasattr(first.obs, "shape") or len(first.obs.shape) != 1:
+            raise ValueError(
+                "the environment must observe one flat array, got "
+                f"{jax.tree.map(lambda leaf: leaf.shape, first.obs)}"
+            )
+        links = first.pipeline_state.x.pos.shape[0]
+        if links != len(self.link_names):
+            raise ValueError(
+                f"the environment's state has {links} links, its model {len(self.link_names)}"
+            )
+        self.state_size = int(first.obs.shape[0])
+        self._obs_dtype = first.obs.dtype
+        carry = BraxCarry(pipeline=first.pipeline_state, metrics=first.metrics, info=first.info)
+        self._dtypes = jax.tree.map(lambda leaf: leaf.dtype, carry)
+
+        state = jax.eval_shape(self.reset, key)
+        try:
+            after = jax.eval_shape(self.step, state, jnp.zeros(self.action_size))
+        except NotImplementedError as error:
+            raise ValueError(
+                f"the {self.backend!r} backend cannot simulate this model: {error}"
+            ) from error
+        if after.reward.shape != ():
+            raise ValueError(f"the reward must be a scalar, got shape {after.reward.shape}")
+        if after.terminated.shape != ():
+            raise ValueError(f"done must be a scalar, got shape {after.terminated.shape}")
+
+
+class MjcfEnv(envs.PipelineEnv):
+    """A Brax environment for any model, with the formulas of an ``MjcfTask``."""
+
+    def __init__(self, model: mujoco.MjModel, task: MjcfTask, backend: str):
+        with loading_silenced():
+            system = mjcf.load_model(model)
+        super().__init__(system, backend=backend, n_frames=task.n_frames)
+        self._task = task
+        self._model = model
+        limited = model.actuator_ctrllimited.astype(bool)
+        # An unlimited actuator takes the action as it is: the map from [-1, 1] to [-1, 1].
+        self._low = np.where(limited, model.actuator_ctrlrange[:, 0], -1).astype(np.float32)
+        self._high = np.where(limited, model.actuator_ctrlrange[:, 1], 1).astype(np.float32)
+
+    @property
+    def action_size(self) -> int:
+        """Number of actuators; Brax itself counts only those that act on joints."""
+        return int(self._model.nu)
+
+    def reset(self, rng: jax.Array) -> envs.State:
+        """Uniform noise around the initial pose."""
+        q_key, qd_key = jax.random.split(rng)
+        noise = self._task.reset_noise
+        q = self.sys.init_q if self._task.init_q is None else jnp.asarray(self._task.init_q)
+        q = q + jax.random.uniform(q_key, q.shape, minval=-noise, maxval=noise)
+        qd = jax.random.uniform(qd_key, (self._model.nv,), minval=-noise, maxval=noise)
+        pipeline = self.pipeline_init(q, qd)
+        zero = jnp.zeros(())
+        return envs.State(pipeline, self._task.observation(kinematics(pipeline)), zero, zero)
+
+    def step(self, state: envs.State, action: jax.Array) -> envs.State:
+        """Control steps as the task's formulas say."""
+        control = self._low + (action + 1) * 0.5 * (self._high - self._low)
+        pipeline = self.pipeline_step(state.pipeline_state, control)
+        before, after = kinematics(state.pipeline_state), kinematics(pipeline)
+        return state.replace(
+            pipeline_state=pipeline,
+            obs=self._task.observation(after),
+            reward=self._task.reward(before, after, action),
+            done=jnp.asarray(self._task.terminated(after), jnp.float32),
+        )
+
+
+def load_brax_env(name: str, backend: str, **options: Any) -> envs.Env:
+    """One of Brax's own environments, bare, loaded without its known warnings.
+
+    Args:
+        name: Brax's name of the task.
+        backend: Brax's name of the engine.
+        **options: further arguments of the environment's class.
+
+    Returns:
+        The environment.
+    """
+    with loading_silenced():
+        return envs.get_environment(name, backend=backend, **options)
+
+
+def kinematics(pipeline_state: Any) -> Kinematics:
+    """The readable part of a Brax backend's state."""
+    return Kinematics(
+        q=jnp.asarray(pipeline_state.q, jnp.float32),
+        qd=jnp.asarray(pipeline_state.qd, jnp.float32),
+        xpos=jnp.asarray(pipeline_state.x.pos, jnp.float32),
+        xquat=quat_normalize(jnp.asarray(pipeline_state.x.rot, jnp.float32)),
+    )
+
+
+def _check_env(env: envs.Env) -> None:
+    layer = env
+    while isinstance(layer, envs.Wrapper):
+        if isinstance(layer, _TRAINING_WRAPPERS):
+            raise ValueError(
+                f"the environment is wrapped in {type(layer).__name__}; pass the bare one, as "
+                "brax.envs.get_environment returns it"
+            )
+        layer = layer.env
+    if getattr(getattr(layer, "sys", None), "mj_model", None) is None:
+        raise ValueError(
+            f"{type(layer).__name__} has no MuJoCo model in env.sys.mj_model, so there is "
+            "nothing to draw"
+        )
+
+
+def _replace_init(env: envs.Env, init: Callable[..., Any]) -> envs.Env:
+    """A shallow copy of ``env``, down through its wrappers, with another ``pipeline_init``."""
+    clone = copy.copy(env)
+    if isinstance(env, envs.Wrapper):
+        clone.env = _replace_init(env.env, init)
+    else:
+        clone.pipeline_init = init
+    return clone
+
+
+def _control_range(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+    if not model.actuator_ctrllimited.all():
+        raise ValueError("unscale_actions needs a control range on every actuator")
+    low, high = model.actuator_ctrlrange.astype(np.float32).T
+    return low, high
+
+
+def _is_finite(brax_state: envs.State, reward: jax.Array) -> jax.Array:
+    pipeline = brax_state.pipeline_state
+    watched = (
+        pipeline.q,
+        pipeline.qd,
+        pipeline.x,
+        pipeline.xd,
+        brax_state.obs,
+        brax_state.done,
+        reward,
+    )
+    # False for NaN too.
+    leaves = [jnp.all(jnp.abs(leaf) < _LARGEST) for leaf in jax.tree.leaves(watched)]
+    return jnp.all(jnp.stack(leaves))
+
+
+def _select(choose_first: jax.Array, first: Any, second: Any) -> Any:
+    return jax.tree.map(lambda a, b: jnp.where(choose_first, a, b), first, second)

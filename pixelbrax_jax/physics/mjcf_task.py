@@ -1,0 +1,191 @@
+"""A task of your own from an MJCF file and three formulas, without writing a Brax class."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from pixelbrax_jax.choices import check_choice
+from pixelbrax_jax.physics.base import BACKENDS, Kinematics
+from pixelbrax_jax.physics.compatibility import loading_silenced
+from pixelbrax_jax.physics.geoms import VISIBLE_GROUPS, Color, read_geoms
+
+if TYPE_CHECKING:
+    from pixelbrax_jax.physics.brax_physics import BraxPhysics
+
+
+def never(after: Kinematics) -> jax.Array:
+    """False: the task has no end of its own."""
+    del after
+    return jnp.zeros((), bool)
+
+
+def joint_state(after: Kinematics) -> jax.Array:
+    """(Q + V,) float32, joint positions, then joint velocities."""
+    return jnp.concatenate([after.q, after.qd])
+
+
+@dataclass(frozen=True, eq=False)
+class MjcfTask:
+    """What a model needs to become a task. Functions are pure and see ONE environment.
+
+    Attributes:
+        reward: of the state before a step, the state after it and the (A,) action in [-1, 1];
+            returns a scalar.
+        terminated: of the state after a step; returns a () bool, true when the task ended.
+        observation: of a state; returns the (S,) float state observation.
+        reset_noise: joint positions and velocities start within plus or minus this of
+            ``init_q`` and 0, uniformly (metres, radians, per second).
+        n_frames: physics steps per control step.
+        init_q: (Q,) joint positions to start from; None for the model's own.
+    """
+
+    reward: Callable[[Kinematics, Kinematics, jax.Array], jax.Array]
+    terminated: Callable[[Kinematics], jax.Array] = never
+    observation: Callable[[Kinematics], jax.Array] = joint_state
+    reset_noise: float = 0.01
+    n_frames: int = 5
+    init_q: np.ndarray | None = None
+
+
+def mjcf_physics(
+    source: str | Path,
+    *,
+    reward: Callable[[Kinematics, Kinematics, jax.Array], jax.Array],
+    terminated: Callable[[Kinematics], jax.Array] = never,
+    observation: Callable[[Kinematics], jax.Array] = joint_state,
+    reset_noise: float = 0.01,
+    n_frames: int = 5,
+    init_q: np.ndarray | None = None,
+    backend: str = "mjx",
+    colors: Mapping[str, Color] | None = None,
+    geom_groups: Collection[int] = VISIBLE_GROUPS,
+) -> BraxPhysics:
+    """Physics of a model in MuJoCo's MJCF (or URDF) format.
+
+    An action in [-1, 1] is mapped linearly to an actuator's control range, or passed as it is
+    if the actuator has none. Bodies without joints are fused with their parents, because links
+    are what moves. The model starts at ``qpos0``, or at its custom numeric ``init_qpos``.
+
+    Args:
+        source: a file, or the XML itself.
+        reward: see ``MjcfTask``.
+        terminated: see ``MjcfTask``.
+        observation: see ``MjcfTask``.
+        reset_noise: see ``MjcfTask``.
+        n_frames: see ``MjcfTask``; the control step lasts this many of the model's time steps.
+        init_q: see ``MjcfTask``.
+        backend: ``"mjx"`` simulates most of MuJoCo; the others are Brax's own engines for
+            trees of hinges, slides and free joints.
+        colors: replacements for the model's colors by geom name, red, green, blue in [0, 1].
+        geom_groups: MuJoCo's geom groups that are visible.
+
+    Returns:
+        The physics, to be used as any other.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if the model cannot be compiled, simulated or drawn, has no joint or no
+            actuator, or a function returns the wrong shape or dtype.
+    """
+    check_choice("backend", backend, BACKENDS)
+    if not math.isfinite(reset_noise) or reset_noise < 0:
+        raise ValueError(f"reset_noise must be finite and not negative, got {reset_noise}")
+    if n_frames < 1 or n_frames != int(n_frames):
+        raise ValueError(f"n_frames must be a positive whole number, got {n_frames}")
+    model = _compile(source)
+    _check_model(model, backend)
+    # A geom that cannot be drawn should be reported before anything slow is loaded.
+    read_geoms(model, colors=colors, geom_groups=geom_groups)
+    if init_q is not None:
+        init_q = np.asarray(init_q, np.float32)
+        if init_q.shape != (model.nq,):
+            raise ValueError(f"init_q must have shape ({model.nq},), got {init_q.shape}")
+    task = MjcfTask(reward, terminated, observation, float(reset_noise), int(n_frames), init_q)
+    _check_functions(task, model)
+    # Importing Brax takes seconds.
+    from pixelbrax_jax.physics.brax_physics import BraxPhysics, MjcfEnv
+
+    return BraxPhysics(MjcfEnv(model, task, backend), colors=colors, geom_groups=geom_groups)
+
+
+def _compile(source: str | Path) -> mujoco.MjModel:
+    is_xml = isinstance(source, str) and source.lstrip().startswith("<")
+    what = "the given XML" if is_xml else f"{str(source)!r}"
+    if not is_xml and not Path(source).is_file():
+        raise FileNotFoundError(f"there is no MJCF file {str(Path(source).absolute())!r}")
+    try:
+        with loading_silenced():
+            spec = (
+                mujoco.MjSpec.from_string(str(source))
+                if is_xml
+                else mujoco.MjSpec.from_file(str(source))
+            )
+            # Every body is then a link that moves. Brax's own loader also fuses, but on the
+            # XML text, where it misses rotations that are not given as quaternions.
+            spec.compiler.fusestatic = True
+            return spec.compile()
+    except ValueError as error:
+        raise ValueError(f"MuJoCo cannot compile {what}: {error}") from error
+
+
+def _check_model(model: mujoco.MjModel, backend: str) -> None:
+    if model.nv == 0:
+        raise ValueError("the model has no joint, so nothing can move")
+    if model.nu == 0:
+        raise ValueError("the model has no actuator, so an agent could not act on it")
+    if backend == "mjx":
+        return
+    # Brax's own engines would leave these out without a word.
+    left_out = [
+        what
+        for what, count in (
+            ("equality constraints", model.neq),
+            ("tendons", model.ntendon),
+            ("bodies without a joint", int((model.body_jntnum[1:] == 0).sum())),
+        )
+        if count
+    ]
+    if left_out:
+        raise ValueError(
+            f"the {backend!r} backend does not simulate {' or '.join(left_out)}; "
+            "use backend='mjx'"
+        )
+
+
+def _check_functions(task: MjcfTask, model: mujoco.MjModel) -> None:
+    links = model.nbody - 1
+    shapes = Kinematics(
+        q=jax.ShapeDtypeStruct((model.nq,), jnp.float32),
+        qd=jax.ShapeDtypeStruct((model.nv,), jnp.float32),
+        xpos=jax.ShapeDtypeStruct((links, 3), jnp.float32),
+        xquat=jax.ShapeDtypeStruct((links, 4), jnp.float32),
+    )
+    action = jax.ShapeDtypeStruct((model.nu,), jnp.float32)
+    _check_result("reward", "a scalar number", jax.eval_shape(task.reward, shapes, shapes, action))
+    _check_result("terminated", "a scalar bool", jax.eval_shape(task.terminated, shapes))
+    _check_result("observation", "a flat float array", jax.eval_shape(task.observation, shapes))
+
+
+def _check_result(name: str, expected: str, result: object) -> None:
+    shape, dtype = getattr(result, "shape", None), getattr(result, "dtype", None)
+    if shape is not None and dtype is not None:
+        is_bool, is_float = dtype == jnp.bool_, jnp.issubdtype(dtype, jnp.floating)
+        is_number = is_float or jnp.issubdtype(dtype, jnp.integer)
+        fits = {
+            "reward": shape == () and is_number,
+            "terminated": shape == () and is_bool,
+            "observation": len(shape) == 1 and shape[0] > 0 and is_float,
+        }[name]
+        if fits:
+            return
+        result = f"shape {shape} and dtype {dtype}"
+    raise ValueError(f"{name} must return {expected}, got {result}")

@@ -1,0 +1,164 @@
+"""Closed forms for a ray from the origin against one convex geom.
+
+A vector is a tuple of its three components, and each component is either a scalar or an
+(H, W) plane of pixels: the same code serves rays that fan out from the camera (ray in planes,
+geom in scalars) and shadow rays towards a distant light (ray in scalars, geom in planes).
+Rays have unit length. A ray enters a geom from outside; a geom around the origin is not seen.
+
+A missed geom yields NaN or a negative distance, never +inf: `fused.py` relies on it. Formulas
+follow from substituting the ray into the surface's equation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from pixelbrax_jax.types import GeomKind
+
+Vector = tuple[jax.Array, jax.Array, jax.Array]
+
+_TINY = 1e-7
+"""Keeps a ray that is parallel to an axis or a face away from a division by zero."""
+
+
+class Hit(NamedTuple):
+    """Where a ray enters a geom.
+
+    Attributes:
+        t: distance from the origin, metres; NaN or negative where the geom is missed.
+        normal_dot: ``normal_dot(v, ray_v)`` is the product of the outer unit normal with the
+            vector ``v``, given also the product ``ray_v`` of the ray with ``v``.
+    """
+
+    t: jax.Array
+    normal_dot: Callable[[Vector, jax.Array], jax.Array]
+
+
+def dot(a: Vector, b: Vector) -> jax.Array:
+    """Inner product."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _nonzero(x: jax.Array) -> jax.Array:
+    return jnp.where(jnp.abs(x) < _TINY, _TINY, x)
+
+
+def _plane(ray: Vector, pos: Vector, axes: tuple[Vector, Vector, Vector], size: Vector) -> Hit:
+    normal = axes[2]
+    descent = dot(ray, normal)
+    # Seen from above alone; from below, the quotient is negative by itself.
+    t = jnp.where(descent < -_TINY, dot(pos, normal) / jnp.minimum(descent, -_TINY), -1.0)
+    return Hit(t, lambda v, ray_v: dot(normal, v))
+
+
+def _sphere(ray: Vector, pos: Vector, axes: tuple[Vector, Vector, Vector], size: Vector) -> Hit:
+    b = dot(ray, pos)
+    t = b - jnp.sqrt(b * b - (dot(pos, pos) - size[0] * size[0]))
+    inv_radius = 1.0 / size[0]
+    return Hit(t, lambda v, ray_v: (t * ray_v - dot(pos, v)) * inv_radius)
+
+
+def _capsule(ray: Vector, pos: Vector, axes: tuple[Vector, Vector, Vector], size: Vector) -> Hit:
+    radius, half, axis = size[0], size[1], axes[2]
+    pos_axis, pos_pos = dot(pos, axis), dot(pos, pos)
+    ray_axis, ray_pos = dot(ray, axis), dot(ray, pos)
+    # The line enters the infinite cylinder at axial coordinate y. Clamped to the segment, y is
+    # the center of the only sphere on it through which the line can enter the capsule.
+    a = jnp.maximum(1.0 - ray_axis * ray_axis, _TINY)
+    b = ray_pos - ray_axis * pos_axis
+    c = pos_pos - pos_axis * pos_axis - radius * radius
+    y = (b - jnp.sqrt(b * b - a * c)) / a * ray_axis - pos_axis
+    y = jnp.clip(y, -half, half)
+    b = ray_pos + y * ray_axis
+    c = (pos_pos - radius * radius) + y * (2.0 * pos_axis + y)
+    t = b - jnp.sqrt(b * b - c)
+    inv_radius = 1.0 / radius
+    return Hit(t, lambda v, ray_v: (t * ray_v - dot(pos, v) - y * dot(axis, v)) * inv_radius)
+
+
+def _ellipsoid(ray: Vector, pos: Vector, axes: tuple[Vector, Vector, Vector], size: Vector) -> Hit:
+    # In coordinates divided by the radii the ellipsoid is the unit sphere.
+    d = [dot(ray, axis) / radius for axis, radius in zip(axes, size, strict=True)]
+    o = [-dot(pos, axis) / radius for axis, radius in zip(axes, size, strict=True)]
+    a, b, c = dot(d, d), dot(d, o), dot(o, o) - 1.0
+    t = (-b - jnp.sqrt(b * b - a * c)) / a
+    n = [(o[k] + t * d[k]) / size[k] for k in range(3)]
+    inv_length = jax.lax.rsqrt(dot(n, n))
+
+    def normal_dot(v, ray_v):
+        return dot(n, [dot(axis, v) for axis in axes]) * inv_length
+
+    return Hit(t, normal_dot)
+
+
+def _cylinder(ray: Vector, pos: Vector, axes: tuple[Vector, Vector, Vector], size: Vector) -> Hit:
+    radius, half = size[0], size[1]
+    dx, dy, dz = (dot(ray, axis) for axis in axes)
+    ox, oy, oz = (-dot(pos, axis) for axis in axes)
+    a = jnp.maximum(dx * dx + dy * dy, _TINY)
+    b, c = ox * dx + oy * dy, ox * ox + oy * oy - radius * radius
+    t_side = (-b - jnp.sqrt(b * b - a * c)) / a
+    on_side = jnp.abs(oz + t_side * dz) <= half  # False for NaN
+    # Otherwise the ray can only enter through the cap that faces it.
+    dz = _nonzero(dz)
+    facing = jnp.where(dz > 0, -1.0, 1.0)
+    t_cap = (facing * half - oz) / dz
+    x, y = ox + t_cap * dx, oy + t_cap * dy
+    t = jnp.where(on_side, t_side, jnp.where(x * x + y * y <= radius * radius, t_cap, -1.0))
+
+    def normal_dot(v, ray_v):
+        vx, vy, vz = (dot(axis, v) for axis in axes)
+        side = ((ox + t * dx) * vx + (oy + t * dy) * vy) / radius
+        return jnp.where(on_side, side, facing * vz)
+
+    return Hit(t, normal_dot)
+
+
+def _box(ray: Vector, pos: Vector, axes: tuple[Vector, Vector, Vector], size: Vector) -> Hit:
+    d = [_nonzero(dot(ray, axis)) for axis in axes]
+    o = [-dot(pos, axis) for axis in axes]
+    facing = [jnp.where(d[k] > 0, -1.0, 1.0) for k in range(3)]
+    near = [(facing[k] * size[k] - o[k]) / d[k] for k in range(3)]
+    far = [(-facing[k] * size[k] - o[k]) / d[k] for k in range(3)]
+    entry = jnp.maximum(jnp.maximum(near[0], near[1]), near[2])
+    leave = jnp.minimum(jnp.minimum(far[0], far[1]), far[2])
+    t = jnp.where(entry <= leave, entry, -1.0)
+
+    def normal_dot(v, ray_v):
+        by_face = [facing[k] * dot(axes[k], v) for k in range(3)]
+        yz = jnp.where(near[1] >= near[2], by_face[1], by_face[2])
+        return jnp.where((near[0] >= near[1]) & (near[0] >= near[2]), by_face[0], yz)
+
+    return Hit(t, normal_dot)
+
+
+_BY_KIND = {
+    GeomKind.PLANE: _plane,
+    GeomKind.SPHERE: _sphere,
+    GeomKind.CAPSULE: _capsule,
+    GeomKind.ELLIPSOID: _ellipsoid,
+    GeomKind.CYLINDER: _cylinder,
+    GeomKind.BOX: _box,
+}
+
+
+def intersect(
+    kind: int, ray: Vector, pos: Vector, axes: tuple[Vector, Vector, Vector], size: Vector
+) -> Hit:
+    """Where unit rays from the origin enter a geom.
+
+    Args:
+        kind: a value of ``GeomKind``.
+        ray: directions, unit length.
+        pos: the geom's center, metres, in the rays' frame.
+        axes: the geom's x, y and z directions in the rays' frame.
+        size: the geom's three size numbers, as in ``Geoms.size``.
+
+    Returns:
+        The hit, in the shape to which ``ray`` and ``pos`` broadcast.
+    """
+    return _BY_KIND[GeomKind(kind)](ray, pos, axes, size)

@@ -1,0 +1,225 @@
+"""The plain ray-caster: the oracle for every faster one, and the one that is differentiated.
+
+It works in the world frame with vectors as last axes, one geom after the other, and computes the
+full normal of every hit. Nothing here is clever; keep it so. A missed geom is at distance
+``inf``, and every root and quotient is guarded so that no gradient is ever NaN.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from pixelbrax_jax import spatial
+from pixelbrax_jax.renderer import ground
+from pixelbrax_jax.types import Camera, Frame, GeomKind, Look, Scene
+
+_SHADOW_BIAS = 1e-3
+
+
+def render(
+    scene: Scene, height: int, width: int, first_row: jax.Array | int, num_rows: int
+) -> Frame:
+    """A band of rows of a picture of the scene.
+
+    Args:
+        scene: what to draw.
+        height: pixels of the whole picture.
+        width: pixels.
+        first_row: () int, the band's first row; may be traced.
+        num_rows: rows of the band.
+
+    Returns:
+        The band, every plane (num_rows, W).
+    """
+    geoms, look, camera = scene.geoms, scene.look, scene.camera
+    rays = pixel_rays(camera, height, width, first_row + jnp.arange(num_rows))
+    distances, normals = [], []
+    for g, kind in enumerate(geoms.kind):
+        t, normal = _cast(kind, camera.pos, rays, scene.pos[g], scene.xmat[g], geoms.size[g])
+        distances.append(t)
+        normals.append(normal)
+    t = jnp.stack(distances)
+    nearest = jnp.argmin(t, axis=0)
+    t = jnp.min(t, axis=0)
+    hit = jnp.isfinite(t)
+    t = jnp.where(hit, t, 1.0)
+    normal = jnp.take_along_axis(jnp.stack(normals), nearest[None, :, :, None], axis=0)[0]
+    points = camera.pos + t[..., None] * rays
+
+    to_light = spatial.unit(look.light)
+    lit = jnp.ones_like(hit)
+    if look.shadows:
+        for g, kind in enumerate(geoms.kind):
+            if kind != GeomKind.PLANE:
+                light_rays = jnp.broadcast_to(to_light, points.shape)
+                way, _ = _cast(kind, points, light_rays, scene.pos[g], scene.xmat[g], geoms.size[g])
+                lit &= ~(jnp.isfinite(way) & (way > _SHADOW_BIAS) & (nearest != g))
+
+    color = jnp.asarray(geoms.rgb)[jnp.array(geoms.material)[nearest]]
+    for g, kind in enumerate(geoms.kind):
+        if kind == GeomKind.PLANE:
+            tiles = _ground_color(look, camera, rays, scene.pos[g], scene.xmat[g], height)
+            color = jnp.where((nearest == g)[..., None], tiles, color)
+
+    back = camera.xmat[:, 2]
+    n_l, n_z = normal @ to_light, normal @ back
+    bright = lit & (n_l > 0.0)
+    gloss = jnp.maximum(2.0 * n_l * n_z - to_light @ back, 0.0) ** look.shininess
+    gloss = jnp.where(bright, gloss, 0.0)[..., None]
+    diffuse = jnp.where(bright, n_l, 0.0)[..., None]
+    shade = look.ambient + look.diffuse * diffuse + look.specular * gloss
+    surface = jnp.clip(color * shade + look.highlight * gloss, 0.0, 1.0)
+    rise = jnp.clip(rays[..., 2:], 0.0, 1.0)
+    sky = look.sky[0] + rise * (look.sky[1] - look.sky[0])
+    rgb = jnp.where(hit[..., None], surface, sky)
+    return Frame(
+        r=rgb[..., 0],
+        g=rgb[..., 1],
+        b=rgb[..., 2],
+        depth=jnp.where(hit, -t * (rays @ back), jnp.inf),
+        seg=jnp.where(hit, nearest, -1).astype(jnp.int32),
+    )
+
+
+def pixel_rays(camera: Camera, height: int, width: int, rows: jax.Array) -> jax.Array:
+    """Unit directions through the pixels' centers, world frame, (len(rows), W, 3)."""
+    pixel = 2.0 * jnp.tan(jnp.deg2rad(camera.fovy) / 2.0) / height
+    x = (jnp.arange(width) - 0.5 * (width - 1)) * pixel
+    y = (0.5 * (height - 1) - rows) * pixel
+    x, y = jnp.meshgrid(x, y)
+    return spatial.unit(jnp.stack([x, y, -jnp.ones_like(x)], axis=-1)) @ camera.xmat.T
+
+
+def _cast(
+    kind: int,
+    origin: jax.Array,
+    rays: jax.Array,
+    pos: jax.Array,
+    xmat: jax.Array,
+    size: jax.Array,
+) -> tuple[jax.Array, jax.Array]:
+    """Distance at which rays enter a geom (``inf`` if never) and the normals there, world."""
+    o = (origin - pos) @ xmat
+    d = rays @ xmat
+    o = jnp.broadcast_to(o, d.shape)
+    t, normal = _LOCAL[GeomKind(kind)](o, d, size)
+    return t, normal @ xmat.T
+
+
+def _entry(a: jax.Array, b: jax.Array, c: jax.Array) -> jax.Array:
+    """Smaller root of ``a t^2 + 2 b t + c`` where it is real and positive, else ``inf``."""
+    discriminant = b * b - a * c
+    real = (discriminant > 0.0) & (a > 1e-7)
+    root = jnp.sqrt(jnp.where(real, discriminant, 1.0))
+    t = (-b - root) / jnp.where(real, a, 1.0)
+    return jnp.where(real & (t > 0.0), t, jnp.inf)
+
+
+def _at(o: jax.Array, d: jax.Array, t: jax.Array) -> jax.Array:
+    """Points on the rays; the origin's neighbor where ``t`` is infinite."""
+    return o + jnp.where(jnp.isfinite(t), t, 1.0)[..., None] * d
+
+
+def _plane(o: jax.Array, d: jax.Array, size: jax.Array) -> tuple[jax.Array, jax.Array]:
+    descends = d[..., 2] < -1e-7
+    t = -o[..., 2] / jnp.where(descends, d[..., 2], -1.0)
+    normal = jnp.broadcast_to(jnp.array([0.0, 0.0, 1.0]), d.shape)
+    return jnp.where(descends & (t > 0.0), t, jnp.inf), normal
+
+
+def _sphere(o: jax.Array, d: jax.Array, size: jax.Array) -> tuple[jax.Array, jax.Array]:
+    t = _entry(jnp.sum(d * d, -1), jnp.sum(o * d, -1), jnp.sum(o * o, -1) - size[0] ** 2)
+    return t, spatial.unit(_at(o, d, t))
+
+
+def _capsule(o: jax.Array, d: jax.Array, size: jax.Array) -> tuple[jax.Array, jax.Array]:
+    radius, half = size[0], size[1]
+    flat_o, flat_d = o[..., :2], d[..., :2]
+    t = _entry(
+        jnp.sum(flat_d * flat_d, -1),
+        jnp.sum(flat_o * flat_d, -1),
+        jnp.sum(flat_o * flat_o, -1) - radius**2,
+    )
+    t = jnp.where(jnp.abs(_at(o, d, t)[..., 2]) <= half, t, jnp.inf)
+    for end in (-half, half):
+        cap, _ = _sphere(o - jnp.array([0.0, 0.0, 1.0]) * end, d, size)
+        t = jnp.minimum(t, cap)
+    point = _at(o, d, t)
+    on_axis = jnp.clip(point[..., 2], -half, half)
+    return t, spatial.unit(point - on_axis[..., None] * jnp.array([0.0, 0.0, 1.0]))
+
+
+def _ellipsoid(o: jax.Array, d: jax.Array, size: jax.Array) -> tuple[jax.Array, jax.Array]:
+    so, sd = o / size, d / size
+    t = _entry(jnp.sum(sd * sd, -1), jnp.sum(so * sd, -1), jnp.sum(so * so, -1) - 1.0)
+    return t, spatial.unit(_at(o, d, t) / size**2)
+
+
+def _cylinder(o: jax.Array, d: jax.Array, size: jax.Array) -> tuple[jax.Array, jax.Array]:
+    radius, half = size[0], size[1]
+    flat_o, flat_d = o[..., :2], d[..., :2]
+    side = _entry(
+        jnp.sum(flat_d * flat_d, -1),
+        jnp.sum(flat_o * flat_d, -1),
+        jnp.sum(flat_o * flat_o, -1) - radius**2,
+    )
+    side = jnp.where(jnp.abs(_at(o, d, side)[..., 2]) <= half, side, jnp.inf)
+    outward = jnp.where(d[..., 2] > 0, -1.0, 1.0)
+    slanted = jnp.abs(d[..., 2]) > 1e-7
+    cap = (outward * half - o[..., 2]) / jnp.where(slanted, d[..., 2], 1.0)
+    flat = _at(o, d, cap)[..., :2]
+    inside = jnp.sum(flat * flat, -1) <= radius**2
+    cap = jnp.where(slanted & inside & (cap > 0.0), cap, jnp.inf)
+    t = jnp.minimum(side, cap)
+    point = _at(o, d, t)
+    side_normal = spatial.unit(point * jnp.array([1.0, 1.0, 0.0]))
+    cap_normal = outward[..., None] * jnp.array([0.0, 0.0, 1.0])
+    return t, jnp.where((side <= cap)[..., None], side_normal, cap_normal)
+
+
+def _box(o: jax.Array, d: jax.Array, size: jax.Array) -> tuple[jax.Array, jax.Array]:
+    safe = jnp.where(jnp.abs(d) < 1e-7, 1e-7, d)
+    outward = jnp.where(safe > 0, -1.0, 1.0)
+    near = (outward * size - o) / safe
+    far = (-outward * size - o) / safe
+    face = jnp.argmax(near, axis=-1)
+    entry, leave = jnp.max(near, axis=-1), jnp.min(far, axis=-1)
+    t = jnp.where((entry <= leave) & (entry > 0.0), entry, jnp.inf)
+    return t, jax.nn.one_hot(face, 3, dtype=d.dtype) * outward
+
+
+_LOCAL = {
+    GeomKind.PLANE: _plane,
+    GeomKind.SPHERE: _sphere,
+    GeomKind.CAPSULE: _capsule,
+    GeomKind.ELLIPSOID: _ellipsoid,
+    GeomKind.CYLINDER: _cylinder,
+    GeomKind.BOX: _box,
+}
+
+
+def _ground_color(
+    look: Look, camera: Camera, rays: jax.Array, pos: jax.Array, xmat: jax.Array, height: int
+) -> jax.Array:
+    """The plane's pattern where the rays meet it, (H, W, 3)."""
+    o, d = (camera.pos - pos) @ xmat, rays @ xmat
+    pixel = 2.0 * jnp.tan(jnp.deg2rad(camera.fovy) / 2.0) / height
+    # Rays of length 1 along the viewing axis are linear in the pixel's position, so their
+    # derivatives by one pixel are the camera's axes.
+    unit_depth = -1.0 / (rays @ camera.xmat[:, 2])
+    d = d * unit_depth[..., None]
+    down = jnp.minimum(d[..., 2], -1e-7)
+    s = -o[2] / down
+    footprint = jnp.zeros((*s.shape, 2))
+    for axis in (camera.xmat[:, 0], camera.xmat[:, 1]):
+        turn = (axis * pixel) @ xmat
+        moved = s[..., None] * (turn[:2] - d[..., :2] * (turn[2] / down)[..., None])
+        footprint += jnp.abs(moved)
+    coords = (o[:2] + s[..., None] * d[..., :2]) / look.ground_pitch
+    footprint = footprint / look.ground_pitch
+    share = ground.second_color_share(
+        look.ground, coords[..., 0], coords[..., 1], footprint[..., 0], footprint[..., 1]
+    )
+    first, second = look.ground_rgb[0], look.ground_rgb[1]
+    return first + share[..., None] * (second - first)

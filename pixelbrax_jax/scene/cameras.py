@@ -1,0 +1,195 @@
+"""Camera rigs as data: one row per task, and views that every task has."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pixelbrax_jax import spatial
+from pixelbrax_jax.choices import check_choice
+from pixelbrax_jax.types import Camera, CameraRig
+
+Vector = tuple[float, float, float]
+
+
+def rig(
+    eye: Vector,
+    target: Vector,
+    fovy: float,
+    *,
+    link: int = -1,
+    track: Vector = (1.0, 1.0, 0.0),
+    up: Vector = (0.0, 0.0, 1.0),
+) -> CameraRig:
+    """A camera rig from plain numbers.
+
+    Args:
+        eye: metres; relative to the tracked link along tracked axes, absolute along others.
+        target: metres, likewise; the point looked at.
+        fovy: vertical field of view, degrees, between 0 and 180.
+        link: index of the followed link, -1 for a camera at rest.
+        track: how much of the link's position is followed, per world axis.
+        up: the world direction that is up in the picture.
+
+    Returns:
+        The rig, float32.
+
+    Raises:
+        ValueError: eye and target coincide, ``up`` is along the view, or ``fovy`` is outside
+            (0, 180).
+    """
+    if not 0.0 < fovy < 180.0:
+        raise ValueError(f"fovy must lie between 0 and 180 degrees, got {fovy}.")
+    view = np.subtract(target, eye)
+    if np.linalg.norm(np.cross(view, up)) < 1e-6 * max(np.linalg.norm(view), 1e-6):
+        raise ValueError(
+            f"a camera at {eye} cannot look at {target} with up={up}: the two points must "
+            "differ and 'up' must not be parallel to the view."
+        )
+    as_f32 = lambda values: np.array(values, np.float32)  # noqa: E731
+    return CameraRig(
+        link=link,
+        track=as_f32(track if link >= 0 else (0.0, 0.0, 0.0)),
+        eye=as_f32(eye),
+        target=as_f32(target),
+        up=as_f32(up),
+        fovy=np.float32(fovy),
+    )
+
+
+_PLANAR = rig((0.0, -2.1, 0.8), (0.0, 0.0, 0.6), 55.0, link=0)
+_HUMANOID = rig((1.7, -1.7, 1.5), (0.0, 0.0, 1.1), 50.0, link=0)
+
+# Viewpoints of the original renderer (arXiv 2502.00021). It gives a horizontal field of view;
+# at its square pictures that is the vertical one too.
+ORIGINAL: dict[str, CameraRig] = {
+    "ant": rig((1.6, -1.6, 3.5), (0.0, 0.0, 0.0), 40.0, link=0),
+    "halfcheetah": _PLANAR,
+    "hopper": _PLANAR,
+    "humanoid": _HUMANOID,
+    "humanoidstandup": _HUMANOID,
+    "inverted_pendulum": rig((0.0, -2.3, 0.0), (0.0, 0.0, 0.0), 55.0),
+    "pusher": rig((1.6, 1.6, 0.75), (0.0, 0.0, 0.0), 50.0, link=0),
+    "reacher": rig((0.0, -0.01, 0.81), (0.0, 0.0, 0.0), 45.0, link=0, up=(0.0, 1.0, 1.0)),
+    "swimmer": rig((2.4, 2.4, 1.25), (0.0, 0.0, 0.0), 50.0, link=1),
+    "walker2d": _PLANAR,
+}
+
+DEFAULT: dict[str, CameraRig] = ORIGINAL | {
+    # The original has no viewpoint for this task.
+    "inverted_double_pendulum": rig((0.0, -3.0, 0.6), (0.0, 0.0, 0.6), 55.0),
+    # The original aims above the lying torso, which then sits at the lower edge.
+    "humanoidstandup": rig((1.7, -1.7, 1.5), (0.0, 0.0, 0.7), 50.0, link=0),
+}
+
+
+def _around(base: CameraRig, direction: Vector, up: Vector) -> CameraRig:
+    """``base`` seen from another side, at the same distance from the same target."""
+    away = np.array(direction) / np.linalg.norm(direction)
+    distance = np.linalg.norm(base.eye - base.target)
+    eye = base.target + np.float32(distance) * away.astype(np.float32)
+    return dataclasses.replace(base, eye=eye, up=np.array(up, np.float32))
+
+
+def named_rigs(task: str, fallback: CameraRig | None = None) -> dict[str, CameraRig]:
+    """All rigs of a task by name.
+
+    Args:
+        task: Brax's name of the task, or any name with ``fallback`` given.
+        fallback: default rig of a task that has no row of its own.
+
+    Returns:
+        ``default``, ``side`` (seen along +y), ``front`` (along -x), ``top`` (from above, +y up
+        in the picture), and ``original`` where the paper has one.
+    """
+    default = DEFAULT.get(task, fallback)
+    if default is None:
+        raise ValueError(f"no camera rig is known for task {task!r}: give one as `camera=`.")
+    rigs = {
+        "default": default,
+        "side": _around(default, (0.0, -1.0, 0.15), (0.0, 0.0, 1.0)),
+        "front": _around(default, (1.0, 0.0, 0.15), (0.0, 0.0, 1.0)),
+        "top": _around(default, (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)),
+    }
+    if task in ORIGINAL:
+        rigs["original"] = ORIGINAL[task]
+    return rigs
+
+
+def make_rig(
+    task: str, camera: str | CameraRig | Camera = "default", fallback: CameraRig | None = None
+) -> CameraRig:
+    """A rig by name, the given one, or one that holds a camera at rest.
+
+    Args:
+        task: the task's name.
+        camera: a name of ``named_rigs``, a ``CameraRig`` or a ``Camera``.
+        fallback: default rig of a task that has no row of its own.
+
+    Returns:
+        The rig.
+
+    Raises:
+        ValueError: the name is unknown.
+        TypeError: ``camera`` is of another type.
+    """
+    if isinstance(camera, CameraRig):
+        return camera
+    if isinstance(camera, Camera):
+        return at_rest(camera)
+    if not isinstance(camera, str):
+        raise TypeError(
+            "camera must be a name, a pixelbrax_jax.CameraRig or a pixelbrax_jax.Camera, "
+            f"got {type(camera).__name__}."
+        )
+    rigs = named_rigs(task, fallback)
+    return rigs[check_choice(f"camera of task {task!r}", camera, rigs)]
+
+
+def at_rest(camera: Camera) -> CameraRig:
+    """The rig that always yields ``camera``."""
+    pos = np.asarray(camera.pos, np.float32)
+    xmat = np.asarray(camera.xmat, np.float32)
+    return CameraRig(
+        link=-1,
+        track=np.zeros(3, np.float32),
+        eye=pos,
+        target=pos - xmat[:, 2],
+        up=xmat[:, 1],
+        fovy=np.asarray(camera.fovy, np.float32),
+    )
+
+
+def aim(rig: CameraRig, xpos: jax.Array) -> Camera:
+    """The camera of a rig for the current link positions.
+
+    Args:
+        rig: the rig.
+        xpos: (L, 3) float32, metres, link origins in the world frame.
+
+    Returns:
+        The camera in the world frame.
+    """
+    follow = rig.track * xpos[rig.link] if rig.link >= 0 else jnp.zeros(3)
+    eye, target = rig.eye + follow, rig.target + follow
+    return Camera(pos=eye, xmat=spatial.look_at(eye, target, rig.up), fovy=jnp.asarray(rig.fovy))
+
+
+def rig_around(points: np.ndarray, link: int = 0) -> CameraRig:
+    """A rig that has all points in view, for a task without a viewpoint of its own.
+
+    Args:
+        points: (P, 3) metres, world frame, at least one.
+        link: index of the link to follow horizontally.
+
+    Returns:
+        A rig that looks from a corner, slightly from above, and follows the link's x and y.
+    """
+    center = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    radius = max(float(np.linalg.norm(points - center, axis=1).max()), 0.1)
+    eye = center + radius * np.array([2.0, -2.0, 1.2])
+    to_vector = lambda v: (float(v[0]), float(v[1]), float(v[2]))  # noqa: E731
+    return rig(to_vector(eye), to_vector(center), 50.0, link=link)

@@ -1,0 +1,68 @@
+"""The two looks: ``default``, made to be read, and ``original``, as in the paper."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from pixelbrax_jax.choices import check_choice
+from pixelbrax_jax.types import Look
+
+
+def _f32(*values: float) -> np.ndarray:
+    return np.array(values, np.float32)
+
+
+LOOKS: dict[str, Look] = {
+    # Cool ground and sky, so that the warm colors of the models stand out.
+    "default": Look(
+        ground="checker",
+        shadows=False,
+        shininess=16,
+        light=_f32(-0.35, -0.55, 1.0),
+        ambient=np.float32(0.5),
+        diffuse=np.float32(0.65),
+        specular=np.float32(0.0),
+        highlight=np.float32(0.25),
+        sky=np.array([[0.86, 0.91, 0.97], [0.35, 0.55, 0.82]], np.float32),
+        ground_rgb=np.array([[0.72, 0.76, 0.80], [0.50, 0.55, 0.61]], np.float32),
+        ground_pitch=np.float32(0.5),
+    ),
+    # Light, coefficients and colors of the original renderer (arXiv 2502.00021): white
+    # background, thin grid of pitch 2000/2048 m, a light so bright that the ground is white.
+    "original": Look(
+        ground="grid",
+        shadows=False,
+        shininess=2,
+        light=_f32(0.577, -0.577, 0.577),
+        ambient=np.float32(0.8),
+        diffuse=np.float32(0.8),
+        specular=np.float32(0.6),
+        highlight=np.float32(0.0),
+        sky=np.ones((2, 3), np.float32),
+        ground_rgb=np.array([[200 / 255] * 3, [0.0] * 3], np.float32),
+        ground_pitch=np.float32(2000 / 2048),
+    ),
+}
+
+
+def make_look(look: str | Look = "default", *, shadows: bool | None = None) -> Look:
+    """A look by name, or the given one.
+
+    Args:
+        look: ``"default"``, ``"original"`` or a ``Look``.
+        shadows: whether geoms cast shadows; None keeps the look's own choice.
+
+    Returns:
+        The look.
+
+    Raises:
+        ValueError: the name is unknown.
+        TypeError: ``look`` is neither a string nor a ``Look``.
+    """
+    if isinstance(look, str):
+        look = LOOKS[check_choice("look", look, LOOKS)]
+    elif not isinstance(look, Look):
+        raise TypeError(f"look must be a name or a pixelbrax_jax.Look, got {type(look).__name__}.")
+    return look if shadows is None else dataclasses.replace(look, shadows=bool(shadows))

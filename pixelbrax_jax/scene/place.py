@@ -1,0 +1,35 @@
+"""Poses of links -> a scene in the world frame."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pixelbrax_jax import spatial
+from pixelbrax_jax.scene.cameras import aim
+from pixelbrax_jax.types import CameraRig, Geoms, Look, Scene
+
+
+def place(geoms: Geoms, rig: CameraRig, look: Look, xpos: jax.Array, xquat: jax.Array) -> Scene:
+    """Carries every geom along with its link and aims the camera.
+
+    Args:
+        geoms: shapes in their links' frames.
+        rig: the camera rig.
+        look: light, sky and ground.
+        xpos: (L, 3) float32, metres, link origins in the world frame.
+        xquat: (L, 4) float32, unit, link orientations in the world frame.
+
+    Returns:
+        The scene in the world frame.
+    """
+    # One more row stands for the world, so that index -1 selects it.
+    origin = jnp.zeros((1, 3), xpos.dtype)
+    upright = jnp.array([[1.0, 0.0, 0.0, 0.0]], xquat.dtype)
+    link = np.array(geoms.link, np.int32)
+    link_pos = jnp.concatenate([xpos, origin])[link]
+    link_quat = jnp.concatenate([xquat, upright])[link]
+    pos = link_pos + spatial.rotate(link_quat, geoms.pos)
+    xmat = spatial.quat_to_mat(spatial.quat_multiply(link_quat, geoms.quat))
+    return Scene(geoms=geoms, pos=pos, xmat=xmat, camera=aim(rig, xpos), look=look)

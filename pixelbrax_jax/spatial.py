@@ -1,0 +1,107 @@
+"""Rotations and frames. Quaternions are ``(w, x, y, z)``, as in MuJoCo and Brax."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+
+def quat_multiply(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Hamilton product: the rotation that applies ``b`` first, then ``a``.
+
+    Args:
+        a: (..., 4) float32.
+        b: (..., 4) float32.
+
+    Returns:
+        (..., 4) float32.
+    """
+    aw, ax, ay, az = (a[..., i] for i in range(4))
+    bw, bx, by, bz = (b[..., i] for i in range(4))
+    return jnp.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        axis=-1,
+    )
+
+
+def quat_normalize(quat: jax.Array) -> jax.Array:
+    """The unit quaternion of the same rotation; the zero quaternion becomes the identity.
+
+    Args:
+        quat: (..., 4) float32.
+
+    Returns:
+        (..., 4) float32 of norm 1.
+    """
+    square = jnp.sum(quat * quat, axis=-1, keepdims=True)
+    identity = jnp.array([1.0, 0.0, 0.0, 0.0], quat.dtype)
+    # The inner `where` keeps the gradient finite at the zero quaternion.
+    unit = quat * jax.lax.rsqrt(jnp.where(square > 0, square, 1.0))
+    return jnp.where(square > 0, unit, identity)
+
+
+def quat_to_mat(quat: jax.Array) -> jax.Array:
+    """Rotation matrix of a unit quaternion; its columns are the rotated axes.
+
+    Args:
+        quat: (..., 4) float32, unit.
+
+    Returns:
+        (..., 3, 3) float32.
+    """
+    w, x, y, z = (quat[..., i] for i in range(4))
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def rotate(quat: jax.Array, vector: jax.Array) -> jax.Array:
+    """``vector`` turned by the unit quaternion ``quat``.
+
+    Args:
+        quat: (..., 4) float32, unit.
+        vector: (..., 3) float32.
+
+    Returns:
+        (..., 3) float32.
+    """
+    w, axis = quat[..., :1], quat[..., 1:]
+    twice = 2 * jnp.cross(axis, vector)
+    return vector + w * twice + jnp.cross(axis, twice)
+
+
+def unit(vector: jax.Array) -> jax.Array:
+    """``vector`` scaled to length 1; the zero vector stays zero, with a zero gradient.
+
+    Args:
+        vector: (..., 3) float32.
+
+    Returns:
+        (..., 3) float32.
+    """
+    square = jnp.sum(vector * vector, axis=-1, keepdims=True)
+    return jnp.where(square > 0, vector * jax.lax.rsqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+
+
+def look_at(eye: jax.Array, target: jax.Array, up: jax.Array) -> jax.Array:
+    """Orientation of a camera at ``eye`` that looks at ``target``.
+
+    Args:
+        eye: (3,) float32, metres.
+        target: (3,) float32, metres, different from ``eye``.
+        up: (3,) float32, not parallel to the viewing direction.
+
+    Returns:
+        (3, 3) float32; columns are the camera's right, up and back directions.
+    """
+    back = unit(eye - target)
+    right = unit(jnp.cross(up, back))
+    return jnp.stack([right, jnp.cross(back, right), back], axis=-1)

@@ -1,0 +1,250 @@
+"""Every value that crosses from one room of the package to the next.
+
+Shapes are those of ONE environment; a batch has the same fields with a leading axis.
+Letters: G geoms, M materials, L links, S state features, A actions, H and W pixels,
+K stacked frames. Lengths are metres, angles degrees, quaternions ``(w, x, y, z)``, colors
+linear in [0, 1]. The world is right-handed with z up. Row 0 of a picture is its top.
+
+Fields marked *static* are Python values: they decide which program is compiled, hence they
+are hashable and cannot be traced. All other fields are arrays and may be differentiated,
+batched or randomised.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import Any
+
+import jax
+from flax import struct
+
+
+class GeomKind(IntEnum):
+    """Shapes the renderer draws, numbered as MuJoCo's ``mjtGeom``."""
+
+    PLANE = 0
+    SPHERE = 2
+    CAPSULE = 3
+    ELLIPSOID = 4
+    CYLINDER = 5
+    BOX = 6
+
+
+@struct.dataclass
+class Geoms:
+    """The visible shapes of a task, each fixed in the frame of its link.
+
+    Attributes:
+        kind: (G,) static, values of ``GeomKind``.
+        link: (G,) static, index of the carrying link, -1 for the world.
+        material: (G,) static, row of ``rgb`` that colors the geom.
+        name: (G,) static, the model's geom name, or ``kind/index`` where it has none.
+        size: (G, 3) float32, metres, with MuJoCo's meaning per kind: radius, half length,
+            half extents. Planes are drawn without bounds whatever their size.
+        pos: (G, 3) float32, metres, in the link's frame.
+        quat: (G, 4) float32, unit, in the link's frame.
+        rgb: (M, 3) float32, one color per material.
+    """
+
+    kind: tuple[int, ...] = struct.field(pytree_node=False)
+    link: tuple[int, ...] = struct.field(pytree_node=False)
+    material: tuple[int, ...] = struct.field(pytree_node=False)
+    name: tuple[str, ...] = struct.field(pytree_node=False)
+    size: jax.Array
+    pos: jax.Array
+    quat: jax.Array
+    rgb: jax.Array
+
+
+@struct.dataclass
+class PhysicsState:
+    """What a physics engine tells the rest of the package after a step.
+
+    Attributes:
+        engine: the engine's own state, opaque to everyone else.
+        xpos: (L, 3) float32, metres, link origins in the world frame.
+        xquat: (L, 4) float32, unit, link orientations in the world frame.
+        obs: (S,) float32, the task's state observation.
+        reward: () float32, reward of the step that led here, 0 after a reset.
+        terminated: () bool, the task ended (never a time limit).
+        non_finite: () bool, the step diverged; the pose shown is then the last finite one.
+    """
+
+    engine: Any
+    xpos: jax.Array
+    xquat: jax.Array
+    obs: jax.Array
+    reward: jax.Array
+    terminated: jax.Array
+    non_finite: jax.Array
+
+
+@struct.dataclass
+class Camera:
+    """A pinhole camera in the world frame.
+
+    Attributes:
+        pos: (3,) float32, metres.
+        xmat: (3, 3) float32, columns are the camera's right, up and back directions; it looks
+            along minus its third column, as MuJoCo's and OpenGL's cameras do.
+        fovy: () float32, vertical field of view, degrees.
+    """
+
+    pos: jax.Array
+    xmat: jax.Array
+    fovy: jax.Array
+
+
+@struct.dataclass
+class CameraRig:
+    """A camera that may follow a link.
+
+    Eye and target are ``offset + track * xpos[link]``; the orientation never follows.
+
+    Attributes:
+        link: static, index of the followed link, -1 to follow nothing.
+        track: (3,) float32, how much of the link's position is followed, per world axis.
+        eye: (3,) float32, metres.
+        target: (3,) float32, metres, the point looked at.
+        up: (3,) float32, the world direction that is up in the picture.
+        fovy: () float32, vertical field of view, degrees.
+    """
+
+    link: int = struct.field(pytree_node=False)
+    track: jax.Array
+    eye: jax.Array
+    target: jax.Array
+    up: jax.Array
+    fovy: jax.Array
+
+
+@struct.dataclass
+class Look:
+    """Light, sky and ground.
+
+    A surface of color ``c`` with normal ``n`` is shaded with Phong's model for a directional
+    light and a viewer at infinity (z is the camera's back axis, ``l`` points to the light,
+    ``r = 2 (n.l) n - l`` is the mirrored light)::
+
+        c * (ambient + diffuse * max(n.l, 0) + specular * s) + highlight * s,
+        s = max(r_z, 0) ** shininess
+
+    then clipped to [0, 1].
+
+    Attributes:
+        ground: static, ``"checker"`` or ``"grid"`` (thin dark lines), drawn on every plane.
+        shadows: static, whether geoms cast shadows (diffuse and specular light vanish there).
+        shininess: static positive int, the exponent.
+        light: (3,) float32, world direction from the scene TO the light, any length but 0.
+        ambient, diffuse, specular, highlight: () float32 coefficients.
+        sky: (2, 3) float32, color at and below the horizon, and straight above.
+        ground_rgb: (2, 3) float32, colors of the two checker tiles, or of tile and line.
+        ground_pitch: () float32, metres, edge of one tile or distance of two lines.
+    """
+
+    ground: str = struct.field(pytree_node=False)
+    shadows: bool = struct.field(pytree_node=False)
+    shininess: int = struct.field(pytree_node=False)
+    light: jax.Array
+    ambient: jax.Array
+    diffuse: jax.Array
+    specular: jax.Array
+    highlight: jax.Array
+    sky: jax.Array
+    ground_rgb: jax.Array
+    ground_pitch: jax.Array
+
+
+@struct.dataclass
+class Scene:
+    """Everything a renderer needs for one picture, in the world frame.
+
+    Attributes:
+        geoms: shapes, sizes and colors.
+        pos: (G, 3) float32, metres, geom centers.
+        xmat: (G, 3, 3) float32, geom orientations; columns are the geom's axes.
+        camera: the viewpoint.
+        look: light, sky and ground.
+    """
+
+    geoms: Geoms
+    pos: jax.Array
+    xmat: jax.Array
+    camera: Camera
+    look: Look
+
+
+@struct.dataclass
+class Frame:
+    """One picture. Color channels stay apart: stacking them early costs a CPU dearly.
+
+    Attributes:
+        r, g, b: (H, W) float32 in [0, 1].
+        depth: (H, W) float32, metres along the camera's viewing axis (not along the ray),
+            ``inf`` where nothing is hit.
+        seg: (H, W) int32, index of the geom seen, -1 for the sky.
+    """
+
+    r: jax.Array
+    g: jax.Array
+    b: jax.Array
+    depth: jax.Array
+    seg: jax.Array
+
+
+@struct.dataclass
+class EnvParams:
+    """The part of an environment that may be randomised; always a jit argument.
+
+    Attributes:
+        geoms: the shapes and their colors.
+        rig: the camera rig.
+        look: light, sky and ground.
+    """
+
+    geoms: Geoms
+    rig: CameraRig
+    look: Look
+
+
+@struct.dataclass
+class EnvState:
+    """State of one pixel environment.
+
+    Attributes:
+        physics: the physics engine's state.
+        frames: (H, W, 3K) uint8, the frame stack, oldest first; (0, 0, 0) without pixels.
+        key: typed PRNG key of the environment; never changes.
+        episode: () uint32, index of the current episode, 0 first.
+        step_count: () int32, control steps taken in this episode.
+        episode_return: () float32, sum of rewards of this episode.
+        done: () bool, the episode has ended and the next call must begin a new one.
+    """
+
+    physics: PhysicsState
+    frames: jax.Array
+    key: jax.Array
+    episode: jax.Array
+    step_count: jax.Array
+    episode_return: jax.Array
+    done: jax.Array
+
+
+@struct.dataclass
+class Timestep:
+    """What an agent sees after a reset or a step.
+
+    Attributes:
+        obs: uint8 (H, W, 3K) pixels, oldest frame first; or (S,) float32 state; or a dict of
+            both under ``"pixels"`` and ``"state"``, as ``obs_mode`` says.
+        reward: () float32, 0 after a reset.
+        terminated: () bool, the task ended.
+        truncated: () bool, the time limit was reached; never together with ``terminated``.
+        info: dict with a fixed set of keys, see ``PixelEnv.step``.
+    """
+
+    obs: Any
+    reward: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    info: dict[str, Any]
