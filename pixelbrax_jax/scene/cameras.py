@@ -82,7 +82,7 @@ DEFAULT: dict[str, CameraRig] = ORIGINAL | {
     # The original has no viewpoint for this task.
     "inverted_double_pendulum": rig((0.0, -3.0, 0.6), (0.0, 0.0, 0.6), 55.0),
     # The original aims above the lying torso, which then sits at the lower edge.
-    "humanoidstandup": rig((1.7, -1.7, 1.5), (0.0, 0.0, 0.7), 50.0, link=0),
+    "humanoidstandup": rig((2.2, -2.2, 1.7), (0.0, 0.0, 0.55), 50.0, link=0),
 }
 
 

@@ -1,0 +1,92 @@
+"""Gymnasium spaces of a pixel environment, which cost no memory however many environments."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import jax
+import numpy as np
+
+_BOUNDS = ("low", "high", "bounded_below", "bounded_above")
+
+
+class BroadcastBox(gymnasium.spaces.Box):
+    """A ``Box`` with one lower and one upper bound, kept once.
+
+    An ordinary ``Box`` stores four arrays of its full shape: for 4096 stacks of 84x84 frames more
+    than a gigabyte, and seconds to fill it. Here they are views of a single number, also in
+    copies and after unpickling. It equals an ordinary ``Box`` of the same bounds.
+    """
+
+    def __init__(self, low: float, high: float, shape: tuple[int, ...], dtype: Any) -> None:
+        """Makes the space.
+
+        Args:
+            low: bound of every entry.
+            high: bound of every entry.
+            shape: of a sample.
+            dtype: of a sample.
+        """
+        super().__init__(low, high, (1,), dtype)
+        self._shape = tuple(shape)
+        self.low_repr, self.high_repr = str(self.low[0]), str(self.high[0])
+        self._spread({name: getattr(self, name)[0] for name in _BOUNDS})
+
+    def _spread(self, bounds: dict[str, Any]) -> None:
+        for name, value in bounds.items():
+            setattr(self, name, np.broadcast_to(value, self._shape))
+
+    def __getstate__(self) -> dict[str, Any]:
+        state = dict(self.__dict__)
+        state["bounds"] = {name: state.pop(name).flat[0] for name in _BOUNDS}
+        return state
+
+    def __setstate__(self, state: Any) -> None:
+        state = dict(state)
+        bounds = state.pop("bounds")
+        self.__dict__.update(state)
+        self._spread(bounds)
+
+    def __eq__(self, other: object) -> bool:
+        if isinstance(other, BroadcastBox):
+            return (
+                self.shape == other.shape
+                and self.dtype == other.dtype
+                and (self.low_repr, self.high_repr) == (other.low_repr, other.high_repr)
+            )
+        return super().__eq__(other)
+
+    __hash__ = None  # type: ignore[assignment]  # as every Gymnasium space that can be compared
+
+
+def observation_space(spec: Any, num_envs: int | None = None) -> gymnasium.Space:
+    """The space of an observation.
+
+    Args:
+        spec: ``PixelEnv.obs_spec``: a ``jax.ShapeDtypeStruct`` or a dict of them.
+        num_envs: of the batch; None for a single environment.
+
+    Returns:
+        uint8 boxes in [0, 255] for pixels, unbounded float32 boxes for state, a ``Dict`` for both.
+    """
+    if isinstance(spec, dict):
+        return gymnasium.spaces.Dict(
+            {name: observation_space(part, num_envs) for name, part in spec.items()}
+        )
+    return _box(spec, num_envs)
+
+
+def _box(spec: jax.ShapeDtypeStruct, num_envs: int | None) -> BroadcastBox:
+    pixels = spec.dtype == np.uint8
+    low, high = (0, 255) if pixels else (-np.inf, np.inf)
+    return BroadcastBox(low, high, _batched(spec.shape, num_envs), spec.dtype)
+
+
+def action_space(action_size: int, num_envs: int | None = None) -> BroadcastBox:
+    """The space of an action: float32 in [-1, 1], whatever the model's control range."""
+    return BroadcastBox(-1.0, 1.0, _batched((action_size,), num_envs), np.float32)
+
+
+def _batched(shape: tuple[int, ...], num_envs: int | None) -> tuple[int, ...]:
+    return tuple(shape) if num_envs is None else (num_envs, *shape)

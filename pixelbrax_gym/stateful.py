@@ -1,0 +1,347 @@
+"""An environment that keeps its state: what every door to PyTorch is built on."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping, Sequence
+from functools import cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnasium import error
+
+from pixelbrax_gym.actions import as_actions
+from pixelbrax_gym.fork import check_not_forked, is_forked
+from pixelbrax_jax import registry
+from pixelbrax_jax.choices import check_choice
+from pixelbrax_jax.envs import observe
+from pixelbrax_jax.envs.pixel_env import PixelEnv
+from pixelbrax_jax.envs.vector import VectorPixelEnv
+from pixelbrax_jax.types import EnvParams, EnvState, Timestep
+
+_SEEDS = 2**32
+"""Seeds lie below this."""
+
+_made: set[Any] = set()
+"""Options of the environments that exist, so that forks of this process can name them."""
+
+
+class StatefulEnv:
+    """``num_envs`` pixel environments and their present states.
+
+    ``reset`` and ``step`` return *outputs*: a dict with ``obs``, ``reward``, ``terminated``,
+    ``truncated``, ``done`` and ``info``, as ``Timestep`` has them, of JAX arrays that nothing
+    reads again. They may be handed out without a copy.
+
+    Environment i that was seeded with s draws everything from ``jax.random.key(s)``; neither
+    i nor ``num_envs`` matters.
+
+    Attributes:
+        env: the pixel environment.
+        params: its parameters.
+        num_envs: N.
+        single: whether outputs lack the leading axis; N is then 1.
+    """
+
+    def __init__(
+        self,
+        task: str,
+        options: Mapping[str, Any],
+        *,
+        num_envs: int = 1,
+        autoreset_mode: str = "disabled",
+        single: bool = False,
+        max_episode_steps: int | None = None,
+        also_allowed: Sequence[str] = (),
+    ) -> None:
+        """Builds the environment; nothing is compiled yet.
+
+        Args:
+            task: one of ``pixelbrax_jax.list_envs()``.
+            options: of ``pixelbrax_jax.make``.
+            num_envs: N.
+            autoreset_mode: as in ``VectorPixelEnv``.
+            single: whether outputs lack the leading axis.
+            max_episode_steps: time limit in calls of ``step``; None or -1 keeps
+                ``options["episode_length"]``, which counts control steps.
+            also_allowed: option names of the caller, for the message about an unknown one.
+
+        Raises:
+            ValueError: an option is unknown or out of range; the message lists what is allowed.
+            RuntimeError: this process is a fork that cannot run JAX.
+        """
+        self.env, self.params = _make(task, dict(options), max_episode_steps, also_allowed)
+        self.num_envs, self.single = num_envs, single
+        self._programs = _programs(self.env, num_envs, autoreset_mode, single)
+        self._must_reset = autoreset_mode == "disabled"
+        self._state: EnvState | None = None
+        self._done: jax.Array | None = None
+        self._device: jax.Device | None = None
+        self._closed = False
+
+    @property
+    def fps(self) -> int:
+        """Frames per second of simulated time, at least 1."""
+        return max(1, round(1.0 / self.env.dt))
+
+    def reset(
+        self,
+        seed: int | Sequence[int | None] | None,
+        rng: np.random.Generator,
+        mask: np.ndarray | None = None,
+    ) -> dict[str, Any]:
+        """Begins episodes.
+
+        Args:
+            seed: s seeds environment i with s + i; a sequence has one seed for each. A seeded
+                environment begins its episode 0. None begins the next episode of an
+                environment, or draws a seed if there was none yet.
+            rng: where seeds are drawn from.
+            mask: (N,) bool, where to begin; None means everywhere.
+
+        Returns:
+            Outputs with reward 0; unmasked environments repeat their observation and flags.
+
+        Raises:
+            ResetNeeded: the first reset leaves some environments out.
+            ClosedEnvironmentError: after ``close``.
+            RuntimeError: this process is a fork that cannot run JAX.
+            TypeError: a seed is not a whole number.
+            ValueError: a seed is out of range, or there are not N.
+        """
+        self._check_usable()
+        seeds = self._seeds(seed)
+        where = np.ones(self.num_envs, bool) if mask is None else mask.copy()
+        if self._state is None:
+            if not where.all():
+                raise error.ResetNeeded("the first reset must be of all environments.")
+            self.params = jax.device_put(self.params)
+            first = int(rng.integers(_SEEDS - self.num_envs + 1))
+            seeds = [first + i if s is None else s for i, s in enumerate(seeds)]
+        given = np.array([s is not None for s in seeds]) & where
+        numbers = np.array([s or 0 for s in seeds], np.uint32)
+        if given.all():
+            self._state, outputs = self._programs.reset(numbers, self.params)
+        else:
+            # One call unless some environments are seeded and others are not.
+            if (where & ~given).any():
+                self._state, outputs = self._programs.reset_where(
+                    self._state, where & ~given, where, self.params, None
+                )
+            if given.any():
+                self._state, outputs = self._programs.reset_where(
+                    self._state, given, where, self.params, numbers
+                )
+        self._done = outputs["done"]
+        self._device = next(iter(self._done.devices()))
+        return outputs
+
+    def step(self, action: Any) -> dict[str, Any]:
+        """Steps all environments.
+
+        Args:
+            action: (N, A) or, of a single environment, (A,); see ``as_actions``.
+
+        Returns:
+            Outputs.
+
+        Raises:
+            ResetNeeded: before the first reset; or an episode has ended and does not begin anew
+                by itself.
+            ClosedEnvironmentError: after ``close``.
+            RuntimeError: this process is a fork that cannot run JAX.
+            TypeError: the action is not floating point.
+            ValueError: the action has another shape, is elsewhere or contains NaN; nothing
+                was stepped.
+        """
+        self._check_ready("step")
+        if self._must_reset:
+            self._check_not_done()
+        shape = (self.env.action_size,)
+        action = as_actions(action, shape if self.single else (self.num_envs, *shape), self.device)
+        self._state, outputs = self._programs.step(self._state, action, self.params)
+        self._done = outputs["done"]
+        return outputs
+
+    def render(self, height: int, width: int) -> jax.Array:
+        """Pictures of the present states, at any size.
+
+        Args:
+            height: pixels.
+            width: pixels.
+
+        Returns:
+            (N, height, width, 3) uint8, row 0 at the top.
+
+        Raises:
+            ResetNeeded: before the first reset.
+            ClosedEnvironmentError: after ``close``.
+            RuntimeError: this process is a fork that cannot run JAX.
+        """
+        self._check_ready("render")
+        return _picture_program(self.env, height, width)(self._state, self.params)
+
+    def close(self) -> None:
+        """Lets go of the states; only another ``close`` may follow."""
+        self._state = self._done = None
+        self._closed = True
+
+    @property
+    def device(self) -> jax.Device:
+        """Where outputs are; known after the first reset."""
+        if self._device is None:
+            raise error.ResetNeeded("call reset() first.")
+        return self._device
+
+    def _check_usable(self) -> None:
+        check_not_forked()
+        if self._closed:
+            raise error.ClosedEnvironmentError("the environment is closed; make a new one.")
+
+    def _check_ready(self, what: str) -> None:
+        self._check_usable()
+        if self._state is None:
+            raise error.ResetNeeded(f"call reset() before {what}().")
+
+    def _check_not_done(self) -> None:
+        done = np.atleast_1d(np.asarray(self._done))
+        if not done.any():
+            return
+        if self.single:
+            raise error.ResetNeeded("the episode has ended; call reset() before the next step().")
+        names = ", ".join(map(str, np.flatnonzero(done)))
+        raise error.ResetNeeded(
+            f"the episode of environment {names} has ended and autoreset is disabled; call "
+            'reset(options={"reset_mask": mask}) with those entries True before the next step().'
+        )
+
+    def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
+        if seed is None:
+            return [None] * self.num_envs
+        if not isinstance(seed, (list, tuple, np.ndarray)):
+            first = _check_seed(seed)
+            return [_check_seed(first + i) for i in range(self.num_envs)]
+        if len(seed) != self.num_envs:
+            raise ValueError(f"expected one seed for each of {self.num_envs}, got {len(seed)}.")
+        return [None if s is None else _check_seed(s) for s in seed]
+
+
+class _Programs:
+    """The compiled programs of one set of options; all environments with them share these.
+
+    States are donated: XLA overwrites them in place. Outputs are not, which is why they can be
+    given away.
+    """
+
+    def __init__(self, vector: VectorPixelEnv, single: bool) -> None:
+        self.vector, self.single = vector, single
+        self.reset = jax.jit(self._reset)
+        self.reset_where = jax.jit(self._reset_where, donate_argnums=0)
+        self.step = jax.jit(self._step, donate_argnums=0)
+
+    def _reset(self, seeds: jax.Array, params: EnvParams) -> tuple[EnvState, dict[str, Any]]:
+        state, timestep = self.vector.reset(jax.vmap(jax.random.key)(seeds), params)
+        return state, self._outputs(timestep, jnp.ones(self.vector.num_envs, bool))
+
+    def _reset_where(
+        self,
+        state: EnvState,
+        mask: jax.Array,
+        reported: jax.Array,
+        params: EnvParams,
+        seeds: jax.Array | None,
+    ) -> tuple[EnvState, dict[str, Any]]:
+        key = None if seeds is None else jax.vmap(jax.random.key)(seeds)
+        state, timestep = self.vector.reset_where(state, mask, params, key)
+        return state, self._outputs(timestep, reported)
+
+    def _step(
+        self, state: EnvState, action: jax.Array, params: EnvParams
+    ) -> tuple[EnvState, dict[str, Any]]:
+        if self.single:
+            action = action[None]
+        state, timestep = self.vector.step(state, action, params)
+        return state, self._outputs(timestep, jnp.ones(self.vector.num_envs, bool))
+
+    def _outputs(self, timestep: Timestep, present: jax.Array) -> dict[str, Any]:
+        done = timestep.terminated | timestep.truncated
+        outputs = {
+            "obs": timestep.obs,
+            "reward": timestep.reward,
+            "terminated": timestep.terminated,
+            "truncated": timestep.truncated,
+            "done": done,
+            "info": timestep.info,
+        }
+        if self.single:
+            return jax.tree.map(lambda x: x[0], outputs)
+        info = dict(timestep.info)
+        ended = {name: info.pop(name) for name in ("final_obs", "final_info") if name in info}
+        info = _with_masks(info, present)
+        if ended:
+            ended["final_info"] = _with_masks(ended["final_info"], done)
+            info |= _with_masks(ended, done)
+        return outputs | {"info": info}
+
+
+def _with_masks(info: Mapping[str, Any], mask: jax.Array) -> dict[str, Any]:
+    """Gymnasium's convention: beside ``key``, ``_key`` says which environments it is about."""
+    return {**info, **{f"_{name}": mask for name in info}}
+
+
+@cache
+def _programs(env: PixelEnv, num_envs: int, autoreset_mode: str, single: bool) -> _Programs:
+    return _Programs(VectorPixelEnv(env, num_envs, autoreset_mode), single)
+
+
+@cache
+def _picture_program(env: PixelEnv, height: int, width: int) -> Any:
+    def picture(state: EnvState, params: EnvParams) -> jax.Array:
+        # Packed first: to stack float planes into (H, W, 3) is slow on a CPU.
+        words = observe.pack(env.render(state, params, height, width))
+        return observe.unpack(words[None])
+
+    return jax.jit(jax.vmap(picture, in_axes=(0, None)))
+
+
+def _make(
+    task: str,
+    options: dict[str, Any],
+    max_episode_steps: int | None,
+    also_allowed: Sequence[str],
+) -> tuple[PixelEnv, EnvParams]:
+    allowed = list(inspect.signature(registry.make).parameters)[1:]
+    for name in options:
+        check_choice("option", name, [*allowed, *also_allowed])
+    if max_episode_steps not in (None, -1):
+        if "episode_length" in options:
+            raise ValueError(
+                "give either max_episode_steps, which counts calls of step(), or "
+                "episode_length, which counts control steps."
+            )
+        if isinstance(max_episode_steps, bool) or not max_episode_steps >= 1:
+            raise ValueError(f"max_episode_steps must be at least 1, got {max_episode_steps!r}.")
+        options["episode_length"] = max_episode_steps * options.get("action_repeat", 1)
+    try:
+        known = (task, frozenset(options.items()))
+        is_made = known in _made
+    except TypeError:  # an option that is an array
+        known, is_made = None, False
+    if is_forked() and not is_made:
+        check_not_forked()
+    # What exists can be named in a fork without starting JAX. The worker then fails in reset(),
+    # where Gymnasium's AsyncVectorEnv passes errors on; from here it would only see a lost pipe.
+    made = registry.make(task, **options)
+    if known is not None:
+        _made.add(known)
+    return made
+
+
+def _check_seed(seed: Any) -> int:
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)):
+        raise TypeError(f"a seed must be a whole number, got {seed!r}.")
+    if not 0 <= seed < _SEEDS:
+        raise ValueError(f"seeds must lie in [0, 2**32), got {seed}.")
+    return int(seed)

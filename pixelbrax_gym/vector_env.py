@@ -1,0 +1,265 @@
+"""Many pixel environments in one compiled program, as a ``gymnasium.vector.VectorEnv``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import gymnasium
+import jax
+import numpy as np
+from gymnasium.vector import AutoresetMode
+
+from pixelbrax_gym.export import exporter
+from pixelbrax_gym.single_env import check_render_size
+from pixelbrax_gym.spaces import action_space, observation_space
+from pixelbrax_gym.stateful import StatefulEnv
+from pixelbrax_jax.choices import check_choice
+from pixelbrax_jax.envs.vector import AUTORESET_MODES
+
+_OWN_OPTIONS = (
+    "num_envs",
+    "autoreset_mode",
+    "output",
+    "render_mode",
+    "render_height",
+    "render_width",
+    "max_episode_steps",
+)
+
+
+class PixelBraxVectorEnv(gymnasium.vector.VectorEnv):
+    """``num_envs`` copies of a Brax task seen through a camera, stepped together.
+
+    Environment i seeded with s is the same whatever ``num_envs`` is and whoever its neighbors.
+
+    Autoreset, with Gymnasium's meanings:
+
+    * ``"next_step"`` (default): the step that ends an episode returns its last observation. The
+      next step ignores that environment's action and returns the first observation of the
+      next episode, reward 0 and both flags False.
+    * ``"same_step"``: the step that ends an episode returns the first observation of the next.
+      The last one is in ``infos["final_obs"]``, the infos it came with in
+      ``infos["final_info"]``.
+    * ``"disabled"``: the user calls ``reset(options={"reset_mask": mask})``.
+
+    Infos are ``episode_return`` (sum of the episode's rewards), ``episode_length`` (control
+    steps) and ``non_finite`` (the physics diverged and ended the episode), each (N,), with
+    masks ``_episode_return`` and so on that say which entries were set.
+
+    ``output`` decides what all of these are:
+
+    * ``"numpy"``: observations are read-only views of what JAX has computed, the rest are
+      arrays of their own. ``final_obs`` is an object array with None where no episode ended,
+      absent when none did, as Gymnasium has it.
+    * ``"torch"`` and ``"jax"``: arrays on the environment's device. ``final_obs`` and
+      ``final_info`` are dense, present in every step, and mean something where the masks
+      ``_final_obs`` and ``_final_info`` are True: the host never waits to find out.
+
+    Observations are never overwritten, and an in-place operation on a tensor reaches no later
+    result.
+
+    Attributes:
+        autoreset_mode: an ``AutoresetMode``, also in ``metadata``.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {
+        "render_modes": ["rgb_array"],
+        "render_fps": 20,
+        "autoreset_mode": AutoresetMode.NEXT_STEP,
+    }
+
+    def __init__(
+        self,
+        task: str,
+        num_envs: int = 1,
+        *,
+        autoreset_mode: str | AutoresetMode = "next_step",
+        output: str = "numpy",
+        render_mode: str | None = None,
+        render_height: int = 480,
+        render_width: int = 480,
+        max_episode_steps: int | None = None,
+        **options: Any,
+    ) -> None:
+        """Builds the environments; the first ``reset`` compiles.
+
+        Args:
+            task: one of ``pixelbrax_jax.list_envs()``.
+            num_envs: N, at least 1.
+            autoreset_mode: ``"next_step"``, ``"same_step"``, ``"disabled"``, or Gymnasium's
+                ``AutoresetMode`` or its value.
+            output: ``"numpy"``, ``"torch"`` or ``"jax"`` arrays.
+            render_mode: None or ``"rgb_array"``.
+            render_height: pixels of ``render()``.
+            render_width: pixels of ``render()``.
+            max_episode_steps: time limit in calls of ``step``; None keeps ``episode_length``,
+                1000 control steps unless told otherwise. A first step that only resets is
+                not counted.
+            **options: everything else that ``pixelbrax_jax.make`` takes, such as ``backend``,
+                ``camera``, ``height``, ``width``, ``frame_stack``, ``obs_mode``,
+                ``action_repeat`` and ``episode_length``.
+
+        Raises:
+            ValueError: an option is unknown or out of range; the message lists what is allowed.
+            ImportError: torch is missing and wanted.
+            RuntimeError: this process is a fork that cannot run JAX.
+        """
+        if render_mode is not None:
+            check_choice("render_mode", render_mode, ("rgb_array",))
+        self.autoreset_mode = as_autoreset_mode(autoreset_mode)
+        self._output, self._export = output, exporter(output)
+        self._stateful = StatefulEnv(
+            task,
+            options,
+            num_envs=num_envs,
+            autoreset_mode=self.autoreset_mode.name.lower(),
+            max_episode_steps=max_episode_steps,
+            also_allowed=_OWN_OPTIONS,
+        )
+        env = self._stateful.env
+        self.num_envs = int(num_envs)
+        self.single_observation_space = observation_space(env.obs_spec)
+        self.single_action_space = action_space(env.action_size)
+        self.observation_space = observation_space(env.obs_spec, self.num_envs)
+        self.action_space = action_space(env.action_size, self.num_envs)
+        self.render_mode = render_mode
+        self.metadata = {
+            **type(self).metadata,
+            "render_fps": self._stateful.fps,
+            "autoreset_mode": self.autoreset_mode,
+        }
+        self._render_size = check_render_size(render_height, render_width)
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begins episodes.
+
+        Args:
+            seed: s seeds environment i with s + i; a list has a seed for each. A seeded
+                environment begins its episode 0; None begins an environment's next episode,
+                or draws a seed if there was none yet.
+            options: ``{"reset_mask": mask}`` with an (N,) bool array, at least one True, resets
+                only those and repeats the observations of the others. Never changed.
+
+        Returns:
+            Observations and infos.
+
+        Raises:
+            TypeError: the mask is not a NumPy array of bool, or a seed not a whole number.
+            ValueError: the mask has another shape or no True; or a seed is out of range.
+            ResetNeeded: the first reset has a mask that leaves environments out.
+            ClosedEnvironmentError: after ``close``.
+            RuntimeError: this process is a fork that cannot run JAX.
+        """
+        mask = _reset_mask(options, self.num_envs)
+        super().reset(seed=int(seed) if isinstance(seed, (int, np.integer)) else None)
+        outputs = self._stateful.reset(seed, self.np_random, mask)
+        return self._export(outputs["obs"]), self._infos(outputs)
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Steps all environments.
+
+        Args:
+            actions: (N, A) floating point, a NumPy array, torch tensor or JAX array whatever
+                ``output`` is; rounded to float32 and clipped to [-1, 1].
+
+        Returns:
+            Observations; rewards, (N,) float32; terminated and truncated, (N,) bool; infos.
+
+        Raises:
+            ResetNeeded: before the first reset; or, with autoreset disabled, an episode has
+                ended and was not reset.
+            ClosedEnvironmentError: after ``close``.
+            RuntimeError: this process is a fork that cannot run JAX.
+            TypeError: the actions are not floating point.
+            ValueError: the actions have another shape, are on another device, or contain a NaN
+                (in a NumPy array or CPU tensor; elsewhere a NaN ends that episode with
+                ``non_finite``). Nothing was stepped.
+        """
+        outputs = self._stateful.step(actions)
+        flags = (outputs["reward"], outputs["terminated"], outputs["truncated"])
+        reward, terminated, truncated = (
+            jax.tree.map(np.array, flags) if self._output == "numpy" else self._export(flags)
+        )
+        return self._export(outputs["obs"]), reward, terminated, truncated, self._infos(outputs)
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """Pictures of the present states.
+
+        Returns:
+            N arrays (render_height, render_width, 3) of uint8; None without a render mode.
+
+        Raises:
+            ResetNeeded: before the first reset.
+            ClosedEnvironmentError: after ``close``.
+        """
+        if self.render_mode is None:
+            return None
+        return tuple(np.asarray(self._stateful.render(*self._render_size)))
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Forgets the states."""
+        del kwargs
+        # Gymnasium also calls this on an environment whose construction failed.
+        if hasattr(self, "_stateful"):
+            self._stateful.close()
+
+    def _infos(self, outputs: Mapping[str, Any]) -> dict[str, Any]:
+        if self._output != "numpy":
+            return self._export(outputs["info"])
+        infos = dict(outputs["info"])
+        final_obs = infos.pop("final_obs", None)
+        final_info = infos.pop("final_info", None)
+        infos.pop("_final_obs", None), infos.pop("_final_info", None)
+        infos = jax.tree.map(np.array, infos)
+        done = np.array(outputs["done"])
+        if final_obs is None or not done.any():
+            return infos
+        final_obs = self._export(final_obs)
+        rows = np.full(self.num_envs, None, dtype=object)
+        for i in np.flatnonzero(done):
+            rows[i] = jax.tree.map(lambda x, i=i: x[i], final_obs)
+        # Zero where no episode ended, as in Gymnasium's own vector environments.
+        final_info = {
+            name: np.where(done, value, np.zeros_like(value)) for name, value in final_info.items()
+        }
+        infos |= {"final_obs": rows, "final_info": final_info}
+        return infos | {"_final_obs": done, "_final_info": done.copy()}
+
+
+def as_autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:
+    """Gymnasium's name of an autoreset mode.
+
+    Args:
+        mode: ours, Gymnasium's, or the value of Gymnasium's.
+
+    Raises:
+        ValueError: there is no such mode; the message lists them.
+    """
+    if isinstance(mode, AutoresetMode):
+        return mode
+    by_value = {member.value: member for member in AutoresetMode}
+    if mode in by_value:
+        return by_value[mode]
+    return AutoresetMode[check_choice("autoreset_mode", mode, AUTORESET_MODES).upper()]
+
+
+def _reset_mask(options: Mapping[str, Any] | None, num_envs: int) -> np.ndarray | None:
+    if options is None or "reset_mask" not in options:
+        return None
+    mask = options["reset_mask"]
+    if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_:
+        kind = f"{mask.dtype} array" if isinstance(mask, np.ndarray) else type(mask).__name__
+        raise TypeError(f"options['reset_mask'] must be a NumPy array of bool, got {kind}.")
+    if mask.shape != (num_envs,):
+        raise ValueError(
+            f"options['reset_mask'] must have shape ({num_envs},), got {mask.shape}."
+        )
+    if not mask.any():
+        raise ValueError("options['reset_mask'] must have at least one True.")
+    return mask

@@ -1,0 +1,55 @@
+"""The window of ``render_mode="human"``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+
+class Window:
+    """Shows pictures on the screen, no faster than a given rate."""
+
+    def __init__(self, title: str, fps: int) -> None:
+        """Opens nothing yet.
+
+        Args:
+            title: of the window.
+            fps: pictures per second.
+
+        Raises:
+            ImportError: pygame is not installed, with the cure.
+        """
+        try:
+            import pygame
+        except ImportError as error:
+            raise ImportError(
+                "render_mode='human' needs pygame; try: pip install \"pixelbrax[human]\""
+            ) from error
+        self._pygame, self._title, self._fps = pygame, title, fps
+        self._screen: Any = None
+        self._clock: Any = None
+
+    def show(self, picture: np.ndarray) -> None:
+        """Shows a picture.
+
+        Args:
+            picture: (H, W, 3) uint8.
+        """
+        pygame = self._pygame
+        if self._screen is None:
+            pygame.display.init()
+            pygame.display.set_caption(self._title)
+            self._screen = pygame.display.set_mode((picture.shape[1], picture.shape[0]))
+            self._clock = pygame.time.Clock()
+        # pygame counts columns first.
+        pygame.surfarray.blit_array(self._screen, picture.swapaxes(0, 1))
+        pygame.event.pump()
+        pygame.display.flip()
+        self._clock.tick(self._fps)
+
+    def close(self) -> None:
+        """Closes the window."""
+        if self._screen is not None:
+            self._pygame.display.quit()
+            self._screen = None

@@ -1,0 +1,93 @@
+"""Scenes that the renderer's tests share."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from pixelbrax_jax import Camera, Geoms, Look, Scene, make_look
+from pixelbrax_jax.spatial import look_at
+
+PRIMITIVES_MJCF = """
+<mujoco>
+  <worldbody>
+    <geom name="ground" type="plane" size="0 0 1"/>
+    <geom name="ball" type="sphere" size="0.3"/>
+    <geom name="pill" type="capsule" size="0.15 0.35"/>
+    <geom name="egg" type="ellipsoid" size="0.2 0.45 0.3"/>
+    <geom name="can" type="cylinder" size="0.25 0.3"/>
+    <geom name="brick" type="box" size="0.2 0.35 0.15"/>
+  </worldbody>
+</mujoco>
+"""
+
+
+def primitives() -> mujoco.MjModel:
+    """One geom of every kind that can be drawn."""
+    return mujoco.MjModel.from_xml_string(PRIMITIVES_MJCF)
+
+
+def geoms_of(model: mujoco.MjModel) -> Geoms:
+    """All geoms of a model, on no link, each with a color of its own."""
+    count = model.ngeom
+    return Geoms(
+        kind=tuple(int(kind) for kind in model.geom_type),
+        link=(-1,) * count,
+        material=tuple(range(count)),
+        name=tuple(model.geom(g).name for g in range(count)),
+        size=jnp.asarray(model.geom_size, jnp.float32),
+        pos=jnp.zeros((count, 3)),
+        quat=jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0]), (count, 1)),
+        rgb=jnp.linspace(0.2, 0.9, 3 * count).reshape(count, 3),
+    )
+
+
+def camera(eye, target=(0.0, 0.0, 0.5), fovy=50.0) -> Camera:
+    """A camera that looks at a point."""
+    eye, target = jnp.array(eye, jnp.float32), jnp.array(target, jnp.float32)
+    up = jnp.array([0.0, 0.0, 1.0])
+    return Camera(pos=eye, xmat=look_at(eye, target, up), fovy=jnp.float32(fovy))
+
+
+def random_scene(seed: int, look: Look | None = None) -> Scene:
+    """All primitives at random poses above the ground, seen from a random side."""
+    rng = np.random.default_rng(seed)
+    geoms = geoms_of(primitives())
+    count = len(geoms.kind)
+    pos = rng.uniform([-0.8, -0.8, 0.1], [0.8, 0.8, 1.1], (count, 3))
+    quat = rng.normal(size=(count, 4))
+    pos[0], quat[0] = 0.0, (1.0, 0.0, 0.0, 0.0)
+    xmat = np.zeros((count, 9))
+    for g in range(count):
+        mujoco.mju_quat2Mat(xmat[g], quat[g] / np.linalg.norm(quat[g]))
+    side = rng.uniform(0, 2 * np.pi)
+    eye = (3.0 * np.cos(side), 3.0 * np.sin(side), rng.uniform(0.5, 2.5))
+    return Scene(
+        geoms=geoms,
+        pos=jnp.asarray(pos, jnp.float32),
+        xmat=jnp.asarray(xmat.reshape(count, 3, 3), jnp.float32),
+        camera=camera(eye),
+        look=look or make_look("default"),
+    )
+
+
+def one_geom(kind: int, size, eye, *, pos=(0.0, 0.0, 0.0), target=(0.0, 0.0, 0.0), fovy=40.0):
+    """A scene with a single geom, axes along the world's."""
+    geoms = Geoms(
+        kind=(int(kind),),
+        link=(-1,),
+        material=(0,),
+        name=("it",),
+        size=jnp.array([size], jnp.float32),
+        pos=jnp.zeros((1, 3)),
+        quat=jnp.array([[1.0, 0.0, 0.0, 0.0]]),
+        rgb=jnp.array([[0.5, 0.4, 0.3]]),
+    )
+    return Scene(
+        geoms=geoms,
+        pos=jnp.array([pos], jnp.float32),
+        xmat=jnp.eye(3)[None],
+        camera=camera(eye, target, fovy),
+        look=make_look("default"),
+    )

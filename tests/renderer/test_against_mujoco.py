@@ -1,0 +1,69 @@
+"""The picture's geometry against MuJoCo's ray caster, which shares no code with ours."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from brax.io import mjcf
+from etils import epath
+
+import pixelbrax_jax
+from pixelbrax_jax import list_envs, place, render
+from tests.renderer import scenes
+from tests.renderer.mujoco_rays import cast
+
+SIZE = 32
+NUM_POSES = 20
+BUILT_IN = [task for task in list_envs() if not task.startswith("test-")]
+
+
+def compare(model: mujoco.MjModel, batch, shown: list[int]) -> None:
+    frames = jax.jit(jax.vmap(lambda scene: render(scene, SIZE, SIZE)))(batch)
+    same, depths, seen = [], [], 0
+    for i in range(NUM_POSES):
+        scene = jax.tree.map(lambda x, i=i: x[i], batch)
+        seg, depth = cast(model, scene, shown, SIZE, SIZE)
+        agree = np.asarray(frames.seg[i]) == seg
+        both = agree & (seg >= 0)
+        same.append(agree.mean())
+        depths.append(np.abs(np.asarray(frames.depth[i])[both] / depth[both] - 1).max(initial=0))
+        assert (np.isinf(np.asarray(frames.depth[i])) == (np.asarray(frames.seg[i]) < 0)).all()
+        seen += len(np.unique(seg[seg >= 0]))
+    # Differences are allowed on silhouettes and on surfaces that coincide.
+    assert np.mean(same) >= 0.995, f"geom ids agree on {np.mean(same):.4%} of the pixels"
+    assert min(same) >= 0.985
+    assert max(depths) <= 1e-3
+    assert seen >= 2 * NUM_POSES, "the poses show too little to compare"
+
+
+@pytest.mark.parametrize("task", BUILT_IN)
+def test_task_at_random_poses(task):
+    env, params = pixelbrax_jax.make(task)
+    name = {"halfcheetah": "half_cheetah"}.get(task, task)
+    model = mjcf.load_mjmodel(epath.resource_path("brax") / f"envs/assets/{name}.xml")
+    shown = [g for g in range(model.ngeom) if model.geom_rgba[g, 3] > 0]
+    assert len(shown) == len(params.geoms.kind)
+
+    # Links at random orientations, anywhere around the first pose: more than joints allow.
+    start = env.physics.reset(jax.random.key(0))
+
+    def scene(key):
+        shift, turn = jax.random.split(key)
+        xpos = start.xpos + jax.random.uniform(shift, start.xpos.shape, minval=-0.1, maxval=0.1)
+        xquat = start.xquat + 0.3 * jax.random.normal(turn, start.xquat.shape)
+        xquat = xquat / jnp.linalg.norm(xquat, axis=-1, keepdims=True)
+        return place(params.geoms, params.rig, params.look, xpos, xquat)
+
+    batch = jax.jit(jax.vmap(scene))(jax.random.split(jax.random.key(1), NUM_POSES))
+    compare(model, batch, shown)
+
+
+def test_every_primitive():
+    model = scenes.primitives()
+    batch = jax.tree.map(
+        lambda *leaves: jnp.stack(leaves), *[scenes.random_scene(s) for s in range(NUM_POSES)]
+    )
+    compare(model, batch, list(range(model.ngeom)))
