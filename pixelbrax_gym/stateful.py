@@ -301,7 +301,7 @@ def _picture_program(env: PixelEnv, height: int, width: int) -> Any:
     def picture(state: EnvState, params: EnvParams) -> jax.Array:
         # Packed first: to stack float planes into (H, W, 3) is slow on a CPU.
         words = observe.pack(env.render(state, params, height, width))
-        return observe.unpack(words[None])
+        return observe.unpack(words)
 
     return jax.jit(jax.vmap(picture, in_axes=(0, None)))
 

@@ -257,9 +257,7 @@ def _reset_mask(options: Mapping[str, Any] | None, num_envs: int) -> np.ndarray 
         kind = f"{mask.dtype} array" if isinstance(mask, np.ndarray) else type(mask).__name__
         raise TypeError(f"options['reset_mask'] must be a NumPy array of bool, got {kind}.")
     if mask.shape != (num_envs,):
-        raise ValueError(
-            f"options['reset_mask'] must have shape ({num_envs},), got {mask.shape}."
-        )
+        raise ValueError(f"options['reset_mask'] must have shape ({num_envs},), got {mask.shape}.")
     if not mask.any():
         raise ValueError("options['reset_mask'] must have at least one True.")
     return mask

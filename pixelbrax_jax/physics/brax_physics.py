@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -216,15 +217,13 @@ class BraxPhysics:
             non_finite=~finite,
         )
 
-    def _outputs(
-        self, brax_state: envs.State
-    ) -> tuple[BraxCarry, jax.Array, jax.Array, jax.Array]:
-        carry = BraxCarry(
-            pipeline=brax_state.pipeline_state, metrics=brax_state.metrics, info=brax_state.info
-        )
+    def _outputs(self, brax_state: envs.State) -> tuple[BraxCarry, jax.Array, jax.Array, jax.Array]:
+        carry = _carry(brax_state)
+        if jax.tree.structure(carry) != self._tree:
+            raise ValueError("step changes the tree of the environment's state")
         # Brax writes Python numbers into some fields. Fixed dtypes keep a jitted step from
         # being traced again for its own output.
-        carry = jax.tree.map(lambda leaf, dtype: jnp.asarray(leaf, dtype), carry, self._dtypes)
+        carry = jax.tree.map(_as_dtype, carry, self._dtypes)
         seen = kinematics(brax_state.pipeline_state)
         return carry, seen.xpos, seen.xquat, jnp.asarray(brax_state.obs, jnp.float32)
 
@@ -248,13 +247,8 @@ class BraxPhysics:
 
     def _check_shapes(self) -> None:
         key = jax.random.key(0)
-        try:
-            with known_warnings_silenced():
-                first = jax.eval_shape(self._env.reset, key)
-        except (AssertionError, NotImplementedError, RuntimeError) as error:
-            raise ValueError(
-                f"the {self.backend!r} backend cannot simulate this model: {error}"
-            ) from error
+        with _explained(self.backend), known_warnings_silenced():
+            first = jax.eval_shape(self._env.reset, key)
         if not hasattr(first.obs, "shape") or len(first.obs.shape) != 1:
             raise ValueError(
                 "the environment must observe one flat array, got "
@@ -267,16 +261,12 @@ class BraxPhysics:
             )
         self.state_size = int(first.obs.shape[0])
         self._obs_dtype = first.obs.dtype
-        carry = BraxCarry(pipeline=first.pipeline_state, metrics=first.metrics, info=first.info)
-        self._dtypes = jax.tree.map(lambda leaf: leaf.dtype, carry)
+        self._dtypes = jax.tree.map(lambda leaf: leaf.dtype, _carry(first))
+        self._tree: Any = jax.tree.structure(self._dtypes)
 
         state = jax.eval_shape(self.reset, key)
-        try:
+        with _explained(self.backend):
             after = jax.eval_shape(self.step, state, jnp.zeros(self.action_size))
-        except NotImplementedError as error:
-            raise ValueError(
-                f"the {self.backend!r} backend cannot simulate this model: {error}"
-            ) from error
         if after.reward.shape != ():
             raise ValueError(f"the reward must be a scalar, got shape {after.reward.shape}")
         if after.terminated.shape != ():
@@ -367,6 +357,18 @@ def _check_env(env: envs.Env) -> None:
         )
 
 
+@contextlib.contextmanager
+def _explained(backend: str) -> Iterator[None]:
+    """Says which engine it is that lacks a feature of the model."""
+    try:
+        yield
+    except (AssertionError, NotImplementedError, RuntimeError) as error:
+        cure = "" if backend == "mjx" else " The 'mjx' backend simulates most of MuJoCo."
+        raise ValueError(
+            f"the {backend!r} backend cannot simulate this model: {error}{cure}"
+        ) from error
+
+
 def _replace_init(env: envs.Env, init: Callable[..., Any]) -> envs.Env:
     """A shallow copy of ``env``, down through its wrappers, with another ``pipeline_init``."""
     clone = copy.copy(env)
@@ -375,6 +377,18 @@ def _replace_init(env: envs.Env, init: Callable[..., Any]) -> envs.Env:
     else:
         clone.pipeline_init = init
     return clone
+
+
+def _as_dtype(leaf: Any, dtype: Any) -> jax.Array:
+    # A key in Brax's info is typed or raw, as the one given to reset was.
+    is_key = jnp.issubdtype(dtype, jax.dtypes.prng_key)
+    return leaf if is_key else jnp.asarray(leaf, dtype)
+
+
+def _carry(brax_state: envs.State) -> BraxCarry:
+    return BraxCarry(
+        pipeline=brax_state.pipeline_state, metrics=brax_state.metrics, info=brax_state.info
+    )
 
 
 def _control_range(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:

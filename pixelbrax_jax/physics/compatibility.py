@@ -103,5 +103,5 @@ def accept_old_clip(module: ModuleType) -> None:
     Args:
         module: a module that knows ``jax.numpy`` as ``jp``.
     """
-    if "a_min" not in inspect.signature(jnp.clip).parameters and module.jp is jnp:
-        module.jp = _NumpyWithOldClip()
+    if "a_min" not in inspect.signature(jnp.clip).parameters and vars(module)["jp"] is jnp:
+        vars(module)["jp"] = _NumpyWithOldClip()

@@ -77,8 +77,8 @@ def read_geoms(
     materials: dict[tuple[bool, Color], int] = {}
     rows = []
     for i, kind in zip(shown, kinds, strict=True):
-        color = colors.get(names[i], _rgba(model, i)[:3])
-        key = (kind == GeomKind.PLANE, tuple(float(c) for c in np.asarray(color, np.float32)))
+        red, green, blue = (float(c) for c in colors.get(names[i], _rgba(model, i)[:3]))
+        key = (kind == GeomKind.PLANE, (red, green, blue))
         rows.append(materials.setdefault(key, len(materials)))
 
     size = np.array(model.geom_size[shown], np.float32)

@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -15,11 +14,9 @@ import numpy as np
 
 from pixelbrax_jax.choices import check_choice
 from pixelbrax_jax.physics.base import BACKENDS, Kinematics
+from pixelbrax_jax.physics.brax_physics import BraxPhysics, MjcfEnv, RewardFn
 from pixelbrax_jax.physics.compatibility import loading_silenced
 from pixelbrax_jax.physics.geoms import VISIBLE_GROUPS, Color, read_geoms
-
-if TYPE_CHECKING:
-    from pixelbrax_jax.physics.brax_physics import BraxPhysics
 
 
 def never(after: Kinematics) -> jax.Array:
@@ -48,7 +45,7 @@ class MjcfTask:
         init_q: (Q,) joint positions to start from; None for the model's own.
     """
 
-    reward: Callable[[Kinematics, Kinematics, jax.Array], jax.Array]
+    reward: RewardFn
     terminated: Callable[[Kinematics], jax.Array] = never
     observation: Callable[[Kinematics], jax.Array] = joint_state
     reset_noise: float = 0.01
@@ -59,7 +56,7 @@ class MjcfTask:
 def mjcf_physics(
     source: str | Path,
     *,
-    reward: Callable[[Kinematics, Kinematics, jax.Array], jax.Array],
+    reward: RewardFn,
     terminated: Callable[[Kinematics], jax.Array] = never,
     observation: Callable[[Kinematics], jax.Array] = joint_state,
     reset_noise: float = 0.01,
@@ -111,9 +108,6 @@ def mjcf_physics(
             raise ValueError(f"init_q must have shape ({model.nq},), got {init_q.shape}")
     task = MjcfTask(reward, terminated, observation, float(reset_noise), int(n_frames), init_q)
     _check_functions(task, model)
-    # Importing Brax takes seconds.
-    from pixelbrax_jax.physics.brax_physics import BraxPhysics, MjcfEnv
-
     return BraxPhysics(MjcfEnv(model, task, backend), colors=colors, geom_groups=geom_groups)
 
 
@@ -156,18 +150,19 @@ def _check_model(model: mujoco.MjModel, backend: str) -> None:
     ]
     if left_out:
         raise ValueError(
-            f"the {backend!r} backend does not simulate {' or '.join(left_out)}; "
-            "use backend='mjx'"
+            f"the {backend!r} backend does not simulate {' or '.join(left_out)}; use backend='mjx'"
         )
 
 
 def _check_functions(task: MjcfTask, model: mujoco.MjModel) -> None:
     links = model.nbody - 1
-    shapes = Kinematics(
-        q=jax.ShapeDtypeStruct((model.nq,), jnp.float32),
-        qd=jax.ShapeDtypeStruct((model.nv,), jnp.float32),
-        xpos=jax.ShapeDtypeStruct((links, 3), jnp.float32),
-        xquat=jax.ShapeDtypeStruct((links, 4), jnp.float32),
+    shapes = jax.eval_shape(
+        lambda: Kinematics(
+            q=jnp.zeros(model.nq),
+            qd=jnp.zeros(model.nv),
+            xpos=jnp.zeros((links, 3)),
+            xquat=jnp.zeros((links, 4)),
+        )
     )
     action = jax.ShapeDtypeStruct((model.nu,), jnp.float32)
     _check_result("reward", "a scalar number", jax.eval_shape(task.reward, shapes, shapes, action))

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from pixelbrax_jax.physics import TASKS, BraxPhysics, Physics, make_physics
+from pixelbrax_jax.physics import TASKS, Physics, make_physics
 from pixelbrax_jax.physics.base import BACKENDS
 from pixelbrax_jax.types import GeomKind
 
@@ -89,5 +89,30 @@ def test_equal_calls_give_different_objects_with_equal_geoms():
     jax.tree.map(np.testing.assert_array_equal, one.geoms, two.geoms)
 
 
-def test_physics_is_exported_lazily():
-    assert BraxPhysics.__module__ == "pixelbrax_jax.physics.brax_physics"
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            {"task": "antt"},
+            r"unknown task: 'antt'; allowed: ant, halfcheetah, .*\. Did you mean 'ant'\?",
+        ),
+        ({"task": "Walker2d"}, "Did you mean 'walker2d'?"),
+        ({"task": None}, "unknown task: None; allowed: ant"),
+        (
+            {"task": "ant", "backend": "sprng"},
+            r"unknown backend of task 'ant': 'sprng'; allowed: generalized, mjx, spring\. "
+            r"Did you mean 'spring'\?",
+        ),
+        (
+            {"task": "swimmer", "backend": "mjx"},
+            "unknown backend of task 'swimmer': 'mjx'; allowed: generalized",
+        ),
+        (
+            {"task": "ant", "reward_preset": "papr"},
+            r"unknown reward_preset: 'papr'; allowed: brax, paper\. Did you mean 'paper'\?",
+        ),
+    ],
+)
+def test_unknown_names(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        make_physics(**arguments)

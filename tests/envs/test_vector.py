@@ -1,0 +1,193 @@
+"""Batches: autoreset modes, independence of environments, masks."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pixelbrax_jax import PixelEnv, VectorPixelEnv
+from tests.envs.toy import PARAMS, Ball
+
+N = 5
+# Environment 0 goes left for ever, the others reach the end at different times.
+ACTIONS = jnp.array([-0.2, 0.5, 0.7, 0.9, 1.0])[:, None]
+
+
+def make(mode: str, num_envs: int = N, **options) -> VectorPixelEnv:
+    options = {"height": 12, "width": 12, "frame_stack": 2, "episode_length": 20} | options
+    return VectorPixelEnv(PixelEnv(Ball(), **options), num_envs, mode)
+
+
+def run(venv: VectorPixelEnv, num_steps: int, actions=ACTIONS):
+    state, first = venv.reset(jax.random.key(0), PARAMS)
+    steps = [first]
+    for _ in range(num_steps):
+        state, timestep = venv.step(state, actions, PARAMS)
+        steps.append(timestep)
+    return state, steps
+
+
+def expected_episodes(env: PixelEnv, key, action, num_steps: int):
+    """What one environment goes through, episode by episode, by its own functions."""
+    state, timestep = env.reset(key, PARAMS)
+    episodes = [[timestep]]
+    for _ in range(num_steps):
+        if state.done:
+            state, timestep = env.next_episode(state, PARAMS)
+            episodes.append([timestep])
+        else:
+            state, timestep = env.step(state, action, PARAMS)
+            episodes[-1].append(timestep)
+    return episodes
+
+
+def assert_same_pixels(actual, expected):
+    # Another batch size may round a silhouette's pixel the other way.
+    difference = np.abs(np.asarray(actual).astype(int) - np.asarray(expected).astype(int))
+    assert np.mean(difference > 1) <= 0.01
+
+
+@pytest.mark.parametrize("mode", ["next_step", "same_step"])
+def test_every_environment_goes_through_its_own_episodes(mode):
+    num_steps = 45
+    venv = make(mode)
+    _, steps = run(venv, num_steps)
+    ends = 0
+    for i in range(N):
+        key = jax.random.fold_in(jax.random.key(0), i)
+        episodes = expected_episodes(venv.env, key, ACTIONS[i], num_steps)
+        t = 0
+        for number, episode in enumerate(episodes):
+            for k, expected in enumerate(episode):
+                if mode == "same_step" and k == 0 and number > 0:
+                    continue  # shown together with the previous episode's last step
+                if t > num_steps:
+                    break
+                actual = steps[t]
+                last = bool(expected.terminated | expected.truncated)
+                assert float(actual.reward[i]) == pytest.approx(float(expected.reward), abs=1e-5)
+                assert bool(actual.terminated[i]) == bool(expected.terminated)
+                assert bool(actual.truncated[i]) == bool(expected.truncated)
+                if mode == "same_step" and last:
+                    ends += 1
+                    assert_same_pixels(actual.info["final_obs"][i], expected.obs)
+                    final = actual.info["final_info"]
+                    assert int(final["episode_length"][i]) == int(expected.info["episode_length"])
+                    assert int(actual.info["episode_length"][i]) == 0
+                    if number + 1 < len(episodes):
+                        assert_same_pixels(actual.obs[i], episodes[number + 1][0].obs)
+                else:
+                    ends += last
+                    assert_same_pixels(actual.obs[i], expected.obs)
+                    length = int(actual.info["episode_length"][i])
+                    assert length == int(expected.info["episode_length"])
+                t += 1
+    assert ends >= N
+
+
+def test_disabled_resets_only_by_mask():
+    venv = make("disabled")
+    state, steps = run(venv, 20)
+    assert bool(steps[-1].truncated[0])
+    done = np.asarray(state.done)
+    assert done.all()
+    mask = jnp.arange(N) == 2
+    after, timestep = venv.reset_where(state, mask, PARAMS)
+    assert int(after.episode[2]) == 1
+    assert int(after.step_count[2]) == 0
+    assert not bool(after.done[2])
+    for i in (0, 1, 3, 4):
+        same = jax.tree.map(
+            lambda old, new, i=i: bool((jax.random.key_data(old[i]) == jax.random.key_data(new[i])).all())
+            if jnp.issubdtype(old.dtype, jax.dtypes.prng_key)
+            else bool((old[i] == new[i]).all()),
+            state,
+            after,
+        )
+        assert all(jax.tree.leaves(same))
+        np.testing.assert_array_equal(timestep.obs[i], steps[-1].obs[i])
+    fresh = np.asarray(timestep.obs[2])
+    np.testing.assert_array_equal(fresh[..., :3], fresh[..., 3:])
+
+
+def test_reset_where_with_keys_begins_episode_zero():
+    venv = make("next_step")
+    state, _ = run(venv, 7)
+    keys = jax.random.split(jax.random.key(9), N)
+    after, timestep = venv.reset_where(state, jnp.ones(N, bool), PARAMS, keys)
+    expected, first = venv.reset(keys, PARAMS)
+    np.testing.assert_array_equal(timestep.obs, first.obs)
+    np.testing.assert_array_equal(after.physics.obs, expected.physics.obs)
+    assert (np.asarray(after.episode) == 0).all()
+
+
+@pytest.mark.parametrize("mode", ["next_step", "same_step"])
+def test_one_end_leaves_the_others_untouched(mode):
+    """The same batch with and without environment 3 ending: all others agree to the bit."""
+    venv = make(mode)
+    quiet = ACTIONS.at[3].set(0.0)
+    _, busy_steps = run(venv, 16, ACTIONS.at[1:3].set(0.0).at[4].set(0.0))
+    _, quiet_steps = run(venv, 16, quiet.at[1:3].set(0.0).at[4].set(0.0))
+    assert any(bool(step.terminated[3]) for step in busy_steps)
+    assert not any(bool(step.terminated.any()) for step in quiet_steps)
+    others = np.array([0, 1, 2, 4])
+    for busy, calm in zip(busy_steps, quiet_steps, strict=True):
+        np.testing.assert_array_equal(busy.obs[others], calm.obs[others])
+        np.testing.assert_array_equal(busy.reward[others], calm.reward[others])
+
+
+def test_successive_episodes_begin_differently():
+    venv = make("next_step", obs_mode="state")
+    _, steps = run(venv, 60, jnp.ones((N, 1)))
+    starts = {float(step.obs[1, 0]) for step in steps if int(step.info["episode_length"][1]) == 0}
+    assert len(starts) >= 4
+
+
+@pytest.mark.parametrize("num_envs", [1, 33, 70])
+def test_more_ends_than_one_block_and_ragged_batches(num_envs):
+    venv = make("next_step", num_envs, obs_mode="state", episode_length=3)
+    state, first = venv.reset(jax.random.key(0), PARAMS)
+    starts = np.asarray(first.obs[:, 0])
+    for _ in range(4):
+        state, timestep = venv.step(state, jnp.zeros((num_envs, 1)), PARAMS)
+    assert (np.asarray(state.episode) == 1).all()
+    fresh = np.asarray(timestep.obs[:, 0])
+    assert (fresh != starts).all()
+    assert len(np.unique(fresh)) == num_envs
+
+
+def test_works_inside_scan_and_is_traced_once():
+    venv = make("next_step")
+    traces = []
+
+    @jax.jit
+    def rollout(state, params):
+        traces.append(None)
+        return jax.lax.scan(lambda s, _: venv.step(s, ACTIONS, params), state, length=45)
+
+    state, _ = venv.reset(jax.random.key(0), PARAMS)
+    state, scanned = rollout(state, PARAMS)
+    rollout(state, PARAMS)
+    assert len(traces) == 1
+    _, steps = run(venv, 45)
+    np.testing.assert_array_equal(scanned.truncated, [step.truncated for step in steps[1:]])
+    assert_same_pixels(scanned.obs[-1], steps[-1].obs)
+
+
+def test_bad_options_and_arguments():
+    with pytest.raises(ValueError, match="num_envs must be a whole number of at least 1, got 0"):
+        make("next_step", 0)
+    with pytest.raises(ValueError, match="unknown autoreset_mode: 'next'.*Did you mean 'next_step'"):
+        make("next")
+    venv = make("next_step", obs_mode="state")
+    state, _ = venv.reset(jax.random.key(0), PARAMS)
+    with pytest.raises(ValueError, match=r"action must have shape \(5, 1\), got \(5,\)"):
+        venv.step(state, jnp.zeros(5), PARAMS)
+    with pytest.raises(TypeError, match="floating point"):
+        venv.step(state, jnp.zeros((5, 1), int), PARAMS)
+    with pytest.raises(ValueError, match="mask must be bool of shape"):
+        venv.reset_where(state, jnp.ones(4, bool), PARAMS)
+    with pytest.raises(TypeError, match=r"key must have shape \(5,\)"):
+        venv.reset(jax.random.split(jax.random.key(0), 4), PARAMS)

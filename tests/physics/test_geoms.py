@@ -1,0 +1,209 @@
+"""Visible geoms and their colors, against MuJoCo's own viewer."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from pixelbrax_jax.physics import TASKS
+from pixelbrax_jax.physics.geoms import read_geoms
+from pixelbrax_jax.types import GeomKind
+
+LOOKS = """
+<mujoco>
+  <asset>
+    <material name="green" rgba="0 1 0 1"/>
+    <material name="clear" rgba="0 0 1 0"/>
+  </asset>
+  <worldbody>
+    <geom name="default" size=".1"/>
+    <geom name="by material" size=".1" material="green"/>
+    <geom name="own over material" size=".1" material="green" rgba="1 0 0 1"/>
+    <geom name="clear material" size=".1" material="clear"/>
+    <geom name="own over clear" size=".1" material="clear" rgba="1 0 0 1"/>
+    <geom name="clear over material" size=".1" material="green" rgba="1 0 0 0"/>
+    <geom name="clear" size=".1" rgba="1 0 0 0"/>
+    <geom name="hidden group" size=".1" group="3"/>
+    <geom name="glass" size=".1" rgba="1 0 0 .3"/>
+    <geom name="ground" type="plane" size="1 1 .1"/>
+    <geom type="box" size=".1 .2 .3"/>
+    <geom type="ellipsoid" size=".1 .2 .3"/>
+    <geom type="cylinder" size=".1 .2"/>
+    <geom type="capsule" size=".1 .2"/>
+  </worldbody>
+</mujoco>
+"""
+
+
+def viewer(model):
+    """{geom index: rgb} that MuJoCo's viewer would draw."""
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    scene = mujoco.MjvScene(model, 1000)
+    option, camera = mujoco.MjvOption(), mujoco.MjvCamera()
+    everything = mujoco.mjtCatBit.mjCAT_ALL
+    mujoco.mjv_updateScene(model, data, option, None, camera, everything, scene)
+    drawn = scene.geoms[: scene.ngeom]
+    return {g.objid: g.rgba[:3].copy() for g in drawn if g.objtype == mujoco.mjtObj.mjOBJ_GEOM}
+
+
+def assert_as_in_viewer(model, geoms):
+    shown = viewer(model)
+    assert len(geoms.name) == len(shown)
+    for index, (original, rgb) in enumerate(sorted(shown.items())):
+        assert geoms.name[index] == (model.geom(original).name or geoms.name[index])
+        assert geoms.kind[index] == model.geom_type[original]
+        np.testing.assert_allclose(geoms.rgb[geoms.material[index]], rgb, atol=1e-6)
+
+
+def test_colors_and_visibility():
+    model = mujoco.MjModel.from_xml_string(LOOKS)
+    geoms = read_geoms(model)
+    assert_as_in_viewer(model, geoms)
+    assert geoms.name[-4:] == ("box/10", "ellipsoid/11", "cylinder/12", "capsule/13")
+    assert "hidden group" not in geoms.name
+    np.testing.assert_allclose(geoms.size[geoms.name.index("capsule/13")], [0.1, 0.2, 0])
+    np.testing.assert_allclose(geoms.size[geoms.name.index("default")], [0.1, 0, 0])
+
+
+@pytest.mark.parametrize("task", sorted(TASKS))
+def test_colors_of_the_tasks(task, unfused_model):
+    model = unfused_model(task)
+    assert_as_in_viewer(model, read_geoms(model))
+
+
+def test_equal_colors_share_a_material_but_a_ground_has_its_own():
+    geoms = read_geoms(mujoco.MjModel.from_xml_string(LOOKS))
+    row = dict(zip(geoms.name, geoms.material, strict=True))
+    assert row["own over material"] == row["own over clear"] == row["glass"]
+    assert row["default"] == row["box/10"]
+    assert row["default"] != row["ground"]
+    np.testing.assert_array_equal(geoms.rgb[row["default"]], geoms.rgb[row["ground"]])
+    assert len(geoms.rgb) == 4
+
+
+def test_chosen_groups():
+    model = mujoco.MjModel.from_xml_string(LOOKS)
+    assert read_geoms(model, geom_groups=(3,)).name == ("hidden group",)
+    with pytest.raises(ValueError, match=r"no geom is visible: .* outside \(4,\)"):
+        read_geoms(model, geom_groups=(4,))
+
+
+def test_replaced_color():
+    model = mujoco.MjModel.from_xml_string(LOOKS)
+    geoms = read_geoms(model, colors={"ground": (0.25, 0.5, 0.75), "box/10": (1, 0, 0)})
+    row = dict(zip(geoms.name, geoms.material, strict=True))
+    np.testing.assert_array_equal(geoms.rgb[row["ground"]], [0.25, 0.5, 0.75])
+    assert row["box/10"] == row["glass"]
+
+
+def test_unknown_geom_in_colors():
+    model = mujoco.MjModel.from_xml_string(LOOKS)
+    with pytest.raises(ValueError, match=r"unknown geom: 'grund'.*Did you mean 'ground'"):
+        read_geoms(model, colors={"grund": (0, 0, 0)})
+
+
+@pytest.mark.parametrize("color", [(0, 0, 2), (0, 0), (0, 0, float("nan")), (255, 0, 0)])
+def test_bad_color(color):
+    model = mujoco.MjModel.from_xml_string(LOOKS)
+    with pytest.raises(ValueError, match=r"color of geom 'ground' .* \[0, 1\], got"):
+        read_geoms(model, colors={"ground": color})
+
+
+MESH = """
+<mujoco>
+  <asset><mesh name="tetra" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset>
+  <worldbody>
+    <geom name="ball" size=".1"/>
+    <body><joint/><geom name="shell" type="mesh" mesh="tetra" {more}/></body>
+  </worldbody>
+  <actuator/>
+</mujoco>
+"""
+
+
+def test_visible_mesh():
+    model = mujoco.MjModel.from_xml_string(MESH.format(more=""))
+    expected = (
+        r"geom 'shell' is a mesh, which cannot be drawn; supported: plane, sphere, capsule, "
+        r"ellipsoid, cylinder, box\. Replace it by these primitives, .* alpha 0"
+    )
+    with pytest.raises(ValueError, match=expected):
+        read_geoms(model)
+
+
+@pytest.mark.parametrize("more", ['rgba="1 1 1 0"', 'group="4"'])
+def test_hidden_mesh_is_no_concern(more):
+    assert read_geoms(mujoco.MjModel.from_xml_string(MESH.format(more=more))).name == ("ball",)
+
+
+def test_visible_height_field():
+    model = mujoco.MjModel.from_xml_string(
+        """
+        <mujoco>
+          <asset><hfield name="hills" nrow="3" ncol="3" size="1 1 1 1"/></asset>
+          <worldbody><geom type="hfield" hfield="hills"/></worldbody>
+        </mujoco>
+        """
+    )
+    with pytest.raises(ValueError, match="geom 'hfield/0' is a hfield, which cannot be drawn"):
+        read_geoms(model)
+
+
+def test_task_colors_name_geoms_that_exist(program):
+    for task, spec in TASKS.items():
+        if not spec.colors:
+            continue
+        geoms = program(task).physics.geoms
+        for name, color in spec.colors.items():
+            row = geoms.material[geoms.name.index(name)]
+            np.testing.assert_allclose(geoms.rgb[row], color, atol=1e-6)
+
+
+def test_the_pushers_nameless_goal_is_the_one_recolored(program):
+    physics = program("pusher").physics
+    index = physics.geoms.name.index("capsule/20")
+    assert physics.link_names[physics.geoms.link[index]] == "goal"
+    np.testing.assert_allclose(physics.geoms.size[index], [0.08, 0.001, 0])
+
+
+# Vienot, Brettel and Mollon, "Digital video colourmaps for checking the legibility of displays
+# by dichromats" (1999): RGB to LMS, and what a deuteranope's missing M cone is replaced by.
+_LMS = np.array(
+    [[17.8824, 43.5161, 4.11935], [3.45565, 27.1554, 3.86714], [0.0299566, 0.184309, 1.46709]]
+)
+_DEUTERANOPE = np.array([[1, 0, 0], [0.494207, 0, 1.24827], [0, 0, 1]])
+_XYZ = np.array(
+    [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
+)  # fmt: skip
+
+
+def lab(rgb, deuteranope):
+    """CIELAB of a color, as full or as deuteranopic vision sees it."""
+    linear = np.asarray(rgb, float) ** 2.2
+    if deuteranope:
+        linear = np.clip(np.linalg.solve(_LMS, _DEUTERANOPE @ _LMS @ linear), 0, 1)
+    x, y, z = np.cbrt(_XYZ @ linear / _XYZ.sum(axis=1))
+    return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)])
+
+
+@pytest.mark.parametrize("deuteranope", [False, True])
+@pytest.mark.parametrize(
+    ("task", "names"),
+    [
+        ("reacher", ("target", "fingertip", "link1")),
+        ("pusher", ("object_geom", "capsule/20", "fa")),
+    ],
+)
+def test_targets_stand_out(task, names, deuteranope, program):
+    """Differences of 10 are seen at a glance; we ask for 20 between any two."""
+    geoms = program(task).physics.geoms
+    seen = [lab(geoms.rgb[geoms.material[geoms.name.index(n)]], deuteranope) for n in names]
+    for i in range(3):
+        for j in range(i):
+            difference = np.linalg.norm(seen[i] - seen[j])
+            assert difference > 20, (names[i], names[j], difference)
+
+
+def test_kinds_are_mujocos_numbers():
+    for kind in GeomKind:
+        assert int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind.name}")) == kind

@@ -1,0 +1,230 @@
+"""Tasks from MJCF files."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from pixelbrax_jax.physics import BACKENDS, Kinematics, Physics, mjcf_physics
+
+# A cart with a leaning pole; the knob is a body without a joint, rotated by Euler angles.
+CART = """
+<mujoco>
+  <option timestep="0.01"/>
+  <default><geom contype="0" conaffinity="0"/></default>
+  <worldbody>
+    <geom name="ground" type="plane" size="1 1 .1" pos="0 0 -1"/>
+    <body name="cart">
+      <joint name="slide" type="slide" axis="1 0 0"/>
+      <geom name="cart" type="box" size=".1 .1 .05"/>
+      <body pos="0 0 .05" euler="0 20 0">
+        <joint name="hinge" axis="0 1 0" damping=".1"/>
+        <geom name="pole" type="capsule" fromto="0 0 0 0 0 .5" size=".02"/>
+        <body name="knob" euler="90 0 30">
+          <geom name="knob" type="cylinder" size=".05 .1" pos="0 .5 .1"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor name="push" joint="slide" gear="10" ctrllimited="true" ctrlrange="-1 3"/>
+    <motor name="turn" joint="hinge"/>
+  </actuator>
+</mujoco>
+"""
+
+
+def upright(before, after, action):
+    return after.xpos[1, 2] - before.xpos[1, 2] - jnp.sum(action**2)
+
+
+def build(source=CART, **changes):
+    options = {"reward": upright, "backend": "generalized", "n_frames": 2} | changes
+    return mjcf_physics(source, **options)
+
+
+@pytest.fixture(scope="module")
+def cart(compiled):
+    return compiled(build(terminated=lambda s: jnp.abs(s.q[1]) > 1.0, reset_noise=0.05))
+
+
+def mujoco_model():
+    return mujoco.MjModel.from_xml_string(CART)
+
+
+def test_facts(cart):
+    physics = cart.physics
+    assert isinstance(physics, Physics)
+    assert physics.dt == 0.02
+    assert physics.action_size == 2
+    assert physics.state_size == 4
+    assert physics.link_names == ("cart", "link/1")
+    assert physics.geoms.name == ("ground", "cart", "pole", "knob")
+    assert physics.geoms.link == (-1, 0, 1, 1)
+
+
+def test_poses_are_mujocos(cart, geom_pose):
+    """Also of the fused body, whose rotation Brax's own loader would lose."""
+    model = mujoco_model()
+    data = mujoco.MjData(model)
+    state = cart.reset(jax.random.key(0))
+    data.qpos[:] = state.engine.pipeline.q
+    mujoco.mj_kinematics(model, data)
+    np.testing.assert_allclose(state.xpos, data.xpos[1:3], atol=1e-6)
+    for index in range(4):
+        pos, mat = geom_pose(cart.physics.geoms, state, index)
+        np.testing.assert_allclose(pos, data.geom_xpos[index], atol=1e-5)
+        np.testing.assert_allclose(mat, data.geom_xmat[index].reshape(3, 3), atol=1e-5)
+
+
+def test_reset_noise(cart):
+    states = [cart.reset(jax.random.key(i)) for i in range(20)]
+    noise = np.array([s.obs for s in states])
+    assert np.abs(noise).max() <= 0.05
+    assert np.abs(noise).max() > 0.04
+    assert len(np.unique(noise)) == noise.size
+
+
+def test_formulas(cart):
+    before = cart.reset(jax.random.key(0))
+    action = np.array([0.5, -0.25], np.float32)
+    after = cart.step(before, action)
+    expected = float(after.xpos[1, 2] - before.xpos[1, 2]) - np.sum(action**2)
+    np.testing.assert_allclose(after.reward, expected, atol=1e-6)
+    joints = after.engine.pipeline
+    np.testing.assert_array_equal(after.obs, np.concatenate([joints.q, joints.qd]))
+    assert not after.terminated
+    leaning = cart.from_qpos(np.array([0, 1.1], np.float32))
+    assert cart.step(leaning, action).terminated
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("backend", ["generalized", "mjx"])
+def test_motion_is_mujocos(backend, compiled):
+    """An action of 1 is the upper end of the control range, or 1 where there is none."""
+    program = compiled(build(backend=backend))
+    model = mujoco_model()
+    data = mujoco.MjData(model)
+    state = program.from_qpos(np.zeros(2, np.float32))
+    for action, control in (([1, 1], [3, 1]), ([0, -1], [1, -1]), ([-1, 0.5], [-1, 0.5])):
+        state = program.step(state, np.array(action, np.float32))
+        data.ctrl[:] = control
+        for _ in range(2):
+            mujoco.mj_step(model, data)
+        np.testing.assert_allclose(state.engine.pipeline.q, data.qpos, atol=2e-3)
+        np.testing.assert_allclose(state.engine.pipeline.qd, data.qvel, rtol=0.02, atol=2e-2)
+
+
+def test_file_that_includes_another(tmp_path):
+    (tmp_path / "cart.xml").write_text(CART)
+    (tmp_path / "scene.xml").write_text('<mujoco><include file="cart.xml"/></mujoco>')
+    physics = build(tmp_path / "scene.xml", colors={"pole": (0, 1, 0)}, init_q=[0.5, 0])
+    assert "pole" in physics.geoms.name
+    assert jax.eval_shape(physics.reset, jax.random.key(0)).xpos.shape == (2, 3)
+
+
+def test_own_observation():
+    physics = build(observation=lambda s: jnp.concatenate([s.xpos[1], s.xquat[1]]))
+    assert physics.state_size == 7
+
+
+@pytest.mark.slow
+def test_start_and_every_feature_of_mjx(compiled):
+    """Ball joints, tendons and equality constraints only exist on MJX."""
+    xml = """
+    <mujoco>
+      <worldbody>
+        <body name="top"><joint name="ball" type="ball"/><geom size=".1" pos="0 0 -.3"/></body>
+        <body name="bob"><joint name="x" type="slide"/><geom size=".1"/></body>
+        <body name="twin"><joint name="y" type="slide"/><geom size=".1"/></body>
+      </worldbody>
+      <tendon><fixed name="pull"><joint joint="x" coef="2"/></fixed></tendon>
+      <equality><joint joint1="x" joint2="y"/></equality>
+      <actuator><motor tendon="pull"/></actuator>
+    </mujoco>
+    """
+    start = [0.0, 0, 3, 4, 1, 2]
+    physics = mjcf_physics(
+        xml, reward=lambda *_: jnp.zeros(()), reset_noise=0.0, init_q=start, backend="mjx"
+    )
+    assert physics.action_size == 1
+    program = compiled(physics)
+    state = program.reset(jax.random.key(0))
+    np.testing.assert_allclose(state.obs[:6], [0, 0, 0.6, 0.8, 1, 2], atol=1e-6)
+    after = program.step(state, np.ones(1, np.float32))
+    assert not after.non_finite
+    assert after.obs[4] > 1
+    with pytest.raises(
+        ValueError, match="'spring' backend does not simulate equality constraints or tendons"
+    ):
+        mjcf_physics(xml, reward=lambda *_: jnp.zeros(()), backend="spring")
+
+
+def test_missing_file(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"there is no MJCF file '.*arm\.xml'"):
+        build(tmp_path / "arm.xml")
+    with pytest.raises(FileNotFoundError, match=r"there is no MJCF file '.*arm\.xml'"):
+        build("arm.xml")
+
+
+def test_broken_xml():
+    with pytest.raises(ValueError, match=r"MuJoCo cannot compile the given XML: (.|\n)*wrldbody"):
+        build("<mujoco><wrldbody/></mujoco>")
+
+
+def test_no_actuator():
+    with pytest.raises(ValueError, match="the model has no actuator"):
+        build(CART[: CART.index("<actuator>")] + "</mujoco>")
+
+
+def test_no_joint():
+    with pytest.raises(ValueError, match="the model has no joint"):
+        build('<mujoco><worldbody><geom size=".1"/></worldbody></mujoco>')
+
+
+def test_mesh():
+    xml = CART.replace(
+        "<worldbody>",
+        '<asset><mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset><worldbody>'
+        '<geom name="statue" type="mesh" mesh="m"/>',
+    )
+    with pytest.raises(ValueError, match="geom 'statue' is a mesh, which cannot be drawn"):
+        build(xml)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"reward": lambda b, a, u: a.q}, r"reward must return a scalar number, got shape \(2,\)"),
+        ({"reward": lambda b, a, u: a.q[0] > 0}, "reward must return a scalar number, .* bool"),
+        ({"reward": lambda b, a, u: None}, "reward must return a scalar number, got None"),
+        ({"terminated": lambda a: a.q[0]}, "terminated must return a scalar bool, .* float32"),
+        ({"terminated": lambda a: a.q > 0}, r"terminated must return a scalar bool, .* \(2,\)"),
+        ({"observation": lambda a: a.xpos}, "observation must return a flat float array"),
+        ({"observation": lambda a: a.q[:0]}, "observation must return a flat float array"),
+        ({"init_q": np.zeros(3)}, r"init_q must have shape \(2,\), got \(3,\)"),
+        ({"n_frames": 0}, "n_frames must be a positive whole number, got 0"),
+        ({"n_frames": 1.5}, "n_frames must be a positive whole number, got 1.5"),
+        ({"reset_noise": -1.0}, "reset_noise must be finite and not negative"),
+        ({"reset_noise": float("nan")}, "reset_noise must be finite and not negative"),
+        ({"backend": "mjs"}, "unknown backend: 'mjs'; .* Did you mean 'mjx'"),
+        ({"colors": {"pol": (1, 0, 0)}}, "unknown geom: 'pol'; .* Did you mean 'pole'"),
+        ({"geom_groups": (5,)}, "no geom is visible"),
+    ],
+)
+def test_bad_arguments(change, message):
+    with pytest.raises(ValueError, match=message):
+        build(**change)
+
+
+@pytest.mark.parametrize("backend", sorted(set(BACKENDS) - {"mjx"}))
+def test_models_beyond_brax_engines(backend):
+    """What an engine cannot simulate is said when it is chosen, not when it runs."""
+    xml = CART.replace('timestep="0.01"', 'timestep="0.01" integrator="RK4"')
+    with pytest.raises(ValueError, match=f"'{backend}' backend cannot simulate this model: Only"):
+        build(xml, backend=backend)
+
+
+def test_view_is_public():
+    assert Kinematics.__dataclass_fields__.keys() == {"q", "qd", "xpos", "xquat"}
