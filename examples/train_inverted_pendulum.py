@@ -31,7 +31,7 @@ from tqdm import tqdm
 import pixelbrax_gym  # noqa: F401  # registers PixelBrax/*
 
 matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402
+import matplotlib.pyplot as plt
 
 
 @dataclass(frozen=True)
@@ -282,7 +282,10 @@ def plot(curve: dict[str, list[float]], evaluation: list[float], path: Path) -> 
     axes.plot(curve["steps"], curve["return"], label="training, mean of recent episodes")
     mean = np.mean(evaluation)
     axes.axhline(
-        mean, color="tab:orange", ls="--", label=f"evaluation, {len(evaluation)} episodes: {mean:.0f}"
+        mean,
+        color="tab:orange",
+        ls="--",
+        label=f"evaluation, {len(evaluation)} episodes: {mean:.0f}",
     )
     axes.set(xlabel="environment steps", ylabel="return", title="Inverted pendulum from pixels")
     axes.set_ylim(bottom=0)
@@ -308,7 +311,9 @@ def main(arguments: list[str] | None = None) -> dict:
     output = Path(config.output_dir)
     output.mkdir(parents=True, exist_ok=True)
     device = torch.device(
-        ("cuda" if torch.cuda.is_available() else "cpu") if config.device == "auto" else config.device
+        ("cuda" if torch.cuda.is_available() else "cpu")
+        if config.device == "auto"
+        else config.device
     )
     torch.manual_seed(config.seed)
     print(f"Training on {device} with {config.num_envs} environments; the first step compiles.")

@@ -129,7 +129,7 @@ def make(
         episode_length,
         renderer,
     )
-    rig = make_rig(task, camera, _fallback_rig(task, env.physics))
+    rig = make_rig(task, camera, _fallback_rig(task))
     if not rig.link < len(env.physics.link_names):
         raise ValueError(
             f"the camera follows link {rig.link}, but task {task!r} has only "
@@ -168,15 +168,16 @@ def _pixel_env(
     )
 
 
-def _fallback_rig(task: str, physics: Physics) -> CameraRig | None:
+def _fallback_rig(task: str) -> CameraRig | None:
     """The default viewpoint of a task that the user registered; None for the built-in ones."""
     if task in TASKS:
         return None
-    return _REGISTRY[task].camera or _corner_rig(physics)
+    return _REGISTRY[task].camera or _corner_rig(task)
 
 
 @cache
-def _corner_rig(physics: Physics) -> CameraRig:
+def _corner_rig(task: str) -> CameraRig:
+    physics = _physics(task, None, "brax")
     state = physics.reset(jax.random.key(0))
     geoms, xpos, xquat = physics.geoms, np.asarray(state.xpos), np.asarray(state.xquat)
     points = [

@@ -30,8 +30,7 @@ class GeomKind(IntEnum):
     BOX = 6
 
 
-@struct.dataclass
-class Geoms:
+class Geoms(struct.PyTreeNode):
     """The visible shapes of a task, each fixed in the frame of its link.
 
     Attributes:
@@ -56,8 +55,7 @@ class Geoms:
     rgb: jax.Array
 
 
-@struct.dataclass
-class PhysicsState:
+class PhysicsState(struct.PyTreeNode):
     """What a physics engine tells the rest of the package after a step.
 
     Attributes:
@@ -79,8 +77,7 @@ class PhysicsState:
     non_finite: jax.Array
 
 
-@struct.dataclass
-class Camera:
+class Camera(struct.PyTreeNode):
     """A pinhole camera in the world frame.
 
     Attributes:
@@ -95,8 +92,7 @@ class Camera:
     fovy: jax.Array
 
 
-@struct.dataclass
-class CameraRig:
+class CameraRig(struct.PyTreeNode):
     """A camera that may follow a link.
 
     Eye and target are ``offset + track * xpos[link]``; the orientation never follows.
@@ -118,8 +114,7 @@ class CameraRig:
     fovy: jax.Array
 
 
-@struct.dataclass
-class Look:
+class Look(struct.PyTreeNode):
     """Light, sky and ground.
 
     A surface of color ``c`` with normal ``n`` is shaded with Phong's model for a directional
@@ -155,8 +150,7 @@ class Look:
     ground_pitch: jax.Array
 
 
-@struct.dataclass
-class Scene:
+class Scene(struct.PyTreeNode):
     """Everything a renderer needs for one picture, in the world frame.
 
     Attributes:
@@ -174,8 +168,7 @@ class Scene:
     look: Look
 
 
-@struct.dataclass
-class Frame:
+class Frame(struct.PyTreeNode):
     """One picture. Color channels stay apart: stacking them early costs a CPU dearly.
 
     Attributes:
@@ -192,8 +185,7 @@ class Frame:
     seg: jax.Array
 
 
-@struct.dataclass
-class EnvParams:
+class EnvParams(struct.PyTreeNode):
     """The part of an environment that may be randomised; always a jit argument.
 
     Attributes:
@@ -207,8 +199,7 @@ class EnvParams:
     look: Look
 
 
-@struct.dataclass
-class EnvState:
+class EnvState(struct.PyTreeNode):
     """State of one pixel environment.
 
     Attributes:
@@ -230,8 +221,7 @@ class EnvState:
     done: jax.Array
 
 
-@struct.dataclass
-class Timestep:
+class Timestep(struct.PyTreeNode):
     """What an agent sees after a reset or a step.
 
     Attributes:

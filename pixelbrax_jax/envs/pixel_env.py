@@ -176,7 +176,11 @@ class PixelEnv:
 
     @partial(jax.jit, static_argnums=(0, 3, 4))
     def render(
-        self, state: EnvState, params: EnvParams, height: int | None = None, width: int | None = None
+        self,
+        state: EnvState,
+        params: EnvParams,
+        height: int | None = None,
+        width: int | None = None,
     ) -> Frame:
         """The float frame of a state, at any size.
 
@@ -212,7 +216,7 @@ class PixelEnv:
         """The state after the action, with nothing drawn yet, and the reward."""
         action = self._check_action(action)
 
-        def control_step(carry, _):
+        def control_step(carry: Any, _: None) -> tuple[Any, None]:
             physics, reward, count, over = carry
             moved = self.physics.step(physics, action)
             physics = jax.tree.map(lambda old, new: jnp.where(over, old, new), physics, moved)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -196,7 +197,9 @@ class VectorPixelEnv:
         return state.replace(frames=jnp.where(mask[:, None, None, None], first, state.frames))
 
 
-def _replace_rows(fn: Callable, arguments: tuple, mask: jax.Array, rows):
+def _replace_rows(
+    fn: Callable[..., Any], arguments: tuple[Any, ...], mask: jax.Array, rows: Any
+) -> Any:
     """``rows`` with ``fn`` of the arguments' rows in place of those where ``mask``.
 
     The work is done in blocks and grows with the number of masked rows, not with N: most steps
@@ -208,7 +211,7 @@ def _replace_rows(fn: Callable, arguments: tuple, mask: jax.Array, rows):
     # Out-of-range entries at the end: read as the last row, never written.
     chosen = jnp.nonzero(mask, size=padded, fill_value=num_rows)[0]
 
-    def put(carry):
+    def put(carry: tuple[jax.Array, Any]) -> tuple[jax.Array, Any]:
         start, rows = carry
         index = jax.lax.dynamic_slice(chosen, (start,), (block,))
         inputs = jax.tree.map(lambda x: jnp.take(x, index, axis=0, mode="clip"), arguments)

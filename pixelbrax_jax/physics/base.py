@@ -13,8 +13,7 @@ BACKENDS = ("generalized", "mjx", "positional", "spring")
 """Names of Brax's engines."""
 
 
-@struct.dataclass
-class Kinematics:
+class Kinematics(struct.PyTreeNode):
     """The readable part of an engine's state; what task formulas are written in.
 
     Attributes:

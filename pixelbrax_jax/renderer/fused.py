@@ -18,7 +18,7 @@ import numpy as np
 
 from pixelbrax_jax import spatial
 from pixelbrax_jax.renderer import ground
-from pixelbrax_jax.renderer.intersect import Hit, Vector, dot, intersect
+from pixelbrax_jax.renderer.intersect import Axes, Hit, Vector, dot, intersect
 from pixelbrax_jax.types import Frame, GeomKind, Geoms, Look, Scene
 
 _INF_BITS = np.uint32(0x7F800000)
@@ -40,7 +40,8 @@ def render(
         num_rows: rows of the band.
 
     Returns:
-        The band, every plane (num_rows, W). Its depth is exact to a relative ``2**(b - 24)``, where b bits hold a rank.
+        The band, every plane (num_rows, W). Its depth is exact to a relative
+        ``2**(b - 24)``, where b bits hold a rank.
     """
     geoms, look = scene.geoms, scene.look
     to_camera = scene.camera.xmat
@@ -58,23 +59,24 @@ def render(
     ray = _rays(pixel, height, shape, first_row)
     # Geoms of one material get neighboring ranks, so that a material is a range of ranks.
     order = sorted(range(len(geoms.kind)), key=lambda g: geoms.material[g])
-    centers = [tuple(pos[g]) for g in order]
-    axes = [tuple(tuple(xmat[g, :, k]) for k in range(3)) for g in order]
-    sizes = [tuple(geoms.size[g]) for g in order]
     kinds = [geoms.kind[g] for g in order]
-    hits = [
-        intersect(*geom) for geom in zip(kinds, [ray] * len(order), centers, axes, sizes, strict=True)
+    centers: list[Vector] = [tuple(pos[g]) for g in order]
+    axes: list[Axes] = [
+        (tuple(xmat[g, :, 0]), tuple(xmat[g, :, 1]), tuple(xmat[g, :, 2])) for g in order
     ]
+    sizes: list[Vector] = [tuple(geoms.size[g]) for g in order]
+    geometry = list(zip(kinds, centers, axes, sizes, strict=True))
+    hits = [intersect(kind, ray, at, along, size) for kind, at, along, size in geometry]
 
     t, winner = _nearest(hits, shape)
     seen = [winner == rank for rank in range(len(order))]
     sky = winner == len(order)
 
-    light = tuple(light)
-    ray_light, z_axis = dot(ray, light), (0.0, 0.0, 1.0)
+    to_light, z_axis = tuple(light), (0.0, 0.0, 1.0)
+    ray_light = dot(ray, to_light)
     n_l = n_z = jnp.zeros(shape)
     for hit, here in zip(hits, seen, strict=True):
-        n_l = jnp.where(here, hit.normal_dot(light, ray_light), n_l)
+        n_l = jnp.where(here, hit.normal_dot(to_light, ray_light), n_l)
         n_z = jnp.where(here, hit.normal_dot(z_axis, ray[2]), n_z)
     lit = jnp.ones(shape, bool)
     if look.shadows:
@@ -83,7 +85,7 @@ def render(
             if kind != GeomKind.PLANE:
                 # A convex geom cannot shade a point of itself that faces the light.
                 there = tuple(c - p for c, p in zip(centers[rank], points, strict=True))
-                blocked = intersect(kind, light, there, axes[rank], sizes[rank]).t > _SHADOW_BIAS
+                blocked = intersect(kind, to_light, there, axes[rank], sizes[rank]).t > _SHADOW_BIAS
                 lit &= ~(blocked & ~seen[rank])
 
     color = _surface_colors(geoms, order, winner)
@@ -106,7 +108,8 @@ def render(
         planes.append(jnp.where(sky, air, surface))
 
     geom_of_rank = jnp.array([*order, -1], jnp.int32)
-    return Frame(*planes, depth=jnp.where(sky, jnp.inf, -t * ray[2]), seg=geom_of_rank[winner])
+    depth = jnp.where(sky, jnp.inf, -t * ray[2])
+    return Frame(r=planes[0], g=planes[1], b=planes[2], depth=depth, seg=geom_of_rank[winner])
 
 
 def _rays(
@@ -149,7 +152,7 @@ def _ground_share(
     t: jax.Array,
     pixel: jax.Array,
     center: Vector,
-    axes: tuple[Vector, Vector, Vector],
+    axes: Axes,
 ) -> jax.Array:
     """Share of the ground's second color in each pixel, for rays that hit a plane at ``t``."""
     normal = axes[2]

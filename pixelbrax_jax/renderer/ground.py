@@ -8,6 +8,8 @@ average tends to a constant, where point samples would alias.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 
@@ -15,7 +17,9 @@ LINE_WIDTH = 1.0 / 84.0
 """Width of a grid line in grid pitches: one texel of the original's texture at 84 pixels."""
 
 
-def _average(integral, center: jax.Array, width: jax.Array) -> jax.Array:
+def _average(
+    integral: Callable[[jax.Array], jax.Array], center: jax.Array, width: jax.Array
+) -> jax.Array:
     """Mean of a periodic function of period 1 over a window, given its integral."""
     width = jnp.maximum(width, 1e-4)
     return (integral(center + 0.5 * width) - integral(center - 0.5 * width)) / width

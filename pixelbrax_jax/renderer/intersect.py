@@ -9,17 +9,19 @@ A missed geom yields NaN or a negative distance, never +inf: `fused.py` relies o
 follow from substituting the ray into the surface's equation.
 """
 
+# ruff: noqa: ARG001, ARG005  # all shapes share one signature, whatever they need of it
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax.types import GeomKind
 
-Vector = tuple[jax.Array, jax.Array, jax.Array]
+Vector = Sequence[Any]
+Axes = tuple[Vector, Vector, Vector]
 
 _TINY = 1e-7
 """Keeps a ray that is parallel to an axis or a face away from a division by zero."""
@@ -47,7 +49,7 @@ def _nonzero(x: jax.Array) -> jax.Array:
     return jnp.where(jnp.abs(x) < _TINY, _TINY, x)
 
 
-def _plane(ray: Vector, pos: Vector, axes: tuple[Vector, Vector, Vector], size: Vector) -> Hit:
+def _plane(ray: Vector, pos: Vector, axes: Axes, size: Vector) -> Hit:
     normal = axes[2]
     descent = dot(ray, normal)
     # Seen from above alone; from below, the quotient is negative by itself.
@@ -55,14 +57,14 @@ def _plane(ray: Vector, pos: Vector, axes: tuple[Vector, Vector, Vector], size: 
     return Hit(t, lambda v, ray_v: dot(normal, v))
 
 
-def _sphere(ray: Vector, pos: Vector, axes: tuple[Vector, Vector, Vector], size: Vector) -> Hit:
+def _sphere(ray: Vector, pos: Vector, axes: Axes, size: Vector) -> Hit:
     b = dot(ray, pos)
     t = b - jnp.sqrt(b * b - (dot(pos, pos) - size[0] * size[0]))
     inv_radius = 1.0 / size[0]
     return Hit(t, lambda v, ray_v: (t * ray_v - dot(pos, v)) * inv_radius)
 
 
-def _capsule(ray: Vector, pos: Vector, axes: tuple[Vector, Vector, Vector], size: Vector) -> Hit:
+def _capsule(ray: Vector, pos: Vector, axes: Axes, size: Vector) -> Hit:
     radius, half, axis = size[0], size[1], axes[2]
     pos_axis, pos_pos = dot(pos, axis), dot(pos, pos)
     ray_axis, ray_pos = dot(ray, axis), dot(ray, pos)
@@ -80,7 +82,7 @@ def _capsule(ray: Vector, pos: Vector, axes: tuple[Vector, Vector, Vector], size
     return Hit(t, lambda v, ray_v: (t * ray_v - dot(pos, v) - y * dot(axis, v)) * inv_radius)
 
 
-def _ellipsoid(ray: Vector, pos: Vector, axes: tuple[Vector, Vector, Vector], size: Vector) -> Hit:
+def _ellipsoid(ray: Vector, pos: Vector, axes: Axes, size: Vector) -> Hit:
     # In coordinates divided by the radii the ellipsoid is the unit sphere.
     d = [dot(ray, axis) / radius for axis, radius in zip(axes, size, strict=True)]
     o = [-dot(pos, axis) / radius for axis, radius in zip(axes, size, strict=True)]
@@ -89,13 +91,13 @@ def _ellipsoid(ray: Vector, pos: Vector, axes: tuple[Vector, Vector, Vector], si
     n = [(o[k] + t * d[k]) / size[k] for k in range(3)]
     inv_length = jax.lax.rsqrt(dot(n, n))
 
-    def normal_dot(v, ray_v):
+    def normal_dot(v: Vector, ray_v: jax.Array) -> jax.Array:
         return dot(n, [dot(axis, v) for axis in axes]) * inv_length
 
     return Hit(t, normal_dot)
 
 
-def _cylinder(ray: Vector, pos: Vector, axes: tuple[Vector, Vector, Vector], size: Vector) -> Hit:
+def _cylinder(ray: Vector, pos: Vector, axes: Axes, size: Vector) -> Hit:
     radius, half = size[0], size[1]
     dx, dy, dz = (dot(ray, axis) for axis in axes)
     ox, oy, oz = (-dot(pos, axis) for axis in axes)
@@ -110,7 +112,7 @@ def _cylinder(ray: Vector, pos: Vector, axes: tuple[Vector, Vector, Vector], siz
     x, y = ox + t_cap * dx, oy + t_cap * dy
     t = jnp.where(on_side, t_side, jnp.where(x * x + y * y <= radius * radius, t_cap, -1.0))
 
-    def normal_dot(v, ray_v):
+    def normal_dot(v: Vector, ray_v: jax.Array) -> jax.Array:
         vx, vy, vz = (dot(axis, v) for axis in axes)
         side = ((ox + t * dx) * vx + (oy + t * dy) * vy) / radius
         return jnp.where(on_side, side, facing * vz)
@@ -118,7 +120,7 @@ def _cylinder(ray: Vector, pos: Vector, axes: tuple[Vector, Vector, Vector], siz
     return Hit(t, normal_dot)
 
 
-def _box(ray: Vector, pos: Vector, axes: tuple[Vector, Vector, Vector], size: Vector) -> Hit:
+def _box(ray: Vector, pos: Vector, axes: Axes, size: Vector) -> Hit:
     d = [_nonzero(dot(ray, axis)) for axis in axes]
     o = [-dot(pos, axis) for axis in axes]
     facing = [jnp.where(d[k] > 0, -1.0, 1.0) for k in range(3)]
@@ -128,7 +130,7 @@ def _box(ray: Vector, pos: Vector, axes: tuple[Vector, Vector, Vector], size: Ve
     leave = jnp.minimum(jnp.minimum(far[0], far[1]), far[2])
     t = jnp.where(entry <= leave, entry, -1.0)
 
-    def normal_dot(v, ray_v):
+    def normal_dot(v: Vector, ray_v: jax.Array) -> jax.Array:
         by_face = [facing[k] * dot(axes[k], v) for k in range(3)]
         yz = jnp.where(near[1] >= near[2], by_face[1], by_face[2])
         return jnp.where((near[0] >= near[1]) & (near[0] >= near[2]), by_face[0], yz)
@@ -146,9 +148,7 @@ _BY_KIND = {
 }
 
 
-def intersect(
-    kind: int, ray: Vector, pos: Vector, axes: tuple[Vector, Vector, Vector], size: Vector
-) -> Hit:
+def intersect(kind: int, ray: Vector, pos: Vector, axes: Axes, size: Vector) -> Hit:
     """Where unit rays from the origin enter a geom.
 
     Args:

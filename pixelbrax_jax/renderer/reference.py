@@ -122,6 +122,7 @@ def _at(o: jax.Array, d: jax.Array, t: jax.Array) -> jax.Array:
 
 
 def _plane(o: jax.Array, d: jax.Array, size: jax.Array) -> tuple[jax.Array, jax.Array]:
+    del size  # drawn without bounds
     descends = d[..., 2] < -1e-7
     t = -o[..., 2] / jnp.where(descends, d[..., 2], -1.0)
     normal = jnp.broadcast_to(jnp.array([0.0, 0.0, 1.0]), d.shape)

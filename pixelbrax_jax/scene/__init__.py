@@ -1,0 +1,1 @@
+"""Poses -> scene: geoms in the world, a camera, and how it all looks."""

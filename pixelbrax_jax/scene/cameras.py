@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +14,11 @@ from pixelbrax_jax.choices import check_choice
 from pixelbrax_jax.types import Camera, CameraRig
 
 Vector = tuple[float, float, float]
+
+
+def _f32(values: Any) -> Any:
+    # NumPy, not JAX: importing this package must not start a device.
+    return np.asarray(values, np.float32)
 
 
 def rig(
@@ -44,19 +50,18 @@ def rig(
     if not 0.0 < fovy < 180.0:
         raise ValueError(f"fovy must lie between 0 and 180 degrees, got {fovy}.")
     view = np.subtract(target, eye)
-    if np.linalg.norm(np.cross(view, up)) < 1e-6 * max(np.linalg.norm(view), 1e-6):
+    if np.linalg.norm(np.cross(view, up)) < 1e-6 * max(float(np.linalg.norm(view)), 1e-6):
         raise ValueError(
             f"a camera at {eye} cannot look at {target} with up={up}: the two points must "
             "differ and 'up' must not be parallel to the view."
         )
-    as_f32 = lambda values: np.array(values, np.float32)  # noqa: E731
     return CameraRig(
         link=link,
-        track=as_f32(track if link >= 0 else (0.0, 0.0, 0.0)),
-        eye=as_f32(eye),
-        target=as_f32(target),
-        up=as_f32(up),
-        fovy=np.float32(fovy),
+        track=_f32(track if link >= 0 else (0.0, 0.0, 0.0)),
+        eye=_f32(eye),
+        target=_f32(target),
+        up=_f32(up),
+        fovy=_f32(fovy),
     )
 
 
@@ -91,7 +96,7 @@ def _around(base: CameraRig, direction: Vector, up: Vector) -> CameraRig:
     away = np.array(direction) / np.linalg.norm(direction)
     distance = np.linalg.norm(base.eye - base.target)
     eye = base.target + np.float32(distance) * away.astype(np.float32)
-    return dataclasses.replace(base, eye=eye, up=np.array(up, np.float32))
+    return dataclasses.replace(base, eye=eye, up=_f32(up))
 
 
 def named_rigs(task: str, fallback: CameraRig | None = None) -> dict[str, CameraRig]:
@@ -151,15 +156,15 @@ def make_rig(
 
 def at_rest(camera: Camera) -> CameraRig:
     """The rig that always yields ``camera``."""
-    pos = np.asarray(camera.pos, np.float32)
-    xmat = np.asarray(camera.xmat, np.float32)
+    pos = _f32(camera.pos)
+    xmat = _f32(camera.xmat)
     return CameraRig(
         link=-1,
-        track=np.zeros(3, np.float32),
+        track=_f32([0.0] * 3),
         eye=pos,
         target=pos - xmat[:, 2],
         up=xmat[:, 1],
-        fovy=np.asarray(camera.fovy, np.float32),
+        fovy=_f32(camera.fovy),
     )
 
 

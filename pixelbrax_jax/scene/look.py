@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 
@@ -10,8 +11,9 @@ from pixelbrax_jax.choices import check_choice
 from pixelbrax_jax.types import Look
 
 
-def _f32(*values: float) -> np.ndarray:
-    return np.array(values, np.float32)
+def _f32(values: Any) -> Any:
+    # NumPy, not JAX: importing this package must not start a device.
+    return np.asarray(values, np.float32)
 
 
 LOOKS: dict[str, Look] = {
@@ -20,14 +22,14 @@ LOOKS: dict[str, Look] = {
         ground="checker",
         shadows=False,
         shininess=16,
-        light=_f32(-0.35, -0.55, 1.0),
-        ambient=np.float32(0.6),
-        diffuse=np.float32(0.8),
-        specular=np.float32(0.0),
-        highlight=np.float32(0.25),
-        sky=np.array([[0.86, 0.91, 0.97], [0.35, 0.55, 0.82]], np.float32),
-        ground_rgb=np.array([[0.58, 0.62, 0.66], [0.42, 0.46, 0.51]], np.float32),
-        ground_pitch=np.float32(0.5),
+        light=_f32([-0.35, -0.55, 1.0]),
+        ambient=_f32(0.6),
+        diffuse=_f32(0.8),
+        specular=_f32(0.0),
+        highlight=_f32(0.25),
+        sky=_f32([[0.86, 0.91, 0.97], [0.35, 0.55, 0.82]]),
+        ground_rgb=_f32([[0.58, 0.62, 0.66], [0.42, 0.46, 0.51]]),
+        ground_pitch=_f32(0.5),
     ),
     # Light, coefficients and colors of the original renderer (arXiv 2502.00021): white
     # background, thin grid of pitch 2000/2048 m, a light so bright that the ground is white.
@@ -35,14 +37,14 @@ LOOKS: dict[str, Look] = {
         ground="grid",
         shadows=False,
         shininess=2,
-        light=_f32(0.577, -0.577, 0.577),
-        ambient=np.float32(0.8),
-        diffuse=np.float32(0.8),
-        specular=np.float32(0.6),
-        highlight=np.float32(0.0),
-        sky=np.ones((2, 3), np.float32),
-        ground_rgb=np.array([[200 / 255] * 3, [0.0] * 3], np.float32),
-        ground_pitch=np.float32(2000 / 2048),
+        light=_f32([0.577, -0.577, 0.577]),
+        ambient=_f32(0.8),
+        diffuse=_f32(0.8),
+        specular=_f32(0.6),
+        highlight=_f32(0.0),
+        sky=_f32([[1.0, 1.0, 1.0]] * 2),
+        ground_rgb=_f32([[200 / 255] * 3, [0.0] * 3]),
+        ground_pitch=_f32(2000 / 2048),
     ),
 }
 

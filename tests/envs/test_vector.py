@@ -100,9 +100,11 @@ def test_disabled_resets_only_by_mask():
     assert not bool(after.done[2])
     for i in (0, 1, 3, 4):
         same = jax.tree.map(
-            lambda old, new, i=i: bool((jax.random.key_data(old[i]) == jax.random.key_data(new[i])).all())
-            if jnp.issubdtype(old.dtype, jax.dtypes.prng_key)
-            else bool((old[i] == new[i]).all()),
+            lambda old, new, i=i: (
+                bool((jax.random.key_data(old[i]) == jax.random.key_data(new[i])).all())
+                if jnp.issubdtype(old.dtype, jax.dtypes.prng_key)
+                else bool((old[i] == new[i]).all())
+            ),
             state,
             after,
         )
@@ -179,7 +181,9 @@ def test_works_inside_scan_and_is_traced_once():
 def test_bad_options_and_arguments():
     with pytest.raises(ValueError, match="num_envs must be a whole number of at least 1, got 0"):
         make("next_step", 0)
-    with pytest.raises(ValueError, match="unknown autoreset_mode: 'next'.*Did you mean 'next_step'"):
+    with pytest.raises(
+        ValueError, match=r"unknown autoreset_mode: 'next'.*Did you mean 'next_step'"
+    ):
         make("next")
     venv = make("next_step", obs_mode="state")
     state, _ = venv.reset(jax.random.key(0), PARAMS)

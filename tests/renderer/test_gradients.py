@@ -11,6 +11,7 @@ from pixelbrax_jax import GeomKind, make_look, render
 from tests.renderer import scenes
 
 SIZE = 24
+STEP = 1e-3
 
 
 def colors_and_depth(scene):
@@ -76,11 +77,10 @@ def test_matches_finite_differences_inside_geoms(program, directional, what):
             tangent = tangent.replace(xmat=spin @ scene.xmat)
         if what == "field of view":
             tangent = jax.tree.map(lambda x: 20 * x, tangent)  # degrees
-        step = 1e-3
-        ahead, seg_ahead = program(jax.tree.map(lambda x, d: x + step * d, scene, tangent))
-        behind, seg_behind = program(jax.tree.map(lambda x, d: x - step * d, scene, tangent))
+        ahead, seg_ahead = program(jax.tree.map(lambda x, d: x + STEP * d, scene, tangent))
+        behind, seg_behind = program(jax.tree.map(lambda x, d: x - STEP * d, scene, tangent))
         seg = np.asarray(program(scene)[1])
-        numeric = np.asarray(ahead - behind) / (2 * step)
+        numeric = np.asarray(ahead - behind) / (2 * STEP)
         exact = np.asarray(directional(scene, tangent))
         assert np.isfinite(exact).all()
         calm = interior(seg) & (np.asarray(seg_ahead) == seg) & (np.asarray(seg_behind) == seg)
@@ -110,7 +110,9 @@ def test_reverse_mode_is_finite_everywhere(shadows):
 def test_finite_where_rays_run_along_axes_and_faces(kind):
     """Level cameras and odd sizes put rays exactly on axes, faces and the horizon."""
     size = {GeomKind.PLANE: (0, 0, 1), GeomKind.SPHERE: (0.3, 0, 0)}.get(kind, (0.3, 0.3, 0.3))
-    scene = jax.tree.map(jnp.asarray, scenes.one_geom(kind, size, (0.0, -2.0, 0.3), target=(0, 0, 0.3)))
+    scene = jax.tree.map(
+        jnp.asarray, scenes.one_geom(kind, size, (0.0, -2.0, 0.3), target=(0, 0, 0.3))
+    )
 
     def loss(scene):
         frame = render(scene, 9, 9)

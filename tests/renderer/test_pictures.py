@@ -166,8 +166,18 @@ class TestGround:
         scene = scenes.one_geom(GeomKind.PLANE, (0, 0, 1), (0.0, -2.0, 1.0), target=(0, 0, 0))
         period = 2 * float(scene.look.ground_pitch)
         pictures = [
-            rgb(draw(scene.replace(camera=scene.camera.replace(
-                pos=scene.camera.pos + jnp.array([shift, 0.0, 0.0]))), SIZE, SIZE, "fused"))
+            rgb(
+                draw(
+                    scene.replace(
+                        camera=scene.camera.replace(
+                            pos=scene.camera.pos + jnp.array([shift, 0.0, 0.0])
+                        )
+                    ),
+                    SIZE,
+                    SIZE,
+                    "fused",
+                )
+            )
             for shift in (0.0, period / 2, period, 100 * period)
         ]
         np.testing.assert_allclose(pictures[2], pictures[0], atol=2 / 255)

@@ -1,0 +1,65 @@
+# Needs Python 3.11 or newer, git and make; everything else is installed into $(VENV).
+#
+#   make PYTHON=python3.12 test     another Python for a new environment
+#   make VENV=/tmp/env test         another place for it
+#   make test ARGS="-k autoreset"   arguments for pytest, the demo or the benchmarks
+
+PYTHON ?= python3
+VENV ?= .venv
+ARGS ?=
+
+RUN := $(VENV)/bin/python
+PIP := $(RUN) -m pip install --quiet --disable-pip-version-check -c constraints.txt
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help demo test test-slow lint format bench docs docs-serve clean
+
+help: ## show this list
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1|/' | \
+		awk -F'|' '{ printf "%-18s %s\n", $$1, $$2 }'
+
+demo: $(VENV)/.installed-demo ## train a PyTorch agent from pixels; results in runs/demo
+	$(RUN) examples/train_inverted_pendulum.py --output-dir runs/demo $(ARGS)
+
+test: $(VENV)/.installed-dev ## run the tests that take minutes at most
+	$(RUN) -m pytest -m "not slow and not gpu" $(ARGS)
+
+test-slow: $(VENV)/.installed-dev ## run the tests that take longer
+	$(RUN) -m pytest -m "slow and not gpu" $(ARGS)
+
+lint: $(VENV)/.installed-dev ## check style, types and spelling
+	$(RUN) -m ruff check .
+	$(RUN) -m ruff format --check .
+	$(RUN) -m mypy
+	$(VENV)/bin/codespell
+
+format: $(VENV)/.installed-dev ## rewrite the code in the project's style
+	$(RUN) -m ruff check --fix .
+	$(RUN) -m ruff format .
+
+bench: $(VENV)/.installed-dev ## measure throughput
+	$(RUN) -m tests.benchmarks.run $(ARGS)
+
+docs: $(VENV)/.installed-docs ## build the documentation into site/, every warning an error
+	$(RUN) -m mkdocs build --strict --quiet
+
+docs-serve: $(VENV)/.installed-docs ## read the documentation in a browser while writing it
+	$(RUN) -m mkdocs serve
+
+clean: ## remove the environment, builds and caches; keeps runs/
+	rm -rf $(VENV) .venv-ci build dist site .mypy_cache .pytest_cache .ruff_cache
+	find pixelbrax_jax pixelbrax_gym tests examples -name __pycache__ -prune -exec rm -rf {} +
+
+# One environment for all; each set of extras is installed when it is first needed, and again
+# when what it is made of has changed.
+$(VENV)/.installed-%: $(VENV)/.created pyproject.toml constraints.txt
+	@echo "Installing PixelBrax with its $* extras into $(VENV); the first time takes minutes ..."
+	@$(PIP) -e ".[$*]"
+	@touch $@
+
+$(VENV)/.created:
+	@$(PYTHON) -c 'import sys; sys.version_info >= (3, 11) or sys.exit("PixelBrax needs Python 3.11 or newer, this is " + sys.version.split()[0] + "; try: make PYTHON=python3.12 ...")'
+	@echo "Creating $(VENV) ..."
+	@$(PYTHON) -m venv $(VENV)
+	@touch $@

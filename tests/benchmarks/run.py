@@ -1,0 +1,236 @@
+"""Throughput of the renderer and of the environments, as JSON and a plot.
+
+    python -m tests.benchmarks.run --output-dir docs/benchmarks
+
+Compile time is measured apart, every timed call is waited for, and a figure is the median of
+several repetitions. Actions are random; episodes end and begin anew as they do in training.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import time
+from collections.abc import Callable
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import jax
+import matplotlib
+import numpy as np
+
+import pixelbrax_gym  # noqa: F401  # registers PixelBrax/*
+import pixelbrax_jax
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+TASKS = {"halfcheetah": "HalfCheetah", "walker2d": "Walker2d", "ant": "Ant", "humanoid": "Humanoid"}
+BATCHES = (1, 10, 100, 1000)
+REPETITIONS = 5
+
+
+def compiled(function: Callable, *arguments: Any, **jit_options: Any) -> tuple[Any, float]:
+    """The compiled program and the seconds it took to trace and compile."""
+    started = time.perf_counter()
+    program = jax.jit(function, **jit_options).lower(*arguments).compile()
+    return program, time.perf_counter() - started
+
+
+def seconds_per_call(call: Callable[[], Any], calls: int) -> float:
+    """Median over repetitions of the mean time of ``calls`` calls, waited for."""
+    jax.block_until_ready(call())
+    times = []
+    for _ in range(REPETITIONS):
+        started = time.perf_counter()
+        for _ in range(calls):
+            result = call()
+        jax.block_until_ready(result)
+        times.append((time.perf_counter() - started) / calls)
+    return float(np.median(times))
+
+
+def renderer(look: str, *, shadows: bool = False, num_envs: int = 256, size: int = 84) -> dict:
+    """Frames per second of the ray-caster alone: packed words from link poses."""
+    env, params = pixelbrax_jax.make("ant", look=look, shadows=shadows, height=size, width=size)
+    states = jax.jit(jax.vmap(env.physics.reset))(jax.random.split(jax.random.key(0), num_envs))
+    draw = jax.vmap(env.draw, in_axes=(0, None))
+    program, compile_seconds = compiled(draw, states, params)
+    seconds = seconds_per_call(lambda: program(states, params), calls=10)
+    memory, cost = program.memory_analysis(), program.cost_analysis() or {}
+    return {
+        "task": "ant",
+        "look": look,
+        "shadows": shadows,
+        "num_envs": num_envs,
+        "size": size,
+        "frames_per_second": num_envs / seconds,
+        "compile_seconds": compile_seconds,
+        "temporary_bytes": memory.temp_size_in_bytes,
+        "output_bytes": memory.output_size_in_bytes,
+        "flops_per_frame": cost.get("flops", float("nan")) / num_envs,
+        "bytes_accessed_per_frame": cost.get("bytes accessed", float("nan")) / num_envs,
+    }
+
+
+def renderer_reference(num_envs: int = 8, size: int = 84) -> dict:
+    """The same figure for the plain ray-caster."""
+    env, params = pixelbrax_jax.make("ant", renderer="reference", height=size, width=size)
+    states = jax.jit(jax.vmap(env.physics.reset))(jax.random.split(jax.random.key(0), num_envs))
+    program, compile_seconds = compiled(jax.vmap(env.draw, in_axes=(0, None)), states, params)
+    seconds = seconds_per_call(lambda: program(states, params), calls=2)
+    return {
+        "num_envs": num_envs,
+        "frames_per_second": num_envs / seconds,
+        "compile_seconds": compile_seconds,
+    }
+
+
+def door(num_envs: int, output: str, calls: int) -> dict:
+    """Steps per second of ``gymnasium.make_vec`` with actions from the caller's side."""
+    started = time.perf_counter()
+    envs = gymnasium.make_vec("PixelBrax/Ant-v0", num_envs=num_envs, output=output)
+    shape = (calls, *envs.action_space.shape)
+    actions = np.random.default_rng(0).uniform(-1, 1, shape).astype(np.float32)
+    if output == "torch":
+        import torch
+
+        actions = torch.from_numpy(actions)
+    envs.reset(seed=0)
+    envs.step(actions[0])
+    setup_seconds = time.perf_counter() - started
+    turn = iter(range(10**9))
+
+    def step() -> Any:
+        # Torch tensors and NumPy arrays are complete when they are handed out; JAX arrays are
+        # waited for by the caller.
+        obs = envs.step(actions[next(turn) % calls])[0]
+        return obs if output == "jax" else None
+
+    seconds = seconds_per_call(step, calls)
+    envs.close()
+    return {
+        "num_envs": num_envs,
+        "output": output,
+        "steps_per_second": num_envs / seconds,
+        "setup_seconds": setup_seconds,
+    }
+
+
+def environment(task: str, obs_mode: str, num_envs: int) -> dict:
+    """Steps per second of the functional environment from a Python loop."""
+    env, params = pixelbrax_jax.make(task, obs_mode=obs_mode)
+    venv = pixelbrax_jax.VectorPixelEnv(env, num_envs)
+    calls = 20 if num_envs <= 100 else 4
+    shape = (calls, num_envs, env.action_size)
+    actions = list(jax.random.uniform(jax.random.key(1), shape, minval=-1.0, maxval=1.0))
+    state, timestep = venv.reset(jax.random.key(0), params)
+
+    def step(state, action, params):
+        return venv.step(state, action, params)
+
+    program, compile_seconds = compiled(step, state, actions[0], params, donate_argnums=0)
+    carry = {"state": state}
+    turn = iter(range(10**9))
+
+    def call():
+        carry["state"], timestep = program(carry["state"], actions[next(turn) % calls], params)
+        return timestep
+
+    seconds = seconds_per_call(call, calls)
+    held = jax.tree.leaves((carry["state"], timestep))
+    return {
+        "task": task,
+        "backend": env.physics.backend,
+        "obs_mode": obs_mode,
+        "num_envs": num_envs,
+        "steps_per_second": num_envs / seconds,
+        "compile_seconds": compile_seconds,
+        "bytes_per_env": sum(leaf.nbytes for leaf in held) / num_envs,
+        "temporary_bytes_per_env": program.memory_analysis().temp_size_in_bytes / num_envs,
+    }
+
+
+def plot(results: list[dict], path: Path) -> None:
+    """Steps per second over the number of environments, one panel a task."""
+    figure, panels = plt.subplots(
+        1, len(TASKS), figsize=(13, 3.6), sharey=True, layout="constrained"
+    )
+    for panel, task in zip(panels, TASKS, strict=True):
+        for obs_mode, label in (("pixels", "84 x 84 pixels, 3 frames"), ("state", "state only")):
+            rows = [r for r in results if r["task"] == task and r["obs_mode"] == obs_mode]
+            panel.loglog(
+                [r["num_envs"] for r in rows],
+                [r["steps_per_second"] for r in rows],
+                marker="o",
+                label=label,
+            )
+        backend = next(r["backend"] for r in results if r["task"] == task)
+        panel.set(title=f"{TASKS[task]} ({backend})", xlabel="environments")
+        panel.grid(alpha=0.3, which="both")
+    panels[0].set_ylabel("steps / s")
+    panels[0].legend()
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
+def main(arguments: list[str] | None = None) -> dict:
+    """Runs everything and writes ``<platform>.json`` and ``<platform>.png``."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--output-dir", default="docs/benchmarks")
+    parser.add_argument("--batches", type=int, nargs="+", default=BATCHES)
+    options = parser.parse_args(arguments)
+    output = Path(options.output_dir)
+    output.mkdir(parents=True, exist_ok=True)
+
+    device = jax.devices()[0]
+    report: dict[str, Any] = {
+        "device": device.device_kind,
+        "platform": device.platform,
+        "processor": _processor(),
+        "cores": os.cpu_count(),
+        "versions": {name: version(name) for name in ("jax", "brax", "gymnasium", "pixelbrax")},
+        "python": platform.python_version(),
+    }
+    cases: list[tuple[str, Callable[[], dict]]] = [
+        ("renderer", lambda: renderer("default")),
+        ("renderer", lambda: renderer("original")),
+        ("renderer", lambda: renderer("default", shadows=True)),
+        ("renderer_reference", renderer_reference),
+        ("door", lambda: door(256, "torch", 10)),
+        ("door", lambda: door(256, "numpy", 10)),
+        ("door", lambda: door(256, "jax", 10)),
+    ]
+    cases += [
+        ("environment", lambda t=task, m=mode, n=n: environment(t, m, n))
+        for task in TASKS
+        for n in options.batches
+        for mode in ("pixels", "state")
+    ]
+    for name, case in cases:
+        result = case()
+        report.setdefault(name, []).append(result)
+        print(json.dumps({"case": name} | result), flush=True)
+        jax.clear_caches()
+    (output / f"{device.platform}.json").write_text(json.dumps(report, indent=2) + "\n")
+    plot(report["environment"], output / f"{device.platform}.png")
+    print(f"Wrote {output / device.platform}.json and .png")
+    return report
+
+
+def _processor() -> str:
+    """The processor's name where the system tells it."""
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        for line in cpuinfo.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.processor() or platform.machine()
+
+
+if __name__ == "__main__":
+    main()

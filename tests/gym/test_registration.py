@@ -1,0 +1,164 @@
+"""Ids, options and time limits, through gymnasium.make and make_vec."""
+
+from __future__ import annotations
+
+import pickle
+import subprocess
+import sys
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.envs.registration import EnvSpec
+
+import pixelbrax_gym
+import pixelbrax_jax
+from tests.gym.conftest import ID, SIZE, TASK
+
+TASKS = {
+    "Ant": "ant",
+    "HalfCheetah": "halfcheetah",
+    "Hopper": "hopper",
+    "Humanoid": "humanoid",
+    "HumanoidStandup": "humanoidstandup",
+    "InvertedPendulum": "inverted_pendulum",
+    "InvertedDoublePendulum": "inverted_double_pendulum",
+    "Pusher": "pusher",
+    "Reacher": "reacher",
+    "Swimmer": "swimmer",
+    "Walker2d": "walker2d",
+}
+
+
+def test_the_eleven_ids():
+    for name, task in TASKS.items():
+        spec = gymnasium.spec(f"PixelBrax/{name}-v0")
+        assert spec.kwargs == {"task": task}
+        assert task in pixelbrax_jax.list_envs()
+
+
+def test_importing_loads_neither_jax_nor_torch():
+    code = (
+        "import sys, pixelbrax_gym; "
+        "assert not {'jax', 'torch', 'brax', 'stable_baselines3'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-W", "error", "-c", code], check=True)
+
+
+def test_lazy_names():
+    assert issubclass(pixelbrax_gym.PixelBraxEnv, gymnasium.Env)
+    assert issubclass(pixelbrax_gym.PixelBraxVectorEnv, gymnasium.vector.VectorEnv)
+    assert callable(pixelbrax_gym.check_vector_env)
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = pixelbrax_gym.nothing
+
+
+def test_register_rejects_unknown_tasks_and_taken_ids():
+    with pytest.raises(ValueError, match=r"unknown task: 'toy_bal'.*Did you mean 'toy_ball'"):
+        pixelbrax_gym.register("toy_bal")
+    with pytest.raises(ValueError, match="registered already"):
+        pixelbrax_gym.register(TASK)
+    assert pixelbrax_gym.register(TASK, "Mine/Ball-v3") == "Mine/Ball-v3"
+    assert gymnasium.spec("Mine/Ball-v3").kwargs == {"task": TASK}
+
+
+def test_make_keeps_its_options_through_a_pickled_spec():
+    env = gymnasium.make(ID, **SIZE, obs_mode="both", render_mode="rgb_array", render_height=7)
+    again = gymnasium.make(pickle.loads(pickle.dumps(env.spec)))
+    assert again.spec == env.spec
+    assert again.observation_space == env.observation_space
+    again.reset(seed=0)
+    assert again.render().shape == (7, 480, 3)
+
+
+def test_spec_survives_json():
+    env = gymnasium.make(ID, **SIZE)
+    assert gymnasium.make(EnvSpec.from_json(env.spec.to_json())).spec == env.spec
+
+
+def test_make_vec_keeps_its_options_through_a_pickled_spec():
+    env = gymnasium.make_vec(ID, num_envs=2, **SIZE, autoreset_mode="same_step")
+    again = gymnasium.make_vec(pickle.loads(pickle.dumps(env.spec)))
+    assert again.num_envs == 2
+    assert again.autoreset_mode is gymnasium.vector.AutoresetMode.SAME_STEP
+    assert again.observation_space == env.observation_space
+
+
+def steps_until_truncated(env) -> int:
+    env.reset(seed=0)
+    action = np.full(env.action_space.shape, -0.1, np.float32)
+    for count in range(1, 100):
+        _, _, terminated, truncated, _ = env.step(action)
+        assert not np.any(terminated)
+        if np.all(truncated):
+            return count
+    raise AssertionError("never truncated")
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"episode_length": 6}, 6),
+        ({"episode_length": 6, "action_repeat": 2}, 3),
+        ({"max_episode_steps": 4}, 4),
+        ({"max_episode_steps": 4, "action_repeat": 2}, 4),
+    ],
+)
+@pytest.mark.parametrize("door", ["make", "vector", "sync"])
+def test_time_limits_mean_the_same_at_every_door(door, options, expected):
+    options = {"obs_mode": "state"} | options
+    if door == "make":
+        env = gymnasium.make(ID, **options)
+    else:
+        mode = "sync" if door == "sync" else None
+        env = gymnasium.make_vec(ID, num_envs=2, vectorization_mode=mode, **options)
+    assert steps_until_truncated(env) == expected
+
+
+def test_minus_one_keeps_the_time_limit_of_the_environment():
+    options = {"obs_mode": "state", "episode_length": 6, "max_episode_steps": -1}
+    assert steps_until_truncated(gymnasium.make(ID, **options)) == 6
+    assert steps_until_truncated(gymnasium.make_vec(ID, num_envs=2, **options)) == 6
+
+
+def test_two_time_limits_are_an_error():
+    with pytest.raises(ValueError, match="give either max_episode_steps"):
+        pixelbrax_gym.PixelBraxEnv(TASK, max_episode_steps=3, episode_length=6)
+
+
+def test_sync_and_vector_doors_agree():
+    options = SIZE | {"obs_mode": "state"}
+    sync = gymnasium.make_vec(ID, num_envs=3, vectorization_mode="sync", **options)
+    vector = gymnasium.make_vec(ID, num_envs=3, **options)
+    assert sync.observation_space == vector.observation_space
+    assert sync.action_space == vector.action_space
+    np.testing.assert_array_equal(sync.reset(seed=5)[0], vector.reset(seed=5)[0])
+    for action in np.linspace(-1, 1, 20, dtype=np.float32):
+        batch = np.full((3, 1), action)
+        for left, right in zip(sync.step(batch)[:4], vector.step(batch)[:4], strict=True):
+            np.testing.assert_array_equal(left, right)
+
+
+def test_spaces_cost_nothing_and_print_fast():
+    env = pixelbrax_gym.PixelBraxVectorEnv(TASK, 4096)
+    assert env.observation_space.shape == (4096, 84, 84, 9)
+    assert env.observation_space.low.strides == (0, 0, 0, 0)
+    assert repr(env.observation_space) == "Box(0, 255, (4096, 84, 84, 9), uint8)"
+    assert len(pickle.dumps(env.observation_space)) < 5000
+    copy = pickle.loads(pickle.dumps(env.observation_space))
+    assert copy == env.observation_space
+    assert copy.low.strides == (0, 0, 0, 0)
+
+
+def test_spaces_equal_ordinary_boxes(make_vector):
+    env = make_vector(obs_mode="both")
+    pixels = gymnasium.spaces.Box(0, 255, (3, 12, 12, 6), np.uint8)
+    assert env.observation_space["pixels"] == pixels
+    assert pixels == env.observation_space["pixels"]
+    assert env.single_action_space == gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+    assert env.single_action_space != gymnasium.spaces.Box(-1, 2, (1,), np.float32)
+    assert env.action_space.sample().shape == (3, 1)
+    env.action_space.seed(4)
+    first = env.action_space.sample()
+    env.action_space.seed(4)
+    np.testing.assert_array_equal(first, env.action_space.sample())

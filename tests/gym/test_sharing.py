@@ -1,0 +1,137 @@
+"""No copy from JAX to torch or NumPy, and no way back into the environment."""
+
+from __future__ import annotations
+
+import builtins
+import importlib
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import torch
+
+from pixelbrax_gym import dlpack
+
+ACTIONS = np.array([[-0.2], [0.9], [1.0]], np.float32)
+
+
+def test_to_torch_shares_memory():
+    tree = {"a": jnp.arange(6, dtype=jnp.uint8).reshape(2, 3), "b": (jnp.ones(2, bool),)}
+    tensors = dlpack.to_torch(tree)
+    assert tensors["a"].data_ptr() == tree["a"].unsafe_buffer_pointer()
+    assert tensors["a"].dtype == torch.uint8
+    assert tensors["b"][0].data_ptr() == tree["b"][0].unsafe_buffer_pointer()
+    assert tensors["b"][0].dtype == torch.bool
+
+
+def record_outputs(env):
+    """What the environment's compiled step returned, beside what the user got."""
+    stateful, seen = env.unwrapped._stateful, []
+    step = stateful.step
+    stateful.step = lambda action: seen.append(step(action)) or seen[-1]
+    return seen
+
+
+@pytest.mark.parametrize("output", ["numpy", "torch"])
+def test_observations_are_the_buffers_that_jax_computed(make_vector, output):
+    env = make_vector(output=output, obs_mode="both")
+    env.reset(seed=0)
+    seen = record_outputs(env)
+    obs = env.step(ACTIONS)[0]
+    for name in ("pixels", "state"):
+        pointer = obs[name].data_ptr() if output == "torch" else obs[name].ctypes.data
+        assert pointer == seen[0]["obs"][name].unsafe_buffer_pointer()
+
+
+def pointers(tree):
+    return {leaf.unsafe_buffer_pointer() for leaf in jax.tree.leaves(tree)}
+
+
+@pytest.mark.parametrize("mode", ["next_step", "same_step", "disabled"])
+def test_nothing_exported_is_part_of_the_state(make_vector, mode):
+    env = make_vector(obs_mode="both", autoreset_mode=mode, output="jax")
+    stateful = env._stateful
+    for outputs in (
+        stateful.reset(0, np.random.default_rng(0)),
+        stateful.step(ACTIONS),
+        stateful.reset(None, np.random.default_rng(0), np.array([True, False, False])),
+    ):
+        state = stateful._state.replace(key=jax.random.key_data(stateful._state.key))
+        assert not pointers(outputs) & pointers(state)
+
+
+@pytest.mark.parametrize("mode", ["next_step", "same_step", "disabled"])
+def test_writing_to_tensors_changes_nothing_later(make_vector, mode):
+    options = {"obs_mode": "both", "autoreset_mode": mode, "output": "torch"}
+    clean, dirty = make_vector(**options), make_vector(**options)
+
+    def spoil(tree):
+        jax.tree.map(lambda x: x.fill_(1), tree)
+
+    clean.reset(seed=0)
+    spoil(dirty.reset(seed=0))
+    for _ in range(5):
+        expected = clean.step(ACTIONS)
+        actual = dirty.step(ACTIONS)
+        jax.tree.map(lambda x, y: np.testing.assert_array_equal(x, y), actual, expected)
+        spoil(actual)
+    mask = {"reset_mask": np.array([False, True, True])}
+    expected, actual = clean.reset(options=mask), dirty.reset(options=mask)
+    jax.tree.map(lambda x, y: np.testing.assert_array_equal(x, y), actual, expected)
+
+
+def test_a_kept_tensor_outlives_later_steps(make_vector):
+    env = make_vector(output="torch")
+    kept, _ = env.reset(seed=0)
+    copy = kept.clone()
+    for _ in range(20):
+        env.step(ACTIONS)
+    env.close()
+    assert torch.equal(kept, copy)
+
+
+def test_actions_are_copied():
+    device = jax.devices("cpu")[0]
+    actions = torch.full((2, 3), 0.5)
+    converted = dlpack.actions_to_jax(actions, device)
+    actions.fill_(-1.0)
+    np.testing.assert_array_equal(converted, np.full((2, 3), 0.5, np.float32))
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float16, torch.bfloat16])
+def test_actions_are_rounded_to_float32(dtype):
+    actions = torch.full((2,), 0.5, dtype=dtype, requires_grad=True)
+    assert dlpack.actions_to_jax(actions, jax.devices("cpu")[0]).dtype == np.float32
+
+
+def test_refilling_the_action_buffer_at_once_is_harmless(make_vector):
+    env, expected = make_vector(output="jax", obs_mode="state"), make_vector(obs_mode="state")
+    buffer = np.zeros((3, 1), np.float32)
+    env.reset(seed=0), expected.reset(seed=0)
+    for value in np.linspace(-0.5, 0.5, 50, dtype=np.float32):
+        buffer[:] = value
+        obs = env.step(buffer)[0]
+        buffer[:] = 77.0
+        wanted = expected.step(np.full((3, 1), value))[0]
+        np.testing.assert_array_equal(obs, wanted)
+
+
+def test_devices_must_agree():
+    with pytest.raises(ValueError, match=r"on device meta, the environment on cpu:0"):
+        dlpack.actions_to_jax(torch.zeros(1, device="meta"), jax.devices("cpu")[0])
+
+
+def test_missing_torch_names_the_cure(monkeypatch):
+    real = builtins.__import__
+
+    def without_torch(name, *args, **kwargs):
+        if name == "torch":
+            raise ImportError(name)
+        return real(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", without_torch)
+    monkeypatch.delitem(sys.modules, "pixelbrax_gym.dlpack")
+    with pytest.raises(ImportError, match=r'pip install "pixelbrax\[torch\]"'):
+        importlib.import_module("pixelbrax_gym.dlpack")

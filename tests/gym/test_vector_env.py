@@ -1,0 +1,298 @@
+"""PixelBraxVectorEnv: the three autoreset modes, masks, and independence of environments."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+import torch
+from gymnasium.vector import AutoresetMode
+
+from pixelbrax_gym import PixelBraxEnv, check_vector_env
+from tests.gym.conftest import SIZE, TASK
+
+MODES = ("next_step", "same_step", "disabled")
+# Environment 0 goes left and times out, the others reach the end at different times.
+ACTIONS = np.array([[-0.2], [0.9], [1.0]], np.float32)
+LONG = {"episode_length": 17}
+
+
+def as_numpy(tree):
+    return jax.tree.map(np.asarray, tree)
+
+
+def episodes(env, num_steps, seed=0):
+    """Per environment, its episodes: lists of (obs, reward, terminated, truncated, length)."""
+    obs, infos = env.reset(seed=seed)
+    done = np.zeros(3, bool)
+    found = [[[(np.array(obs[i]), 0.0, False, False, 0)]] for i in range(3)]
+    for _ in range(num_steps):
+        if env.autoreset_mode is AutoresetMode.DISABLED and done.any():
+            obs, infos = env.reset(options={"reset_mask": done})
+            for i in np.flatnonzero(done):
+                found[i].append([(np.array(obs[i]), 0.0, False, False, 0)])
+            done = np.zeros(3, bool)
+        ended = done
+        obs, reward, terminated, truncated, infos = env.step(ACTIONS)
+        done = terminated | truncated
+        for i in range(3):
+            flags = (float(reward[i]), bool(terminated[i]), bool(truncated[i]))
+            if env.autoreset_mode is AutoresetMode.NEXT_STEP and ended[i]:
+                assert flags == (0.0, False, False)
+                found[i].append([])
+            same_step = env.autoreset_mode is AutoresetMode.SAME_STEP and done[i]
+            last = infos["final_obs"][i] if same_step else obs[i]
+            length = infos["final_info"] if same_step else infos
+            found[i][-1].append((np.array(last), *flags, int(length["episode_length"][i])))
+            if same_step:
+                assert infos["episode_length"][i] == 0
+                found[i].append([(np.array(obs[i]), 0.0, False, False, 0)])
+    return found
+
+
+def single_episodes(row, num_steps, seed=0, **options):
+    env = PixelBraxEnv(TASK, **(SIZE | LONG | options))
+    found = [[(env.reset(seed=seed + row)[0], 0.0, False, False, 0)]]
+    for _ in range(num_steps):
+        if found[-1][-1][2] or found[-1][-1][3]:
+            found.append([(env.reset()[0], 0.0, False, False, 0)])
+        obs, reward, terminated, truncated, info = env.step(ACTIONS[row])
+        found[-1].append((obs, reward, terminated, truncated, info["episode_length"]))
+    return found
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_every_mode_goes_through_the_episodes_of_the_single_environment(make_vector, mode):
+    actual = episodes(make_vector(autoreset_mode=mode, **LONG), 40)
+    for row in range(3):
+        expected = single_episodes(row, 40)
+        assert len(actual[row]) >= 2
+        for mine, other in zip(actual[row], expected, strict=False):
+            for step, (left, right) in enumerate(zip(mine, other, strict=False)):
+                np.testing.assert_array_equal(left[0], right[0], err_msg=f"{row}, {step}")
+                assert left[1:] == right[1:]
+
+
+@pytest.mark.parametrize("output", ["numpy", "torch", "jax"])
+@pytest.mark.parametrize("mode", MODES)
+def test_checker_is_content(make_vector, mode, output):
+    env = make_vector(
+        autoreset_mode=mode,
+        output=output,
+        obs_mode="both",
+        render_mode="rgb_array",
+        render_height=8,
+        render_width=8,
+    )
+    check_vector_env(env, num_steps=20)
+
+
+def check_task(name, mode):
+    # Long enough for a reset to show, short enough for every task to end.
+    env = gymnasium_make_vec(name, mode)
+    check_vector_env(env, num_steps=15)
+
+
+def gymnasium_make_vec(name, mode):
+    import gymnasium
+
+    return gymnasium.make_vec(
+        f"PixelBrax/{name}-v0",
+        num_envs=2,
+        height=16,
+        width=16,
+        max_episode_steps=6,
+        autoreset_mode=mode,
+        render_mode="rgb_array",
+        render_height=8,
+        render_width=8,
+    )
+
+
+def test_checker_is_content_with_a_task():
+    check_task("InvertedPendulum", "next_step")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize(
+    "name",
+    [
+        "Ant",
+        "HalfCheetah",
+        "Hopper",
+        "Humanoid",
+        "HumanoidStandup",
+        "InvertedDoublePendulum",
+        "InvertedPendulum",
+        "Pusher",
+        "Reacher",
+        "Swimmer",
+        "Walker2d",
+    ],
+)
+def test_checker_is_content_with_every_task(name, mode):
+    check_task(name, mode)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_mode_is_in_metadata_and_attribute(make_vector, mode):
+    env = make_vector(autoreset_mode=mode)
+    assert env.metadata["autoreset_mode"] is env.autoreset_mode
+    assert env.autoreset_mode is AutoresetMode[mode.upper()]
+    assert make_vector(autoreset_mode=env.autoreset_mode).autoreset_mode is env.autoreset_mode
+    assert make_vector(autoreset_mode=env.autoreset_mode.value).autoreset_mode is env.autoreset_mode
+    assert type(env).metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+
+
+def test_infos_follow_gymnasium(make_vector):
+    env = make_vector(autoreset_mode="same_step", episode_length=3)
+    env.reset(seed=0)
+    keys = {"episode_return", "episode_length", "non_finite"}
+    for count in range(1, 7):
+        infos = env.step(ACTIONS)[4]
+        masks = {f"_{key}" for key in keys}
+        final = {"final_obs", "_final_obs", "final_info", "_final_info"}
+        assert set(infos) == keys | masks | (final if count % 3 == 0 else set())
+        assert all(infos[mask].all() for mask in masks)
+    assert infos["final_obs"].dtype == object
+    assert all(obs in env.single_observation_space for obs in infos["final_obs"])
+    assert set(infos["final_info"]) == keys | masks
+    np.testing.assert_array_equal(infos["final_info"]["episode_length"], [3, 3, 3])
+    np.testing.assert_array_equal(infos["episode_length"], [0, 0, 0])
+
+
+def test_final_entries_are_empty_where_no_episode_ended(make_vector):
+    env = make_vector(autoreset_mode="same_step", **LONG)
+    env.reset(seed=0)
+    while True:
+        _, _, terminated, truncated, infos = env.step(ACTIONS)
+        if terminated.any():
+            break
+    done = terminated | truncated
+    assert not done.all()
+    np.testing.assert_array_equal([obs is not None for obs in infos["final_obs"]], done)
+    np.testing.assert_array_equal(infos["_final_info"], done)
+    assert not infos["final_info"]["episode_length"][~done].any()
+
+
+def test_dense_final_entries_of_torch(make_vector):
+    env = make_vector(autoreset_mode="same_step", output="torch", episode_length=2)
+    plain = make_vector(autoreset_mode="same_step", episode_length=2)
+    env.reset(seed=0), plain.reset(seed=0)
+    infos = env.step(torch.from_numpy(ACTIONS))[4]
+    assert isinstance(infos["final_obs"], torch.Tensor)
+    assert not infos["_final_obs"].any()
+    plain.step(ACTIONS)
+    infos, expected = env.step(torch.from_numpy(ACTIONS))[4], plain.step(ACTIONS)[4]
+    assert infos["_final_obs"].all()
+    np.testing.assert_array_equal(infos["final_obs"], np.stack(expected["final_obs"]))
+    np.testing.assert_array_equal(
+        infos["final_info"]["episode_return"], expected["final_info"]["episode_return"]
+    )
+
+
+def test_results_other_than_observations_may_be_written_to(make_vector):
+    env = make_vector()
+    env.reset(seed=0)
+    obs, reward, terminated, truncated, infos = env.step(ACTIONS)
+    assert not obs.flags.writeable
+    for array in (reward, terminated, truncated, *infos.values()):
+        array[:] = 1
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_reset_mask_touches_one_row(make_vector, mode):
+    env, other = make_vector(autoreset_mode=mode), make_vector(autoreset_mode=mode)
+    for each in (env, other):
+        each.reset(seed=0)
+        before = each.step(ACTIONS)[0]
+    options = {"reset_mask": np.array([False, True, False]), "mine": 1}
+    obs, infos = env.reset(options=options)
+    np.testing.assert_array_equal(options["reset_mask"], [False, True, False])
+    assert set(options) == {"reset_mask", "mine"}
+    np.testing.assert_array_equal(infos["_episode_length"], [False, True, False])
+    np.testing.assert_array_equal(infos["episode_length"], [1, 0, 1])
+    np.testing.assert_array_equal(obs[[0, 2]], before[[0, 2]])
+    assert not np.array_equal(obs[1], before[1])
+    for _ in range(4):
+        mine, theirs = env.step(ACTIONS), other.step(ACTIONS)
+        for left, right in zip(mine[:4], theirs[:4], strict=True):
+            np.testing.assert_array_equal(left[[0, 2]], right[[0, 2]])
+
+
+def test_reset_mask_cancels_a_pending_autoreset(make_vector):
+    env = make_vector(episode_length=2)
+    env.reset(seed=0)
+    env.step(ACTIONS)
+    assert env.step(ACTIONS)[3].all()
+    env.reset(options={"reset_mask": np.array([True, False, True])})
+    _, reward, _, _, infos = env.step(ACTIONS)
+    np.testing.assert_array_equal(infos["episode_length"], [1, 0, 1])
+    assert reward[1] == 0.0
+
+
+def test_reset_mask_with_a_seed(make_vector):
+    env = make_vector(obs_mode="state")
+    first, _ = env.reset(seed=0)
+    env.step(ACTIONS)
+    obs, _ = env.reset(seed=0, options={"reset_mask": np.array([False, False, True])})
+    np.testing.assert_array_equal(obs[2], first[2])
+    assert not np.array_equal(obs[0], first[0])
+
+
+def test_an_ending_leaves_the_others_bitwise_alone(make_vector):
+    # Environment 2 ends in one run and lives on in the other.
+    env, other = make_vector(obs_mode="both", **LONG), make_vector(obs_mode="both", **LONG)
+    lazy = ACTIONS * np.array([[1.0], [0.1], [0.0]], np.float32)
+    busy = ACTIONS * np.array([[1.0], [0.1], [1.0]], np.float32)
+    env.reset(seed=0), other.reset(seed=0)
+    ended = False
+    for _ in range(16):
+        mine, theirs = env.step(busy), other.step(lazy)
+        ended |= bool(mine[2][2])
+        left = jax.tree.map(lambda x: x[:2], mine[:4])
+        right = jax.tree.map(lambda x: x[:2], theirs[:4])
+        jax.tree.map(np.testing.assert_array_equal, left, right)
+    assert ended
+
+
+def test_seeds(make_vector):
+    env = make_vector(obs_mode="state")
+    first = np.array(env.reset(seed=4)[0])
+    np.testing.assert_array_equal(env.reset(seed=[4, 5, 6])[0], first)
+    np.testing.assert_array_equal(env.reset(seed=np.int64(4))[0], first)
+    np.testing.assert_array_equal(env.reset(seed=[6, 4, 5])[0], first[[2, 0, 1]])
+    second = np.array(env.reset()[0])
+    assert not np.isin(second[:, 0], first[:, 0]).any()
+    mixed = env.reset(seed=[None, 4, None])[0]
+    np.testing.assert_array_equal(mixed[1], first[0])
+    assert not np.array_equal(mixed[0], second[0])
+    np.testing.assert_array_equal(env.reset(seed=[6, None, None])[0][0], first[2])
+
+
+def test_number_of_environments_does_not_matter(make_vector):
+    few, many = make_vector(2, obs_mode="state"), make_vector(7, obs_mode="state")
+    few.reset(seed=1), many.reset(seed=1)
+    for _ in range(12):
+        left, right = few.step(ACTIONS[[0, 1]]), many.step(ACTIONS[[0, 1, 2, 2, 2, 2, 2]])
+        np.testing.assert_allclose(left[0], right[0][:2], rtol=1e-6)
+
+
+def test_render_is_a_tuple(make_vector):
+    env = make_vector(render_mode="rgb_array", render_height=10, render_width=11)
+    env.reset(seed=0)
+    pictures = env.render()
+    assert isinstance(pictures, tuple)
+    assert [picture.shape for picture in pictures] == [(10, 11, 3)] * 3
+    assert make_vector().render() is None
+
+
+def test_non_finite_actions_on_the_device_end_the_episode(make_vector):
+    env = make_vector(output="jax")
+    env.reset(seed=0)
+    actions = jax.numpy.asarray(ACTIONS).at[1].set(jax.numpy.nan)
+    _, reward, terminated, _, infos = env.step(actions)
+    np.testing.assert_array_equal(terminated, [False, True, False])
+    np.testing.assert_array_equal(infos["non_finite"], [False, True, False])
+    assert np.isfinite(reward).all()

@@ -1,0 +1,230 @@
+"""The arrows of CONTRIBUTING.md hold, and the checker that says so can see a broken one."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("pixelbrax_jax", "pixelbrax_gym")
+
+FOUNDATIONS = {"types", "spatial", "choices"}
+DRAWING_ROOMS = {"physics", "scene", "renderer", "distractors"}
+"""They never import each other; `envs` joins them."""
+
+ALLOWED: dict[str, set[str]] = {
+    "pixelbrax_jax.types": set(),
+    "pixelbrax_jax.choices": set(),
+    "pixelbrax_jax.spatial": {"pixelbrax_jax.types"},
+    **{
+        f"pixelbrax_jax.{room}": {f"pixelbrax_jax.{name}" for name in FOUNDATIONS}
+        for room in DRAWING_ROOMS
+    },
+    "pixelbrax_jax.envs": {f"pixelbrax_jax.{name}" for name in FOUNDATIONS | DRAWING_ROOMS},
+    "pixelbrax_jax.registry": {
+        f"pixelbrax_jax.{name}" for name in FOUNDATIONS | DRAWING_ROOMS | {"envs"}
+    },
+    # The package root, its table of contents.
+    "pixelbrax_jax": {
+        f"pixelbrax_jax.{name}" for name in FOUNDATIONS | DRAWING_ROOMS | {"envs", "registry"}
+    },
+    "pixelbrax_jax.agents": {
+        "pixelbrax_jax",
+        *(f"pixelbrax_jax.{name}" for name in FOUNDATIONS | {"envs", "registry"}),
+    },
+    "pixelbrax_gym": {
+        "pixelbrax_jax",
+        "pixelbrax_jax.registry",
+        "pixelbrax_jax.types",
+        "pixelbrax_jax.choices",
+    },
+}
+"""Room -> the rooms that it may import besides itself."""
+
+HOMES: dict[str, set[str]] = {
+    "brax": {"pixelbrax_jax/physics/brax_physics.py"},
+    "torch": {"pixelbrax_gym/dlpack.py"},
+    "pygame": {"pixelbrax_gym/window.py"},
+}
+"""Third party -> the only files that may import it."""
+
+NO_NAMES = {"utils", "helpers", "common", "misc"}
+MAX_LINES = 400
+
+
+def modules_of(root: Path) -> dict[str, Path]:
+    """Dotted names of all modules of the packages below ``root``."""
+    return {
+        ".".join(path.relative_to(root).with_suffix("").parts).removesuffix(".__init__"): path
+        for package in PACKAGES
+        for path in sorted((root / package).rglob("*.py"))
+    }
+
+
+def imports_of(path: Path, modules: dict[str, Path]) -> Iterator[str]:
+    """Dotted names that a file imports, wherever in it: at the top, in a function, by name."""
+    for node in ast.walk(ast.parse(path.read_text("utf-8"), str(path))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            if node.level:
+                yield "." * node.level + (node.module or "")
+                continue
+            for alias in node.names:
+                inner = f"{node.module}.{alias.name}"
+                yield inner if inner in modules else str(node.module)
+        elif isinstance(node, ast.Call) and node.args:
+            function = getattr(node.func, "attr", getattr(node.func, "id", None))
+            argument = node.args[0]
+            if function in ("import_module", "__import__") and isinstance(argument, ast.Constant):
+                yield str(argument.value)
+
+
+def room_of(module: str) -> str:
+    """The room that a module belongs to: a folder or a file right below ``pixelbrax_jax``."""
+    package, _, rest = module.partition(".")
+    return f"{package}.{rest.split('.')[0]}" if package == "pixelbrax_jax" and rest else package
+
+
+def violations(root: Path) -> list[str]:
+    """One line for each broken rule in the packages below ``root``."""
+    modules, broken = modules_of(root), []
+    for module, path in modules.items():
+        room, where = room_of(module), path.relative_to(root).as_posix()
+        source = path.read_text("utf-8")
+        if source.count("\n") > MAX_LINES:
+            broken.append(f"{where}: more than {MAX_LINES} lines")
+        if path.stem in NO_NAMES:
+            broken.append(f"{where}: a module needs a name that says what is in it")
+        public = not any(part.startswith("_") for part in module.split("."))
+        if public and not ast.get_docstring(ast.parse(source)):
+            broken.append(f"{where}: no docstring")
+        for imported in imports_of(path, modules):
+            if imported.startswith("."):
+                broken.append(f"{where}: relative import {imported}")
+            elif imported.split(".")[0] in PACKAGES:
+                target = room_of(imported)
+                if room == "pixelbrax_jax.cli" or target == room:
+                    continue
+                if target not in ALLOWED.get(room, set()):
+                    broken.append(f"{where}: {room} may not import {target}")
+            elif where not in HOMES.get(imported.split(".")[0], {where}):
+                broken.append(f"{where}: may not import {imported}")
+    return broken
+
+
+def third_parties(root: Path) -> dict[str, set[str]]:
+    """Third-party package -> the files that import it."""
+    found: dict[str, set[str]] = {}
+    modules = modules_of(root)
+    for path in modules.values():
+        for imported in imports_of(path, modules):
+            top = imported.split(".")[0]
+            if top not in sys.stdlib_module_names and top not in PACKAGES:
+                found.setdefault(top, set()).add(path.relative_to(root).as_posix())
+    return found
+
+
+def test_the_arrows_hold():
+    assert not violations(ROOT), "\n" + "\n".join(violations(ROOT))
+
+
+def test_every_room_is_known():
+    rooms = {room_of(module) for module in modules_of(ROOT)} - {"pixelbrax_jax.cli"}
+    assert rooms <= set(ALLOWED)
+
+
+def test_every_third_party_is_declared():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    core = {Requirement(line).name for line in project["dependencies"]}
+    extras = {
+        Requirement(line).name
+        for name, lines in project["optional-dependencies"].items()
+        if name not in ("dev", "docs")
+        for line in lines
+    }
+    used = third_parties(ROOT)
+    assert set(used) <= core | extras, f"not declared: {set(used) - core - extras}"
+    assert core <= set(used), f"declared but not imported: {core - set(used)}"
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_importing_a_package_loads_nothing_heavy(package):
+    code = (
+        f"import sys, {package}\n"
+        "heavy = {'torch', 'stable_baselines3', 'torchrl', 'matplotlib', 'pygame', 'imageio'}\n"
+        "print(sorted(heavy & set(sys.modules)))"
+    )
+    result = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=False
+    )
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.strip() == "[]"
+
+
+def test_importing_pixelbrax_gym_loads_no_physics():
+    code = "import sys, pixelbrax_gym; print('brax' in sys.modules or 'mujoco' in sys.modules)"
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert result.stdout.strip() == "False"
+
+
+SOUND = {
+    "pixelbrax_jax/__init__.py": "from pixelbrax_jax.envs.pixel_env import step\n",
+    "pixelbrax_jax/types.py": "import jax\n",
+    "pixelbrax_jax/physics/brax_physics.py": "import brax.envs\nfrom pixelbrax_jax import types\n",
+    "pixelbrax_jax/scene/place.py": "from pixelbrax_jax.types import Scene\n",
+    "pixelbrax_jax/renderer/base.py": "from pixelbrax_jax import spatial, types\n",
+    "pixelbrax_jax/spatial.py": "import jax\n",
+    "pixelbrax_jax/envs/pixel_env.py": "from pixelbrax_jax.scene.place import place\n",
+    "pixelbrax_gym/dlpack.py": "import jax\nimport torch\n",
+    "pixelbrax_gym/vector_env.py": "import pixelbrax_jax\nfrom pixelbrax_jax.types import Scene\n",
+}
+
+
+def write_tree(root: Path, files: dict[str, str]) -> None:
+    for name, code in files.items():
+        path = root / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(code if code.startswith('"""') else f'"""What it is for."""\n{code}')
+
+
+def test_the_checker_passes_a_sound_tree(tmp_path):
+    write_tree(tmp_path, SOUND)
+    assert violations(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "code", "complaint"),
+    [
+        ("pixelbrax_jax/scene/place.py", "import pixelbrax_jax.physics.brax_physics", "physics"),
+        ("pixelbrax_jax/scene/place.py", "from pixelbrax_jax.envs import pixel_env", "envs"),
+        ("pixelbrax_jax/renderer/base.py", "from pixelbrax_jax.scene import place", "scene"),
+        ("pixelbrax_jax/renderer/base.py", "def f():\n    import pixelbrax_jax", "pixelbrax_jax"),
+        ("pixelbrax_jax/types.py", "from pixelbrax_jax import spatial", "spatial"),
+        ("pixelbrax_jax/envs/pixel_env.py", "import brax", "import brax"),
+        ("pixelbrax_jax/envs/pixel_env.py", "from pixelbrax_gym import dlpack", "pixelbrax_gym"),
+        ("pixelbrax_gym/vector_env.py", "from torch import nn", "import torch"),
+        ("pixelbrax_gym/vector_env.py", "importlib.import_module('torch')", "import torch"),
+        ("pixelbrax_gym/vector_env.py", "from pixelbrax_jax.physics import tasks", "physics"),
+        ("pixelbrax_gym/vector_env.py", "from .dlpack import f", "relative"),
+        ("pixelbrax_jax/scene/utils.py", "x = 1", "name"),
+        ("pixelbrax_jax/scene/place.py", '""""""\nx = 1', "docstring"),
+        ("pixelbrax_jax/scene/place.py", "x = 1\n" * 401, "lines"),
+        ("pixelbrax_jax/kitchen/sink.py", "import pixelbrax_jax.types", "kitchen may not"),
+    ],
+)
+def test_the_checker_sees_a_violation(tmp_path, name, code, complaint):
+    write_tree(tmp_path, {**SOUND, name: code})
+    found = violations(tmp_path)
+    assert len(found) == 1
+    assert found[0].startswith(name)
+    assert complaint in found[0]
