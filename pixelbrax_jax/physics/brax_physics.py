@@ -78,6 +78,7 @@ class BraxPhysics:
         env: envs.Env,
         *,
         colors: Mapping[str, Color] | None = None,
+        drawn_radius: Mapping[str, float] | None = None,
         geom_groups: Collection[int] = VISIBLE_GROUPS,
         unscale_actions: bool = False,
         reward: RewardFn | None = None,
@@ -87,6 +88,7 @@ class BraxPhysics:
         Args:
             env: a bare environment, such as ``brax.envs.get_environment("ant")``.
             colors: replacements for colors by geom name, see ``read_geoms``.
+            drawn_radius: metres by name of a sphere to draw larger, see ``read_geoms``.
             geom_groups: MuJoCo's geom groups that are visible.
             unscale_actions: for environments that map actions from [-1, 1] to the control
                 range: undo that map, so that costs and actuators see the action as given.
@@ -101,7 +103,9 @@ class BraxPhysics:
         _check_env(env)
         accept_old_clip(fluid)
         model: mujoco.MjModel = env.unwrapped.sys.mj_model
-        self.geoms = read_geoms(model, colors=colors, geom_groups=geom_groups)
+        self.geoms = read_geoms(
+            model, colors=colors, drawn_radius=drawn_radius, geom_groups=geom_groups
+        )
         # Brax keeps the time step in float32; six digits give back the model's own number.
         self.dt = float(f"{float(env.dt):.6g}")
         self.action_size = int(env.action_size)

@@ -32,6 +32,7 @@ def read_geoms(
     model: mujoco.MjModel,
     *,
     colors: Mapping[str, Color] | None = None,
+    drawn_radius: Mapping[str, float] | None = None,
     geom_groups: Collection[int] = VISIBLE_GROUPS,
 ) -> Geoms:
     """The geoms MuJoCo's viewer would show, without textures.
@@ -43,14 +44,17 @@ def read_geoms(
     Args:
         model: a compiled model; link i is its body i + 1.
         colors: replacements by geom name, red, green, blue in [0, 1].
+        drawn_radius: metres, replacements by name of a sphere that is drawn larger than it
+            is, because it would be lost in a small picture. Physics does not see it.
         geom_groups: the groups shown.
 
     Returns:
         The shapes in the model's order.
 
     Raises:
-        ValueError: for an unknown name or a bad value in ``colors``, for a visible geom, flex
-            or skin that the renderer has no formula for, or if nothing is visible.
+        ValueError: for an unknown name or a bad value in ``colors`` or ``drawn_radius``, for a
+            visible geom, flex or skin that the renderer has no formula for, or if nothing is
+            visible.
     """
     colors = dict(colors or {})
     names = [_name(model, i) for i in range(model.ngeom)]
@@ -59,6 +63,15 @@ def read_geoms(
         if np.shape(color) != (3,) or not all(0 <= c <= 1 for c in color):
             raise ValueError(
                 f"color of geom {name!r} must be three numbers in [0, 1], got {color!r}"
+            )
+    drawn_radius = dict(drawn_radius or {})
+    for name, radius in drawn_radius.items():
+        check_choice("geom", name, names)
+        kind = _kind_name(model, names.index(name))
+        if kind != "sphere" or not radius > 0:
+            raise ValueError(
+                f"drawn_radius must be a positive number for a sphere, got {radius!r} for geom "
+                f"{name!r}, a {kind}."
             )
     if model.nflex or model.nskin:
         raise ValueError("flexes and skins cannot be drawn; remove them from the model")
@@ -82,8 +95,9 @@ def read_geoms(
         rows.append(materials.setdefault(key, len(materials)))
 
     size = np.array(model.geom_size[shown], np.float32)
-    for row, kind in zip(size, kinds, strict=True):
+    for row, i, kind in zip(size, shown, kinds, strict=True):
         row[_SIZES[kind] :] = 0
+        row[0] = drawn_radius.get(names[i], row[0])
     return Geoms(
         kind=tuple(int(kind) for kind in kinds),
         # Brax's link 0 is MuJoCo's body 1, because the world is no link.

@@ -18,6 +18,7 @@ REWARD_PRESETS = ("brax", "paper")
 
 # Okabe and Ito's palette (Color Universal Design, 2008) is told apart with any color vision.
 _SKY_BLUE = (0.337, 0.706, 0.914)
+_YELLOW = (0.941, 0.894, 0.259)
 _VERMILLION = (0.835, 0.369, 0.0)
 _RED = (1.0, 0.0, 0.0)
 
@@ -37,6 +38,7 @@ class TaskSpec:
         default_backend: the engine used unless told otherwise.
         backends: the engines that simulate this task sanely, sorted.
         colors: colors by geom name that replace Brax's.
+        drawn_radius: metres, spheres by name that are drawn larger than they are.
         paper_options: arguments of Brax's environment for the "paper" preset.
         paper_unscaled: whether the "paper" preset hands actions to costs and actuators as
             they are, where Brax first maps them from [-1, 1] to the control range. The
@@ -48,6 +50,7 @@ class TaskSpec:
     default_backend: str
     backends: tuple[str, ...] = BACKENDS
     colors: Mapping[str, Color] = field(default_factory=dict)
+    drawn_radius: Mapping[str, float] = field(default_factory=dict)
     paper_options: Mapping[str, float] = field(default_factory=dict)
     paper_unscaled: bool = False
     paper_reward: RewardFn | None = None
@@ -73,7 +76,13 @@ _ROWS = (
         colors={"object_geom": _SKY_BLUE, "capsule/20": _VERMILLION},
         paper_unscaled=True,
     ),
-    TaskSpec("reacher", "generalized", colors={"fingertip": _SKY_BLUE, "target": _RED}),
+    TaskSpec(
+        "reacher",
+        "generalized",
+        colors={"fingertip": _YELLOW, "target": _RED},
+        # At 84 pixels their 9 and 10 mm are two pixels.
+        drawn_radius={"fingertip": 0.015, "target": 0.018},
+    ),
     # Brax itself refuses the swimmer on other engines.
     TaskSpec("swimmer", "generalized", backends=("generalized",), paper_reward=_distance_swum),
     TaskSpec("walker2d", "spring", paper_options={"forward_reward_weight": 10.0}),
@@ -110,6 +119,7 @@ def make_physics(
     return BraxPhysics(
         load_brax_env(task, backend, **(spec.paper_options if paper else {})),
         colors=spec.colors,
+        drawn_radius=spec.drawn_radius,
         unscale_actions=paper and spec.paper_unscaled,
         reward=spec.paper_reward if paper else None,
     )

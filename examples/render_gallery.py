@@ -1,0 +1,60 @@
+"""One real frame per task, for the gallery of the documentation.
+
+    python examples/render_gallery.py --output-dir docs/images/gallery
+
+Each picture is the environment's after a few random actions; the strip shows, side by side, what
+the agent gets (84 x 84, enlarged), the default look with shadows, and the original look.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import imageio.v2 as imageio
+import jax
+import numpy as np
+
+import pixelbrax_jax
+
+SIZE = 336  # four times the 84 pixels that agents get
+
+
+def to_uint8(frame: pixelbrax_jax.Frame) -> np.ndarray:
+    """(H, W, 3) uint8 pixels of a float frame."""
+    rgb = np.stack([frame.r, frame.g, frame.b], axis=-1)
+    return np.floor(255.0 * rgb + 0.5).astype(np.uint8)
+
+
+def strip(task: str, num_steps: int) -> np.ndarray:
+    """The task's three pictures side by side, (SIZE, 3 SIZE + gaps, 3) uint8."""
+    env, params = pixelbrax_jax.make(task, obs_mode="state")
+    key = jax.random.key(1)
+    state, _ = env.reset(key, params)
+    for t in range(num_steps):
+        shape = (env.action_size,)
+        action = jax.random.uniform(jax.random.fold_in(key, t), shape, minval=-1.0)
+        state, _ = env.step(state, action, params)
+    pictures = []
+    for look, shadows, size in (("default", False, 84), ("default", True, SIZE), ("original", False, SIZE)):
+        dressed = params.replace(look=pixelbrax_jax.make_look(look, shadows=shadows))
+        pixels = to_uint8(env.render(state, dressed, size, size))
+        pictures.append(pixels.repeat(SIZE // size, axis=0).repeat(SIZE // size, axis=1))
+    gap = np.full((SIZE, 8, 3), 255, np.uint8)
+    return np.concatenate([pictures[0], gap, pictures[1], gap, pictures[2]], axis=1)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Writes one PNG a task."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--output-dir", default="docs/images/gallery")
+    parser.add_argument("--num-steps", type=int, default=8)
+    options = parser.parse_args(arguments)
+    output = Path(options.output_dir)
+    output.mkdir(parents=True, exist_ok=True)
+    for task in pixelbrax_jax.list_envs():
+        imageio.imwrite(output / f"{task}.png", strip(task, options.num_steps))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,166 @@
+"""What the README and the documentation say is so: code runs, commands and links exist."""
+
+from __future__ import annotations
+
+import html
+import re
+import shlex
+import textwrap
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import gymnasium
+import pytest
+
+import pixelbrax_jax
+from pixelbrax_jax import registry
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
+NAMES = [page.relative_to(ROOT).as_posix() for page in PAGES]
+
+FENCE = re.compile(r"^(?P<indent>\s*)```(?P<language>\w*)")
+NOT_RUN = re.compile(r"^\s*<!-- not run: \S.*-->\s*$")
+LINK = re.compile(r"\]\(([^)\s]+)(?:\s+\"[^\"]*\")?\)|<img[^>]*\ssrc=\"([^\"]+)\"")
+SNIPPET = re.compile(r"^\s*--8<-- \"([^:\"]+)(?::([\w-]+))?\"", re.MULTILINE)
+
+
+@dataclass(frozen=True)
+class Block:
+    """A fenced block of code; ``line`` is where its code begins."""
+
+    language: str
+    line: int
+    code: str
+    runs: bool
+
+
+def blocks_of(text: str) -> Iterator[Block]:
+    """The fenced blocks of a page, in order."""
+    lines, above, i = text.splitlines(), "", 0
+    while i < len(lines):
+        fence = FENCE.match(lines[i])
+        if fence is None:
+            above = lines[i] if lines[i].strip() else above
+            i += 1
+            continue
+        start = i = i + 1
+        while lines[i].strip() != "```":
+            i += 1
+        code = textwrap.dedent("\n".join(lines[start:i])) + "\n"
+        yield Block(fence["language"], start + 1, code, not NOT_RUN.match(above))
+        above, i = "", i + 1
+
+
+def without_code(text: str) -> str:
+    """A page without fenced blocks and code spans."""
+    return re.sub(r"`[^`\n]*`", "", re.sub(r"^\s*```.*?^\s*```$", "", text, flags=re.S | re.M))
+
+
+def anchors_of(text: str) -> set[str]:
+    """The anchors of a page's headings."""
+    headings = re.findall(r"^#+ (.+)$", without_code(text.replace("`", "")), flags=re.M)
+    plain = [re.sub(r"[^\w\- ]", "", html.unescape(heading)).strip() for heading in headings]
+    return {re.sub(r"\s+", "-", heading.lower()) for heading in plain}
+
+
+def make_targets() -> set[str]:
+    return set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text("utf-8"), flags=re.M))
+
+
+@pytest.fixture
+def _own_registries():
+    """A page may register tasks; the next test does not see them."""
+    tables = (gymnasium.registry, registry._REGISTRY)
+    before = [dict(table) for table in tables]
+    yield
+    for table, kept in zip(tables, before, strict=True):
+        table.clear()
+        table.update(kept)
+
+
+@pytest.mark.usefixtures("_own_registries")
+@pytest.mark.parametrize("name", NAMES)
+def test_python_blocks_run(name, tmp_path, monkeypatch):
+    blocks = [b for b in blocks_of((ROOT / name).read_text("utf-8")) if b.language == "python"]
+    if not blocks:
+        return
+    monkeypatch.chdir(tmp_path)
+    namespace = {"__name__": "__main__"}
+    for block in blocks:
+        # The empty lines make a traceback point at the line of the page.
+        code = compile("\n" * (block.line - 1) + block.code, str(ROOT / name), "exec")
+        if block.runs:
+            exec(code, namespace)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_make_commands_exist(name):
+    for block in blocks_of((ROOT / name).read_text("utf-8")):
+        if block.language not in ("bash", "console", "sh"):
+            continue
+        for line in block.code.splitlines():
+            words = shlex.split(line, comments=True)
+            if words[:1] == ["make"]:
+                targets = {w for w in words[1:] if "=" not in w and not w.startswith("-")}
+                assert targets <= make_targets(), f"{name}: {line}"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_links_resolve(name):
+    page = ROOT / name
+    for first, second in LINK.findall(without_code(page.read_text("utf-8"))):
+        link = first or second
+        if re.match(r"https?://|mailto:", link):
+            continue
+        target, _, anchor = link.partition("#")
+        file = (page.parent / target).resolve() if target else page
+        assert file.exists(), f"{name}: {link}"
+        assert file.is_relative_to(ROOT), f"{name}: {link}"
+        if anchor and file.suffix == ".md":
+            assert anchor in anchors_of(file.read_text("utf-8")), f"{name}: {link}"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_included_sections_exist(name):
+    for file, section in SNIPPET.findall((ROOT / name).read_text("utf-8")):
+        text = (ROOT / file).read_text("utf-8")
+        if section:
+            for end in ("start", "end"):
+                assert text.count(f"--8<-- [{end}:{section}]") == 1, f"{name}: {file}:{section}"
+
+
+def table_of(section: str) -> list[list[str]]:
+    """Rows of the table in a section of the README, without heading and code marks."""
+    text = (ROOT / "README.md").read_text("utf-8")
+    text = text.split(f"[start:{section}]")[1].split(f"[end:{section}]")[0]
+    rows = [line for line in text.splitlines() if line.startswith("| ")][2:]
+    return [[cell.strip().replace("`", "") for cell in row.split("|")[1:-1]] for row in rows]
+
+
+def test_the_table_of_tasks_is_true():
+    rows = table_of("tasks")
+    assert [row[1] for row in rows] == sorted(pixelbrax_jax.list_envs())
+    for id_, task, actions, backend, _ in rows:
+        assert gymnasium.spec(id_).kwargs == {"task": task}
+        env, _ = pixelbrax_jax.make(task)
+        assert env.action_size == int(actions)
+        named, _ = pixelbrax_jax.make(task, backend=backend)
+        assert type(named.physics) is type(env.physics)
+        assert named.physics.dt == env.physics.dt
+
+
+def test_the_table_of_options_is_true():
+    defaults = pixelbrax_jax.make.__kwdefaults__
+    for names, values, _ in table_of("options"):
+        for option, value in zip(names.split(", "), values.split(", "), strict=True):
+            assert repr(defaults[option]).replace("'", '"') == value, option
+
+
+def test_blocks_are_found():
+    page = "a\n```python\nx = 1\n```\n<!-- not run: why -->\n\n    ```bash\n    make demo\n    ```\n"
+    assert list(blocks_of(page)) == [
+        Block("python", 3, "x = 1\n", runs=True),
+        Block("bash", 8, "make demo\n", runs=False),
+    ]
