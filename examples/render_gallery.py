@@ -36,7 +36,11 @@ def strip(task: str, num_steps: int) -> np.ndarray:
         action = jax.random.uniform(jax.random.fold_in(key, t), shape, minval=-1.0)
         state, _ = env.step(state, action, params)
     pictures = []
-    for look, shadows, size in (("default", False, 84), ("default", True, SIZE), ("original", False, SIZE)):
+    for look, shadows, size in (
+        ("default", False, 84),
+        ("default", True, SIZE),
+        ("original", False, SIZE),
+    ):
         dressed = params.replace(look=pixelbrax_jax.make_look(look, shadows=shadows))
         pixels = to_uint8(env.render(state, dressed, size, size))
         pictures.append(pixels.repeat(SIZE // size, axis=0).repeat(SIZE // size, axis=1))

@@ -76,15 +76,15 @@ class _Check:
     def check_attributes(self) -> None:
         env = self.env
         _require(isinstance(env, VectorEnv), "the environment must be a gymnasium VectorEnv")
-        num_envs = getattr(env, "num_envs", None)
+        num_envs: Any = getattr(env, "num_envs", None)
         _require(
-            isinstance(num_envs, (int, np.integer)) and num_envs >= 1,
+            isinstance(num_envs, (int, np.integer)) and bool(num_envs >= 1),
             f"num_envs must be a whole number of at least 1, is {num_envs!r}",
         )
         self.num_envs = int(num_envs)
         for kind in ("observation", "action"):
-            single = getattr(env, f"single_{kind}_space", None)
-            batched = getattr(env, f"{kind}_space", None)
+            single: Any = getattr(env, f"single_{kind}_space", None)
+            batched: Any = getattr(env, f"{kind}_space", None)
             for name, space in ((f"single_{kind}_space", single), (f"{kind}_space", batched)):
                 _require(isinstance(space, spaces.Space), f"{name} must be a Space")
             _require(
@@ -92,7 +92,7 @@ class _Check:
                 f"{kind}_space must be single_{kind}_space, batched {self.num_envs} times: "
                 f"{batched} is not that of {single}",
             )
-        mode = env.metadata.get("autoreset_mode")
+        mode: Any = env.metadata.get("autoreset_mode")
         _require(
             isinstance(mode, AutoresetMode),
             f"metadata['autoreset_mode'] must be an AutoresetMode, is {mode!r}",
@@ -118,12 +118,13 @@ class _Check:
         self.check_infos(infos, "reset")
         results = [_host_copy(obs)]
         for index in range(_REPLAYED_STEPS):
-            obs, reward, terminated, truncated, _ = self.env.step(self.env.action_space.sample())
-            results.append(_host_copy([obs, reward, terminated, truncated]))
-            if np.any(_host(terminated) | _host(truncated)):
+            returned = self.env.step(self.env.action_space.sample())
+            ended = self.check_step(returned)
+            results.append(_host_copy(returned[:4]))
+            if ended.any():
                 break
             if index == 0 and reset_mask is not None:
-                self.reset_some(reset_mask, obs)
+                self.reset_some(reset_mask, returned[0])
         return results
 
     def check_rollout(self, num_steps: int) -> None:
@@ -252,7 +253,7 @@ class _Check:
     def check_render(self) -> None:
         if self.env.render_mode is None:
             return
-        pictures = self.env.render()
+        pictures: Any = self.env.render()
         _require(
             isinstance(pictures, tuple) and len(pictures) == self.num_envs,
             f"render() must return a tuple of {self.num_envs}, returned {type(pictures).__name__}",
@@ -267,7 +268,7 @@ class _Check:
                 and picture.shape[2] == 3,
                 "render() must return uint8 NumPy arrays (height, width, 3)",
             )
-        fps = self.env.metadata.get("render_fps")
+        fps: Any = self.env.metadata.get("render_fps")
         _require(bool(fps) and fps > 0, f"metadata['render_fps'] must be positive, is {fps!r}")
 
     def check_close(self) -> None:
@@ -316,7 +317,7 @@ def _equal(one: Any, other: Any) -> bool:
     return len(left) == len(right) and all(map(np.array_equal, left, right))
 
 
-def _row(batch: Any, index: int) -> Any:
+def _row(batch: Any, index: Any) -> Any:
     if isinstance(batch, dict):
         return {name: _row(part, index) for name, part in batch.items()}
     return batch[index]

@@ -9,6 +9,7 @@ import numpy as np
 
 try:
     import torch
+    import torch.utils.dlpack
 except ImportError as error:
     raise ImportError('torch is not installed; try: pip install "pixelbrax[torch]"') from error
 
@@ -27,7 +28,7 @@ def to_torch(tree: Any) -> Any:
         The same tree of tensors, of the same shapes and dtypes.
     """
     # The arrays themselves, not capsules of them: only so do the two agree on a stream.
-    return jax.tree.map(torch.from_dlpack, tree)
+    return jax.tree.map(torch.utils.dlpack.from_dlpack, tree)
 
 
 def is_tensor(value: Any) -> bool:

@@ -14,11 +14,8 @@ from gymnasium import error
 
 from pixelbrax_gym.actions import as_actions
 from pixelbrax_gym.fork import check_not_forked, is_forked
-from pixelbrax_jax import registry
+from pixelbrax_jax import PixelEnv, VectorPixelEnv, registry
 from pixelbrax_jax.choices import check_choice
-from pixelbrax_jax.envs import observe
-from pixelbrax_jax.envs.pixel_env import PixelEnv
-from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.types import EnvParams, EnvState, Timestep
 
 _SEEDS = 2**32
@@ -73,8 +70,11 @@ class StatefulEnv:
             RuntimeError: this process is a fork that cannot run JAX.
         """
         self.env, self.params = _make(task, dict(options), max_episode_steps, also_allowed)
-        self.num_envs, self.single = num_envs, single
-        self._programs = _programs(self.env, num_envs, autoreset_mode, single)
+        # Before the cache is asked, to which True is as good as 1.
+        if isinstance(num_envs, bool) or int(num_envs) != num_envs or num_envs < 1:
+            raise ValueError(f"num_envs must be a whole number of at least 1, got {num_envs!r}.")
+        self.num_envs, self.single = int(num_envs), single
+        self._programs = _programs(self.env, self.num_envs, autoreset_mode, single)
         self._must_reset = autoreset_mode == "disabled"
         self._state: EnvState | None = None
         self._done: jax.Array | None = None
@@ -278,7 +278,9 @@ class _Programs:
         if self.single:
             return jax.tree.map(lambda x: x[0], outputs)
         info = dict(timestep.info)
-        ended = {name: info.pop(name) for name in ("final_obs", "final_info") if name in info}
+        ended: dict[str, Any] = {
+            name: info.pop(name) for name in ("final_obs", "final_info") if name in info
+        }
         info = _with_masks(info, present)
         if ended:
             ended["final_info"] = _with_masks(ended["final_info"], done)
@@ -299,9 +301,7 @@ def _programs(env: PixelEnv, num_envs: int, autoreset_mode: str, single: bool) -
 @cache
 def _picture_program(env: PixelEnv, height: int, width: int) -> Any:
     def picture(state: EnvState, params: EnvParams) -> jax.Array:
-        # Packed first: to stack float planes into (H, W, 3) is slow on a CPU.
-        words = observe.pack(env.render(state, params, height, width))
-        return observe.unpack(words)
+        return env.picture(state, params, height, width)
 
     return jax.jit(jax.vmap(picture, in_axes=(0, None)))
 

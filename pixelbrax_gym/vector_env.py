@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import jax
@@ -14,8 +14,8 @@ from pixelbrax_gym.export import exporter
 from pixelbrax_gym.single_env import check_render_size
 from pixelbrax_gym.spaces import action_space, observation_space
 from pixelbrax_gym.stateful import StatefulEnv
+from pixelbrax_jax import AUTORESET_MODES
 from pixelbrax_jax.choices import check_choice
-from pixelbrax_jax.envs.vector import AUTORESET_MODES
 
 _OWN_OPTIONS = (
     "num_envs",
@@ -63,7 +63,7 @@ class PixelBraxVectorEnv(gymnasium.vector.VectorEnv):
         autoreset_mode: an ``AutoresetMode``, also in ``metadata``.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {
+    metadata: dict[str, Any] = {  # noqa: RUF012  # as Gymnasium declares it
         "render_modes": ["rgb_array"],
         "render_fps": 20,
         "autoreset_mode": AutoresetMode.NEXT_STEP,
@@ -118,7 +118,7 @@ class PixelBraxVectorEnv(gymnasium.vector.VectorEnv):
             also_allowed=_OWN_OPTIONS,
         )
         env = self._stateful.env
-        self.num_envs = int(num_envs)
+        self.num_envs = self._stateful.num_envs
         self.single_observation_space = observation_space(env.obs_spec)
         self.single_action_space = action_space(env.action_size)
         self.observation_space = observation_space(env.obs_spec, self.num_envs)
@@ -225,9 +225,9 @@ class PixelBraxVectorEnv(gymnasium.vector.VectorEnv):
         for i in np.flatnonzero(done):
             rows[i] = jax.tree.map(lambda x, i=i: x[i], final_obs)
         # Zero where no episode ended, as in Gymnasium's own vector environments.
-        final_info = {
-            name: np.where(done, value, np.zeros_like(value)) for name, value in final_info.items()
-        }
+        final_info = jax.tree.map(np.array, final_info)
+        for value in final_info.values():
+            value[~done] = 0
         infos |= {"final_obs": rows, "final_info": final_info}
         return infos | {"_final_obs": done, "_final_info": done.copy()}
 

@@ -2,6 +2,7 @@
 
 from pixelbrax_jax.envs.check import check_env as check_env
 from pixelbrax_jax.envs.pixel_env import PixelEnv as PixelEnv
+from pixelbrax_jax.envs.vector import AUTORESET_MODES as AUTORESET_MODES
 from pixelbrax_jax.envs.vector import VectorPixelEnv as VectorPixelEnv
 from pixelbrax_jax.physics.base import Physics as Physics
 from pixelbrax_jax.physics.brax_physics import BraxPhysics as BraxPhysics

@@ -56,7 +56,7 @@ HOMES: dict[str, set[str]] = {
 """Third party -> the only files that may import it."""
 
 NO_NAMES = {"utils", "helpers", "common", "misc"}
-MAX_LINES = 400
+MAX_LINES = 450
 
 
 def modules_of(root: Path) -> dict[str, Path]:

@@ -13,6 +13,7 @@ from pathlib import Path
 import gymnasium
 import pytest
 
+import pixelbrax_gym  # noqa: F401  # registers PixelBrax/*
 import pixelbrax_jax
 from pixelbrax_jax import registry
 
@@ -159,7 +160,9 @@ def test_the_table_of_options_is_true():
 
 
 def test_blocks_are_found():
-    page = "a\n```python\nx = 1\n```\n<!-- not run: why -->\n\n    ```bash\n    make demo\n    ```\n"
+    page = (
+        "a\n```python\nx = 1\n```\n<!-- not run: why -->\n\n    ```bash\n    make demo\n    ```\n"
+    )
     assert list(blocks_of(page)) == [
         Block("python", 3, "x = 1\n", runs=True),
         Block("bash", 8, "make demo\n", runs=False),

@@ -196,6 +196,28 @@ class PixelEnv:
         scene = self._scene(state.physics, params)
         return render(scene, height or self.height, width or self.width, self.renderer)
 
+    @partial(jax.jit, static_argnums=(0, 3, 4))
+    def picture(
+        self,
+        state: EnvState,
+        params: EnvParams,
+        height: int | None = None,
+        width: int | None = None,
+    ) -> jax.Array:
+        """A state as pixels, rounded like an observation, at any size.
+
+        Args:
+            state: the state to draw.
+            params: what may be randomised.
+            height: pixels, the observation's by default.
+            width: pixels, the observation's by default.
+
+        Returns:
+            (height, width, 3) uint8, row 0 at the top.
+        """
+        height, width = height or self.height, width or self.width
+        return observe.unpack(self.draw_at(state.physics, params, height, width))
+
     # The pieces of a step, which `VectorPixelEnv` puts together in another order.
 
     def begin(self, key: jax.Array, episode: jax.Array) -> EnvState:

@@ -67,11 +67,11 @@ def read_geoms(
     drawn_radius = dict(drawn_radius or {})
     for name, radius in drawn_radius.items():
         check_choice("geom", name, names)
-        kind = _kind_name(model, names.index(name))
-        if kind != "sphere" or not radius > 0:
+        shape = _kind_name(model, names.index(name))
+        if shape != "sphere" or not radius > 0:
             raise ValueError(
                 f"drawn_radius must be a positive number for a sphere, got {radius!r} for geom "
-                f"{name!r}, a {kind}."
+                f"{name!r}, a {shape}."
             )
     if model.nflex or model.nskin:
         raise ValueError("flexes and skins cannot be drawn; remove them from the model")

@@ -1,0 +1,198 @@
+"""Every mistake is named, with its cure, and leaves the environment usable."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.error import ClosedEnvironmentError, ResetNeeded
+
+from pixelbrax_gym import PixelBraxEnv, PixelBraxVectorEnv
+from tests.gym.conftest import ID, TASK
+
+ACTIONS = np.array([[-0.2], [0.9], [1.0]], np.float32)
+
+
+@pytest.mark.parametrize("kind", [PixelBraxEnv, PixelBraxVectorEnv])
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"heigth": 3}, r"unknown option: 'heigth'; allowed: .*width.* Did you mean 'height'\?"),
+        ({"rendermode": 3}, r"Did you mean 'render_mode'\?"),
+        ({"output": "tensor"}, "unknown output: 'tensor'; allowed: jax, numpy, torch"),
+        ({"render_mode": "ansi"}, "unknown render_mode: 'ansi'"),
+        ({"render_height": 0}, "render_height must be a whole number of at least 1"),
+        ({"render_width": 2.5}, "render_width must be a whole number of at least 1"),
+        ({"height": 0}, "height must be a whole number"),
+        ({"obs_mode": "pixel"}, r"Did you mean 'pixels'\?"),
+        ({"camera": "nowhere"}, "camera"),
+        ({"look": "nice"}, "unknown look"),
+        ({"backend": "mjx"}, "registered with its own physics"),
+        ({"max_episode_steps": 0}, "max_episode_steps must be at least 1"),
+        ({"max_episode_steps": -2}, "max_episode_steps must be at least 1"),
+    ],
+)
+def test_options(kind, options, message):
+    with pytest.raises(ValueError, match=message):
+        kind(TASK, **options)
+
+
+def test_task():
+    with pytest.raises(ValueError, match=r"unknown task: 'Ant'; allowed: ant.*Did you mean 'ant'"):
+        PixelBraxEnv("Ant")
+
+
+@pytest.mark.parametrize("num_envs", [0, -1, 1.5, True])
+def test_num_envs(num_envs):
+    with pytest.raises(ValueError, match="num_envs must be a whole number of at least 1"):
+        PixelBraxVectorEnv(TASK, num_envs)
+
+
+@pytest.mark.parametrize("mode", ["nextstep", None, "NEXT"])
+def test_autoreset_mode(mode):
+    with pytest.raises(ValueError, match=r"unknown autoreset_mode.*allowed: disabled, next_step"):
+        PixelBraxVectorEnv(TASK, 2, autoreset_mode=mode)
+
+
+def test_human_rendering_of_many():
+    with pytest.raises(ValueError, match="unknown render_mode: 'human'; allowed: rgb_array"):
+        PixelBraxVectorEnv(TASK, 2, render_mode="human")
+
+
+@pytest.mark.parametrize(
+    ("action", "error", "message"),
+    [
+        (np.zeros((3, 2), np.float32), ValueError, r"shape \(3, 1\), got \(3, 2\)"),
+        (np.zeros(3, np.float32), ValueError, r"shape \(3, 1\), got \(3,\)"),
+        (torch.zeros(2, 1), ValueError, r"shape \(3, 1\), got \(2, 1\)"),
+        (np.zeros((3, 1), int), TypeError, r"got int64; convert it to float32"),
+        (np.zeros((3, 1), bool), TypeError, "got bool"),
+        ([[1], [0], [1]], TypeError, "got int64"),
+        (torch.zeros(3, 1, dtype=torch.int32), TypeError, "got torch.int32"),
+        (np.array([["a"], ["b"], ["c"]]), TypeError, "must be floating point"),
+        (None, ValueError, r"shape \(3, 1\), got \(\)"),
+        (np.array([[0.0], [np.nan], [np.nan]]), ValueError, "environment 1, 2 contains NaN"),
+        (torch.tensor([[0.0], [0.0], [torch.nan]]), ValueError, "environment 2 contains NaN"),
+    ],
+)
+def test_actions_leave_the_environment_usable(make_vector, action, error, message):
+    env, other = make_vector(obs_mode="state"), make_vector(obs_mode="state")
+    env.reset(seed=0), other.reset(seed=0)
+    with pytest.raises(error, match=message):
+        env.step(action)
+    np.testing.assert_array_equal(env.step(ACTIONS)[0], other.step(ACTIONS)[0])
+
+
+@pytest.mark.parametrize(
+    ("action", "error", "message"),
+    [
+        (0.5, ValueError, r"shape \(1,\), got \(\)"),
+        (np.zeros(2), ValueError, r"shape \(1,\), got \(2,\)"),
+        (np.zeros(1, int), TypeError, "floating point"),
+        (np.array([np.nan]), ValueError, "the action contains NaN; nothing was stepped"),
+    ],
+)
+def test_action_of_a_single_environment(make_single, action, error, message):
+    env = make_single(obs_mode="state")
+    env.reset(seed=0)
+    with pytest.raises(error, match=message):
+        env.step(action)
+    env.step(ACTIONS[0])
+
+
+def test_infinite_actions_are_clipped(make_single):
+    env = make_single(obs_mode="state")
+    env.reset(seed=0)
+    _, _, _, _, info = env.step(np.array([np.inf]))
+    assert not info["non_finite"]
+
+
+@pytest.mark.parametrize(
+    ("mask", "error", "message"),
+    [
+        ([True, False, True], TypeError, "NumPy array of bool, got list"),
+        (torch.ones(3, dtype=torch.bool), TypeError, "NumPy array of bool, got Tensor"),
+        (np.ones(3, int), TypeError, "NumPy array of bool, got int64 array"),
+        (np.ones(2, bool), ValueError, r"shape \(3,\), got \(2,\)"),
+        (np.zeros(3, bool), ValueError, "at least one True"),
+    ],
+)
+def test_reset_mask(make_vector, mask, error, message):
+    env = make_vector(obs_mode="state")
+    before = env.reset(seed=0)[0]
+    with pytest.raises(error, match=message):
+        env.reset(options={"reset_mask": mask})
+    # A mask that is refused draws no numbers and begins no episode either.
+    repeat = env.reset(seed=0)[0]
+    np.testing.assert_array_equal(before, repeat)
+
+
+def test_first_reset_must_be_whole(make_vector):
+    env = make_vector(obs_mode="state")
+    with pytest.raises(ResetNeeded, match="first reset must be of all"):
+        env.reset(options={"reset_mask": np.array([True, False, True])})
+    env.reset(options={"reset_mask": np.array([True, True, True])})
+
+
+@pytest.mark.parametrize(
+    ("seed", "error", "message"),
+    [
+        (-1, ValueError, "Seed must be greater"),
+        (2**32, ValueError, r"\[0, 2\*\*32\), got 4294967296"),
+        (2**32 - 1, ValueError, r"\[0, 2\*\*32\), got 4294967296"),
+        ([1, 2], ValueError, "one seed for each of 3, got 2"),
+        ([1, 2, -3], ValueError, r"\[0, 2\*\*32\), got -3"),
+        ([1, 2, 0.5], TypeError, "whole number, got 0.5"),
+        (0.5, TypeError, "whole number, got 0.5"),
+        (True, TypeError, "whole number, got True"),
+        ("7", TypeError, "whole number, got '7'"),
+    ],
+)
+def test_seeds(make_vector, seed, error, message):
+    env = make_vector(obs_mode="state")
+    with pytest.raises((error, gymnasium.error.Error), match=message):
+        env.reset(seed=seed)
+    env.reset(seed=2**32 - 3)
+
+
+def test_order_of_calls(make_vector, make_single):
+    for env, action in (
+        (make_vector(render_mode="rgb_array"), ACTIONS),
+        (make_single(render_mode="rgb_array"), ACTIONS[0]),
+    ):
+        with pytest.raises(ResetNeeded, match=r"call reset\(\) before step"):
+            env.step(action)
+        with pytest.raises(ResetNeeded, match=r"call reset\(\) before render"):
+            env.render()
+        env.reset(seed=0)
+        env.close()
+        env.close()
+        for call in (env.reset, lambda env=env: env.step(ACTIONS), env.render):
+            with pytest.raises(ClosedEnvironmentError, match="is closed; make a new one"):
+                call()
+
+
+def test_stepping_on_after_the_end(make_vector, make_single):
+    env = make_vector(autoreset_mode="disabled", obs_mode="state", episode_length=2)
+    env.reset(seed=0)
+    env.step(ACTIONS)
+    env.step(ACTIONS)
+    env.reset(options={"reset_mask": np.array([False, True, False])})
+    with pytest.raises(ResetNeeded, match=r"environment 0, 2 has ended.*reset_mask"):
+        env.step(ACTIONS)
+    env.reset(options={"reset_mask": np.array([True, False, True])})
+    env.step(ACTIONS)
+
+    single = make_single(obs_mode="state", episode_length=1)
+    single.reset(seed=0)
+    single.step(ACTIONS[0])
+    with pytest.raises(ResetNeeded, match="the episode has ended; call reset"):
+        single.step(ACTIONS[0])
+
+
+def test_gymnasium_passes_messages_on():
+    with pytest.raises(ValueError, match="unknown option: 'widht'"):
+        gymnasium.make(ID, widht=3)
+    with pytest.raises(ValueError, match="unknown option: 'widht'"):
+        gymnasium.make_vec(ID, num_envs=2, widht=3)

@@ -1,0 +1,47 @@
+"""Forked workers say what is wrong; spawned ones work."""
+
+from __future__ import annotations
+
+import gymnasium
+import jax
+import numpy as np
+import pytest
+
+from tests.gym.conftest import ID, SIZE
+
+pytestmark = pytest.mark.filterwarnings(
+    # JAX and Python warn of the fork that these tests are about.
+    "ignore:.*fork.*:RuntimeWarning",
+    "ignore:.*fork.*:DeprecationWarning",
+    # Gymnasium reports a worker's error as a warning too.
+    "ignore::UserWarning",
+)
+
+
+@pytest.mark.timeout(120)
+def test_forked_workers_name_the_cure():
+    jax.devices()  # JAX runs before the fork
+    makers = [lambda: gymnasium.make(ID, **SIZE)] * 2
+    env = gymnasium.vector.AsyncVectorEnv(makers, context="fork", shared_memory=False)
+    try:
+        with pytest.raises(RuntimeError, match=r"PixelBrax was forked.*spawn.*make_vec"):
+            env.reset(seed=0)
+    finally:
+        env.close(terminate=True)
+
+
+@pytest.mark.slow
+def test_spawned_workers_work():
+    def make():
+        import gymnasium
+
+        return gymnasium.make(
+            "pixelbrax_gym:PixelBrax/InvertedPendulum-v0", height=8, width=8, obs_mode="state"
+        )
+
+    env = gymnasium.vector.AsyncVectorEnv([make] * 2, context="spawn")
+    together = gymnasium.make_vec(
+        "PixelBrax/InvertedPendulum-v0", num_envs=2, height=8, width=8, obs_mode="state"
+    )
+    np.testing.assert_array_equal(env.reset(seed=0)[0], together.reset(seed=0)[0])
+    env.close()
