@@ -218,7 +218,7 @@ def test_the_checker_passes_a_sound_tree(tmp_path):
         ("pixelbrax_gym/vector_env.py", "from .dlpack import f", "relative"),
         ("pixelbrax_jax/scene/utils.py", "x = 1", "name"),
         ("pixelbrax_jax/scene/place.py", '""""""\nx = 1', "docstring"),
-        ("pixelbrax_jax/scene/place.py", "x = 1\n" * 401, "lines"),
+        ("pixelbrax_jax/scene/place.py", "x = 1\n" * (MAX_LINES + 1), "lines"),
         ("pixelbrax_jax/kitchen/sink.py", "import pixelbrax_jax.types", "kitchen may not"),
     ],
 )

@@ -71,6 +71,9 @@ class BraxPhysics:
     numbers. And a diverging step ends the episode instead of returning NaN: the step counts as
     diverged if a joint or link position or velocity, the observation, the reward or the done
     flag is not finite or larger than 1e10 in magnitude.
+
+    On the ``"mjx"`` backend link poses are one physics step older than joint positions after a
+    ``step`` (never after a ``reset``), because MuJoCo computes them before it integrates.
     """
 
     def __init__(

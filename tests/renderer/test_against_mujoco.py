@@ -11,13 +11,13 @@ from brax.io import mjcf
 from etils import epath
 
 import pixelbrax_jax
-from pixelbrax_jax import list_envs, place, render
+from pixelbrax_jax import place, render
+from pixelbrax_jax.physics.tasks import TASKS
 from tests.renderer import scenes
 from tests.renderer.mujoco_rays import cast
 
 SIZE = 32
 NUM_POSES = 20
-BUILT_IN = [task for task in list_envs() if not task.startswith("test-")]
 
 
 def compare(model: mujoco.MjModel, batch, shown: list[int]) -> None:
@@ -39,7 +39,7 @@ def compare(model: mujoco.MjModel, batch, shown: list[int]) -> None:
     assert seen >= 2 * NUM_POSES, "the poses show too little to compare"
 
 
-@pytest.mark.parametrize("task", BUILT_IN)
+@pytest.mark.parametrize("task", TASKS)
 def test_task_at_random_poses(task):
     env, params = pixelbrax_jax.make(task)
     name = {"halfcheetah": "half_cheetah"}.get(task, task)
