@@ -42,10 +42,10 @@ bench: $(VENV)/.installed-dev ## measure throughput
 	$(RUN) -m tests.benchmarks.run $(ARGS)
 
 docs: $(VENV)/.installed-docs ## build the documentation into site/, every warning an error
-	$(RUN) -m mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs build --strict --quiet
 
 docs-serve: $(VENV)/.installed-docs ## read the documentation in a browser while writing it
-	$(RUN) -m mkdocs serve
+	NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs serve
 
 clean: ## remove the environment, builds and caches; keeps runs/
 	rm -rf $(VENV) .venv-ci build dist site .mypy_cache .pytest_cache .ruff_cache

@@ -14,11 +14,17 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import platform
 import time
+import warnings
 from dataclasses import asdict, dataclass, fields
 from importlib.metadata import version
 from pathlib import Path
+
+# JAX and PyTorch take turns on the same cores; a PyTorch thread that spins while it waits for
+# its siblings would keep JAX from running. Read when torch is imported.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import gymnasium
 import imageio.v2 as imageio
@@ -258,6 +264,7 @@ def record(agent: Agent, config: Config, device: torch.device, path: Path) -> No
     """Films the trained agent at 480 x 480 pixels, in the task's own time."""
     env = gymnasium.make(
         config.env_id,
+        disable_env_checker=True,  # Gymnasium's checker knows NumPy arrays alone
         render_mode="rgb_array",
         output="torch",
         height=config.image_size,
@@ -272,7 +279,10 @@ def record(agent: Agent, config: Config, device: torch.device, path: Path) -> No
         frames.append(env.render())
         if terminated or truncated:
             obs, _ = env.reset()
-    imageio.mimwrite(path, frames, fps=env.metadata["render_fps"], codec="libx264")
+    with warnings.catch_warnings():
+        # FFmpeg is started as a process of its own at once, which is safe beside JAX's threads.
+        warnings.filterwarnings("ignore", r"os\.fork\(\) was called", RuntimeWarning)
+        imageio.mimwrite(path, frames, fps=env.metadata["render_fps"], codec="libx264")
     env.close()
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache, lru_cache, partial
 
 import jax
 import numpy as np
@@ -143,7 +143,8 @@ def _physics(task: str, backend: str | None, reward_preset: str) -> Physics:
     return _REGISTRY[task].make_physics(backend=backend, reward_preset=reward_preset)
 
 
-@cache
+# Typed, because True equals 1 and must not slip past the checks.
+@lru_cache(maxsize=None, typed=True)
 def _pixel_env(
     task: str,
     backend: str | None,
