@@ -42,7 +42,7 @@ bench: $(VENV)/.installed-dev ## measure throughput
 	$(RUN) -m tests.benchmarks.run $(ARGS)
 
 docs: $(VENV)/.installed-docs ## build the documentation into site/, every warning an error
-	NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs build --strict
 
 docs-serve: $(VENV)/.installed-docs ## read the documentation in a browser while writing it
 	NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs serve

@@ -18,6 +18,7 @@ import numpy as np
 import pixelbrax_jax
 
 SIZE = 336  # four times the 84 pixels that agents get
+GAP = 8
 
 
 def to_uint8(frame: pixelbrax_jax.Frame) -> np.ndarray:
@@ -44,8 +45,17 @@ def strip(task: str, num_steps: int) -> np.ndarray:
         dressed = params.replace(look=pixelbrax_jax.make_look(look, shadows=shadows))
         pixels = to_uint8(env.render(state, dressed, size, size))
         pictures.append(pixels.repeat(SIZE // size, axis=0).repeat(SIZE // size, axis=1))
-    gap = np.full((SIZE, 8, 3), 255, np.uint8)
+    gap = np.full((SIZE, GAP, 3), 255, np.uint8)
     return np.concatenate([pictures[0], gap, pictures[1], gap, pictures[2]], axis=1)
+
+
+def overview(strips: list[np.ndarray], columns: int = 6) -> np.ndarray:
+    """The middle pictures of all strips at half size, in rows of ``columns``."""
+    start = SIZE + GAP
+    tiles = [picture[::2, start : start + SIZE : 2] for picture in strips]
+    tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % columns)
+    rows = [np.concatenate(tiles[k : k + columns], axis=1) for k in range(0, len(tiles), columns)]
+    return np.concatenate(rows, axis=0)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -56,8 +66,10 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     output = Path(options.output_dir)
     output.mkdir(parents=True, exist_ok=True)
-    for task in pixelbrax_jax.list_envs():
-        imageio.imwrite(output / f"{task}.png", strip(task, options.num_steps))
+    strips = {task: strip(task, options.num_steps) for task in pixelbrax_jax.list_envs()}
+    for task, picture in strips.items():
+        imageio.imwrite(output / f"{task}.png", picture)
+    imageio.imwrite(output / "overview.png", overview(list(strips.values())))
 
 
 if __name__ == "__main__":
