@@ -215,8 +215,9 @@ def main(arguments: list[str] | None = None) -> dict:
         result = case()
         report.setdefault(name, []).append(result)
         print(json.dumps({"case": name} | result), flush=True)
+        # After each case, so that a run that is cut short has not been for nothing.
+        (output / f"{device.platform}.json").write_text(json.dumps(report, indent=2) + "\n")
         jax.clear_caches()
-    (output / f"{device.platform}.json").write_text(json.dumps(report, indent=2) + "\n")
     plot(report["environment"], output / f"{device.platform}.png")
     print(f"Wrote {output / device.platform}.json and .png")
     return report
