@@ -10,7 +10,7 @@ from pixelbrax_jax.physics import BACKENDS, TASKS, make_physics
 from pixelbrax_jax.physics.brax_physics import load_brax_env
 
 ENVS = 2
-# MJX's solver never converges on the pusher in float32 and always takes all of its 20 x 50
+# MJX is slow on the pusher: its solver seems not to converge in float32 and to take all 20 x 50
 # iterations.
 STEPS = {("pusher", "mjx"): 10}
 PAIRS = [(task, backend) for task, spec in TASKS.items() for backend in spec.backends]
