@@ -13,9 +13,12 @@ import gymnasium
 
 if TYPE_CHECKING:
     from pixelbrax_gym.check import check_vector_env as check_vector_env
+    from pixelbrax_gym.sb3_env import PixelBraxSB3VecEnv as PixelBraxSB3VecEnv
     from pixelbrax_gym.single_env import PixelBraxEnv as PixelBraxEnv
+    from pixelbrax_gym.torchrl_env import PixelBraxTorchRLEnv as PixelBraxTorchRLEnv
     from pixelbrax_gym.vector_env import PixelBraxVectorEnv as PixelBraxVectorEnv
 
+# What needs an extra is not here, lest a star import fail without it.
 __all__ = ["PixelBraxEnv", "PixelBraxVectorEnv", "check_vector_env", "register"]
 
 _IDS = {
@@ -34,6 +37,8 @@ _IDS = {
 
 _LAZY = {
     "PixelBraxEnv": "pixelbrax_gym.single_env",
+    "PixelBraxSB3VecEnv": "pixelbrax_gym.sb3_env",
+    "PixelBraxTorchRLEnv": "pixelbrax_gym.torchrl_env",
     "PixelBraxVectorEnv": "pixelbrax_gym.vector_env",
     "check_vector_env": "pixelbrax_gym.check",
 }

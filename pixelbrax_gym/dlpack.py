@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 try:
@@ -31,9 +32,18 @@ def to_torch(tree: Any) -> Any:
     return jax.tree.map(torch.utils.dlpack.from_dlpack, tree)
 
 
-def is_tensor(value: Any) -> bool:
-    """Whether ``value`` is a torch tensor."""
-    return isinstance(value, torch.Tensor)
+def to_host(tree: Any) -> Any:
+    """Every array of a tree as a NumPy array that may be written to.
+
+    Without a copy where the array is on a CPU: hand over only arrays that nobody reads again.
+
+    Args:
+        tree: a pytree of JAX arrays, each on one device.
+
+    Returns:
+        The same tree of NumPy arrays, of the same shapes and dtypes.
+    """
+    return jax.tree.map(lambda tensor: tensor.cpu().numpy(), to_torch(tree))
 
 
 def actions_to_jax(tensor: torch.Tensor, device: jax.Device) -> np.ndarray | jax.Array:
@@ -78,3 +88,14 @@ def torch_device(device: jax.Device) -> torch.device:
     if device.platform in ("gpu", "cuda", "rocm"):
         return torch.device("cuda", device.local_hardware_id)
     raise ValueError(f"torch cannot share the memory of {device}; use output='numpy'.")
+
+
+def default_torch_device() -> torch.device:
+    """The torch name of the device on which JAX computes unless told otherwise.
+
+    Raises:
+        ValueError: torch has none, e.g. of a TPU.
+    """
+    # A small array tells, whatever the device was chosen by.
+    (device,) = jnp.zeros(()).devices()
+    return torch_device(device)

@@ -88,5 +88,17 @@ def action_space(action_size: int, num_envs: int | None = None) -> BroadcastBox:
     return BroadcastBox(-1.0, 1.0, _batched((action_size,), num_envs), np.float32)
 
 
+def channels_first_space(space: gymnasium.Space) -> gymnasium.Space:
+    """The space of an observation whose pixels are (3K, H, W) instead of (H, W, 3K)."""
+    if isinstance(space, gymnasium.spaces.Dict):
+        return gymnasium.spaces.Dict(
+            {name: channels_first_space(part) for name, part in space.spaces.items()}
+        )
+    if space.dtype != np.uint8 or space.shape is None:
+        return space
+    height, width, channels = space.shape
+    return BroadcastBox(0, 255, (channels, height, width), np.uint8)
+
+
 def _batched(shape: tuple[int, ...], num_envs: int | None) -> tuple[int, ...]:
     return tuple(shape) if num_envs is None else (num_envs, *shape)

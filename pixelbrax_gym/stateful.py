@@ -18,7 +18,7 @@ from pixelbrax_jax import PixelEnv, VectorPixelEnv, registry
 from pixelbrax_jax.choices import check_choice
 from pixelbrax_jax.types import EnvParams, EnvState, Timestep
 
-_SEEDS = 2**32
+SEEDS = 2**32
 """Seeds lie below this."""
 
 _made: set[Any] = set()
@@ -89,7 +89,7 @@ class StatefulEnv:
     def reset(
         self,
         seed: int | Sequence[int | None] | None,
-        rng: np.random.Generator,
+        rng: np.random.Generator | None = None,
         mask: np.ndarray | None = None,
     ) -> dict[str, Any]:
         """Begins episodes.
@@ -98,7 +98,7 @@ class StatefulEnv:
             seed: s seeds environment i with s + i; a sequence has one seed for each. A seeded
                 environment begins its episode 0. None begins the next episode of an
                 environment, or draws a seed if there was none yet.
-            rng: where seeds are drawn from.
+            rng: where seeds are drawn from; by default from the operating system.
             mask: (N,) bool, where to begin; None means everywhere.
 
         Returns:
@@ -118,7 +118,8 @@ class StatefulEnv:
             if not where.all():
                 raise error.ResetNeeded("the first reset must be of all environments.")
             self.params = jax.device_put(self.params)
-            first = int(rng.integers(_SEEDS - self.num_envs + 1))
+            rng = np.random.default_rng() if rng is None else rng
+            first = int(rng.integers(SEEDS - self.num_envs + 1))
             seeds = [first + i if s is None else s for i, s in enumerate(seeds)]
         given = np.array([s is not None for s in seeds]) & where
         numbers = np.array([s or 0 for s in seeds], np.uint32)
@@ -126,7 +127,7 @@ class StatefulEnv:
             self._state, outputs = self._programs.reset(numbers, self.params)
         else:
             # One call unless some environments are seeded and others are not.
-            if (where & ~given).any():
+            if (where & ~given).any() or not given.any():
                 self._state, outputs = self._programs.reset_where(
                     self._state, where & ~given, where, self.params, None
                 )
@@ -138,14 +139,17 @@ class StatefulEnv:
         self._device = next(iter(self._done.devices()))
         return outputs
 
-    def step(self, action: Any) -> dict[str, Any]:
-        """Steps all environments.
+    def step(self, action: Any, mask: np.ndarray | None = None) -> dict[str, Any]:
+        """Steps all environments, or some.
 
         Args:
             action: (N, A) or, of a single environment, (A,); see ``as_actions``.
+            mask: (N,) bool, which ones to step; None means all. The others stay as they are.
+                Not for a single environment.
 
         Returns:
-            Outputs.
+            Outputs. Environments that were not stepped repeat their observation, with ``done``
+            False; the rest of theirs means nothing.
 
         Raises:
             ResetNeeded: before the first reset; or an episode has ended and does not begin anew
@@ -161,9 +165,29 @@ class StatefulEnv:
             self._check_not_done()
         shape = (self.env.action_size,)
         action = as_actions(action, shape if self.single else (self.num_envs, *shape), self.device)
-        self._state, outputs = self._programs.step(self._state, action, self.params)
+        if mask is None:
+            self._state, outputs = self._programs.step(self._state, action, self.params)
+        else:
+            self._state, outputs = self._programs.step_where(self._state, mask, action, self.params)
         self._done = outputs["done"]
         return outputs
+
+    def age(self, control_steps: np.ndarray) -> None:
+        """Brings the time limit of the present episodes nearer.
+
+        Args:
+            control_steps: (N,) int, as if so many had been taken already. ``episode_length`` in
+                ``info`` counts them too.
+
+        Raises:
+            ResetNeeded: before the first reset.
+            ClosedEnvironmentError: after ``close``.
+            RuntimeError: this process is a fork that cannot run JAX.
+        """
+        self._check_ready("age")
+        assert self._state is not None
+        step_count = self._state.step_count + jnp.asarray(control_steps, jnp.int32)
+        self._state = self._state.replace(step_count=step_count)
 
     def render(self, height: int, width: int) -> jax.Array:
         """Pictures of the present states, at any size.
@@ -240,6 +264,7 @@ class _Programs:
         self.reset = jax.jit(self._reset)
         self.reset_where = jax.jit(self._reset_where, donate_argnums=0)
         self.step = jax.jit(self._step, donate_argnums=0)
+        self.step_where = jax.jit(self._step_where, donate_argnums=0)
 
     def _reset(self, seeds: jax.Array, params: EnvParams) -> tuple[EnvState, dict[str, Any]]:
         state, timestep = self.vector.reset(jax.vmap(jax.random.key)(seeds), params)
@@ -264,6 +289,18 @@ class _Programs:
             action = action[None]
         state, timestep = self.vector.step(state, action, params)
         return state, self._outputs(timestep, jnp.ones(self.vector.num_envs, bool))
+
+    def _step_where(
+        self, state: EnvState, mask: jax.Array, action: jax.Array, params: EnvParams
+    ) -> tuple[EnvState, dict[str, Any]]:
+        stepped, outputs = self._step(state, action, params)
+
+        def choose(new: jax.Array, old: jax.Array) -> jax.Array:
+            return jnp.where(mask.reshape(mask.shape + (1,) * (new.ndim - 1)), new, old)
+
+        state = jax.tree.map(choose, stepped, state)
+        obs = jax.vmap(self.vector.env.obs)(state)
+        return state, outputs | {"obs": obs, "done": outputs["done"] & mask}
 
     def _outputs(self, timestep: Timestep, present: jax.Array) -> dict[str, Any]:
         done = timestep.terminated | timestep.truncated
@@ -342,6 +379,6 @@ def _make(
 def _check_seed(seed: Any) -> int:
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)):
         raise TypeError(f"a seed must be a whole number, got {seed!r}.")
-    if not 0 <= seed < _SEEDS:
+    if not 0 <= seed < SEEDS:
         raise ValueError(f"seeds must lie in [0, 2**32), got {seed}.")
     return int(seed)

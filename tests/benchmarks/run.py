@@ -18,12 +18,16 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+# JAX and PyTorch take turns on the same cores.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
 import gymnasium
 import jax
 import matplotlib
 import numpy as np
+import torch
 
-import pixelbrax_gym  # noqa: F401  # registers PixelBrax/*
+import pixelbrax_gym
 import pixelbrax_jax
 
 matplotlib.use("Agg")
@@ -31,7 +35,9 @@ import matplotlib.pyplot as plt
 
 TASKS = {"halfcheetah": "HalfCheetah", "walker2d": "Walker2d", "ant": "Ant", "humanoid": "Humanoid"}
 BATCHES = (1, 10, 100, 1000)
+PACKAGES = ("jax", "brax", "gymnasium", "torch", "torchrl", "stable-baselines3", "pixelbrax")
 REPETITIONS = 5
+ROUNDS = 9
 
 
 def compiled(function: Callable, *arguments: Any, **jit_options: Any) -> tuple[Any, float]:
@@ -90,35 +96,99 @@ def renderer_reference(num_envs: int = 8, size: int = 84) -> dict:
     }
 
 
-def door(num_envs: int, output: str, calls: int) -> dict:
-    """Steps per second of ``gymnasium.make_vec`` with actions from the caller's side."""
-    started = time.perf_counter()
-    envs = gymnasium.make_vec("PixelBrax/Ant-v0", num_envs=num_envs, output=output)
-    shape = (calls, *envs.action_space.shape)
+def doors(num_envs: int, calls: int = 10) -> list[dict]:
+    """Steps per second of every door to PyTorch, and of the functional environment in Python.
+
+    All take turns, so that a change of the machine's mood strikes them alike; ``ratio`` is the
+    median of a door's speed over that of the functional loop with the same autoreset mode.
+    """
+    action_size = pixelbrax_jax.make("ant")[0].action_size
+    shape = (calls, num_envs, action_size)
     actions = np.random.default_rng(0).uniform(-1, 1, shape).astype(np.float32)
-    if output == "torch":
-        import torch
+    runners: dict[tuple[str, str], Callable[[], Any]] = {}
+    for mode in ("next_step", "same_step"):
+        runners["JAX loop", mode] = _jax_loop(num_envs, mode, actions)
+    for output in ("jax", "torch", "numpy"):
+        runners[f"Gymnasium, {output}", "next_step"] = _gymnasium(num_envs, output, actions)
+    runners["TorchRL", "same_step"] = _torchrl(num_envs, actions)
+    runners["Stable-Baselines3", "same_step"] = _sb3(num_envs, actions)
+    times: dict[tuple[str, str], list[float]] = {key: [] for key in runners}
+    for call in runners.values():
+        call()
+    for _ in range(ROUNDS):
+        for key, call in runners.items():
+            started = time.perf_counter()
+            call()
+            times[key].append((time.perf_counter() - started) / calls)
+    return [
+        {
+            "door": name,
+            "autoreset_mode": mode,
+            "num_envs": num_envs,
+            "steps_per_second": num_envs / float(np.median(seconds)),
+            "ratio": float(np.median(np.divide(times["JAX loop", mode], seconds))),
+        }
+        for (name, mode), seconds in times.items()
+    ]
 
-        actions = torch.from_numpy(actions)
+
+def _jax_loop(num_envs: int, mode: str, actions: np.ndarray) -> Callable[[], Any]:
+    env, params = pixelbrax_jax.make("ant")
+    venv = pixelbrax_jax.VectorPixelEnv(env, num_envs, mode)
+    step = jax.jit(lambda state, action: venv.step(state, action, params), donate_argnums=0)
+    carry = {"state": venv.reset(jax.random.key(0), params)[0]}
+    on_device = [jax.device_put(action) for action in actions]
+
+    def call() -> Any:
+        for action in on_device:
+            carry["state"], timestep = step(carry["state"], action)
+        return jax.block_until_ready(timestep)
+
+    return call
+
+
+def _gymnasium(num_envs: int, output: str, actions: np.ndarray) -> Callable[[], Any]:
+    envs = gymnasium.make_vec("PixelBrax/Ant-v0", num_envs=num_envs, output=output)
+    convert = {"jax": jax.device_put, "torch": torch.from_numpy, "numpy": np.asarray}[output]
+    own = [convert(action) for action in actions]
     envs.reset(seed=0)
-    envs.step(actions[0])
-    setup_seconds = time.perf_counter() - started
-    turn = iter(range(10**9))
 
-    def step() -> Any:
-        # Torch tensors and NumPy arrays are complete when they are handed out; JAX arrays are
-        # waited for by the caller.
-        obs = envs.step(actions[next(turn) % calls])[0]
-        return obs if output == "jax" else None
+    def call() -> Any:
+        for action in own:
+            obs = envs.step(action)[0]
+        # Tensors and NumPy arrays are complete when they are handed out.
+        return jax.block_until_ready(obs) if output == "jax" else obs
 
-    seconds = seconds_per_call(step, calls)
-    envs.close()
-    return {
-        "num_envs": num_envs,
-        "output": output,
-        "steps_per_second": num_envs / seconds,
-        "setup_seconds": setup_seconds,
-    }
+    return call
+
+
+def _torchrl(num_envs: int, actions: np.ndarray) -> Callable[[], Any]:
+    env = pixelbrax_gym.PixelBraxTorchRLEnv("ant", num_envs)
+    env.set_seed(0)
+    env.reset()
+    own = [env.full_action_spec.zero().set("action", torch.from_numpy(a)) for a in actions]
+
+    def call() -> Any:
+        for action in own:
+            stepped = env._step(action)
+            if stepped["done"].any():
+                env._reset(stepped.select("done").set("_reset", stepped["done"]))
+        return stepped
+
+    return call
+
+
+def _sb3(num_envs: int, actions: np.ndarray) -> Callable[[], Any]:
+    env = pixelbrax_gym.PixelBraxSB3VecEnv("ant", num_envs)
+    env.seed(0)
+    env.reset()
+
+    def call() -> Any:
+        for action in actions:
+            obs = env.step(action)[0]
+        return obs
+
+    return call
 
 
 def environment(task: str, obs_mode: str, num_envs: int) -> dict:
@@ -193,17 +263,15 @@ def main(arguments: list[str] | None = None) -> dict:
         "platform": device.platform,
         "processor": _processor(),
         "cores": os.cpu_count(),
-        "versions": {name: version(name) for name in ("jax", "brax", "gymnasium", "pixelbrax")},
+        "versions": {name: version(name) for name in PACKAGES},
         "python": platform.python_version(),
     }
-    cases: list[tuple[str, Callable[[], dict]]] = [
+    cases: list[tuple[str, Callable[[], dict | list[dict]]]] = [
         ("renderer", lambda: renderer("default")),
         ("renderer", lambda: renderer("original")),
         ("renderer", lambda: renderer("default", shadows=True)),
         ("renderer_reference", renderer_reference),
-        ("door", lambda: door(256, "torch", 10)),
-        ("door", lambda: door(256, "numpy", 10)),
-        ("door", lambda: door(256, "jax", 10)),
+        ("doors", lambda: doors(256)),
     ]
     cases += [
         ("environment", lambda t=task, m=mode, n=n: environment(t, m, n))
@@ -212,9 +280,10 @@ def main(arguments: list[str] | None = None) -> dict:
         for mode in ("pixels", "state")
     ]
     for name, case in cases:
-        result = case()
-        report.setdefault(name, []).append(result)
-        print(json.dumps({"case": name} | result), flush=True)
+        results = case()
+        for result in results if isinstance(results, list) else [results]:
+            report.setdefault(name, []).append(result)
+            print(json.dumps({"case": name} | result), flush=True)
         # After each case, so that a run that is cut short has not been for nothing.
         (output / f"{device.platform}.json").write_text(json.dumps(report, indent=2) + "\n")
         jax.clear_caches()

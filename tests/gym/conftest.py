@@ -49,3 +49,34 @@ def make_vector():
     yield make
     for env in made:
         env.close()
+
+
+@pytest.fixture
+def make_torchrl():
+    made = []
+
+    def make(num_envs=3, seed=0, **options):
+        options = SIZE | {"episode_length": 20} | options
+        made.append(pixelbrax_gym.PixelBraxTorchRLEnv(TASK, num_envs, **options))
+        if seed is not None:
+            made[-1].set_seed(seed)
+        return made[-1]
+
+    yield make
+    for env in made:
+        env.close()
+
+
+@pytest.fixture
+def make_sb3():
+    made = []
+
+    def make(num_envs=3, seed=0, **options):
+        options = SIZE | {"episode_length": 20} | options
+        made.append(pixelbrax_gym.PixelBraxSB3VecEnv(TASK, num_envs, **options))
+        made[-1].seed(seed)
+        return made[-1]
+
+    yield make
+    for env in made:
+        env.close()

@@ -1,0 +1,281 @@
+"""Whether JAX and PyTorch work together on this machine, in plain words and with cures."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+_PACKAGES = ("pixelbrax", "jax", "jaxlib", "brax", "mujoco", "gymnasium", "numpy")
+_OPTIONAL = {"torch": "torch", "torchrl": "torchrl", "stable-baselines3": "sb3"}
+"""Package -> the extra that brings it."""
+
+_GL_LIBRARIES = ("libGL.", "libEGL.", "libOSMesa.", "libGLX.")
+
+_PREALLOCATE = "XLA_PYTHON_CLIENT_PREALLOCATE"
+_FRACTION = "XLA_CLIENT_MEM_FRACTION"
+_OLD_FRACTION = "XLA_PYTHON_CLIENT_MEM_FRACTION"
+_ALLOCATOR = "XLA_PYTHON_CLIENT_ALLOCATOR"
+
+
+@dataclass(frozen=True)
+class Machine:
+    """What was found out; see ``inspect``.
+
+    Attributes:
+        versions: package -> installed release, None where there is none.
+        jax_device: JAX's default device, e.g. ``"cuda:0"``.
+        jax_platform: ``"cpu"``, ``"gpu"``, ``"tpu"``, ...
+        jax_error: why JAX has no device, else None.
+        has_nvidia: whether the system has an NVIDIA GPU.
+        torch_cuda: whether torch can use CUDA; None without torch.
+        to_torch: whether an array of JAX's became a tensor on the same memory; None without
+            torch, or an explanation where it failed.
+        to_jax: the same, from a tensor to an array.
+        gl_libraries: OpenGL libraries loaded into this process; None where that is unknown.
+        environ: environment variables.
+    """
+
+    versions: dict[str, str | None]
+    jax_device: str | None
+    jax_platform: str | None
+    jax_error: str | None
+    has_nvidia: bool
+    torch_cuda: bool | None
+    to_torch: bool | str | None
+    to_jax: bool | str | None
+    gl_libraries: tuple[str, ...] | None
+    environ: dict[str, str]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the report.
+
+    Attributes:
+        level: ``"ok"``, ``"note"`` (works, but could be better) or ``"trouble"``.
+        text: what was found.
+        cure: what to do, where there is something to do.
+    """
+
+    level: str
+    text: str
+    cure: str = ""
+
+
+def inspect() -> Machine:
+    """Looks at this machine. Starts JAX; takes a second or two."""
+    versions = {name: _version(name) for name in (*_PACKAGES, *_OPTIONAL)}
+    device = jax_platform = jax_error = None
+    try:
+        import jax
+
+        first = jax.devices()[0]
+        device, jax_platform = str(first), first.platform
+    except Exception as error:  # whatever it is, it shall be reported and not raised
+        jax_error = f"{type(error).__name__}: {error}"
+    torch_cuda: bool | None = None
+    to_torch: bool | str | None = None
+    to_jax: bool | str | None = None
+    if versions["torch"] is not None:
+        import torch
+
+        torch_cuda = torch.cuda.is_available()
+        if jax_error is None:
+            to_torch, to_jax = _attempt(_shares_to_torch), _attempt(_shares_to_jax)
+    return Machine(
+        versions=versions,
+        jax_device=device,
+        jax_platform=jax_platform,
+        jax_error=jax_error,
+        has_nvidia=Path("/proc/driver/nvidia/version").exists(),
+        torch_cuda=torch_cuda,
+        to_torch=to_torch,
+        to_jax=to_jax,
+        gl_libraries=_gl_libraries(),
+        environ=dict(os.environ),
+    )
+
+
+def diagnose(machine: Machine) -> list[Finding]:
+    """What the facts mean.
+
+    Args:
+        machine: the facts.
+
+    Returns:
+        Findings, the most basic first.
+    """
+    return [
+        *_about_packages(machine),
+        *_about_devices(machine),
+        *_about_sharing(machine),
+        *_about_memory(machine),
+        *_about_gl(machine),
+    ]
+
+
+def report(findings: list[Finding]) -> str:
+    """The findings as text for a terminal."""
+    lines = []
+    for finding in findings:
+        lines.append(f"{finding.level:>8}  {finding.text}")
+        if finding.cure:
+            lines.append(f"{'':>8}  -> {finding.cure}")
+    troubles = sum(finding.level == "trouble" for finding in findings)
+    lines.append("")
+    lines.append(
+        f"{troubles} trouble{'s' if troubles > 1 else ''} found." if troubles else "All is well."
+    )
+    return "\n".join(lines)
+
+
+def _about_packages(machine: Machine) -> Iterator[Finding]:
+    here = ", ".join(f"{name} {version}" for name, version in machine.versions.items() if version)
+    yield Finding("ok", f"Python {platform.python_version()}, {here}")
+    for name, extra in _OPTIONAL.items():
+        if machine.versions[name] is None:
+            cure = f'pip install "pixelbrax[{extra}]", should you want it'
+            yield Finding("note", f"{name} is not installed", cure)
+
+
+def _about_devices(machine: Machine) -> Iterator[Finding]:
+    if machine.jax_error is not None:
+        yield Finding(
+            "trouble",
+            f"JAX finds no device to compute on: {machine.jax_error}",
+            "unset JAX_PLATFORMS, or install the jax release that goes with your driver: "
+            'pip install "pixelbrax[cuda12]" or "pixelbrax[cuda13]"',
+        )
+        return
+    yield Finding("ok", f"JAX computes on {machine.jax_device}")
+    on_cpu = machine.jax_platform == "cpu"
+    if on_cpu and machine.has_nvidia:
+        yield Finding(
+            "trouble",
+            "there is an NVIDIA GPU, but JAX does not use it",
+            'pip install "pixelbrax[cuda12]" or "pixelbrax[cuda13]", as nvidia-smi tells the CUDA '
+            "version; unset JAX_PLATFORMS; and import jax before torch, whose CUDA libraries may "
+            "hide JAX's",
+        )
+    if machine.torch_cuda is None:
+        return
+    if on_cpu and machine.torch_cuda:
+        yield Finding(
+            "trouble",
+            "torch uses CUDA and JAX the CPU: frames are drawn slowly and must be copied",
+            'pip install "pixelbrax[cuda12]" or "pixelbrax[cuda13]"',
+        )
+    elif machine.jax_platform in ("gpu", "cuda", "rocm") and not machine.torch_cuda:
+        yield Finding(
+            "trouble",
+            "JAX uses the GPU and torch cannot: output='torch' will not work",
+            "install a torch built for CUDA, see https://pytorch.org/get-started/locally",
+        )
+    else:
+        yield Finding("ok", "JAX and torch see the same device")
+
+
+def _about_sharing(machine: Machine) -> Iterator[Finding]:
+    for way, result in (("JAX to torch", machine.to_torch), ("torch to JAX", machine.to_jax)):
+        if result is True:
+            yield Finding("ok", f"arrays cross from {way} without a copy")
+        elif result is False:
+            yield Finding(
+                "trouble",
+                f"arrays are copied on their way from {way}",
+                "use a current torch and jax; the releases in constraints.txt do not copy",
+            )
+        elif result is not None:
+            yield Finding(
+                "trouble",
+                f"arrays do not cross from {way}: {result}",
+                "mend the devices first; else use output='numpy'",
+            )
+
+
+def _about_memory(machine: Machine) -> Iterator[Finding]:
+    environ = machine.environ
+    if _FRACTION in environ and _OLD_FRACTION in environ:
+        yield Finding(
+            "trouble",
+            f"{_FRACTION} and {_OLD_FRACTION} are both set, which JAX refuses",
+            f"unset {_OLD_FRACTION}",
+        )
+    if machine.jax_platform not in ("gpu", "cuda", "rocm"):
+        return
+    preallocates = environ.get(_PREALLOCATE, "true").lower() not in ("false", "0")
+    if environ.get(_ALLOCATOR, "default") in ("platform", "cuda_async"):
+        preallocates = False
+    fraction = environ.get(_FRACTION, environ.get(_OLD_FRACTION, "0.75"))
+    if preallocates and float(fraction) > 0.5 and machine.torch_cuda:
+        yield Finding(
+            "note",
+            f"JAX takes {float(fraction):.0%} of the GPU's memory at its start and leaves torch "
+            "the rest",
+            f"export {_FRACTION}=0.4, or {_PREALLOCATE}=false, before Python starts",
+        )
+    else:
+        yield Finding("ok", "JAX leaves GPU memory for others")
+
+
+def _about_gl(machine: Machine) -> Iterator[Finding]:
+    if machine.gl_libraries is None:
+        yield Finding("ok", "pictures need no OpenGL and no display")
+    elif machine.gl_libraries:
+        names = ", ".join(machine.gl_libraries)
+        yield Finding("note", f"pictures need no OpenGL, though something else has loaded {names}")
+    else:
+        yield Finding("ok", "pictures need no OpenGL and no display, and none is loaded")
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _attempt(check: object) -> bool | str:
+    assert callable(check)
+    try:
+        return bool(check())
+    except Exception as error:  # reported, not raised
+        return f"{type(error).__name__}: {error}"
+
+
+def _shares_to_torch() -> bool:
+    import jax
+    import jax.numpy as jnp
+
+    from pixelbrax_gym.dlpack import to_torch
+
+    frames = jax.block_until_ready(jnp.zeros((2, 8, 8, 3), jnp.uint8))
+    return bool(to_torch(frames).data_ptr() == frames.unsafe_buffer_pointer())
+
+
+def _shares_to_jax() -> bool:
+    import jax
+    import torch
+
+    from pixelbrax_gym.dlpack import default_torch_device
+
+    # Larger than any alignment asks for, as an allocator aligns what is large.
+    tensor = torch.zeros(1 << 16, device=default_torch_device())
+    array = jax.block_until_ready(jax.dlpack.from_dlpack(tensor))
+    return bool(array.unsafe_buffer_pointer() == tensor.data_ptr())
+
+
+def _gl_libraries() -> tuple[str, ...] | None:
+    """OpenGL libraries in this process, after all that draws a frame has been imported."""
+    import pixelbrax_jax  # noqa: F401
+
+    maps = Path("/proc/self/maps")
+    if not sys.platform.startswith("linux") or not maps.exists():
+        return None
+    names = {Path(line.split()[-1]).name for line in maps.read_text().splitlines() if "/" in line}
+    return tuple(sorted(name for name in names if name.startswith(_GL_LIBRARIES)))

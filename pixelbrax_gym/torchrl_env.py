@@ -1,0 +1,200 @@
+"""Many pixel environments in one compiled program, as a TorchRL environment."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import error
+
+try:
+    from tensordict import TensorDict, TensorDictBase
+    from torchrl.data import Unbounded
+    from torchrl.envs import EnvBase
+except ImportError as missing:
+    raise ImportError(
+        'TorchRL is not installed; try: pip install "pixelbrax[torchrl]"'
+    ) from missing
+
+from pixelbrax_gym.dlpack import default_torch_device, to_torch
+from pixelbrax_gym.single_env import check_render_size
+from pixelbrax_gym.stateful import SEEDS, StatefulEnv
+from pixelbrax_gym.torchrl_specs import action_spec, done_spec, observation_spec
+
+_OWN_OPTIONS = ("num_envs", "device", "render_height", "render_width")
+
+
+class PixelBraxTorchRLEnv(EnvBase):
+    """``num_envs`` copies of a Brax task seen through a camera, stepped together.
+
+    Batch size (N,). Keys: ``pixels``, (N, H, W, 3K) uint8, oldest frame first; ``observation``,
+    (N, S) float32, with ``obs_mode="state"`` or ``"both"``; ``action``, (N, A) float32 in
+    [-1, 1]; ``reward``, (N, 1) float32; ``done``, ``terminated`` and ``truncated``, (N, 1) bool.
+
+    The step that ends an episode returns its true last observation under ``"next"``. The same
+    compiled program has begun the next episode by then and drawn its first frame, which
+    ``reset`` hands out for the rows that its ``"_reset"`` mask names; TorchRL's collectors and
+    rollouts do so by themselves. All other rows keep their state.
+
+    Tensors share memory with what JAX has computed. Nothing reads that again, hence an in-place
+    operation changes nothing that comes later.
+
+    Environment i seeded with s draws what environment i of a ``PixelBraxVectorEnv`` seeded with
+    s draws.
+
+    Attributes:
+        infos: after a step, a dict of (N,) tensors about the episodes that the step belongs to:
+            ``episode_return`` (sum of rewards), ``episode_length`` (control steps), and
+            ``non_finite`` (the physics diverged and ended the episode).
+
+    Example:
+        >>> env = PixelBraxTorchRLEnv("ant", num_envs=256)
+        >>> env.set_seed(0)
+        >>> rollout = env.rollout(10, break_when_any_done=False)
+    """
+
+    def __init__(
+        self,
+        task: str,
+        num_envs: int = 1,
+        *,
+        device: torch.device | str | None = None,
+        render_height: int = 480,
+        render_width: int = 480,
+        **options: Any,
+    ) -> None:
+        """Builds the environments; the first ``reset`` compiles.
+
+        Args:
+            task: one of ``pixelbrax_jax.list_envs()``.
+            num_envs: N, at least 1.
+            device: where tensors are. None means JAX's default device, from which nothing is
+                copied; tensors are copied to and from any other device.
+            render_height: pixels of ``render()``.
+            render_width: pixels of ``render()``.
+            **options: everything else that ``pixelbrax_jax.make`` takes, such as ``backend``,
+                ``camera``, ``height``, ``width``, ``frame_stack``, ``obs_mode``,
+                ``action_repeat`` and ``episode_length``.
+
+        Raises:
+            ValueError: an option is unknown or out of range; the message lists what is allowed.
+            RuntimeError: this process is a fork that cannot run JAX.
+        """
+        stateful = StatefulEnv(
+            task,
+            options,
+            num_envs=num_envs,
+            autoreset_mode="same_step",
+            also_allowed=_OWN_OPTIONS,
+        )
+        self._jax_device = default_torch_device()
+        device = self._jax_device if device is None else torch.device(device)
+        super().__init__(device=device, batch_size=(stateful.num_envs,))
+        self.is_closed = False
+        self.infos: dict[str, torch.Tensor] = {}
+        self._stateful, self._num_envs = stateful, stateful.num_envs
+        self._render_size = check_render_size(render_height, render_width)
+        self._seeds: list[int] | None = None
+        self._is_seeded = False
+        # First observations of the episodes that the last step began, and where it began any.
+        self._first_obs: Any = None
+        self._began: Any = np.zeros(self._num_envs, bool)
+
+        env, size = stateful.env, (self._num_envs, self.device)
+        self.observation_spec = observation_spec(env.obs_spec, *size)
+        self.action_spec = action_spec(env.action_size, *size)
+        self.reward_spec = Unbounded((self._num_envs, 1), device=self.device, dtype=torch.float32)
+        self.done_spec = done_spec(*size)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        del kwargs
+        mask = np.ones(self._num_envs, bool)
+        given = None if tensordict is None else tensordict.get("_reset", None)
+        if given is not None:
+            mask = given.reshape(self._num_envs).cpu().numpy()
+        began = np.asarray(self._began)
+        if not self._is_seeded:
+            self._set_seed(None)
+        seeds, self._seeds = self._seeds, None
+        # An episode that has begun already is not begun twice, unless it shall have another seed.
+        fresh = mask if seeds is not None else mask & ~began
+        if fresh.any() or self._first_obs is None:
+            outputs = self._stateful.reset(seeds, mask=fresh)
+            self._first_obs = outputs["obs"]
+        self._began = began & ~mask
+        # Handed out once, and so never shared by two who might write to it.
+        obs, self._first_obs = self._first_obs, None
+        return self._tensordict(self._observations(to_torch(obs)) | self._flags())
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        where = tensordict.get("_step", None)
+        if where is not None:
+            where = where.reshape(self._num_envs).cpu().numpy()
+        began = np.asarray(self._began)
+        ended = began if where is None else began & where
+        if ended.any():
+            raise error.ResetNeeded(
+                f"the episode of environment {', '.join(map(str, np.flatnonzero(ended)))} has "
+                "ended; call reset() with their '_reset' True before the next step(). Should a "
+                "transform step several times in a row, use action_repeat instead."
+            )
+        action = tensordict.get("action").to(self._jax_device)
+        outputs = self._stateful.step(action, where)
+        infos = outputs["info"]
+        self._first_obs = outputs["obs"]
+        self._began = outputs["done"] if where is None else began | np.asarray(outputs["done"])
+        exported = to_torch(
+            {
+                "obs": infos["final_obs"],
+                "infos": infos["final_info"],
+                **{name: outputs[name] for name in ("reward", "done", "terminated", "truncated")},
+            }
+        )
+        self.infos = {
+            name: value for name, value in exported.pop("infos").items() if name[0] != "_"
+        }
+        observations = self._observations(exported.pop("obs"))
+        return self._tensordict(
+            observations | {name: value[:, None] for name, value in exported.items()}
+        )
+
+    def _set_seed(self, seed: int | None) -> None:
+        """Environment i draws from ``seed + i`` from its next reset on; torch draws for None."""
+        if seed is None:
+            seed = int(torch.randint(SEEDS, ()))
+        self._seeds = [(int(seed) + i) % SEEDS for i in range(self._num_envs)]
+        self._is_seeded = True
+
+    def render(self) -> torch.Tensor:
+        """Pictures of the present states, e.g. for TorchRL's ``PixelRenderTransform``.
+
+        Returns:
+            (N, render_height, render_width, 3) uint8, row 0 at the top.
+
+        Raises:
+            ResetNeeded: before the first reset.
+            ClosedEnvironmentError: after ``close``.
+        """
+        return to_torch(self._stateful.render(*self._render_size)).to(self.device)
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Forgets the states."""
+        del raise_if_closed
+        self.is_closed = True
+        # TorchRL also closes an environment whose construction failed.
+        if "_stateful" in self.__dict__:
+            self._stateful.close()
+
+    def _observations(self, obs: Any) -> dict[str, torch.Tensor]:
+        if not isinstance(obs, dict):
+            return {"pixels" if obs.dtype == torch.uint8 else "observation": obs}
+        return {"pixels": obs["pixels"], "observation": obs["state"]}
+
+    def _flags(self) -> dict[str, torch.Tensor]:
+        names = ("done", "terminated", "truncated")
+        shape = (self._num_envs, 1)
+        return {name: torch.zeros(shape, dtype=torch.bool, device=self.device) for name in names}
+
+    def _tensordict(self, values: dict[str, torch.Tensor]) -> TensorDict:
+        return TensorDict(values, batch_size=self.batch_size, device=self.device)

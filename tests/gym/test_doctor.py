@@ -1,0 +1,148 @@
+"""The doctor's findings, from invented machines and from this one."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from importlib.metadata import version
+
+import pytest
+
+from pixelbrax_gym import doctor
+from pixelbrax_jax import cli
+
+HEALTHY = doctor.Machine(
+    versions=dict.fromkeys(("jax", "torch", "torchrl", "stable-baselines3"), "1.0"),
+    jax_device="cuda:0",
+    jax_platform="gpu",
+    jax_error=None,
+    has_nvidia=True,
+    torch_cuda=True,
+    to_torch=True,
+    to_jax=True,
+    gl_libraries=(),
+    environ={"XLA_CLIENT_MEM_FRACTION": "0.4"},
+)
+
+
+def not_ok(**changes):
+    return [f for f in doctor.diagnose(replace(HEALTHY, **changes)) if f.level != "ok"]
+
+
+def test_a_healthy_machine():
+    findings = doctor.diagnose(HEALTHY)
+    assert {finding.level for finding in findings} == {"ok"}
+    text = doctor.report(findings)
+    assert "JAX and torch see the same device" in text
+    assert "JAX to torch without a copy" in text
+    assert text.endswith("All is well.")
+
+
+@pytest.mark.parametrize(
+    ("changes", "level", "text", "cure"),
+    [
+        (
+            {"jax_platform": "cpu", "jax_device": "cpu:0", "torch_cuda": False},
+            "trouble",
+            "NVIDIA GPU, but JAX does not use it",
+            "pixelbrax[cuda12]",
+        ),
+        (
+            {"jax_platform": "cpu", "has_nvidia": False},
+            "trouble",
+            "torch uses CUDA and JAX the CPU",
+            "pixelbrax[cuda12]",
+        ),
+        ({"torch_cuda": False}, "trouble", "JAX uses the GPU and torch cannot", "torch built for"),
+        (
+            {"jax_error": "RuntimeError: no backend", "to_torch": None, "to_jax": None},
+            "trouble",
+            "JAX finds no device to compute on: RuntimeError: no backend",
+            "JAX_PLATFORMS",
+        ),
+        ({"to_torch": False}, "trouble", "copied on their way from JAX to torch", "constraints"),
+        ({"to_jax": "BufferError: x"}, "trouble", "from torch to JAX: BufferError: x", "numpy"),
+        ({"environ": {}}, "note", "75% of the GPU's memory", "XLA_CLIENT_MEM_FRACTION=0.4"),
+        (
+            {
+                "environ": {
+                    "XLA_CLIENT_MEM_FRACTION": "0.4",
+                    "XLA_PYTHON_CLIENT_MEM_FRACTION": "0.4",
+                }
+            },
+            "trouble",
+            "are both set",
+            "unset XLA_PYTHON_CLIENT_MEM_FRACTION",
+        ),
+        ({"gl_libraries": ("libGL.so.1",)}, "note", "loaded libGL.so.1", ""),
+        (
+            {"versions": HEALTHY.versions | {"torchrl": None}},
+            "note",
+            "torchrl is not installed",
+            "pixelbrax[torchrl]",
+        ),
+    ],
+)
+def test_each_trouble_has_a_cure(changes, level, text, cure):
+    (finding,) = not_ok(**changes)
+    assert finding.level == level
+    assert text in finding.text
+    assert cure in finding.cure
+
+
+@pytest.mark.parametrize(
+    "environ",
+    [
+        {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"},
+        {"XLA_PYTHON_CLIENT_ALLOCATOR": "platform"},
+        {"XLA_CLIENT_MEM_FRACTION": ".3"},
+    ],
+)
+def test_memory_may_be_left_to_others(environ):
+    assert not not_ok(environ=environ)
+
+
+def test_a_cpu_alone_is_fine():
+    cpu = {
+        "jax_platform": "cpu",
+        "jax_device": "cpu:0",
+        "has_nvidia": False,
+        "torch_cuda": False,
+        "environ": {},
+    }
+    assert not not_ok(**cpu)
+    assert not not_ok(**cpu, to_torch=None, to_jax=None)
+
+
+def test_troubles_are_counted():
+    text = doctor.report(doctor.diagnose(replace(HEALTHY, to_torch=False, to_jax=False)))
+    assert text.endswith("2 troubles found.")
+    assert " -> use a current torch" in text
+
+
+def test_this_machine():
+    machine = doctor.inspect()
+    assert machine.versions["jax"] == version("jax")
+    assert machine.to_torch is True
+    assert machine.to_jax is True
+
+
+@pytest.mark.parametrize(("broken", "status"), [(False, 0), (True, 1)])
+def test_command(monkeypatch, capsys, broken, status):
+    machine = replace(HEALTHY, to_torch=not broken)
+    monkeypatch.setattr(doctor, "inspect", lambda: machine)
+    assert cli.main(["doctor"]) == status
+    assert ("1 trouble found." if broken else "All is well.") in capsys.readouterr().out
+
+
+def test_the_command_is_installed():
+    command = [sys.executable, "-m", "pixelbrax_jax.cli", "--version"]
+    result = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == version("pixelbrax")
+
+
+def test_an_unknown_command_lists_the_known(capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["docter"])
+    assert "doctor" in capsys.readouterr().err

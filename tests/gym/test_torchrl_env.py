@@ -1,0 +1,436 @@
+"""The TorchRL door: its contract, true transitions, partial resets, clear errors."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import error
+from tensordict import TensorDict
+from torchrl.collectors import Collector
+from torchrl.data import LazyTensorStorage, ReplayBuffer, Unbounded
+from torchrl.envs import (
+    CatFrames,
+    Compose,
+    RewardSum,
+    StepCounter,
+    ToTensorImage,
+    TransformedEnv,
+    check_env_specs,
+)
+
+import pixelbrax_gym
+import pixelbrax_jax
+from pixelbrax_gym.torchrl_specs import PixelSpec
+from tests.gym.conftest import TASK
+
+RIGHT = np.array([[-0.2], [0.9], [1.0]], np.float32)
+"""Ball 0 stays until the time limit; 1 and 2 leave the line, one before the other."""
+
+STAY = np.zeros((3, 1), np.float32)
+
+
+def act(td, action=RIGHT):
+    return td.set("action", torch.as_tensor(action))
+
+
+def policy(td):
+    return act(td, np.resize(RIGHT, (*td.shape, 1)))
+
+
+@pytest.mark.parametrize("obs_mode", ["pixels", "state", "both"])
+def test_specs(make_torchrl, obs_mode):
+    check_env_specs(make_torchrl(obs_mode=obs_mode))
+
+
+def test_keys_shapes_and_types(make_torchrl):
+    env = make_torchrl(obs_mode="both")
+    td = env.rand_step(env.reset())
+    expected = {
+        "pixels": ((3, 12, 12, 6), torch.uint8),
+        "observation": ((3, 2), torch.float32),
+        "reward": ((3, 1), torch.float32),
+        "done": ((3, 1), torch.bool),
+        "terminated": ((3, 1), torch.bool),
+        "truncated": ((3, 1), torch.bool),
+    }
+    assert {key: (tuple(value.shape), value.dtype) for key, value in td["next"].items()} == expected
+    assert td["action"].abs().max() <= 1.0
+    assert env.batch_size == torch.Size([3])
+    assert env.device == torch.device("cpu")
+
+
+@pytest.mark.parametrize("break_when", [True, False, "both"])
+def test_rollouts_count_every_step(make_torchrl, break_when):
+    env = make_torchrl(obs_mode="both")
+    options = {"break_when_any_done": break_when is True}
+    if break_when == "both":
+        options["break_when_all_done"] = True
+    ended = 0
+    for _ in range(3):
+        data = env.rollout(40, policy, **options)
+        check_transitions(data, frozen_after_end=break_when == "both")
+        ended += data["next", "done"].sum()
+    assert ended
+
+
+def check_transitions(data, *, frozen_after_end=False):
+    """The toy's second state feature counts steps: 0 first, and one more with each transition.
+
+    Where one environment's end does not end the rollout, TorchRL repeats its last transition.
+    """
+    steps = data["observation"][..., 1]
+    assert (data["next", "observation"][..., 1] == steps + 1).all()
+    assert (steps[..., 0] == 0).all()
+    # Where an episode went on, the next transition starts where this one ended.
+    goes_on = ~data["next", "done"][..., :-1, 0]
+    for key in ("pixels", "observation"):
+        after, before = data["next", key][..., :-1, :], data[key][..., 1:, :]
+        if key == "pixels":
+            after, before = data["next", key][:, :-1], data[key][:, 1:]
+        assert (after[goes_on] == before[goes_on]).all()
+    if frozen_after_end:
+        assert (steps[..., 1:][~goes_on] == steps[..., :-1][~goes_on]).all()
+    else:
+        assert (steps[..., 1:][~goes_on] == 0).all()
+
+
+def test_collector_transitions_are_true(make_torchrl):
+    collector = Collector(
+        make_torchrl(obs_mode="both"), policy, frames_per_batch=90, total_frames=180
+    )
+    batches = [batch.clone() for batch in collector]
+    collector.shutdown()
+    assert len(batches) == 2
+    data = torch.cat(batches, -1)
+    assert data["next", "terminated"].any()
+    assert data["next", "truncated"].any()
+    check_transitions(data)
+
+
+def test_one_end_leaves_the_others_alone(make_torchrl):
+    options = {"obs_mode": "both", "episode_length": 100}
+    env, alone = make_torchrl(**options), make_torchrl(**options)
+    td, expected = env.reset(), alone.reset()
+    ends = 0
+    for _ in range(40):
+        # Environment 1 ends again and again, the others merely live on.
+        action = np.array([[0.1], [1.0], [-0.1]], np.float32)
+        stepped, td = env.step_and_maybe_reset(act(td, action))
+        wanted = alone.step(act(expected, np.array([[0.1], [0.0], [-0.1]], np.float32)))
+        ends += stepped["next", "done"][1].item()
+        for row in (0, 2):
+            for key in ("pixels", "observation", "reward", "done"):
+                assert torch.equal(stepped["next", key][row], wanted["next", key][row])
+        expected = wanted["next"]
+    assert ends >= 2
+
+
+def test_reset_mask_changes_one_row(make_torchrl):
+    env, other = make_torchrl(obs_mode="both"), make_torchrl(obs_mode="both")
+    steps = [act(e.reset(), STAY) for e in (env, other)]
+    td, untouched = env.step(steps[0])["next"], other.step(steps[1])["next"]
+    td["_reset"] = torch.tensor([[False], [True], [False]])
+    reset = env.reset(td)
+    assert reset["observation"][:, 1].tolist() == [1.0, 0.0, 1.0]
+    later = env.step(act(reset, STAY))["next"]
+    expected = other.step(act(untouched, STAY))["next"]
+    for row in (0, 2):
+        assert torch.equal(later["pixels"][row], expected["pixels"][row])
+        assert torch.equal(later["observation"][row], expected["observation"][row])
+    assert later["observation"][1, 1] == 1.0
+
+
+def test_resets_hand_out_what_the_step_has_drawn(make_torchrl):
+    env = make_torchrl(obs_mode="both", episode_length=3)
+    td = env.reset()
+    calls = []
+    reset = env._stateful.reset
+    env._stateful.reset = lambda *args, **kwargs: calls.append(args) or reset(*args, **kwargs)
+    for _ in range(12):
+        _, td = env.step_and_maybe_reset(act(td))
+    # A full reset counts the episodes that have begun already.
+    for _ in range(3):
+        td = env.step(act(td))["next"]
+    assert td["done"].all()
+    first = env.reset()
+    assert not calls
+    assert first["observation"][:, 1].tolist() == [0.0] * 3
+
+
+def test_two_ends_may_be_reset_one_after_the_other(make_torchrl):
+    options = {"obs_mode": "both", "episode_length": 1}
+    env, together = make_torchrl(**options), make_torchrl(**options)
+    expected = together.step(act(together.reset()))["next"]
+    expected["_reset"] = expected["done"].clone()
+    expected = together.reset(expected)
+    td = env.step(act(env.reset()))["next"]
+    td["_reset"] = torch.tensor([[True], [False], [False]])
+    first = env.reset(td)
+    assert first["done"].flatten().tolist() == [False, True, True]
+    with pytest.raises(error.ResetNeeded, match=r"environment 1, 2 has ended.*'_reset'"):
+        env.step(act(first.clone()))
+    first["_reset"] = torch.tensor([[False], [True], [True]])
+    both = env.reset(first)
+    assert not both["done"].any()
+    for key in ("pixels", "observation"):
+        assert torch.equal(both[key], expected[key])
+
+
+def test_partial_steps_leave_the_rest(make_torchrl):
+    env, whole = make_torchrl(obs_mode="both"), make_torchrl(obs_mode="both")
+    td = env.step(act(env.reset(), STAY))["next"]
+    td["_step"] = torch.tensor([True, False, True])
+    env.step(act(td, STAY))
+    # Environment 1 has taken one step less than the others.
+    td = env.step(act(td.select("done"), STAY))["next"]
+    assert td["observation"][:, 1].tolist() == [3.0, 2.0, 3.0]
+    expected = whole.reset()
+    for _ in range(3):
+        expected = whole.step(act(expected, STAY))["next"]
+    for row in (0, 2):
+        assert torch.equal(td["pixels"][row], expected["pixels"][row])
+
+
+def test_tensors_are_the_buffers_that_jax_computed(make_torchrl):
+    env = make_torchrl(obs_mode="both")
+    stateful, seen = env._stateful, []
+    for name in ("reset", "step"):
+        method = getattr(stateful, name)
+
+        def spy(*args, method=method, **kwargs):
+            seen.append(method(*args, **kwargs))
+            return seen[-1]
+
+        setattr(stateful, name, spy)
+    td = env.reset()
+    assert td["pixels"].data_ptr() == seen[0]["obs"]["pixels"].unsafe_buffer_pointer()
+    td = env.step(act(td))["next"]
+    final = seen[1]["info"]["final_obs"]
+    assert td["pixels"].data_ptr() == final["pixels"].unsafe_buffer_pointer()
+    assert td["observation"].data_ptr() == final["state"].unsafe_buffer_pointer()
+    assert td["reward"].data_ptr() == seen[1]["reward"].unsafe_buffer_pointer()
+
+
+def test_writing_to_tensors_changes_nothing_later(make_torchrl):
+    clean, dirty = make_torchrl(obs_mode="both"), make_torchrl(obs_mode="both")
+    td, expected = dirty.reset(), clean.reset()
+    td["pixels"].fill_(7)
+    for _ in range(25):
+        done, td = dirty.step_and_maybe_reset(act(td))
+        wanted, expected = clean.step_and_maybe_reset(act(expected))
+        for key in ("pixels", "observation", "reward", "done"):
+            assert torch.equal(done["next", key], wanted["next", key])
+        # The last frame and the first of the next episode.
+        done["next", "pixels"].fill_(3)
+        td["pixels"].fill_(5)
+    td, expected = dirty.reset(), clean.reset()
+    assert torch.equal(td["pixels"], expected["pixels"])
+
+
+def test_seeds(make_torchrl):
+    def first(env):
+        return env.reset()["observation"][:, 0].tolist()
+
+    one = first(make_torchrl(obs_mode="state", seed=5))
+    assert first(make_torchrl(obs_mode="state", seed=5)) == one
+    assert first(make_torchrl(obs_mode="state", seed=6))[:2] == one[1:]
+    # Seeds of any size, as TorchRL hands them on.
+    assert first(make_torchrl(obs_mode="state", seed=2**32 + 5)) == one
+    unseeded = []
+    for _ in range(2):
+        torch.manual_seed(3)
+        unseeded.append(first(make_torchrl(obs_mode="state", seed=None)))
+    assert unseeded[0] == unseeded[1]
+    env = make_torchrl(obs_mode="state", seed=5)
+    assert first(env) == one
+    later = first(env)
+    assert later != one
+    env.set_seed(5)
+    assert first(env) == one
+    assert first(env) == later
+
+
+def test_episodes_are_those_of_gymnasium(make_torchrl, make_vector):
+    """First frames, all frames between, and true last ones, over several episodes."""
+    env = make_torchrl(obs_mode="both", episode_length=6)
+    gym_env = make_vector(obs_mode="both", autoreset_mode="same_step")
+    td, (obs, _) = env.reset(), gym_env.reset(seed=0)
+    for _ in range(20):
+        np.testing.assert_array_equal(td["pixels"], obs["pixels"])
+        stepped, td = env.step_and_maybe_reset(act(td))
+        obs, reward, terminated, truncated, info = gym_env.step(RIGHT)
+        np.testing.assert_array_equal(stepped["next", "reward"][:, 0], reward)
+        np.testing.assert_array_equal(stepped["next", "terminated"][:, 0], terminated)
+        np.testing.assert_array_equal(stepped["next", "truncated"][:, 0], truncated)
+        for i in np.flatnonzero(terminated | truncated):
+            final = info["final_obs"][i]
+            np.testing.assert_array_equal(stepped["next", "pixels"][i], final["pixels"])
+            np.testing.assert_array_equal(stepped["next", "observation"][i], final["state"])
+
+
+def test_transforms(make_torchrl):
+    env = TransformedEnv(
+        make_torchrl(frame_stack=1),
+        Compose(
+            ToTensorImage(),
+            CatFrames(N=2, dim=-3, in_keys=["pixels"]),
+            StepCounter(),
+            RewardSum(),
+        ),
+    )
+    check_env_specs(env)
+    data = env.rollout(25, policy, break_when_any_done=False)
+    assert data["pixels"].shape == (3, 25, 6, 12, 12)
+    assert data["pixels"].dtype == torch.float32
+    ended = data["next", "done"].squeeze(-1)
+    assert ended.any()
+    # The toy's reward is its position, and StepCounter starts anew with each episode.
+    assert data["step_count"][:, 1:][ended[:, :-1]].eq(0).all()
+    returns = data["next", "reward"].cumsum(1)[ended.cumsum(1) == 0]
+    torch.testing.assert_close(data["next", "episode_reward"][ended.cumsum(1) == 0], returns)
+
+
+def test_replay_buffer(make_torchrl):
+    data = make_torchrl().rollout(12, policy, break_when_any_done=False)
+    buffer = ReplayBuffer(storage=LazyTensorStorage(100), batch_size=8)
+    buffer.extend(data.reshape(-1))
+    sample = buffer.sample()
+    assert sample["next", "pixels"].dtype == torch.uint8
+    assert len(buffer) == 36
+
+
+def test_render(make_torchrl):
+    env = make_torchrl(render_height=10, render_width=14)
+    env.reset()
+    pictures = env.render()
+    assert pictures.shape == (3, 10, 14, 3)
+    assert pictures.dtype == torch.uint8
+
+
+def test_infos(make_torchrl):
+    env = make_torchrl(obs_mode="state")
+    td = env.reset()
+    rewards = torch.zeros(3)
+    for steps in (1, 2):
+        td = env.step(act(td, STAY))["next"]
+        rewards += td["reward"][:, 0]
+        assert env.infos["episode_length"].tolist() == [steps] * 3
+    torch.testing.assert_close(env.infos["episode_return"], rewards)
+    assert not env.infos["non_finite"].any()
+
+
+@pytest.mark.parametrize(
+    ("action", "error_type", "message"),
+    [
+        (torch.zeros(3, 2), ValueError, r"action must have shape \(3, 1\), got \(3, 2\)"),
+        (torch.zeros(3, 1, dtype=torch.int64), TypeError, "floating point.*int64"),
+        (torch.full((3, 1), torch.nan), ValueError, "environment 0, 1, 2 contains NaN"),
+    ],
+)
+def test_bad_actions(make_torchrl, action, error_type, message):
+    env = make_torchrl(obs_mode="state")
+    td = env.reset()
+    bad = TensorDict({"action": action}, batch_size=[3])
+    with pytest.raises(error_type, match=message):
+        env.step(bad)
+    assert env.step(act(td))["next", "observation"][:, 1].tolist() == [1.0] * 3
+
+
+def test_actions_are_converted(make_torchrl):
+    wanted = torch.tensor([[0.25], [-0.5], [1.0]])
+    strided = torch.zeros(3, 2)
+    strided[:, :1] = wanted
+    results = []
+    for action in (
+        wanted,
+        wanted.double(),
+        wanted.clone().requires_grad_(),
+        strided[:, :1],
+    ):
+        env = make_torchrl(obs_mode="state")
+        td = env.reset().set("action", action)
+        results.append(env.step(td)["next", "observation"])
+    for result in results[1:]:
+        assert torch.equal(result, results[0])
+
+
+def test_wrong_batch_size(make_torchrl):
+    env = make_torchrl()
+    env.reset()
+    with pytest.raises(RuntimeError, match="shape"):
+        env.step(TensorDict({"action": torch.zeros(2, 1)}, batch_size=[2]))
+
+
+def test_use_out_of_order(make_torchrl):
+    env = make_torchrl()
+    with pytest.raises(error.ResetNeeded, match="reset"):
+        env.step(TensorDict({"action": torch.zeros(3, 1)}, batch_size=[3]))
+    env.reset()
+    env.close()
+    env.close()
+    with pytest.raises(error.ClosedEnvironmentError, match="closed"):
+        env.reset()
+
+
+def test_options_are_checked():
+    with pytest.raises(ValueError, match=r"unknown option: 'heigth'.*Did you mean 'height'"):
+        pixelbrax_gym.PixelBraxTorchRLEnv(TASK, 2, heigth=12)
+
+
+@pytest.mark.parametrize("obs_mode", ["pixels", "state"])
+def test_specs_cost_no_memory(obs_mode):
+    spec = pixelbrax_gym.torchrl_specs.observation_spec(
+        pixelbrax_jax.make(TASK, obs_mode=obs_mode)[0].obs_spec, 4096, torch.device("cpu")
+    )
+    assert spec["pixels" if obs_mode == "pixels" else "observation"].shape[0] == 4096
+    if obs_mode == "pixels":
+        for derived in (spec, spec.clone(), spec.to("cpu"), spec.expand(1, 4096), spec[:7]):
+            assert derived["pixels"].space is None
+
+
+def test_pixel_spec_behaves_as_unbounded():
+    ours = PixelSpec((2, 4, 4, 3))
+    theirs = Unbounded((2, 4, 4, 3), dtype=torch.uint8)
+    assert ours == theirs
+    assert ours == ours.clone()
+    assert ours != PixelSpec((2, 4, 4, 6))
+    for spec in (ours, theirs):
+        assert spec.is_in(spec.rand())
+        assert not spec.is_in(spec.rand().float())
+        assert spec.zero().shape == (2, 4, 4, 3)
+        assert spec.rand((5,)).shape == (5, 2, 4, 4, 3)
+        assert spec.to(torch.float32).dtype == torch.float32
+    assert type(ours.to(torch.float32)) is PixelSpec
+    assert "PixelSpec" in repr(ours)
+
+
+def test_nothing_is_compiled_twice(make_torchrl):
+    env = make_torchrl()
+    td = env.reset()
+    counts = []
+    for num_steps in (20, 200):
+        for _ in range(num_steps):
+            _, td = env.step_and_maybe_reset(env.rand_action(td))
+        programs = env._stateful._programs
+        counts.append([p._cache_size() for p in (programs.step, programs.reset_where)])
+    assert counts[0] == counts[1]
+    assert counts[0][0] == 1
+
+
+def test_missing_torchrl_names_the_cure(monkeypatch):
+    import builtins
+    import importlib
+    import sys
+
+    real = builtins.__import__
+
+    def without(name, *args, **kwargs):
+        if name.partition(".")[0] == "torchrl":
+            raise ImportError(name)
+        return real(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    monkeypatch.delitem(sys.modules, "pixelbrax_gym.torchrl_env")
+    with pytest.raises(ImportError, match=r'pip install "pixelbrax\[torchrl\]"'):
+        importlib.import_module("pixelbrax_gym.torchrl_env")
