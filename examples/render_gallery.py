@@ -21,12 +21,6 @@ SIZE = 336  # four times the 84 pixels that agents get
 GAP = 8
 
 
-def to_uint8(frame: pixelbrax_jax.Frame) -> np.ndarray:
-    """(H, W, 3) uint8 pixels of a float frame."""
-    rgb = np.stack([frame.r, frame.g, frame.b], axis=-1)
-    return np.floor(255.0 * rgb + 0.5).astype(np.uint8)
-
-
 def strip(task: str, num_steps: int) -> np.ndarray:
     """The task's three pictures side by side, (SIZE, 3 SIZE + gaps, 3) uint8."""
     env, params = pixelbrax_jax.make(task, obs_mode="state")
@@ -43,7 +37,7 @@ def strip(task: str, num_steps: int) -> np.ndarray:
         ("original", False, SIZE),
     ):
         dressed = params.replace(look=pixelbrax_jax.make_look(look, shadows=shadows))
-        pixels = to_uint8(env.render(state, dressed, size, size))
+        pixels = np.asarray(env.picture(state, dressed, size, size))
         pictures.append(pixels.repeat(SIZE // size, axis=0).repeat(SIZE // size, axis=1))
     gap = np.full((SIZE, GAP, 3), 255, np.uint8)
     return np.concatenate([pictures[0], gap, pictures[1], gap, pictures[2]], axis=1)

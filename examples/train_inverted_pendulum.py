@@ -156,7 +156,9 @@ class Rollouts:
             obs = self.obs.to(self.device)
             policy, value = agent(obs)
             action = policy.sample()
-            self.obs, reward, terminated, truncated, info = self.envs.step(action)
+            # Where PyTorch and JAX work on different devices, actions and frames are copied.
+            action_there = action.to(self.obs.device)
+            self.obs, reward, terminated, truncated, info = self.envs.step(action_there)
             terminated, truncated = terminated.to(self.device), truncated.to(self.device)
             done = terminated | truncated
             for key, tensor in (
@@ -252,7 +254,7 @@ def evaluate(agent: Agent, config: Config, device: torch.device) -> list[float]:
     running = torch.ones(config.eval_episodes, dtype=torch.bool)
     while running.any():
         policy, _ = agent(obs.to(device))
-        obs, reward, terminated, truncated, _ = envs.step(policy.mean)
+        obs, reward, terminated, truncated, _ = envs.step(policy.mean.to(obs.device))
         returns += reward.cpu() * running
         running &= ~(terminated | truncated).cpu()
     envs.close()
@@ -275,7 +277,7 @@ def record(agent: Agent, config: Config, device: torch.device, path: Path) -> No
     frames = [env.render()]
     for _ in range(config.video_steps):
         policy, _ = agent(obs[None].to(device))
-        obs, _, terminated, truncated, _ = env.step(policy.mean[0])
+        obs, _, terminated, truncated, _ = env.step(policy.mean[0].to(obs.device))
         frames.append(env.render())
         if terminated or truncated:
             obs, _ = env.reset()

@@ -75,6 +75,11 @@ def _check_nan(values: np.ndarray) -> None:
         return
     if values.ndim == 1:
         raise ValueError("the action contains NaN; nothing was stepped.")
-    rows = np.flatnonzero(bad.any(axis=1))
-    names = ", ".join(str(row) for row in rows[:_MANY]) + (", ..." if len(rows) > _MANY else "")
-    raise ValueError(f"the action of environment {names} contains NaN; nothing was stepped.")
+    rows = name_rows(bad.any(axis=1))
+    raise ValueError(f"the action of environment {rows} contains NaN; nothing was stepped.")
+
+
+def name_rows(mask: np.ndarray) -> str:
+    """The environments of an (N,) mask for a message; of many, the first ones."""
+    rows = np.flatnonzero(mask)
+    return ", ".join(str(row) for row in rows[:_MANY]) + (", ..." if len(rows) > _MANY else "")

@@ -6,7 +6,7 @@ import importlib.metadata
 import os
 import platform
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +15,8 @@ _OPTIONAL = {"torch": "torch", "torchrl": "torchrl", "stable-baselines3": "sb3"}
 """Package -> the extra that brings it."""
 
 _GL_LIBRARIES = ("libGL.", "libEGL.", "libOSMesa.", "libGLX.")
+
+_GPUS = ("gpu", "cuda", "rocm")
 
 _PREALLOCATE = "XLA_PYTHON_CLIENT_PREALLOCATE"
 _FRACTION = "XLA_CLIENT_MEM_FRACTION"
@@ -32,7 +34,7 @@ class Machine:
         jax_platform: ``"cpu"``, ``"gpu"``, ``"tpu"``, ...
         jax_error: why JAX has no device, else None.
         has_nvidia: whether the system has an NVIDIA GPU.
-        torch_cuda: whether torch can use CUDA; None without torch.
+        torch_cuda: whether torch can use CUDA; None without torch, or why it cannot be imported.
         to_torch: whether an array of JAX's became a tensor on the same memory; None without
             torch, or an explanation where it failed.
         to_jax: the same, from a tensor to an array.
@@ -45,7 +47,7 @@ class Machine:
     jax_platform: str | None
     jax_error: str | None
     has_nvidia: bool
-    torch_cuda: bool | None
+    torch_cuda: bool | str | None
     to_torch: bool | str | None
     to_jax: bool | str | None
     gl_libraries: tuple[str, ...] | None
@@ -78,14 +80,12 @@ def inspect() -> Machine:
         device, jax_platform = str(first), first.platform
     except Exception as error:  # whatever it is, it shall be reported and not raised
         jax_error = f"{type(error).__name__}: {error}"
-    torch_cuda: bool | None = None
+    torch_cuda: bool | str | None = None
     to_torch: bool | str | None = None
     to_jax: bool | str | None = None
     if versions["torch"] is not None:
-        import torch
-
-        torch_cuda = torch.cuda.is_available()
-        if jax_error is None:
+        torch_cuda = _attempt(_torch_has_cuda)
+        if jax_error is None and isinstance(torch_cuda, bool):
             to_torch, to_jax = _attempt(_shares_to_torch), _attempt(_shares_to_jax)
     return Machine(
         versions=versions,
@@ -164,13 +164,26 @@ def _about_devices(machine: Machine) -> Iterator[Finding]:
         )
     if machine.torch_cuda is None:
         return
-    if on_cpu and machine.torch_cuda:
+    on_gpu = machine.jax_platform in _GPUS
+    if isinstance(machine.torch_cuda, str):
+        yield Finding(
+            "trouble",
+            f"torch is installed and cannot be imported: {machine.torch_cuda}",
+            "install it again, see https://pytorch.org/get-started/locally",
+        )
+    elif not on_cpu and not on_gpu:
+        yield Finding(
+            "note",
+            f"torch cannot share the memory of a {machine.jax_platform}",
+            "use output='numpy' or output='jax'",
+        )
+    elif on_cpu and machine.torch_cuda:
         yield Finding(
             "trouble",
             "torch uses CUDA and JAX the CPU: frames are drawn slowly and must be copied",
             'pip install "pixelbrax[cuda12]" or "pixelbrax[cuda13]"',
         )
-    elif machine.jax_platform in ("gpu", "cuda", "rocm") and not machine.torch_cuda:
+    elif on_gpu and not machine.torch_cuda:
         yield Finding(
             "trouble",
             "JAX uses the GPU and torch cannot: output='torch' will not work",
@@ -206,17 +219,20 @@ def _about_memory(machine: Machine) -> Iterator[Finding]:
             f"{_FRACTION} and {_OLD_FRACTION} are both set, which JAX refuses",
             f"unset {_OLD_FRACTION}",
         )
-    if machine.jax_platform not in ("gpu", "cuda", "rocm"):
+    if machine.jax_platform not in _GPUS:
         return
-    preallocates = environ.get(_PREALLOCATE, "true").lower() not in ("false", "0")
-    if environ.get(_ALLOCATOR, "default") in ("platform", "cuda_async"):
+    # As JAX itself reads them.
+    preallocates = environ.get(_PREALLOCATE) not in ("false", "False", "0")
+    if environ.get(_ALLOCATOR, "default").lower() in ("platform", "cuda_async"):
         preallocates = False
-    fraction = environ.get(_FRACTION, environ.get(_OLD_FRACTION, "0.75"))
-    if preallocates and float(fraction) > 0.5 and machine.torch_cuda:
+    try:
+        fraction = float(environ.get(_FRACTION) or environ.get(_OLD_FRACTION) or 0.75)
+    except ValueError:
+        fraction = 0.75
+    if preallocates and fraction > 0.5 and machine.torch_cuda:
         yield Finding(
             "note",
-            f"JAX takes {float(fraction):.0%} of the GPU's memory at its start and leaves torch "
-            "the rest",
+            f"JAX takes {fraction:.0%} of the GPU's memory at its start and leaves torch the rest",
             f"export {_FRACTION}=0.4, or {_PREALLOCATE}=false, before Python starts",
         )
     else:
@@ -240,12 +256,17 @@ def _version(package: str) -> str | None:
         return None
 
 
-def _attempt(check: object) -> bool | str:
-    assert callable(check)
+def _attempt(check: Callable[[], bool]) -> bool | str:
     try:
         return bool(check())
     except Exception as error:  # reported, not raised
         return f"{type(error).__name__}: {error}"
+
+
+def _torch_has_cuda() -> bool:
+    import torch
+
+    return bool(torch.cuda.is_available())
 
 
 def _shares_to_torch() -> bool:
@@ -272,8 +293,10 @@ def _shares_to_jax() -> bool:
 
 def _gl_libraries() -> tuple[str, ...] | None:
     """OpenGL libraries in this process, after all that draws a frame has been imported."""
-    import pixelbrax_jax  # noqa: F401
-
+    try:
+        import pixelbrax_jax  # noqa: F401
+    except Exception:  # told of elsewhere
+        return None
     maps = Path("/proc/self/maps")
     if not sys.platform.startswith("linux") or not maps.exists():
         return None

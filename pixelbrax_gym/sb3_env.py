@@ -19,7 +19,7 @@ except ImportError as missing:
 from pixelbrax_gym.dlpack import to_host
 from pixelbrax_gym.single_env import check_render_size
 from pixelbrax_gym.spaces import action_space, channels_first_space, observation_space
-from pixelbrax_gym.stateful import SEEDS, StatefulEnv
+from pixelbrax_gym.stateful import SEEDS, StatefulEnv, spread_seeds
 from pixelbrax_jax.choices import check_choice
 
 _OWN_OPTIONS = (
@@ -141,14 +141,18 @@ class PixelBraxSB3VecEnv(VecEnv):
         """Environment i draws from ``seed + i`` from the next reset on.
 
         Args:
-            seed: in [0, 2**32); NumPy's global generator draws one for None.
+            seed: a whole number; beyond 2**32 - 1 they begin anew at 0. NumPy's global generator
+                draws one for None.
 
         Returns:
             The N seeds.
+
+        Raises:
+            TypeError: it is not a whole number.
         """
         if seed is None:
             seed = int(np.random.randint(SEEDS, dtype=np.uint64))  # noqa: NPY002  # as SB3 does
-        seeds = [(int(seed) + i) % SEEDS for i in range(self.num_envs)]
+        seeds = spread_seeds(seed, self.num_envs)
         self._seeds = list(seeds)
         return seeds
 

@@ -11,7 +11,7 @@ from pixelbrax_gym.export import exporter
 from pixelbrax_gym.spaces import action_space, observation_space
 from pixelbrax_gym.stateful import StatefulEnv
 from pixelbrax_gym.window import Window
-from pixelbrax_jax.choices import check_choice
+from pixelbrax_jax.choices import check_choice, check_whole
 
 RENDER_MODES = ("human", "rgb_array")
 
@@ -183,10 +183,7 @@ def check_render_size(height: Any, width: Any) -> tuple[int, int]:
     Raises:
         ValueError: it is not a pair of whole numbers of at least 1.
     """
-    for name, value in (("render_height", height), ("render_width", width)):
-        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
-            raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}.")
-    return int(height), int(width)
+    return check_whole("render_height", height), check_whole("render_width", width)
 
 
 def _plain(info: dict[str, Any]) -> dict[str, Any]:

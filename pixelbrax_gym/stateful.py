@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from gymnasium import error
 
-from pixelbrax_gym.actions import as_actions
+from pixelbrax_gym.actions import as_actions, name_rows
 from pixelbrax_gym.fork import check_not_forked, is_forked
 from pixelbrax_jax import PixelEnv, VectorPixelEnv, registry
-from pixelbrax_jax.choices import check_choice
+from pixelbrax_jax.choices import check_choice, check_whole
 from pixelbrax_jax.types import EnvParams, EnvState, Timestep
 
 SEEDS = 2**32
@@ -71,9 +71,7 @@ class StatefulEnv:
         """
         self.env, self.params = _make(task, dict(options), max_episode_steps, also_allowed)
         # Before the cache is asked, to which True is as good as 1.
-        if isinstance(num_envs, bool) or int(num_envs) != num_envs or num_envs < 1:
-            raise ValueError(f"num_envs must be a whole number of at least 1, got {num_envs!r}.")
-        self.num_envs, self.single = int(num_envs), single
+        self.num_envs, self.single = check_whole("num_envs", num_envs), single
         self._programs = _programs(self.env, self.num_envs, autoreset_mode, single)
         self._must_reset = autoreset_mode == "disabled"
         self._state: EnvState | None = None
@@ -235,10 +233,10 @@ class StatefulEnv:
             return
         if self.single:
             raise error.ResetNeeded("the episode has ended; call reset() before the next step().")
-        names = ", ".join(map(str, np.flatnonzero(done)))
         raise error.ResetNeeded(
-            f"the episode of environment {names} has ended and autoreset is disabled; call "
-            'reset(options={"reset_mask": mask}) with those entries True before the next step().'
+            f"the episode of environment {name_rows(done)} has ended and autoreset is disabled; "
+            'call reset(options={"reset_mask": mask}) with those entries True before the next '
+            "step()."
         )
 
     def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
@@ -358,9 +356,9 @@ def _make(
                 "give either max_episode_steps, which counts calls of step(), or "
                 "episode_length, which counts control steps."
             )
-        if isinstance(max_episode_steps, bool) or not max_episode_steps >= 1:
-            raise ValueError(f"max_episode_steps must be at least 1, got {max_episode_steps!r}.")
-        options["episode_length"] = max_episode_steps * options.get("action_repeat", 1)
+        calls = check_whole("max_episode_steps", max_episode_steps)
+        repeat = check_whole("action_repeat", options.get("action_repeat", 1))
+        options["episode_length"] = calls * repeat
     try:
         known = (task, frozenset(options.items()))
         is_made = known in _made
@@ -374,6 +372,19 @@ def _make(
     if known is not None:
         _made.add(known)
     return made
+
+
+def spread_seeds(seed: int, num_envs: int) -> list[int]:
+    """Seed i is ``seed + i``, beginning anew at 0 beyond 2**32 - 1.
+
+    For frameworks that hand seeds of any size from one environment to the next.
+
+    Raises:
+        TypeError: it is not a whole number.
+    """
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)):
+        raise TypeError(f"a seed must be a whole number, got {seed!r}.")
+    return [(int(seed) + i) % SEEDS for i in range(num_envs)]
 
 
 def _check_seed(seed: Any) -> int:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import torch
 from gymnasium import error
 
 try:
+    import torch
     from tensordict import TensorDict, TensorDictBase
     from torchrl.data import Unbounded
     from torchrl.envs import EnvBase
@@ -17,9 +17,11 @@ except ImportError as missing:
         'TorchRL is not installed; try: pip install "pixelbrax[torchrl]"'
     ) from missing
 
+from pixelbrax_gym.actions import name_rows
 from pixelbrax_gym.dlpack import default_torch_device, to_torch
+from pixelbrax_gym.fork import check_not_forked
 from pixelbrax_gym.single_env import check_render_size
-from pixelbrax_gym.stateful import SEEDS, StatefulEnv
+from pixelbrax_gym.stateful import SEEDS, StatefulEnv, spread_seeds
 from pixelbrax_gym.torchrl_specs import action_spec, done_spec, observation_spec
 
 _OWN_OPTIONS = ("num_envs", "device", "render_height", "render_width")
@@ -44,9 +46,10 @@ class PixelBraxTorchRLEnv(EnvBase):
     s draws.
 
     Attributes:
-        infos: after a step, a dict of (N,) tensors about the episodes that the step belongs to:
-            ``episode_return`` (sum of rewards), ``episode_length`` (control steps), and
-            ``non_finite`` (the physics diverged and ended the episode).
+        infos: after a step, a dict of tensors of leading axis N about the episodes that the
+            step belongs to: ``episode_return`` (sum of rewards), ``episode_length`` (control
+            steps), ``non_finite`` (the physics diverged and ended the episode), and what
+            distractors tell.
 
     Example:
         >>> env = PixelBraxTorchRLEnv("ant", num_envs=256)
@@ -81,6 +84,7 @@ class PixelBraxTorchRLEnv(EnvBase):
             ValueError: an option is unknown or out of range; the message lists what is allowed.
             RuntimeError: this process is a fork that cannot run JAX.
         """
+        check_not_forked()
         stateful = StatefulEnv(
             task,
             options,
@@ -95,7 +99,8 @@ class PixelBraxTorchRLEnv(EnvBase):
         self.infos: dict[str, torch.Tensor] = {}
         self._stateful, self._num_envs = stateful, stateful.num_envs
         self._render_size = check_render_size(render_height, render_width)
-        self._seeds: list[int] | None = None
+        # Of environments whose next reset shall begin episode 0 of a seed; else None.
+        self._seeds: list[int | None] | None = None
         self._is_seeded = False
         # First observations of the episodes that the last step began, and where it began any.
         self._first_obs: Any = None
@@ -108,62 +113,70 @@ class PixelBraxTorchRLEnv(EnvBase):
         self.done_spec = done_spec(*size)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        del kwargs
+        if kwargs:
+            raise TypeError(
+                f"reset() takes no {', '.join(kwargs)}; seeds are given by set_seed(), everything "
+                "else when the environment is made."
+            )
         mask = np.ones(self._num_envs, bool)
         given = None if tensordict is None else tensordict.get("_reset", None)
         if given is not None:
             mask = given.reshape(self._num_envs).cpu().numpy()
-        began = np.asarray(self._began)
         if not self._is_seeded:
             self._set_seed(None)
-        seeds, self._seeds = self._seeds, None
+        seeds = None
         # An episode that has begun already is not begun twice, unless it shall have another seed.
-        fresh = mask if seeds is not None else mask & ~began
+        fresh = mask & ~np.asarray(self._began)
+        if self._seeds is not None:
+            seeds = [seed if here else None for seed, here in zip(self._seeds, mask, strict=True)]
+            fresh |= np.array([seed is not None for seed in seeds])
         if fresh.any() or self._first_obs is None:
             outputs = self._stateful.reset(seeds, mask=fresh)
             self._first_obs = outputs["obs"]
-        self._began = began & ~mask
+        self._began = np.asarray(self._began) & ~mask
+        if self._seeds is not None:
+            left = [None if here else seed for seed, here in zip(self._seeds, mask, strict=True)]
+            self._seeds = left if any(seed is not None for seed in left) else None
         # Handed out once, and so never shared by two who might write to it.
         obs, self._first_obs = self._first_obs, None
         return self._tensordict(self._observations(to_torch(obs)) | self._flags())
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         where = tensordict.get("_step", None)
-        if where is not None:
-            where = where.reshape(self._num_envs).cpu().numpy()
+        mask = None if where is None else where.reshape(self._num_envs).cpu().numpy()
         began = np.asarray(self._began)
-        ended = began if where is None else began & where
+        ended = began if mask is None else began & mask
         if ended.any():
             raise error.ResetNeeded(
-                f"the episode of environment {', '.join(map(str, np.flatnonzero(ended)))} has "
-                "ended; call reset() with their '_reset' True before the next step(). Should a "
-                "transform step several times in a row, use action_repeat instead."
+                f"the episode of environment {name_rows(ended)} has ended; call reset() with "
+                "their '_reset' True before the next step(). Should a transform step several "
+                "times in a row, use action_repeat instead."
             )
-        action = tensordict.get("action").to(self._jax_device)
-        outputs = self._stateful.step(action, where)
+        outputs = self._stateful.step(tensordict.get("action").to(self._jax_device), mask)
         infos = outputs["info"]
         self._first_obs = outputs["obs"]
-        self._began = outputs["done"] if where is None else began | np.asarray(outputs["done"])
+        # Not `done` itself, which leaves and may be written to.
+        self._began = infos["_final_obs"] if mask is None else began | np.asarray(outputs["done"])
+        names = ("reward", "done", "terminated", "truncated")
         exported = to_torch(
             {
                 "obs": infos["final_obs"],
-                "infos": infos["final_info"],
-                **{name: outputs[name] for name in ("reward", "done", "terminated", "truncated")},
+                "infos": {k: v for k, v in infos["final_info"].items() if k[0] != "_"},
+                **{name: outputs[name] for name in names},
             }
         )
-        self.infos = {
-            name: value for name, value in exported.pop("infos").items() if name[0] != "_"
-        }
-        observations = self._observations(exported.pop("obs"))
-        return self._tensordict(
-            observations | {name: value[:, None] for name, value in exported.items()}
-        )
+        self.infos = exported["infos"]
+        values = {name: exported[name][:, None] for name in names}
+        values |= self._observations(exported["obs"])
+        if where is not None:
+            values = _keep_unstepped(values, tensordict, where.reshape(self._num_envs))
+        return self._tensordict(values)
 
     def _set_seed(self, seed: int | None) -> None:
         """Environment i draws from ``seed + i`` from its next reset on; torch draws for None."""
         if seed is None:
             seed = int(torch.randint(SEEDS, ()))
-        self._seeds = [(int(seed) + i) % SEEDS for i in range(self._num_envs)]
+        self._seeds = list(spread_seeds(seed, self._num_envs))
         self._is_seeded = True
 
     def render(self) -> torch.Tensor:
@@ -198,3 +211,17 @@ class PixelBraxTorchRLEnv(EnvBase):
 
     def _tensordict(self, values: dict[str, torch.Tensor]) -> TensorDict:
         return TensorDict(values, batch_size=self.batch_size, device=self.device)
+
+
+def _keep_unstepped(
+    values: dict[str, torch.Tensor], before: TensorDictBase, where: torch.Tensor
+) -> dict[str, torch.Tensor]:
+    """``values``, but what was before, and no reward, for environments that were not stepped."""
+
+    def choose(name: str, value: torch.Tensor) -> torch.Tensor:
+        old = before.get(name, None) if name != "reward" else None
+        old = torch.zeros_like(value) if old is None else old.to(value.device)
+        here = where.to(value.device).reshape(-1, *[1] * (value.ndim - 1))
+        return torch.where(here, value, old)
+
+    return {name: choose(name, value) for name, value in values.items()}

@@ -223,7 +223,8 @@ class PixelBraxVectorEnv(gymnasium.vector.VectorEnv):
         final_obs = self._export(final_obs)
         rows = np.full(self.num_envs, None, dtype=object)
         for i in np.flatnonzero(done):
-            rows[i] = jax.tree.map(lambda x, i=i: x[i], final_obs)
+            # A copy: a view would keep the frames of all environments alive.
+            rows[i] = jax.tree.map(lambda x, i=i: x[i].copy(), final_obs)
         # Zero where no episode ended, as in Gymnasium's own vector environments.
         final_info = jax.tree.map(np.array, final_info)
         for value in final_info.values():

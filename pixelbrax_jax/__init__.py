@@ -1,5 +1,7 @@
 """PixelBrax: Brax physics seen through a pure-JAX ray-caster."""
 
+from pixelbrax_jax import distractors as distractors
+from pixelbrax_jax.distractors import load_clips as load_clips
 from pixelbrax_jax.envs.check import check_env as check_env
 from pixelbrax_jax.envs.pixel_env import PixelEnv as PixelEnv
 from pixelbrax_jax.envs.vector import AUTORESET_MODES as AUTORESET_MODES
@@ -17,6 +19,7 @@ from pixelbrax_jax.scene.look import make_look as make_look
 from pixelbrax_jax.scene.place import place as place
 from pixelbrax_jax.types import Camera as Camera
 from pixelbrax_jax.types import CameraRig as CameraRig
+from pixelbrax_jax.types import Clips as Clips
 from pixelbrax_jax.types import EnvParams as EnvParams
 from pixelbrax_jax.types import EnvState as EnvState
 from pixelbrax_jax.types import Frame as Frame

@@ -1,9 +1,10 @@
-"""One way to reject an unknown name."""
+"""One way to reject an unknown name, and one to reject what is not a count."""
 
 from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from numbers import Integral
 
 
 def check_choice(what: str, value: object, allowed: Iterable[str]) -> str:
@@ -29,3 +30,21 @@ def check_choice(what: str, value: object, allowed: Iterable[str]) -> str:
         match = next(n for n in names if n.lower() == nearest[0])
         message += f" Did you mean {match!r}?"
     raise ValueError(message)
+
+
+def check_whole(what: str, value: object) -> int:
+    """``value`` if it is a whole number of at least 1.
+
+    Args:
+        what: what the value stands for, as the message should call it.
+        value: what the user gave; Python's or NumPy's integers, but no truth values.
+
+    Returns:
+        ``value`` as Python's own.
+
+    Raises:
+        ValueError: otherwise, naming the value.
+    """
+    if isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= 1:
+        return int(value)
+    raise ValueError(f"{what} must be a whole number of at least 1, got {value!r}.")

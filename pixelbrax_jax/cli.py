@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -20,7 +20,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="pixelbrax", description="Continuous control from pixels, on JAX."
     )
-    parser.add_argument("--version", action="version", version=version("pixelbrax"))
+    parser.add_argument("--version", action="version", version=_version())
     commands = parser.add_subparsers(title="commands", required=True)
     command = commands.add_parser(
         "doctor",
@@ -32,6 +32,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     command.set_defaults(run=_doctor)
     options = parser.parse_args(arguments)
     return int(options.run())
+
+
+def _version() -> str:
+    try:
+        return version("pixelbrax")
+    except PackageNotFoundError:
+        return "not installed"
 
 
 def _doctor() -> int:

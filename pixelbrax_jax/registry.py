@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache, lru_cache, partial
+from pathlib import Path
 
 import jax
 import numpy as np
 
 from pixelbrax_jax import spatial
 from pixelbrax_jax.choices import check_choice
+from pixelbrax_jax.distractors.base import Distractor
+from pixelbrax_jax.distractors.clips import ClipBank, load_clips, warn_procedural
+from pixelbrax_jax.distractors.presets import resolve
+from pixelbrax_jax.distractors.video import Video
 from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.physics.base import Physics
 from pixelbrax_jax.physics.tasks import REWARD_PRESETS, TASKS, make_physics
 from pixelbrax_jax.scene.cameras import make_rig, rig_around
 from pixelbrax_jax.scene.look import make_look
-from pixelbrax_jax.types import Camera, CameraRig, EnvParams, GeomKind, Look
+from pixelbrax_jax.types import Camera, CameraRig, Clips, EnvParams, GeomKind, Look
 
 
 @dataclass(frozen=True)
@@ -88,6 +93,9 @@ def make(
     action_repeat: int = 1,
     episode_length: int = 1000,
     renderer: str = "fused",
+    distractors: str | Distractor | Iterable[str | Distractor] = (),
+    clips: str | Path | ClipBank | None = None,
+    split: str = "train",
 ) -> tuple[PixelEnv, EnvParams]:
     """A pixel environment and its parameters.
 
@@ -108,15 +116,23 @@ def make(
         action_repeat: control steps per step.
         episode_length: time limit in control steps.
         renderer: ``"fused"`` or ``"reference"``.
+        distractors: what changes the picture: a ``Distractor``, a name of
+            ``distractors.presets.PRESETS``, or several of them.
+        clips: what a video distractor plays: the folder of DAVIS-2017 or one with videos, a bank
+            of ``load_clips``, or ``"procedural"``; None means ``"procedural"`` with a warning.
+        split: which of the clips, ``"train"`` or ``"test"``; see ``load_clips``.
 
     Returns:
         The environment and its parameters.
 
     Raises:
         ValueError: a name is unknown or a number out of range; the message lists what is allowed.
+        FileNotFoundError: clips are missing.
+        MemoryError: the clips would take too much memory.
     """
     check_choice("task", task, _REGISTRY)
     check_choice("reward_preset", reward_preset, REWARD_PRESETS)
+    links = resolve(distractors, task)
     env = _pixel_env(
         task,
         backend,
@@ -128,14 +144,41 @@ def make(
         action_repeat,
         episode_length,
         renderer,
+        links,
     )
+    videos = [link for link in env.distractors.links if isinstance(link, Video)]
+    bank = _clips(clips, split, env.height, env.width, videos[0].num_clips) if videos else None
     rig = make_rig(task, camera, _fallback_rig(task))
     if not rig.link < len(env.physics.link_names):
         raise ValueError(
             f"the camera follows link {rig.link}, but task {task!r} has only "
             f"{len(env.physics.link_names)} links: {', '.join(env.physics.link_names)}."
         )
-    return env, EnvParams(geoms=env.physics.geoms, rig=rig, look=make_look(look, shadows=shadows))
+    look = make_look(look, shadows=shadows)
+    return env, EnvParams(geoms=env.physics.geoms, rig=rig, look=look, clips=bank)
+
+
+def _clips(
+    clips: str | Path | ClipBank | None,
+    split: str,
+    height: int,
+    width: int,
+    num_clips: int | None,
+) -> Clips:
+    """Clips on the device; equal ones are there once."""
+    if isinstance(clips, ClipBank):
+        bank = clips
+    else:
+        if clips is None:
+            warn_procedural()
+            clips = "procedural"
+        bank = load_clips(clips, split, height=height, width=width, num_clips=num_clips)
+    return _on_device(bank)
+
+
+@lru_cache(maxsize=8)
+def _on_device(bank: ClipBank) -> Clips:
+    return bank.to_device()
 
 
 @cache
@@ -156,6 +199,7 @@ def _pixel_env(
     action_repeat: int,
     episode_length: int,
     renderer: str,
+    distractors: tuple[Distractor, ...],
 ) -> PixelEnv:
     return PixelEnv(
         _physics(task, backend, reward_preset),
@@ -166,6 +210,7 @@ def _pixel_env(
         action_repeat=action_repeat,
         episode_length=episode_length,
         renderer=renderer,
+        distractors=distractors,
     )
 
 

@@ -176,6 +176,7 @@ class Frame(struct.PyTreeNode):
         depth: (H, W) float32, metres along the camera's viewing axis (not along the ray),
             ``inf`` where nothing is hit.
         seg: (H, W) int32, index of the geom seen, -1 for the sky.
+        ground: (H, W) bool, a plane is seen; cheaper to ask than ``seg``.
     """
 
     r: jax.Array
@@ -183,6 +184,21 @@ class Frame(struct.PyTreeNode):
     b: jax.Array
     depth: jax.Array
     seg: jax.Array
+    ground: jax.Array
+
+
+class Clips(struct.PyTreeNode):
+    """Video clips on the device, one after the other. C clips, T frames in all.
+
+    Attributes:
+        words: (T, H, W) uint32, packed pixels: red in the low byte, then green, then blue.
+        first: (C,) int32, index of a clip's first frame.
+        length: (C,) int32, frames of a clip, at least 1.
+    """
+
+    words: jax.Array
+    first: jax.Array
+    length: jax.Array
 
 
 class EnvParams(struct.PyTreeNode):
@@ -192,11 +208,13 @@ class EnvParams(struct.PyTreeNode):
         geoms: the shapes and their colors.
         rig: the camera rig.
         look: light, sky and ground.
+        clips: videos for the background; None where no distractor shows any.
     """
 
     geoms: Geoms
     rig: CameraRig
     look: Look
+    clips: Clips | None = None
 
 
 class EnvState(struct.PyTreeNode):
@@ -210,6 +228,7 @@ class EnvState(struct.PyTreeNode):
         step_count: () int32, control steps taken in this episode.
         episode_return: () float32, sum of rewards of this episode.
         done: () bool, the episode has ended and the next call must begin a new one.
+        distraction: states of the distractors, a tuple.
     """
 
     physics: PhysicsState
@@ -219,6 +238,7 @@ class EnvState(struct.PyTreeNode):
     step_count: jax.Array
     episode_return: jax.Array
     done: jax.Array
+    distraction: Any = ()
 
 
 class Timestep(struct.PyTreeNode):

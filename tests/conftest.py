@@ -2,6 +2,7 @@
 
 import gc
 import os
+from pathlib import Path
 
 # Nothing here may need a display.
 os.environ.setdefault("MPLBACKEND", "Agg")
@@ -10,13 +11,26 @@ os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
 import jax
 import pytest
 
+MAX_MAPS = 25_000
+"""Memory maps of this process beyond which compiled programs are forgotten."""
+
 
 def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
-    """Forgets compiled programs where one folder of tests ends.
+    """Forgets compiled programs where one folder of tests ends, or when there are too many.
 
     Every program maps memory of its own, and a process may have some 65,000 maps on Linux
     (vm.max_map_count). The compiler crashes beyond them.
     """
-    if nextitem is None or nextitem.path.parent != item.path.parent:
+    if (
+        nextitem is None
+        or nextitem.path.parent != item.path.parent
+        or (item.get_closest_marker("slow") and number_of_maps() > MAX_MAPS)
+    ):
         jax.clear_caches()
         gc.collect()
+
+
+def number_of_maps() -> int:
+    """Memory maps of this process; 0 where the system does not tell."""
+    maps = Path("/proc/self/maps")
+    return maps.read_bytes().count(b"\n") if maps.exists() else 0

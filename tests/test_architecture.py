@@ -63,6 +63,9 @@ HOMES: dict[str, set[str]] = {
 }
 """Third party -> the only files that may import it."""
 
+_DISTRIBUTIONS = {"PIL": "pillow"}
+"""Import name -> what is installed, where the two differ."""
+
 NO_NAMES = {"utils", "helpers", "common", "misc"}
 MAX_LINES = 450
 
@@ -158,7 +161,7 @@ def test_every_third_party_is_declared():
         if name not in ("dev", "docs")
         for line in lines
     }
-    used = {name.replace("_", "-") for name in third_parties(ROOT)}
+    used = {_DISTRIBUTIONS.get(name, name.replace("_", "-")) for name in third_parties(ROOT)}
     # TorchRL pins the release of tensordict that goes with it.
     used -= {"tensordict"}
     assert used <= core | extras, f"not declared: {used - core - extras}"

@@ -133,6 +133,13 @@ def test_included_sections_exist(name):
                 assert text.count(f"--8<-- [{end}:{section}]") == 1, f"{name}: {file}:{section}"
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_every_inclusion_is_understood(name):
+    """A formatter may take the scissors of an inclusion for Python and spread them out."""
+    text = (ROOT / name).read_text("utf-8")
+    assert len(re.findall(r"^\s*-+ ?8 ?<", text, re.MULTILINE)) == len(SNIPPET.findall(text))
+
+
 def table_of(section: str) -> list[list[str]]:
     """Rows of the table in a section of the README, without heading and code marks."""
     text = (ROOT / "README.md").read_text("utf-8")

@@ -8,12 +8,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from pixelbrax_jax.choices import check_choice
+from pixelbrax_jax.choices import check_choice, check_whole
+from pixelbrax_jax.distractors.base import Chain, Distractor
 from pixelbrax_jax.envs import observe
 from pixelbrax_jax.physics.base import Physics
 from pixelbrax_jax.renderer.base import RENDERERS, render
 from pixelbrax_jax.scene.place import place
-from pixelbrax_jax.types import EnvParams, EnvState, Frame, PhysicsState, Scene, Timestep
+from pixelbrax_jax.types import EnvParams, EnvState, Frame, Scene, Timestep
 
 OBS_MODES = ("pixels", "state", "both")
 
@@ -45,6 +46,7 @@ class PixelEnv:
         obs_mode: ``"pixels"``, ``"state"`` or ``"both"``.
         action_repeat: control steps per call of ``step``.
         episode_length: time limit, in control steps.
+        distractors: what changes the picture, a ``Chain``; empty without pixels.
     """
 
     def __init__(
@@ -58,6 +60,7 @@ class PixelEnv:
         action_repeat: int = 1,
         episode_length: int = 1000,
         renderer: str = "fused",
+        distractors: tuple[Distractor, ...] = (),
     ) -> None:
         """Checks the options.
 
@@ -70,25 +73,20 @@ class PixelEnv:
             action_repeat: control steps per call of ``step``, at least 1.
             episode_length: time limit in control steps, at least 1.
             renderer: ``"fused"`` or ``"reference"``.
+            distractors: what changes the picture; at most one of a kind.
 
         Raises:
             ValueError: an option is out of range; the message says what is allowed.
         """
-        whole = {
-            "height": height,
-            "width": width,
-            "frame_stack": frame_stack,
-            "action_repeat": action_repeat,
-            "episode_length": episode_length,
-        }
-        for name, value in whole.items():
-            if isinstance(value, bool) or int(value) != value or value < 1:
-                raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}.")
         self.physics = physics
-        self.height, self.width, self.frame_stack = int(height), int(width), int(frame_stack)
+        self.height = check_whole("height", height)
+        self.width = check_whole("width", width)
+        self.frame_stack = check_whole("frame_stack", frame_stack)
         self.obs_mode = check_choice("obs_mode", obs_mode, OBS_MODES)
-        self.action_repeat, self.episode_length = int(action_repeat), int(episode_length)
+        self.action_repeat = check_whole("action_repeat", action_repeat)
+        self.episode_length = check_whole("episode_length", episode_length)
         self.renderer = check_choice("renderer", renderer, RENDERERS)
+        self.distractors = Chain(distractors if obs_mode != "state" else ())
 
     @property
     def action_size(self) -> int:
@@ -123,7 +121,7 @@ class PixelEnv:
             TypeError: ``key`` is not a single typed key.
         """
         check_key(key)
-        state = self.begin(key, jnp.uint32(0))
+        state = self.begin(key, jnp.uint32(0), params)
         state = self.show(state, params, jnp.bool_(True))
         return state, self.timestep(state, jnp.float32(0.0))
 
@@ -149,13 +147,15 @@ class PixelEnv:
             * ``episode_return``: () float32, sum of this episode's rewards so far,
             * ``episode_length``: () int32, control steps so far,
             * ``non_finite``: () bool, the physics diverged; the episode is then terminated with
-              reward 0 and the last finite pose is shown.
+              reward 0 and the last finite pose is shown,
+
+            and what the distractors tell of themselves.
 
         Raises:
             ValueError: ``action`` has another shape.
             TypeError: ``action`` is not floating point.
         """
-        state, reward = self.advance(state, action)
+        state, reward = self.advance(state, action, params)
         state = self.show(state, params, jnp.bool_(False))
         return state, self.timestep(state, reward)
 
@@ -170,7 +170,7 @@ class PixelEnv:
         Returns:
             The state and the first timestep, with reward 0.
         """
-        state = self.begin(state.key, state.episode + 1)
+        state = self.begin(state.key, state.episode + 1, params)
         state = self.show(state, params, jnp.bool_(True))
         return state, self.timestep(state, jnp.float32(0.0))
 
@@ -182,7 +182,7 @@ class PixelEnv:
         height: int | None = None,
         width: int | None = None,
     ) -> Frame:
-        """The float frame of a state, at any size.
+        """The float frame of a state, at any size, distractors included.
 
         Args:
             state: the state to draw.
@@ -193,8 +193,10 @@ class PixelEnv:
         Returns:
             Colors, depth and segmentation.
         """
-        scene = self._scene(state.physics, params)
-        return render(scene, height or self.height, width or self.width, self.renderer)
+        height, width = self._size(height, width)
+        frame = render(self._scene(state, params), height, width, self.renderer)
+        backdrops = self.distractors.backdrops(state.distraction, params, height, width)
+        return self.distractors.change_frame(state.distraction, frame, backdrops)
 
     @partial(jax.jit, static_argnums=(0, 3, 4))
     def picture(
@@ -215,12 +217,12 @@ class PixelEnv:
         Returns:
             (height, width, 3) uint8, row 0 at the top.
         """
-        height, width = height or self.height, width or self.width
-        return observe.unpack(self.draw_at(state.physics, params, height, width))
+        height, width = self._size(height, width)
+        return observe.unpack(self.draw_at(state, params, height, width))
 
     # The pieces of a step, which `VectorPixelEnv` puts together in another order.
 
-    def begin(self, key: jax.Array, episode: jax.Array) -> EnvState:
+    def begin(self, key: jax.Array, episode: jax.Array, params: EnvParams) -> EnvState:
         """The state at the start of an episode, with nothing drawn yet."""
         episode_key = jax.random.fold_in(key, episode)
         shape = (self.height, self.width, 3 * self.frame_stack)
@@ -232,9 +234,12 @@ class PixelEnv:
             step_count=jnp.int32(0),
             episode_return=jnp.float32(0.0),
             done=jnp.bool_(False),
+            distraction=self.distractors.begin(episode_key, params),
         )
 
-    def advance(self, state: EnvState, action: jax.Array) -> tuple[EnvState, jax.Array]:
+    def advance(
+        self, state: EnvState, action: jax.Array, params: EnvParams
+    ) -> tuple[EnvState, jax.Array]:
         """The state after the action, with nothing drawn yet, and the reward."""
         action = self._check_action(action)
 
@@ -255,41 +260,48 @@ class PixelEnv:
             (physics, reward, count, _), _ = jax.lax.scan(
                 control_step, start, length=self.action_repeat
             )
+        # The number of this frame in its episode; the last one may come early.
+        frame = -(-count // self.action_repeat)
+        episode_key = jax.random.fold_in(state.key, state.episode)
         state = state.replace(
             physics=physics,
             step_count=count,
             episode_return=state.episode_return + reward,
             done=physics.terminated | (count >= limit),
+            distraction=self.distractors.advance(state.distraction, episode_key, frame, params),
         )
         return state, reward
 
-    def draw(self, physics: PhysicsState, params: EnvParams) -> jax.Array:
-        """The packed frame of a physics state, (H, W) uint32."""
-        return self.draw_at(physics, params, self.height, self.width)
+    def draw(self, state: EnvState, params: EnvParams) -> jax.Array:
+        """The packed frame of a state, (H, W) uint32."""
+        return self.draw_at(state, params, self.height, self.width)
 
-    def draw_at(
-        self, physics: PhysicsState, params: EnvParams, height: int, width: int
-    ) -> jax.Array:
-        """The packed frame of a physics state at any size, (height, width) uint32."""
-        scene = self._scene(physics, params)
+    def draw_at(self, state: EnvState, params: EnvParams, height: int, width: int) -> jax.Array:
+        """The packed frame of a state at any size, (height, width) uint32."""
+        scene = self._scene(state, params)
         # A loop over bands of rows is a wall that XLA does not fuse across: without it the
         # renderer is fused into whoever reads the words, and runs again for every reader.
         num_bands = max(2, round(height / _BAND_ROWS))
         rows = -(-height // num_bands)
 
-        def band(first_row: jax.Array) -> jax.Array:
-            return observe.pack(
-                render(scene, height, width, self.renderer, first_row=first_row, num_rows=rows)
-            )
+        def in_bands(picture: jax.Array) -> jax.Array:
+            missing = num_bands * rows - height
+            return jnp.pad(picture, ((0, missing), (0, 0))).reshape(num_bands, rows, width)
 
-        words = jax.lax.map(band, jnp.arange(num_bands) * rows)
+        def band(inputs: Any) -> jax.Array:
+            first_row, backdrops = inputs
+            frame = render(scene, height, width, self.renderer, first_row=first_row, num_rows=rows)
+            return observe.pack(self.distractors.change_frame(state.distraction, frame, backdrops))
+
+        backdrops = self.distractors.backdrops(state.distraction, params, height, width)
+        words = jax.lax.map(band, (jnp.arange(num_bands) * rows, jax.tree.map(in_bands, backdrops)))
         return words.reshape(-1, width)[:height]
 
     def show(self, state: EnvState, params: EnvParams, first: jax.Array) -> EnvState:
         """``state`` with its present frame on the stack."""
         if self.obs_mode == "state":
             return state
-        newest = self.draw(state.physics, params)
+        newest = self.draw(state, params)
         return state.replace(frames=observe.push(state.frames, newest, first))
 
     def timestep(self, state: EnvState, reward: jax.Array) -> Timestep:
@@ -304,6 +316,7 @@ class PixelEnv:
                 "episode_return": state.episode_return,
                 "episode_length": state.step_count,
                 "non_finite": state.physics.non_finite,
+                **self.distractors.info(state.distraction),
             },
         )
 
@@ -315,7 +328,15 @@ class PixelEnv:
             return state.frames
         return {"pixels": state.frames, "state": state.physics.obs}
 
-    def _scene(self, physics: PhysicsState, params: EnvParams) -> Scene:
+    def _size(self, height: int | None, width: int | None) -> tuple[int, int]:
+        return (
+            self.height if height is None else check_whole("height", height),
+            self.width if width is None else check_whole("width", width),
+        )
+
+    def _scene(self, state: EnvState, params: EnvParams) -> Scene:
+        params = self.distractors.change_params(state.distraction, params)
+        physics = state.physics
         return place(params.geoms, params.rig, params.look, physics.xpos, physics.xquat)
 
     def _check_action(self, action: jax.Array) -> jax.Array:

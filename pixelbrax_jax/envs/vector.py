@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from pixelbrax_jax.choices import check_choice
+from pixelbrax_jax.choices import check_choice, check_whole
 from pixelbrax_jax.envs import observe
 from pixelbrax_jax.envs.pixel_env import PixelEnv, check_key
 from pixelbrax_jax.types import EnvParams, EnvState, Timestep
@@ -55,10 +55,8 @@ class VectorPixelEnv:
         Raises:
             ValueError: an option is out of range; the message says what is allowed.
         """
-        if isinstance(num_envs, bool) or int(num_envs) != num_envs or num_envs < 1:
-            raise ValueError(f"num_envs must be a whole number of at least 1, got {num_envs!r}.")
         self.env = env
-        self.num_envs = int(num_envs)
+        self.num_envs = check_whole("num_envs", num_envs)
         self.autoreset_mode = check_choice("autoreset_mode", autoreset_mode, AUTORESET_MODES)
 
     @partial(jax.jit, static_argnums=0)
@@ -77,7 +75,8 @@ class VectorPixelEnv:
             TypeError: ``key`` is neither.
         """
         keys = self._env_keys(key)
-        state = jax.vmap(self.env.begin)(keys, jnp.zeros(self.num_envs, jnp.uint32))
+        episode = jnp.zeros(self.num_envs, jnp.uint32)
+        state = jax.vmap(self.env.begin, in_axes=(0, 0, None))(keys, episode, params)
         state = self._show(state, params, jnp.ones(self.num_envs, bool))
         return state, self._timestep(state, jnp.zeros(self.num_envs))
 
@@ -143,9 +142,9 @@ class VectorPixelEnv:
         if action.shape != expected:
             raise ValueError(f"action must have shape {expected}, got {tuple(action.shape)}.")
         begins = state.done
-        state, reward = jax.vmap(self.env.advance)(state, action)
+        state, reward = jax.vmap(self.env.advance, in_axes=(0, 0, None))(state, action, params)
         if self.autoreset_mode == "next_step":
-            state = self._restart(state, begins, state.episode + 1)
+            state = self._restart(state, begins, state.episode + 1, params)
             state = self._show(state, params, begins)
             return state, self._timestep(state, jnp.where(begins, 0.0, reward))
         state = self._show(state, params, jnp.zeros(self.num_envs, bool))
@@ -170,12 +169,14 @@ class VectorPixelEnv:
     def _show(self, state: EnvState, params: EnvParams, first: jax.Array) -> EnvState:
         return jax.vmap(self.env.show, in_axes=(0, None, 0))(state, params, first)
 
-    def _restart(self, state: EnvState, mask: jax.Array, episode: jax.Array) -> EnvState:
+    def _restart(
+        self, state: EnvState, mask: jax.Array, episode: jax.Array, params: EnvParams
+    ) -> EnvState:
         """``state`` with fresh episodes where ``mask``, whose frames are not drawn yet."""
 
         def begin(key: jax.Array, episode: jax.Array) -> EnvState:
             # The key stays, and the frames are not ready: neither travels through the loop.
-            return self.env.begin(key, episode).replace(key=None, frames=None)
+            return self.env.begin(key, episode, params).replace(key=None, frames=None)
 
         kept = state.replace(key=None, frames=None)
         begun = _replace_rows(begin, (state.key, episode), mask, kept)
@@ -185,13 +186,12 @@ class VectorPixelEnv:
         self, state: EnvState, mask: jax.Array, episode: jax.Array, params: EnvParams
     ) -> EnvState:
         """``state`` with fresh episodes where ``mask``, drawn; the others keep their frames."""
-        state = self._restart(state, mask, episode)
+        state = self._restart(state, mask, episode, params)
         if self.env.obs_mode == "state":
             return state
         blank = jnp.zeros((self.num_envs, self.env.height, self.env.width), jnp.uint32)
-        newest = _replace_rows(
-            lambda physics: self.env.draw(physics, params), (state.physics,), mask, blank
-        )
+        shown = state.replace(key=None, frames=None)
+        newest = _replace_rows(lambda row: self.env.draw(row, params), (shown,), mask, blank)
         first = jax.vmap(observe.push)(state.frames, newest, jnp.ones_like(mask))
         # Environments that go on keep their stack as it is: nothing new was drawn for them.
         return state.replace(frames=jnp.where(mask[:, None, None, None], first, state.frames))

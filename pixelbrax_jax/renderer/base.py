@@ -30,7 +30,7 @@ def render(
     sizes, colors, camera and light. The derivative is finite everywhere. It is that of the
     surface seen at the pixel's center, hence right away from silhouettes, shadow edges and
     the borders between geoms; how those edges move is not in it, nor is the gloss that begins
-    or ends where a surface turns to the light. ``seg`` has no derivative.
+    or ends where a surface turns to the light. ``seg`` and ``ground`` have none.
 
     Args:
         scene: what to draw, in the world frame.
@@ -68,8 +68,11 @@ def _fused_jvp(
     scene, first_row = primals
 
     def floats(scene: Scene) -> Frame:
-        return reference.render(scene, height, width, first_row, num_rows).replace(seg=None)
+        return reference.render(scene, height, width, first_row, num_rows).replace(
+            seg=None, ground=None
+        )
 
     _, tangent = jax.jvp(floats, (scene,), tangents[:1])
     frame = fused.render(scene, height, width, first_row, num_rows)
-    return frame, tangent.replace(seg=np.zeros(frame.seg.shape, jax.dtypes.float0))
+    none = np.zeros(frame.seg.shape, jax.dtypes.float0)
+    return frame, tangent.replace(seg=none, ground=none)

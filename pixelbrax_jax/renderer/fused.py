@@ -109,7 +109,18 @@ def render(
 
     geom_of_rank = jnp.array([*order, -1], jnp.int32)
     depth = jnp.where(sky, jnp.inf, -t * ray[2])
-    return Frame(r=planes[0], g=planes[1], b=planes[2], depth=depth, seg=geom_of_rank[winner])
+    on_plane = jnp.zeros(shape, bool)
+    for rank, kind in enumerate(kinds):
+        if kind == GeomKind.PLANE:
+            on_plane |= seen[rank]
+    return Frame(
+        r=planes[0],
+        g=planes[1],
+        b=planes[2],
+        depth=depth,
+        seg=geom_of_rank[winner],
+        ground=on_plane,
+    )
 
 
 def _rays(

@@ -79,6 +79,7 @@ def render(
         b=rgb[..., 2],
         depth=jnp.where(hit, -t * (rays @ back), jnp.inf),
         seg=jnp.where(hit, nearest, -1).astype(jnp.int32),
+        ground=hit & (jnp.array(geoms.kind)[nearest] == GeomKind.PLANE),
     )
 
 

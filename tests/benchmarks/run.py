@@ -60,10 +60,17 @@ def seconds_per_call(call: Callable[[], Any], calls: int) -> float:
     return float(np.median(times))
 
 
+def first_states(env: pixelbrax_jax.PixelEnv, params: Any, num_envs: int) -> Any:
+    """States at the start of an episode, without key and frames, which drawing does not read."""
+    keys = jax.random.split(jax.random.key(0), num_envs)
+    begin = jax.jit(jax.vmap(lambda key: env.begin(key, jax.numpy.uint32(0), params)))
+    return begin(keys).replace(key=None, frames=None)
+
+
 def renderer(look: str, *, shadows: bool = False, num_envs: int = 256, size: int = 84) -> dict:
     """Frames per second of the ray-caster alone: packed words from link poses."""
     env, params = pixelbrax_jax.make("ant", look=look, shadows=shadows, height=size, width=size)
-    states = jax.jit(jax.vmap(env.physics.reset))(jax.random.split(jax.random.key(0), num_envs))
+    states = first_states(env, params, num_envs)
     draw = jax.vmap(env.draw, in_axes=(0, None))
     program, compile_seconds = compiled(draw, states, params)
     seconds = seconds_per_call(lambda: program(states, params), calls=10)
@@ -86,7 +93,7 @@ def renderer(look: str, *, shadows: bool = False, num_envs: int = 256, size: int
 def renderer_reference(num_envs: int = 8, size: int = 84) -> dict:
     """The same figure for the plain ray-caster."""
     env, params = pixelbrax_jax.make("ant", renderer="reference", height=size, width=size)
-    states = jax.jit(jax.vmap(env.physics.reset))(jax.random.split(jax.random.key(0), num_envs))
+    states = first_states(env, params, num_envs)
     program, compile_seconds = compiled(jax.vmap(env.draw, in_axes=(0, None)), states, params)
     seconds = seconds_per_call(lambda: program(states, params), calls=2)
     return {
@@ -100,17 +107,20 @@ def doors(num_envs: int, calls: int = 10) -> list[dict]:
     """Steps per second of every door to PyTorch, and of the functional environment in Python.
 
     All take turns, so that a change of the machine's mood strikes them alike; ``ratio`` is the
-    median of a door's speed over that of the functional loop with the same autoreset mode.
+    median of a door's speed over that of the functional loop with the same autoreset mode that
+    waits for each step as the door does. All see the same actions and the same episodes.
     """
     action_size = pixelbrax_jax.make("ant")[0].action_size
     shape = (calls, num_envs, action_size)
     actions = np.random.default_rng(0).uniform(-1, 1, shape).astype(np.float32)
     runners: dict[tuple[str, str], Callable[[], Any]] = {}
     for mode in ("next_step", "same_step"):
-        runners["JAX loop", mode] = _jax_loop(num_envs, mode, actions)
+        runners["JAX loop", mode] = _jax_loop(num_envs, mode, actions, waits=True)
+        runners["JAX loop, never waiting", mode] = _jax_loop(num_envs, mode, actions, waits=False)
     for output in ("jax", "torch", "numpy"):
         runners[f"Gymnasium, {output}", "next_step"] = _gymnasium(num_envs, output, actions)
-    runners["TorchRL", "same_step"] = _torchrl(num_envs, actions)
+    runners["TorchRL, _step", "same_step"] = _torchrl(num_envs, actions, whole=False)
+    runners["TorchRL, step_and_maybe_reset", "same_step"] = _torchrl(num_envs, actions, whole=True)
     runners["Stable-Baselines3", "same_step"] = _sb3(num_envs, actions)
     times: dict[tuple[str, str], list[float]] = {key: [] for key in runners}
     for call in runners.values():
@@ -132,16 +142,20 @@ def doors(num_envs: int, calls: int = 10) -> list[dict]:
     ]
 
 
-def _jax_loop(num_envs: int, mode: str, actions: np.ndarray) -> Callable[[], Any]:
+def _jax_loop(num_envs: int, mode: str, actions: np.ndarray, *, waits: bool) -> Callable[[], Any]:
     env, params = pixelbrax_jax.make("ant")
+    params = jax.device_put(params)
     venv = pixelbrax_jax.VectorPixelEnv(env, num_envs, mode)
-    step = jax.jit(lambda state, action: venv.step(state, action, params), donate_argnums=0)
-    carry = {"state": venv.reset(jax.random.key(0), params)[0]}
-    on_device = [jax.device_put(action) for action in actions]
+    step = jax.jit(venv.step, donate_argnums=0)
+    keys = jax.vmap(jax.random.key)(jax.numpy.arange(num_envs))
+    carry = {"state": venv.reset(keys, params)[0]}
+    own = [jax.device_put(action) for action in actions]
 
     def call() -> Any:
-        for action in on_device:
-            carry["state"], timestep = step(carry["state"], action)
+        for action in own:
+            carry["state"], timestep = step(carry["state"], action, params)
+            if waits:
+                jax.block_until_ready(timestep)
         return jax.block_until_ready(timestep)
 
     return call
@@ -149,31 +163,44 @@ def _jax_loop(num_envs: int, mode: str, actions: np.ndarray) -> Callable[[], Any
 
 def _gymnasium(num_envs: int, output: str, actions: np.ndarray) -> Callable[[], Any]:
     envs = gymnasium.make_vec("PixelBrax/Ant-v0", num_envs=num_envs, output=output)
-    convert = {"jax": jax.device_put, "torch": torch.from_numpy, "numpy": np.asarray}[output]
-    own = [convert(action) for action in actions]
-    envs.reset(seed=0)
+    first, _ = envs.reset(seed=0)
+    convert: dict[str, Callable[[np.ndarray], Any]] = {
+        "jax": jax.device_put,
+        "torch": lambda action: torch.from_numpy(action).to(first.device),
+        "numpy": np.asarray,
+    }
+    own = [convert[output](action) for action in actions]
 
     def call() -> Any:
         for action in own:
             obs = envs.step(action)[0]
-        # Tensors and NumPy arrays are complete when they are handed out.
-        return jax.block_until_ready(obs) if output == "jax" else obs
+            if output == "jax":
+                jax.block_until_ready(obs)
+            elif output == "torch":
+                _wait_for_torch()
+        return obs
 
     return call
 
 
-def _torchrl(num_envs: int, actions: np.ndarray) -> Callable[[], Any]:
+def _torchrl(num_envs: int, actions: np.ndarray, *, whole: bool) -> Callable[[], Any]:
     env = pixelbrax_gym.PixelBraxTorchRLEnv("ant", num_envs)
     env.set_seed(0)
-    env.reset()
-    own = [env.full_action_spec.zero().set("action", torch.from_numpy(a)) for a in actions]
+    carry = {"td": env.reset()}
+    own = [torch.from_numpy(action).to(env.device) for action in actions]
 
     def call() -> Any:
         for action in own:
-            stepped = env._step(action)
-            if stepped["done"].any():
-                env._reset(stepped.select("done").set("_reset", stepped["done"]))
-        return stepped
+            td = carry["td"].set("action", action)
+            if whole:
+                _, carry["td"] = env.step_and_maybe_reset(td)
+            else:
+                stepped = env._step(td)
+                if stepped["done"].any():
+                    stepped = env._reset(stepped.select("done").set("_reset", stepped["done"]))
+                carry["td"] = stepped
+            _wait_for_torch()
+        return carry["td"]
 
     return call
 
@@ -189,6 +216,12 @@ def _sb3(num_envs: int, actions: np.ndarray) -> Callable[[], Any]:
         return obs
 
     return call
+
+
+def _wait_for_torch() -> None:
+    """On a CPU a tensor is complete when it is handed out."""
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
 
 
 def environment(task: str, obs_mode: str, num_envs: int) -> dict:
@@ -253,12 +286,18 @@ def main(arguments: list[str] | None = None) -> dict:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--output-dir", default="docs/benchmarks")
     parser.add_argument("--batches", type=int, nargs="+", default=BATCHES)
+    parser.add_argument(
+        "--only", nargs="+", help="cases to measure anew; the others stay as they are in the JSON"
+    )
     options = parser.parse_args(arguments)
     output = Path(options.output_dir)
     output.mkdir(parents=True, exist_ok=True)
 
     device = jax.devices()[0]
-    report: dict[str, Any] = {
+    file = output / f"{device.platform}.json"
+    kept = json.loads(file.read_text()) if options.only and file.exists() else {}
+    report: dict[str, Any] = {k: v for k, v in kept.items() if k not in (options.only or ())}
+    report |= {
         "device": device.device_kind,
         "platform": device.platform,
         "processor": _processor(),
@@ -280,12 +319,14 @@ def main(arguments: list[str] | None = None) -> dict:
         for mode in ("pixels", "state")
     ]
     for name, case in cases:
+        if options.only and name not in options.only:
+            continue
         results = case()
         for result in results if isinstance(results, list) else [results]:
             report.setdefault(name, []).append(result)
             print(json.dumps({"case": name} | result), flush=True)
         # After each case, so that a run that is cut short has not been for nothing.
-        (output / f"{device.platform}.json").write_text(json.dumps(report, indent=2) + "\n")
+        file.write_text(json.dumps(report, indent=2) + "\n")
         jax.clear_caches()
     plot(report["environment"], output / f"{device.platform}.png")
     print(f"Wrote {output / device.platform}.json and .png")

@@ -23,7 +23,7 @@ def make(**options) -> PixelEnv:
 
 def test_pack_rounds_to_the_nearest_level():
     level = np.linspace(0, 1, 1021, dtype=np.float32).reshape(1, -1)
-    frame = Frame(r=level, g=1 - level, b=level**2, depth=None, seg=None)
+    frame = Frame(r=level, g=1 - level, b=level**2, depth=None, seg=None, ground=None)
     pixels = observe.unpack(observe.pack(frame))
     for c, plane in enumerate((level, 1 - level, level**2)):
         np.testing.assert_array_equal(pixels[..., c], np.floor(255 * plane + np.float32(0.5)))

@@ -67,4 +67,3 @@ def test_skrl_ppo(tmp_path):
 def test_agents_learn(name, tmp_path):
     figures = load(name).main(["--output-dir", str(tmp_path)])
     assert figures["eval_return_mean"] >= 500
-    assert figures["train_seconds"] < 600

@@ -29,8 +29,8 @@ ACTIONS = np.array([[-0.2], [0.9], [1.0]], np.float32)
         ({"camera": "nowhere"}, "camera"),
         ({"look": "nice"}, "unknown look"),
         ({"backend": "mjx"}, "registered with its own physics"),
-        ({"max_episode_steps": 0}, "max_episode_steps must be at least 1"),
-        ({"max_episode_steps": -2}, "max_episode_steps must be at least 1"),
+        ({"max_episode_steps": 0}, "max_episode_steps must be a whole number of at least 1"),
+        ({"max_episode_steps": -2}, "max_episode_steps must be a whole number of at least 1"),
     ],
 )
 def test_options(kind, options, message):

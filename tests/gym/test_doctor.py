@@ -61,6 +61,18 @@ def test_a_healthy_machine():
             "JAX finds no device to compute on: RuntimeError: no backend",
             "JAX_PLATFORMS",
         ),
+        (
+            {"torch_cuda": "ImportError: libcudart", "to_torch": None, "to_jax": None},
+            "trouble",
+            "torch is installed and cannot be imported: ImportError: libcudart",
+            "install it again",
+        ),
+        (
+            {"jax_platform": "tpu", "torch_cuda": False, "has_nvidia": False, "to_torch": None},
+            "note",
+            "cannot share the memory of a tpu",
+            "output='numpy'",
+        ),
         ({"to_torch": False}, "trouble", "copied on their way from JAX to torch", "constraints"),
         ({"to_jax": "BufferError: x"}, "trouble", "from torch to JAX: BufferError: x", "numpy"),
         ({"environ": {}}, "note", "75% of the GPU's memory", "XLA_CLIENT_MEM_FRACTION=0.4"),
@@ -95,7 +107,8 @@ def test_each_trouble_has_a_cure(changes, level, text, cure):
     "environ",
     [
         {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"},
-        {"XLA_PYTHON_CLIENT_ALLOCATOR": "platform"},
+        {"XLA_PYTHON_CLIENT_ALLOCATOR": "Platform"},
+        {"XLA_CLIENT_MEM_FRACTION": "", "XLA_PYTHON_CLIENT_PREALLOCATE": "0"},
         {"XLA_CLIENT_MEM_FRACTION": ".3"},
     ],
 )

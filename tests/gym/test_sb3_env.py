@@ -148,6 +148,8 @@ def test_seeds(make_sb3):
     assert first(env) == one
     assert first(env) != one, "a seed serves one reset"
     assert env.seed(2**32 - 1) == [2**32 - 1, 0, 1]
+    with pytest.raises(TypeError, match="whole number"):
+        env.seed(1.5)
     np.random.seed(0)  # noqa: NPY002
     drawn = env.seed()
     np.random.seed(0)  # noqa: NPY002

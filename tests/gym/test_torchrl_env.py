@@ -21,6 +21,7 @@ from torchrl.envs import (
 
 import pixelbrax_gym
 import pixelbrax_jax
+from pixelbrax_gym import torchrl_specs
 from pixelbrax_gym.torchrl_specs import PixelSpec
 from tests.gym.conftest import TASK
 
@@ -192,6 +193,24 @@ def test_partial_steps_leave_the_rest(make_torchrl):
         assert torch.equal(td["pixels"][row], expected["pixels"][row])
 
 
+def test_unstepped_environments_keep_what_they_had(make_torchrl):
+    env = make_torchrl(obs_mode="both", episode_length=2)
+    td = env.step(act(env.step(act(env.reset()))["next"]))
+    assert td["next", "truncated"].all()
+    ended = td["next"].copy()
+    ended["_reset"] = torch.tensor([[True], [False], [True]])
+    td = env.reset(ended.clone())
+    td["_step"] = torch.tensor([True, False, True])
+    after = env.step(act(td))["next"]
+    assert after["done"].flatten().tolist() == [False, True, False]
+    assert after["truncated"].flatten().tolist() == [False, True, False]
+    assert after["reward"][1] == 0.0
+    assert after["reward"][0] != 0.0
+    for key in ("pixels", "observation"):
+        assert torch.equal(after[key][1], ended[key][1])
+    assert after["observation"][:, 1].tolist() == [1.0, 2.0, 1.0]
+
+
 def test_tensors_are_the_buffers_that_jax_computed(make_torchrl):
     env = make_torchrl(obs_mode="both")
     stateful, seen = env._stateful, []
@@ -221,8 +240,12 @@ def test_writing_to_tensors_changes_nothing_later(make_torchrl):
         wanted, expected = clean.step_and_maybe_reset(act(expected))
         for key in ("pixels", "observation", "reward", "done"):
             assert torch.equal(done["next", key], wanted["next", key])
-        # The last frame and the first of the next episode.
-        done["next", "pixels"].fill_(3)
+        # The last frame, the first of the next episode, and the flags.
+        td = td.copy()
+        flags = {key: td[key].clone() for key in ("done", "terminated", "truncated")}
+        for tensor in done["next"].values():
+            tensor.fill_(1)
+        td.update(flags)
         td["pixels"].fill_(5)
     td, expected = dirty.reset(), clean.reset()
     assert torch.equal(td["pixels"], expected["pixels"])
@@ -249,6 +272,21 @@ def test_seeds(make_torchrl):
     env.set_seed(5)
     assert first(env) == one
     assert first(env) == later
+    # Each environment begins its seed when it is next reset, be it alone.
+    env.set_seed(5)
+    td = env.step(act(env.reset()))["next"]
+    env.set_seed(7)
+    td["_reset"] = torch.tensor([[False], [True], [False]])
+    alone = env.reset(td.clone())
+    seven = first(make_torchrl(obs_mode="state", seed=7))
+    assert alone["observation"][1, 0] == seven[1]
+    td["_reset"] = torch.tensor([[True], [False], [True]])
+    rest = env.reset(td)
+    assert [rest["observation"][i, 0].item() for i in (0, 2)] == [seven[0], seven[2]]
+    with pytest.raises(TypeError, match="whole number"):
+        env.set_seed(1.5)
+    with pytest.raises(TypeError, match="takes no seed; seeds are given by set_seed"):
+        env.reset(seed=3)
 
 
 def test_episodes_are_those_of_gymnasium(make_torchrl, make_vector):
@@ -378,15 +416,13 @@ def test_options_are_checked():
         pixelbrax_gym.PixelBraxTorchRLEnv(TASK, 2, heigth=12)
 
 
-@pytest.mark.parametrize("obs_mode", ["pixels", "state"])
-def test_specs_cost_no_memory(obs_mode):
-    spec = pixelbrax_gym.torchrl_specs.observation_spec(
-        pixelbrax_jax.make(TASK, obs_mode=obs_mode)[0].obs_spec, 4096, torch.device("cpu")
+def test_pixel_specs_have_no_tensors():
+    spec = torchrl_specs.observation_spec(
+        pixelbrax_jax.make(TASK)[0].obs_spec, 4096, torch.device("cpu")
     )
-    assert spec["pixels" if obs_mode == "pixels" else "observation"].shape[0] == 4096
-    if obs_mode == "pixels":
-        for derived in (spec, spec.clone(), spec.to("cpu"), spec.expand(1, 4096), spec[:7]):
-            assert derived["pixels"].space is None
+    assert spec["pixels"].shape == (4096, 84, 84, 9)
+    for derived in (spec, spec.clone(), spec.to("cpu"), spec.expand(1, 4096), spec[:7]):
+        assert derived["pixels"].space is None
 
 
 def test_pixel_spec_behaves_as_unbounded():
@@ -418,7 +454,8 @@ def test_nothing_is_compiled_twice(make_torchrl):
     assert counts[0][0] == 1
 
 
-def test_missing_torchrl_names_the_cure(monkeypatch):
+@pytest.mark.parametrize("package", ["torch", "torchrl"])
+def test_missing_torchrl_names_the_cure(monkeypatch, package):
     import builtins
     import importlib
     import sys
@@ -426,7 +463,7 @@ def test_missing_torchrl_names_the_cure(monkeypatch):
     real = builtins.__import__
 
     def without(name, *args, **kwargs):
-        if name.partition(".")[0] == "torchrl":
+        if name.partition(".")[0] == package:
             raise ImportError(name)
         return real(name, *args, **kwargs)
 

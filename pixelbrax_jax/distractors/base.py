@@ -1,0 +1,148 @@
+"""The interface of a distractor, and how several work together."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import jax
+
+from pixelbrax_jax.types import EnvParams, Frame
+
+
+class Distractor:
+    """Changes what an environment looks like and nothing else.
+
+    Written for ONE environment. A distractor is a frozen dataclass of plain numbers and strings,
+    for it decides which program is compiled. Whatever varies is in its *state*, a pytree that
+    ``begin`` draws when an episode begins and ``advance`` carries from frame to frame.
+
+    ``change_params`` acts before the picture is drawn, ``change_frame`` after. Each is a no-op
+    unless it is overridden.
+
+    Attributes:
+        kind: name of the distractor; an environment has at most one of a kind.
+        stream: name of its random stream, folded into an episode's key; its own for each kind.
+    """
+
+    kind: ClassVar[str]
+    stream: ClassVar[int]
+
+    def begin(self, key: jax.Array, params: EnvParams) -> Any:
+        """The state at the first frame of an episode.
+
+        Args:
+            key: a key of this episode and this distractor alone.
+            params: of the environment.
+        """
+        raise NotImplementedError
+
+    def advance(self, state: Any, key: jax.Array, frame: jax.Array, params: EnvParams) -> Any:
+        """The state at the next frame.
+
+        Args:
+            state: at the frame before.
+            key: a key of this frame and this distractor alone.
+            frame: () int32, index of the frame in its episode, 0 first.
+            params: of the environment.
+        """
+        del key, frame, params
+        return state
+
+    def change_params(self, state: Any, params: EnvParams) -> EnvParams:
+        """Parameters to draw the frame with: other colors, another camera."""
+        del state
+        return params
+
+    def backdrop(self, state: Any, params: EnvParams, height: int, width: int) -> jax.Array | None:
+        """A picture that ``change_frame`` mixes in, (height, width) packed uint32, or None."""
+        del state, params, height, width
+        return None
+
+    def change_frame(self, state: Any, frame: Frame, backdrop: jax.Array | None) -> Frame:
+        """The picture with other colors, all in [0, 1].
+
+        Args:
+            state: at this frame.
+            frame: a band of rows.
+            backdrop: the same rows of the backdrop, if there is one.
+        """
+        del state, backdrop
+        return frame
+
+    def info(self, state: Any) -> dict[str, jax.Array]:
+        """What ``Timestep.info`` tells of the state."""
+        del state
+        return {}
+
+
+class Chain:
+    """Distractors one after the other; of each kind at most one.
+
+    Its state is the tuple of theirs. A picture passes them in the order camera, video, color,
+    others, whatever the order in which they were given.
+    """
+
+    _ORDER = ("camera", "video", "color")
+
+    def __init__(self, distractors: tuple[Distractor, ...] = ()) -> None:
+        """Sorts and checks.
+
+        Args:
+            distractors: any of them.
+
+        Raises:
+            ValueError: two are of one kind.
+        """
+        kinds = [distractor.kind for distractor in distractors]
+        for kind in kinds:
+            if kinds.count(kind) > 1:
+                raise ValueError(f"there are two distractors of kind {kind!r}; give one of them.")
+        known = {kind: place for place, kind in enumerate(self._ORDER)}
+        self.links = tuple(sorted(distractors, key=lambda d: known.get(d.kind, len(known))))
+
+    def begin(self, key: jax.Array, params: EnvParams) -> tuple[Any, ...]:
+        """States at the first frame of the episode that ``key`` stands for."""
+        return tuple(link.begin(self._key(key, link, 0), params) for link in self.links)
+
+    def advance(
+        self, states: tuple[Any, ...], key: jax.Array, frame: jax.Array, params: EnvParams
+    ) -> tuple[Any, ...]:
+        """States at frame ``frame``, at least 1, of the episode that ``key`` stands for."""
+        return tuple(
+            link.advance(state, self._key(key, link, frame), frame, params)
+            for link, state in zip(self.links, states, strict=True)
+        )
+
+    def change_params(self, states: tuple[Any, ...], params: EnvParams) -> EnvParams:
+        """Parameters to draw with."""
+        for link, state in zip(self.links, states, strict=True):
+            params = link.change_params(state, params)
+        return params
+
+    def backdrops(
+        self, states: tuple[Any, ...], params: EnvParams, height: int, width: int
+    ) -> tuple[jax.Array | None, ...]:
+        """The pictures to mix in."""
+        return tuple(
+            link.backdrop(state, params, height, width)
+            for link, state in zip(self.links, states, strict=True)
+        )
+
+    def change_frame(
+        self, states: tuple[Any, ...], frame: Frame, backdrops: tuple[jax.Array | None, ...]
+    ) -> Frame:
+        """The changed picture."""
+        for link, state, backdrop in zip(self.links, states, backdrops, strict=True):
+            frame = link.change_frame(state, frame, backdrop)
+        return frame
+
+    def info(self, states: tuple[Any, ...]) -> dict[str, jax.Array]:
+        """What all of them tell."""
+        told: dict[str, jax.Array] = {}
+        for link, state in zip(self.links, states, strict=True):
+            told |= link.info(state)
+        return told
+
+    @staticmethod
+    def _key(key: jax.Array, link: Distractor, frame: jax.Array | int) -> jax.Array:
+        return jax.random.fold_in(jax.random.fold_in(key, link.stream), frame)

@@ -1,0 +1,272 @@
+"""Banks of clips: from a folder, from a cache, or made on the spot."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import tempfile
+import warnings
+import zipfile
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from pixelbrax_jax.choices import check_choice, check_whole
+from pixelbrax_jax.distractors import folders, procedural
+from pixelbrax_jax.types import Clips
+
+MAX_BYTES = 2 * 1024**3
+"""Device memory that a bank may take unless told otherwise."""
+
+_CACHE_VERSION = 1
+"""Raised when the same files would give other pixels."""
+
+
+class ProceduralClipsWarning(UserWarning):
+    """Procedural clips are in use, not DAVIS."""
+
+
+@dataclass(frozen=True, eq=False)
+class ClipBank:
+    """Clips of one size, in host memory.
+
+    Attributes:
+        frames: (T, H, W, 3) uint8, all clips one after the other, row 0 at the top.
+        length: (C,) int32, frames of each clip.
+        names: of the clips.
+        source: where they come from.
+        split: which split they are.
+    """
+
+    frames: np.ndarray
+    length: np.ndarray
+    names: tuple[str, ...]
+    source: str
+    split: str
+
+    @property
+    def first(self) -> np.ndarray:
+        """(C,) int32, index of each clip's first frame."""
+        return np.concatenate([[0], np.cumsum(self.length)[:-1]]).astype(np.int32)
+
+    @property
+    def device_bytes(self) -> int:
+        """Bytes that ``to_device`` takes: four for each pixel."""
+        return int(self.frames.shape[0] * self.frames.shape[1] * self.frames.shape[2] * 4)
+
+    def to_device(self) -> Clips:
+        """The clips as ``EnvParams.clips`` wants them, on JAX's default device."""
+        rgb = self.frames.astype(np.uint32)
+        words = rgb[..., 0] | rgb[..., 1] << 8 | rgb[..., 2] << 16
+        return Clips(
+            words=jnp.asarray(words),
+            first=jnp.asarray(self.first),
+            length=jnp.asarray(self.length, jnp.int32),
+        )
+
+
+def load_clips(
+    source: str | Path = "procedural",
+    split: str = "train",
+    *,
+    height: int = 84,
+    width: int = 84,
+    num_clips: int | None = None,
+    max_bytes: int = MAX_BYTES,
+    cache_dir: str | Path | None = None,
+    progress: bool = True,
+) -> ClipBank:
+    """A bank of clips.
+
+    Pictures are cut to the middle of the wanted proportions and scaled with an antialiasing
+    filter. What was read once is cached on disk, under a name made from all that decides it.
+
+    Args:
+        source: a folder: DAVIS-2017, or videos, or folders of pictures; see
+            ``folders.find``. ``"procedural"`` makes clips without any file; results with them
+            are not results with DAVIS.
+        split: of a DAVIS folder ``"train"``, ``"test"``, ``"paper-train"``, ``"paper-test"``; of
+            procedural clips ``"train"``, ``"test"`` (other clips of the same families) and
+            ``"ood"`` (other families); of another folder its subfolders, or ``"all"``.
+        height: pixels.
+        width: pixels.
+        num_clips: how many of the split, the first ones; None means all.
+        max_bytes: device memory that the bank may take.
+        cache_dir: where to cache; None means ``$PIXELBRAX_CACHE``, else
+            ``~/.cache/pixelbrax``.
+        progress: whether a bar is shown while files are read, if tqdm is installed.
+
+    Returns:
+        The bank.
+
+    Raises:
+        FileNotFoundError: something is missing; the message names it and what was expected.
+        ValueError: an unknown split, a file that cannot be read, or a clip without frames.
+        MemoryError: the bank would be too large; the message says how to make it smaller.
+        ImportError: Pillow or imageio is missing, with the cure.
+    """
+    height, width = check_whole("height", height), check_whole("width", width)
+    if num_clips is not None:
+        num_clips = check_whole("num_clips", num_clips)
+    if str(source) == "procedural":
+        check_choice("split of procedural clips", split, procedural.SPLITS)
+        names = procedural.names(split)[:num_clips]
+        _check_size(len(names) * procedural.FRAMES, height, width, max_bytes)
+        return _procedural(tuple(names), split, height, width)
+    folder = Path(source).expanduser()
+    sources = folders.find(folder, split)[:num_clips]
+    pictures = sum(len(s.files) for s in sources if not s.is_video)
+    _check_size(pictures, height, width, max_bytes)
+    home = _cache_home(cache_dir) / f"{_digest(sources, height, width)}.npz"
+    frames, length = _read_cache(home) or _decode(sources, height, width, max_bytes, progress)
+    _write_cache(home, frames, length)
+    return ClipBank(frames, length, tuple(s.name for s in sources), str(folder), split)
+
+
+@lru_cache(maxsize=8)
+def _procedural(names: tuple[str, ...], split: str, height: int, width: int) -> ClipBank:
+    frames = np.concatenate([procedural.clip(name, height, width) for name in names])
+    length = np.full(len(names), procedural.FRAMES, np.int32)
+    return ClipBank(frames, length, names, "procedural", split)
+
+
+def warn_procedural() -> None:
+    """Says, once for each place in the code, that these clips are not DAVIS."""
+    warnings.warn(
+        "the background plays procedural clips, as no clips= were given; results are not results "
+        "on DAVIS. Say clips='procedural' if that is what you want, or clips='<folder of "
+        "DAVIS-2017>'.",
+        ProceduralClipsWarning,
+        stacklevel=3,
+    )
+
+
+def _check_size(frames: int, height: int, width: int, max_bytes: int) -> None:
+    needed = frames * height * width * 4
+    if needed > max_bytes:
+        raise MemoryError(
+            f"{frames} frames of {height} x {width} pixels take {needed / 1e6:.0f} MB on the "
+            f"device, and max_bytes allows {max_bytes / 1e6:.0f} MB; take fewer clips "
+            "(num_clips), smaller pictures, or raise max_bytes."
+        )
+
+
+def _decode(
+    sources: list[folders.Source], height: int, width: int, max_bytes: int, progress: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    clips: list[np.ndarray] = []
+    total = 0
+    for source in _with_progress(sources, progress):
+        frames = [_fit(picture, height, width) for picture in _pictures(source)]
+        if not frames:
+            raise ValueError(f"{source.files[0]} has no frames; remove it.")
+        clips.append(np.stack(frames))
+        total += len(frames)
+        _check_size(total, height, width, max_bytes)
+    return np.concatenate(clips), np.array([len(clip) for clip in clips], np.int32)
+
+
+def _with_progress(sources: list[folders.Source], progress: bool) -> Iterable[folders.Source]:
+    if not progress:
+        return sources
+    try:
+        from tqdm import tqdm
+    except ImportError:
+        return sources
+    return tqdm(sources, desc="reading clips", unit="clip", leave=False)
+
+
+def _pictures(source: folders.Source) -> Iterator[Any]:
+    """The clip's frames as Pillow images."""
+    image_module = _pillow()
+    if not source.is_video:
+        for file in source.files:
+            try:
+                with image_module.open(file) as image:
+                    yield image.convert("RGB")
+            except OSError as error:
+                raise ValueError(
+                    f"{file} cannot be read as a picture ({error}); unpack it again."
+                ) from error
+        return
+    (file,) = source.files
+    try:
+        import imageio.v3 as imageio
+    except ImportError as error:
+        raise ImportError(
+            'reading videos needs imageio; try: pip install "pixelbrax[clips]"'
+        ) from error
+    try:
+        for frame in imageio.imiter(file):
+            yield image_module.fromarray(np.asarray(frame)[..., :3])
+    except (OSError, RuntimeError, StopIteration) as error:
+        raise ValueError(f"{file} cannot be read as a video ({error}).") from error
+
+
+def _fit(image: Any, height: int, width: int) -> np.ndarray:
+    """The middle of a picture at the wanted proportions, scaled; (height, width, 3) uint8."""
+    scale = min(image.width / width, image.height / height)
+    across, down = scale * width, scale * height
+    left, top = (image.width - across) / 2, (image.height - down) / 2
+    box = (left, top, left + across, top + down)
+    resized = image.resize((width, height), _pillow().Resampling.LANCZOS, box=box)
+    return np.asarray(resized, np.uint8)
+
+
+def _pillow() -> Any:
+    try:
+        from PIL import Image
+    except ImportError as error:
+        raise ImportError(
+            'reading pictures needs Pillow; try: pip install "pixelbrax[clips]"'
+        ) from error
+    return Image
+
+
+def _cache_home(given: str | Path | None) -> Path:
+    home = given or os.environ.get("PIXELBRAX_CACHE") or Path.home() / ".cache" / "pixelbrax"
+    return Path(home).expanduser() / "clips"
+
+
+def _digest(sources: list[folders.Source], height: int, width: int) -> str:
+    """A name for the content of these files at this size, wherever they lie."""
+    digest = hashlib.sha256(json.dumps([_CACHE_VERSION, height, width]).encode())
+    for source in sources:
+        digest.update(json.dumps([source.name, len(source.files)]).encode())
+        for file in source.files:
+            digest.update(hashlib.sha256(file.read_bytes()).digest())
+    return digest.hexdigest()[:32]
+
+
+def _read_cache(file: Path) -> tuple[np.ndarray, np.ndarray] | None:
+    if not file.is_file():
+        return None
+    try:
+        with np.load(file) as cached:
+            return cached["frames"], cached["length"]
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile):
+        file.unlink(missing_ok=True)  # damaged: it is made again
+        return None
+
+
+def _write_cache(file: Path, frames: np.ndarray, length: np.ndarray) -> None:
+    """Written beside and then renamed: a half-written cache never has the name that is read."""
+    if file.is_file():
+        return
+    half: Path | None = None
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=file.parent, suffix=".tmp", delete=False) as opened:
+            half = Path(opened.name)
+            np.savez(opened, frames=frames, length=length)
+        half.replace(file)
+    except OSError as error:
+        if half is not None:
+            half.unlink(missing_ok=True)
+        warnings.warn(f"clips could not be cached in {file.parent} ({error}).", stacklevel=3)

@@ -1,0 +1,107 @@
+"""Names for the distractors of published benchmarks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from pixelbrax_jax.choices import check_choice
+from pixelbrax_jax.distractors.base import Distractor
+from pixelbrax_jax.distractors.camera import Camera
+from pixelbrax_jax.distractors.color import Color
+from pixelbrax_jax.distractors.video import Video
+
+_SCALES = {"easy": 0.1, "medium": 0.2, "hard": 0.3}
+_NUM_CLIPS = {"easy": 4, "medium": 8, "hard": None}
+
+_GROUND_ALPHA = {"reacher": 0.0, "walker2d": 1.0, "halfcheetah": 1.0, "hopper": 1.0}
+"""Of the Distracting Control Suite, which has 0 for reacher, 1 for walker and cheetah."""
+
+_OTHER_GROUND_ALPHA = 0.3
+
+_FIXED: dict[str, tuple[Distractor, ...]] = {
+    "color": (Color(),),
+    "video": (Video(),),
+    "camera": (Camera(),),
+    "paper-color": (Color(mode="frame", dynamics="iid", scale=0.3, distribution="normal"),),
+    "paper-video": (Video(mode="overlay", alpha=0.5, dynamics="loop"),),
+    "video-easy": (Video(ground_alpha=1.0, dynamics="loop", num_clips=10, random_start=False),),
+    "video-hard": (Video(ground_alpha=0.0, dynamics="loop", num_clips=100, random_start=False),),
+}
+
+PRESETS = (
+    *_FIXED,
+    *(f"dcs-{level}{suffix}" for level in _SCALES for suffix in ("", "-static")),
+)
+
+
+def preset(name: str, task: str) -> tuple[Distractor, ...]:
+    """The distractors of a benchmark.
+
+    * ``"color"``, ``"video"``, ``"camera"``: each with its defaults.
+    * ``"paper-color"``, ``"paper-video"``: those of the paper, arXiv 2502.00021.
+    * ``"dcs-easy"``, ``"dcs-medium"``, ``"dcs-hard"``, and each with ``"-static"``: color, video
+      and camera of the Distracting Control Suite, arXiv 2101.02722.
+    * ``"video-easy"``, ``"video-hard"``: of the DMControl Generalization Benchmark, arXiv
+      2011.13389.
+
+    Args:
+        name: one of ``PRESETS``.
+        task: the task, which decides how much of the ground a DCS video covers.
+
+    Returns:
+        The distractors.
+
+    Raises:
+        ValueError: there is no such preset; the message lists them.
+    """
+    check_choice("distractor", name, PRESETS)
+    if name in _FIXED:
+        return _FIXED[name]
+    _, level, *rest = name.split("-")
+    dynamic = not rest
+    scale = _SCALES[level]
+    return (
+        Camera(scale=scale, dynamic=dynamic),
+        Video(
+            ground_alpha=_GROUND_ALPHA.get(task, _OTHER_GROUND_ALPHA),
+            dynamics="pingpong" if dynamic else "static",
+            num_clips=_NUM_CLIPS[level],
+        ),
+        Color(
+            mode="geom",
+            dynamics="walk" if dynamic else "static",
+            scale=scale,
+            distribution="uniform",
+        ),
+    )
+
+
+def resolve(
+    distractors: str | Distractor | Iterable[str | Distractor], task: str
+) -> tuple[Distractor, ...]:
+    """What the user gave, as distractors.
+
+    Args:
+        distractors: a name or a distractor, or several.
+        task: the task.
+
+    Returns:
+        The distractors.
+
+    Raises:
+        ValueError: a name is unknown.
+        TypeError: something is neither a name nor a distractor.
+    """
+    given = (distractors,) if isinstance(distractors, (str, Distractor)) else tuple(distractors)
+    resolved: list[Distractor] = []
+    for item in given:
+        if isinstance(item, str):
+            resolved += preset(item, task)
+        elif isinstance(item, Distractor):
+            resolved.append(item)
+        else:
+            raise TypeError(
+                f"a distractor is a name or a Distractor, got {type(item).__name__}; names: "
+                f"{', '.join(PRESETS)}."
+            )
+    return tuple(resolved)

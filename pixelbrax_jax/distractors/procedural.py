@@ -1,0 +1,179 @@
+"""Clips made from integers, for those who have no videos at hand.
+
+Nothing but additions, multiplications, divisions, square roots and floors in float64, which
+IEEE 754 defines to the bit: the same clips on every machine.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+FRAMES = 64
+"""Frames of every clip. The last one goes over into the first."""
+
+_FAMILIES = {
+    "train": ("noise", "gratings"),
+    "test": ("noise", "gratings"),
+    "ood": ("blobs", "tiles"),
+}
+_FIRST_SEED = {"train": 1_000, "test": 2_000, "ood": 3_000}
+_CLIPS = {"train": 16, "test": 8, "ood": 8}
+
+SPLITS = tuple(_FAMILIES)
+
+
+def names(split: str) -> list[str]:
+    """Names of a split's clips: family and seed."""
+    families, first = _FAMILIES[split], _FIRST_SEED[split]
+    return [f"{families[i % len(families)]}-{first + i}" for i in range(_CLIPS[split])]
+
+
+def clip(name: str, height: int, width: int) -> np.ndarray:
+    """One clip.
+
+    Args:
+        name: of ``names``.
+        height: pixels.
+        width: pixels.
+
+    Returns:
+        (FRAMES, height, width, 3) uint8.
+    """
+    family, seed = name.split("-")
+    draw = _Draws(int(seed))
+    # Units of a picture's smaller side, whatever its size.
+    unit = 1.0 / min(height, width)
+    y = (np.arange(height) + 0.5)[:, None] * unit
+    x = (np.arange(width) + 0.5)[None, :] * unit
+    palette = draw.uniform((3, 3))
+    planes = _PAINTERS[family](x, y, draw)
+    return np.stack([_colored(plane, palette) for plane in planes])
+
+
+class _Draws:
+    """Numbers from a seed by SplitMix64 (Steele, Lea and Flood, OOPSLA 2014).
+
+    NumPy's own generators may change their streams from release to release.
+    """
+
+    def __init__(self, seed: int) -> None:
+        self._state = np.uint64(seed)
+
+    def uniform(self, shape: tuple[int, ...]) -> np.ndarray:
+        """Float64 in [0, 1)."""
+        count = int(np.prod(shape, dtype=np.int64))
+        with np.errstate(over="ignore"):
+            steps = np.arange(1, count + 1, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+            z = self._state + steps
+            self._state = z[-1] if count else self._state
+            z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+            z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+            z = z ^ (z >> np.uint64(31))
+        return ((z >> np.uint64(11)) * 2.0**-53).reshape(shape)
+
+    def integer(self, low: int, high: int) -> int:
+        """In [low, high]."""
+        return low + int(self.uniform((1,))[0] * (high - low + 1))
+
+
+def _colored(plane: np.ndarray, palette: np.ndarray) -> np.ndarray:
+    """A plane of values in [0, 1] in colors between the three of a palette."""
+    value = np.minimum(np.maximum(plane, 0.0), 1.0)[..., None] * 2.0
+    low = palette[0] + (palette[1] - palette[0]) * np.minimum(value, 1.0)
+    colors = low + (palette[2] - palette[1]) * np.maximum(value - 1.0, 0.0)
+    return np.floor(colors * 255.0 + 0.5).astype(np.uint8)
+
+
+def _smooth(t: np.ndarray) -> np.ndarray:
+    return t * t * (3.0 - 2.0 * t)
+
+
+def _wave(turns: np.ndarray) -> np.ndarray:
+    """A wave of period 1 between 0 and 1, much like a sine."""
+    fraction = turns - np.floor(turns)
+    return _smooth(np.abs(2.0 * fraction - 1.0))
+
+
+def _noise(x: np.ndarray, y: np.ndarray, draw: _Draws) -> list[np.ndarray]:
+    """Drifting value noise in three octaves, on lattices that repeat."""
+    lattices = [draw.uniform((size, size)) for size in (8, 16, 32)]
+    # Whole repeats in a clip, so that its end meets its beginning.
+    drift = [(draw.integer(-1, 1), draw.integer(-1, 1)) for _ in lattices]
+    drift[0] = (1, drift[0][1])
+    planes = []
+    for frame in range(FRAMES):
+        share = frame / FRAMES
+        plane = np.zeros(np.broadcast_shapes(x.shape, y.shape))
+        for octave, (lattice, (dx, dy)) in enumerate(zip(lattices, drift, strict=True)):
+            size = lattice.shape[0]
+            cells = 4.0 * 2.0**octave
+            u, v = x * cells + dx * share * size, y * cells + dy * share * size
+            plane = plane + _value_noise(lattice, u, v) * 0.5**octave
+        planes.append((plane / 1.75 - 0.5) * 1.8 + 0.5)
+    return planes
+
+
+def _value_noise(lattice: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    size = lattice.shape[0]
+    u, v = np.broadcast_arrays(u, v)
+    left, top = np.floor(u), np.floor(v)
+    fu, fv = _smooth(u - left), _smooth(v - top)
+    i, j = left.astype(np.int64) % size, top.astype(np.int64) % size
+    i1, j1 = (i + 1) % size, (j + 1) % size
+    upper = lattice[j, i] + (lattice[j, i1] - lattice[j, i]) * fu
+    lower = lattice[j1, i] + (lattice[j1, i1] - lattice[j1, i]) * fu
+    return upper + (lower - upper) * fv
+
+
+def _gratings(x: np.ndarray, y: np.ndarray, draw: _Draws) -> list[np.ndarray]:
+    """Two gratings that run across each other."""
+    waves = []
+    for _ in range(2):
+        along = (draw.integer(-4, 4), draw.integer(1, 4))
+        length = np.sqrt(float(along[0] ** 2 + along[1] ** 2))
+        pitch = 2.0 + 6.0 * float(draw.uniform((1,))[0])
+        speed = draw.integer(1, 3) * (1 if draw.integer(0, 1) else -1)
+        waves.append((along[0] / length * pitch, along[1] / length * pitch, speed))
+    (a, b, fast), (c, d, slow) = waves
+    return [
+        0.5 * _wave(x * a + y * b + fast * frame / FRAMES)
+        + 0.5 * _wave(x * c + y * d + slow * frame / FRAMES)
+        for frame in range(FRAMES)
+    ]
+
+
+def _blobs(x: np.ndarray, y: np.ndarray, draw: _Draws) -> list[np.ndarray]:
+    """Soft discs on closed paths."""
+    number = 7
+    centers, radii = draw.uniform((number, 2)), 0.08 + 0.17 * draw.uniform((number,))
+    reach, phases = 0.3 * draw.uniform((number, 2)), draw.uniform((number, 2))
+    heights = 0.4 + 0.6 * draw.uniform((number,))
+    planes = []
+    for frame in range(FRAMES):
+        plane = np.zeros(np.broadcast_shapes(x.shape, y.shape))
+        for k in range(number):
+            shift = reach[k] * (_wave(phases[k] + frame / FRAMES) - 0.5)
+            square = (x - centers[k, 0] - shift[0]) ** 2 + (y - centers[k, 1] - shift[1]) ** 2
+            fall = np.maximum(1.0 - square / radii[k] ** 2, 0.0)
+            plane = np.maximum(plane, heights[k] * fall * fall)
+        planes.append(plane)
+    return planes
+
+
+def _tiles(x: np.ndarray, y: np.ndarray, draw: _Draws) -> list[np.ndarray]:
+    """A scrolling page of small glyphs: 5 x 5 dots each, with a gap."""
+    size = 48
+    dots = (draw.uniform((size, size)) < 0.45).astype(np.float64)
+    gap = np.arange(size) % 6 == 5
+    dots[gap, :] = 0.0
+    dots[:, gap] = 0.0
+    across, down = draw.integer(-1, 1), draw.integer(0, 1) * 2 - 1
+    planes = []
+    for frame in range(FRAMES):
+        i = np.floor(x * 24.0 + across * frame * size / FRAMES).astype(np.int64) % size
+        j = np.floor(y * 24.0 + down * frame * size / FRAMES).astype(np.int64) % size
+        planes.append(0.15 + 0.7 * dots[j, i])
+    return planes
+
+
+_PAINTERS = {"noise": _noise, "gratings": _gratings, "blobs": _blobs, "tiles": _tiles}

@@ -1,0 +1,202 @@
+"""A video in place of the background, or over the whole picture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from pixelbrax_jax.choices import check_choice, check_whole
+from pixelbrax_jax.distractors.base import Distractor
+from pixelbrax_jax.types import Clips, EnvParams, Frame
+
+MODES = ("overlay", "background")
+DYNAMICS = ("pingpong", "loop", "static")
+
+
+class VideoState(struct.PyTreeNode):
+    """What is played.
+
+    Attributes:
+        clip: () int32, index of the clip.
+        start: () int32, its frame at the beginning of the episode.
+        direction: () int32, +1 or -1.
+        frame: () int32, its frame now.
+    """
+
+    clip: jax.Array
+    start: jax.Array
+    direction: jax.Array
+    frame: jax.Array
+
+
+@dataclass(frozen=True)
+class Video(Distractor):
+    """Plays a clip of ``EnvParams.clips``, one of its frames for each frame of the episode.
+
+    With v the video's pixel and a = ``alpha``:
+
+    * ``mode="overlay"``: every pixel p becomes ``(1 - a) p + a v``.
+    * ``mode="background"``: the sky s becomes ``(1 - a) s + a v``, the ground g
+      ``g ground_alpha + (1 - ground_alpha) v``; all else stays as it is, to the bit.
+
+    A clip, its first frame and its direction are drawn when an episode begins. At frame t of
+    the episode a clip of L frames that started at s in direction d shows
+
+    * ``"loop"``: frame ``(s + d t) mod L``,
+    * ``"pingpong"``: there and back: with ``P = 2 (L - 1)`` and ``q = (s + d t) mod P``, frame
+      ``min(q, P - q)``,
+    * ``"static"``: frame s.
+
+    Sources: an overlay at a = 0.5 is that of the paper, arXiv 2502.00021; backgrounds that go
+    back and forth are those of the Distracting Control Suite, arXiv 2101.02722; sky alone, or sky
+    and ground, on a loop are video-easy and video-hard of the DMControl Generalization
+    Benchmark, arXiv 2011.13389.
+
+    Attributes:
+        mode: ``"overlay"`` or ``"background"``.
+        alpha: share of the video, in [0, 1]; None means 0.5 for an overlay, 1 for a background.
+        ground_alpha: share of the ground that is kept, in [0, 1]; of a background only.
+        dynamics: ``"pingpong"``, ``"loop"`` or ``"static"``.
+        num_clips: how many clips of the split are used, the first ones; None means all.
+        random_start: whether the first frame is drawn; else it is the clip's first.
+    """
+
+    mode: str = "background"
+    alpha: float | None = None
+    ground_alpha: float = 1.0
+    dynamics: str = "pingpong"
+    num_clips: int | None = None
+    random_start: bool = True
+
+    kind: ClassVar[str] = "video"
+    stream: ClassVar[int] = 2
+
+    def __post_init__(self) -> None:
+        """Checks the options.
+
+        Raises:
+            ValueError: an option is unknown or out of range; the message says what is allowed.
+        """
+        check_choice("mode of Video", self.mode, MODES)
+        check_choice("dynamics of Video", self.dynamics, DYNAMICS)
+        for name, value in (("alpha", self.share), ("ground_alpha", self.ground_alpha)):
+            if not 0.0 <= value <= 1.0:
+                raise ValueError(f"{name} of Video must lie in [0, 1], got {value!r}.")
+        if self.num_clips is not None:
+            check_whole("num_clips of Video", self.num_clips)
+
+    @property
+    def share(self) -> float:
+        """Of the video, in [0, 1]."""
+        if self.alpha is not None:
+            return self.alpha
+        return 0.5 if self.mode == "overlay" else 1.0
+
+    def begin(self, key: jax.Array, params: EnvParams) -> VideoState:
+        """A clip, where it starts and which way it goes."""
+        clips = _clips(params)
+        clip_key, start_key, direction_key = jax.random.split(key, 3)
+        count = clips.length.shape[0]
+        count = count if self.num_clips is None else min(count, self.num_clips)
+        clip = jax.random.randint(clip_key, (), 0, count)
+        start = jax.random.randint(start_key, (), 0, jnp.asarray(clips.length)[clip])
+        backward = jax.random.bernoulli(direction_key)
+        return VideoState(
+            clip=clip,
+            start=start if self.random_start else jnp.zeros_like(start),
+            direction=jnp.where(backward & (self.dynamics == "pingpong"), -1, 1),
+            frame=start if self.random_start else jnp.zeros_like(start),
+        )
+
+    def advance(
+        self, state: VideoState, key: jax.Array, frame: jax.Array, params: EnvParams
+    ) -> VideoState:
+        """The clip's next frame."""
+        del key
+        length = jnp.asarray(_clips(params).length)[state.clip]
+        return state.replace(
+            frame=frame_index(self.dynamics, length, state.start, state.direction, frame)
+        )
+
+    def backdrop(self, state: VideoState, params: EnvParams, height: int, width: int) -> jax.Array:
+        """The clip's frame, its nearest pixels where the picture is of another size."""
+        clips = _clips(params)
+        index = jnp.asarray(clips.first)[state.clip] + state.frame
+        words = jax.lax.dynamic_index_in_dim(clips.words, index, keepdims=False)
+        if words.shape == (height, width):
+            return words
+        rows, columns = (
+            (np.arange(wanted) * 2 + 1) * present // (2 * wanted)
+            for wanted, present in zip((height, width), words.shape, strict=True)
+        )
+        return words[rows][:, columns]
+
+    def change_frame(self, state: VideoState, frame: Frame, backdrop: jax.Array | None) -> Frame:
+        """The frame with the video in it."""
+        del state
+        assert backdrop is not None
+        video = [(backdrop >> shift & 0xFF).astype(jnp.float32) / 255.0 for shift in (0, 8, 16)]
+        planes = [
+            self._mix(plane, pixel, frame)
+            for plane, pixel in zip((frame.r, frame.g, frame.b), video, strict=True)
+        ]
+        return frame.replace(r=planes[0], g=planes[1], b=planes[2])
+
+    def _mix(self, plane: jax.Array, video: jax.Array, frame: Frame) -> jax.Array:
+        mixed = plane + self.share * (video - plane)
+        if self.mode == "overlay":
+            return mixed
+        plane = jnp.where(jnp.isinf(frame.depth), mixed, plane)
+        if self.ground_alpha == 1.0:
+            return plane
+        ground = video + self.ground_alpha * (plane - video)
+        return jnp.where(frame.ground, ground, plane)
+
+    def info(self, state: VideoState) -> dict[str, jax.Array]:
+        """``video_clip`` and ``video_frame``: which clip, and which of its frames."""
+        return {"video_clip": state.clip, "video_frame": state.frame}
+
+
+def frame_index(
+    dynamics: str,
+    length: jax.Array | int,
+    start: jax.Array | int,
+    direction: jax.Array | int,
+    frame: jax.Array | int,
+) -> jax.Array:
+    """The clip's frame at frame ``frame`` of the episode; see ``Video``.
+
+    Args:
+        dynamics: ``"pingpong"``, ``"loop"`` or ``"static"``.
+        length: () int32, frames of the clip, at least 1.
+        start: () int32, in [0, length).
+        direction: () int32, +1 or -1.
+        frame: () int32, at least 0.
+
+    Returns:
+        () int32 in [0, length).
+    """
+    first = jnp.asarray(start, jnp.int32)
+    if dynamics == "static":
+        return first
+    place = first + direction * jnp.asarray(frame, jnp.int32)
+    if dynamics == "loop":
+        return jnp.mod(place, length)
+    # A clip of one frame has no way to go; a period of 1 keeps it there.
+    period = jnp.maximum(2 * (jnp.int32(length) - 1), 1)
+    there = jnp.mod(place, period)
+    return jnp.asarray(jnp.where(jnp.int32(length) > 1, jnp.minimum(there, period - there), 0))
+
+
+def _clips(params: EnvParams) -> Clips:
+    if params.clips is None:
+        raise ValueError(
+            "a Video needs clips: pass clips= to pixelbrax_jax.make, or put them into "
+            "EnvParams.clips with load_clips(...).to_device()."
+        )
+    return params.clips

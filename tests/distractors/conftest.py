@@ -1,0 +1,22 @@
+"""Small clips for a small task."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+
+from pixelbrax_jax.distractors import ClipBank
+from pixelbrax_jax.types import Clips
+
+SIZE = {"height": 24, "width": 20, "frame_stack": 2}
+
+
+def make_bank(lengths=(5, 1, 8), height=24, width=20):
+    rng = np.random.default_rng(0)
+    frames = rng.integers(0, 256, (sum(lengths), height, width, 3), dtype=np.uint8)
+    names = tuple(f"clip{i}" for i in range(len(lengths)))
+    return ClipBank(frames, np.array(lengths, np.int32), names, "tests", "train")
+
+
+def make_clips(**options) -> Clips:
+    return jax.tree.map(np.asarray, make_bank(**options).to_device())

@@ -1,0 +1,143 @@
+"""The color distractor: its statistics, and what it changes."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pixelbrax_jax import VectorPixelEnv, distractors
+from pixelbrax_jax.envs.pixel_env import PixelEnv
+from tests.distractors.conftest import SIZE
+from tests.envs.toy import PARAMS, Ball
+
+KEYS = jax.vmap(jax.random.key)(jnp.arange(20_000))
+
+
+def starts(color):
+    return np.asarray(jax.jit(jax.vmap(lambda key: color.begin(key, PARAMS)))(KEYS))
+
+
+def walk(color, steps, num=500):
+    """(steps, num, ...) shifts."""
+
+    def one(key):
+        def step(state, t):
+            state = color.advance(state, jax.random.fold_in(key, t), t, PARAMS)
+            return state, state
+
+        first = color.begin(jax.random.fold_in(key, 0), PARAMS)
+        return jax.lax.scan(step, first, jnp.arange(1, steps))[1]
+
+    return np.asarray(jax.jit(jax.vmap(one, out_axes=1))(KEYS[:num]))
+
+
+@pytest.mark.parametrize("scale", [0.1, 0.3])
+def test_normal_offsets(scale):
+    shifts = starts(distractors.Color(scale=scale))
+    assert shifts.shape == (20_000, 3)
+    np.testing.assert_allclose(shifts.mean(0), 0.0, atol=4 * scale / np.sqrt(20_000))
+    np.testing.assert_allclose(shifts.std(0), scale, rtol=0.02)
+    # Channels are independent, and there are large shifts: nothing wraps or saturates.
+    assert np.abs(np.corrcoef(shifts.T)[np.triu_indices(3, 1)]).max() < 0.03
+    assert np.abs(shifts).max() > 3.5 * scale
+
+
+def test_uniform_offsets():
+    shifts = starts(distractors.Color(scale=0.2, distribution="uniform"))
+    np.testing.assert_allclose(shifts.std(0), 0.2 / np.sqrt(3), rtol=0.02)
+    assert np.abs(shifts).max() <= 0.2
+
+
+def test_iid_frames_are_independent():
+    shifts = walk(distractors.Color(scale=0.3), steps=50)
+    np.testing.assert_allclose(shifts.std(), 0.3, rtol=0.02)
+    correlation = np.corrcoef(shifts[:-1].ravel(), shifts[1:].ravel())[0, 1]
+    assert abs(correlation) < 0.02
+
+
+def test_a_static_color_stays():
+    shifts = walk(distractors.Color(scale=0.3, dynamics="static"), steps=10)
+    assert (shifts == shifts[0]).all()
+    assert len(np.unique(shifts[0, :, 0])) == 500
+
+
+def test_a_walk_takes_small_steps_and_stays_in_its_box():
+    shifts = walk(distractors.Color(scale=0.2, dynamics="walk"), steps=2000, num=50)
+    assert np.abs(shifts).max() <= 0.2 + 1e-6
+    steps = np.diff(shifts, axis=0)
+    inside = np.abs(shifts[:-1]) < 0.15
+    np.testing.assert_allclose(steps[inside].std(), 0.03 * 0.2, rtol=0.03)
+    # It gets about.
+    assert (shifts.max(0) - shifts.min(0)).mean() > 0.2
+
+
+def frames_of(color, steps=4):
+    env = PixelEnv(Ball(), **SIZE, distractors=(color,) if color else ())
+    state, timestep = env.reset(jax.random.key(0), PARAMS)
+    seen = [(timestep, env.render(state, PARAMS))]
+    for _ in range(steps - 1):
+        state, timestep = env.step(state, jnp.array([0.2]), PARAMS)
+        seen.append((timestep, env.render(state, PARAMS)))
+    return seen
+
+
+def test_paper_color_is_one_offset_for_each_frame():
+    (color,) = distractors.preset("paper-color", "ant")
+    offsets = []
+    for (timestep, frame), (_, clean) in zip(frames_of(color), frames_of(None), strict=True):
+        offset = np.asarray(timestep.info["color"])
+        offsets.append(offset)
+        for c, (plane, bare) in enumerate(
+            ((frame.r, clean.r), (frame.g, clean.g), (frame.b, clean.b))
+        ):
+            np.testing.assert_allclose(plane, np.clip(bare + offset[c], 0, 1), atol=1e-6)
+        # The uint8 path rounds the same picture.
+        levels = np.floor(np.stack([frame.r, frame.g, frame.b], -1) * 255 + 0.5)
+        np.testing.assert_allclose(timestep.obs[..., -3:], levels, atol=1)
+        assert (np.asarray(timestep.obs[..., -3:]) != levels).mean() < 1e-3
+    assert len({tuple(offset) for offset in offsets}) == len(offsets)
+
+
+@pytest.mark.parametrize("dynamics", ["iid", "walk", "static"])
+@pytest.mark.parametrize("distribution", ["normal", "uniform"])
+def test_materials_keep_colors_in_range(dynamics, distribution):
+    color = distractors.Color("geom", dynamics, 0.6, distribution)
+    shifts = walk(color, steps=20, num=200)
+    rgb = PARAMS.geoms.rgb + shifts
+    assert shifts.shape[-2:] == PARAMS.geoms.rgb.shape
+    assert rgb.min() >= 0.0
+    assert rgb.max() <= 1.0 + 1e-6
+    # Each material of its own.
+    assert abs(np.corrcoef(shifts[0, :, 0, 2], shifts[0, :, 1, 2])[0, 1]) < 0.3
+
+
+def test_geom_colors_change_things_and_not_the_sky():
+    color = distractors.Color("geom", "static", 0.3, "uniform")
+    for (_, frame), (_, clean) in zip(frames_of(color), frames_of(None), strict=True):
+        sky, ball = clean.seg == -1, clean.seg == 1
+        np.testing.assert_array_equal(frame.r[sky], clean.r[sky])
+        assert (np.asarray(frame.g)[ball] != np.asarray(clean.g)[ball]).all()
+        assert (np.asarray(frame.g)[clean.ground] != np.asarray(clean.g)[clean.ground]).any()
+
+
+def test_environments_differ():
+    env = VectorPixelEnv(PixelEnv(Ball(), **SIZE, distractors=(distractors.Color(),)), 8)
+    _, timestep = env.reset(jax.random.key(0), PARAMS)
+    assert len(np.unique(timestep.info["color"])) == 24
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"mode": "pixel"}, "unknown mode of Color: 'pixel'.*frame, geom"),
+        ({"dynamics": "random"}, "unknown dynamics of Color"),
+        ({"distribution": "gauss"}, "unknown distribution of Color"),
+        ({"scale": 2.0}, r"scale of Color must lie in \[0, 1\], got 2.0"),
+        ({"scale": float("nan")}, r"scale of Color must lie in \[0, 1\], got nan"),
+    ],
+)
+def test_options_are_checked(options, message):
+    with pytest.raises(ValueError, match=message):
+        distractors.Color(**options)

@@ -1,0 +1,157 @@
+"""The video distractor: which frame is shown, and where in the picture."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pixelbrax_jax import VectorPixelEnv, distractors
+from pixelbrax_jax.distractors.video import frame_index
+from pixelbrax_jax.envs.pixel_env import PixelEnv
+from pixelbrax_jax.types import GeomKind
+from tests.distractors.conftest import SIZE, make_clips
+from tests.envs.toy import PARAMS, Ball
+
+
+def counted(dynamics, length, start, direction, frames):
+    """The indices by a counter that is carried along."""
+    index, seen = start, []
+    for _ in range(frames):
+        seen.append(index)
+        if dynamics == "loop":
+            index = (index + direction) % length
+        elif dynamics == "pingpong" and length > 1:
+            if not 0 <= index + direction < length:
+                direction = -direction
+            index += direction
+    return seen
+
+
+@pytest.mark.parametrize("dynamics", ["loop", "pingpong", "static"])
+@pytest.mark.parametrize("length", [1, 2, 3, 7])
+@pytest.mark.parametrize("direction", [1, -1])
+def test_closed_form_is_the_counter(dynamics, length, direction):
+    frames = 3 * max(2 * (length - 1), length) + 2
+    for start in range(length):
+        closed = [int(frame_index(dynamics, length, start, direction, t)) for t in range(frames)]
+        assert closed == counted(dynamics, length, start, direction, frames)
+
+
+def run(distractor, frames=5, key=0, clips=None):
+    """Words, clean words and states of an episode of the toy."""
+    env = PixelEnv(Ball(), **SIZE, distractors=(distractor,) if distractor else ())
+    params = PARAMS.replace(clips=make_clips() if clips is None else clips)
+    state, timestep = env.reset(jax.random.key(key), params)
+    seen = [(timestep, env.render(state, params), state)]
+    for _ in range(frames - 1):
+        state, timestep = env.step(state, jnp.array([0.3]), params)
+        seen.append((timestep, env.render(state, params), state))
+    return seen
+
+
+def test_an_overlay_covers_everything():
+    video = run(distractors.Video(mode="overlay", alpha=0.25, dynamics="loop"))
+    clean = run(None)
+    clips = make_clips()
+    for (timestep, frame, _), (_, plain, _) in zip(video, clean, strict=True):
+        info = timestep.info
+        word = clips.words[clips.first[info["video_clip"]] + info["video_frame"]]
+        for shift, plane, bare in ((0, frame.r, plain.r), (8, frame.g, plain.g)):
+            expected = 0.75 * bare + 0.25 * ((word >> shift) & 0xFF) / 255.0
+            np.testing.assert_allclose(plane, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("ground_alpha", [1.0, 0.3, 0.0])
+def test_a_background_leaves_the_agent_alone(ground_alpha):
+    video = run(distractors.Video(ground_alpha=ground_alpha))
+    clean = run(None)
+    clips = make_clips()
+    ground = Ball.geoms.kind.index(GeomKind.PLANE)
+    for (timestep, frame, _), (bare, plain, _) in zip(video, clean, strict=True):
+        info = timestep.info
+        word = clips.words[clips.first[info["video_clip"]] + info["video_frame"]]
+        red = (word & 0xFF) / 255.0
+        sky, floor = plain.seg == -1, plain.seg == ground
+        agent = ~sky & ~floor
+        assert agent.any()
+        assert sky.any()
+        assert floor.any()
+        newest, clean_pixels = timestep.obs[..., -3:], bare.obs[..., -3:]
+        np.testing.assert_array_equal(newest[agent], clean_pixels[agent])
+        np.testing.assert_array_equal(frame.r[agent], plain.r[agent])
+        np.testing.assert_allclose(frame.r[sky], red[sky], atol=1e-6)
+        expected = ground_alpha * plain.r + (1 - ground_alpha) * red
+        np.testing.assert_allclose(frame.r[floor], expected[floor], atol=1e-6)
+
+
+def test_every_frame_shows_the_clip_in_order():
+    clips = make_clips()
+    for dynamics in ("loop", "pingpong", "static"):
+        for key in range(4):
+            steps = run(distractors.Video(dynamics=dynamics), frames=12, key=key, clips=clips)
+            state = steps[0][2].distraction[0]
+            expected = counted(
+                dynamics,
+                int(clips.length[state.clip]),
+                int(state.start),
+                int(state.direction),
+                12,
+            )
+            assert [int(t.info["video_frame"]) for t, *_ in steps] == expected
+
+
+def test_an_episode_draws_a_clip_a_start_and_a_direction():
+    env = VectorPixelEnv(
+        PixelEnv(Ball(), **SIZE, distractors=(distractors.Video(),)), 64, "next_step"
+    )
+    params = PARAMS.replace(clips=make_clips())
+    state, _ = env.reset(jax.random.key(0), params)
+    video = state.distraction[0]
+    assert set(np.asarray(video.clip).tolist()) == {0, 1, 2}
+    assert set(np.asarray(video.direction).tolist()) == {-1, 1}
+    longest = int(np.argmax(params.clips.length))
+    assert len(set(np.asarray(video.start)[np.asarray(video.clip) == longest].tolist())) > 3
+    later, _ = env.reset_where(state, jnp.ones(64, bool), params)
+    assert (np.asarray(later.distraction[0].clip) != np.asarray(video.clip)).any()
+    # A clip of one frame stays there.
+    assert not np.asarray(video.start)[np.asarray(video.clip) == 1].any()
+
+
+def test_few_clips_and_no_random_start():
+    video = distractors.Video(num_clips=1, random_start=False)
+    for key in range(5):
+        (timestep, *_), *_ = run(video, frames=1, key=key)
+        assert (int(timestep.info["video_clip"]), int(timestep.info["video_frame"])) == (0, 0)
+
+
+def test_pictures_of_another_size_show_the_same_video():
+    env = PixelEnv(Ball(), **SIZE, distractors=(distractors.Video(mode="overlay", alpha=1.0),))
+    params = PARAMS.replace(clips=make_clips())
+    state, timestep = env.reset(jax.random.key(0), params)
+    large = env.picture(state, params, 2 * SIZE["height"], 3 * SIZE["width"])
+    small = timestep.obs[..., -3:]
+    np.testing.assert_array_equal(large[::2, ::3], small)
+    np.testing.assert_array_equal(large[1::2, 2::3], small)
+
+
+def test_no_clips():
+    env = PixelEnv(Ball(), **SIZE, distractors=(distractors.Video(),))
+    with pytest.raises(ValueError, match=r"Video needs clips.*load_clips"):
+        env.reset(jax.random.key(0), PARAMS)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"mode": "foreground"}, "unknown mode of Video: 'foreground'.*overlay"),
+        ({"dynamics": "ping-pong"}, "Did you mean 'pingpong'"),
+        ({"alpha": 1.5}, r"alpha of Video must lie in \[0, 1\], got 1.5"),
+        ({"ground_alpha": -0.1}, r"ground_alpha of Video must lie in \[0, 1\], got -0.1"),
+        ({"num_clips": 0}, "num_clips of Video must be a whole number of at least 1, got 0"),
+    ],
+)
+def test_options_are_checked(options, message):
+    with pytest.raises(ValueError, match=message):
+        distractors.Video(**options)
