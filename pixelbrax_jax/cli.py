@@ -6,6 +6,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
+from typing import Any
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -30,8 +31,53 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "is.",
     )
     command.set_defaults(run=_doctor)
+    _add_clips(commands)
     options = parser.parse_args(arguments)
-    return int(options.run())
+    return int(options.run(options))
+
+
+def _add_clips(commands: Any) -> None:
+    command = commands.add_parser(
+        "clips",
+        help="read and cache the videos of a distractor, and show them",
+        description="Reads the clips of a folder (DAVIS-2017, video files or folders of "
+        "pictures), or makes procedural ones, caches them, and tells what there is.",
+    )
+    command.add_argument("source", help="a folder, or 'procedural'")
+    command.add_argument("--split", default="train", help="train, test, ... (default: train)")
+    command.add_argument("--size", type=int, default=84, help="pixels, square (default: 84)")
+    command.add_argument("--num-clips", type=int, help="only the first ones")
+    command.add_argument("--cache-dir", help="default: $PIXELBRAX_CACHE or ~/.cache/pixelbrax")
+    command.add_argument("--sheet", help="write a contact sheet to this picture file")
+    command.set_defaults(run=_clips)
+
+
+def _clips(options: argparse.Namespace) -> int:
+    from pixelbrax_jax.distractors.clips import load_clips
+    from pixelbrax_jax.distractors.sheet import contact_sheet
+
+    try:
+        bank = load_clips(
+            options.source,
+            options.split,
+            height=options.size,
+            width=options.size,
+            num_clips=options.num_clips,
+            cache_dir=options.cache_dir,
+        )
+    except (OSError, ValueError, MemoryError, ImportError) as error:
+        sys.stderr.write(f"pixelbrax clips: {error}\n")
+        return 1
+    for name, length in zip(bank.names, bank.length, strict=True):
+        sys.stdout.write(f"{int(length):6d}  {name}\n")
+    sys.stdout.write(
+        f"{len(bank.names)} clips, {len(bank.frames)} frames of {options.size} x {options.size} "
+        f"pixels, {bank.device_bytes / 1e6:.1f} MB on the device\n"
+    )
+    if options.sheet:
+        contact_sheet(bank).save(options.sheet)
+        sys.stdout.write(f"contact sheet in {options.sheet}\n")
+    return 0
 
 
 def _version() -> str:
@@ -41,7 +87,8 @@ def _version() -> str:
         return "not installed"
 
 
-def _doctor() -> int:
+def _doctor(options: argparse.Namespace) -> int:
+    del options
     from pixelbrax_gym import doctor
 
     findings = doctor.diagnose(doctor.inspect())

@@ -8,7 +8,7 @@ import os
 import tempfile
 import warnings
 import zipfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -163,7 +163,7 @@ def _decode(
     clips: list[np.ndarray] = []
     total = 0
     for source in _with_progress(sources, progress):
-        frames = [_fit(picture, height, width) for picture in _pictures(source)]
+        frames = _frames(source, height, width)
         if not frames:
             raise ValueError(f"{source.files[0]} has no frames; remove it.")
         clips.append(np.stack(frames))
@@ -182,44 +182,57 @@ def _with_progress(sources: list[folders.Source], progress: bool) -> Iterable[fo
     return tqdm(sources, desc="reading clips", unit="clip", leave=False)
 
 
-def _pictures(source: folders.Source) -> Iterator[Any]:
-    """The clip's frames as Pillow images."""
-    image_module = _pillow()
-    if not source.is_video:
-        for file in source.files:
-            try:
-                with image_module.open(file) as image:
-                    yield image.convert("RGB")
-            except OSError as error:
-                raise ValueError(
-                    f"{file} cannot be read as a picture ({error}); unpack it again."
-                ) from error
-        return
-    (file,) = source.files
+def _frames(source: folders.Source, height: int, width: int) -> list[np.ndarray]:
+    """The clip's frames at the wanted size."""
+    if source.is_video:
+        return _video_frames(source.files[0], height, width)
+    frames = []
+    for file in source.files:
+        try:
+            with pillow().open(file) as image:
+                frames.append(_fit(image.convert("RGB"), height, width))
+        except OSError as error:
+            raise ValueError(
+                f"{file} cannot be read as a picture ({error}); unpack it again."
+            ) from error
+    return frames
+
+
+def _video_frames(file: Path, height: int, width: int) -> list[np.ndarray]:
     try:
         import imageio.v3 as imageio
     except ImportError as error:
         raise ImportError(
             'reading videos needs imageio; try: pip install "pixelbrax[clips]"'
         ) from error
-    try:
-        for frame in imageio.imiter(file):
-            yield image_module.fromarray(np.asarray(frame)[..., :3])
-    except (OSError, RuntimeError, StopIteration) as error:
-        raise ValueError(f"{file} cannot be read as a video ({error}).") from error
+    image_module = pillow()
+    with warnings.catch_warnings():
+        # FFmpeg is started as a process of its own at once, which is safe beside JAX's threads.
+        warnings.filterwarnings("ignore", r"os\.fork\(\) was called", RuntimeWarning)
+        try:
+            return [
+                _fit(image_module.fromarray(np.asarray(frame)).convert("RGB"), height, width)
+                for frame in imageio.imiter(file)
+            ]
+        except (OSError, RuntimeError, StopIteration) as error:
+            raise ValueError(f"{file} cannot be read as a video ({error}).") from error
 
 
 def _fit(image: Any, height: int, width: int) -> np.ndarray:
     """The middle of a picture at the wanted proportions, scaled; (height, width, 3) uint8."""
     scale = min(image.width / width, image.height / height)
-    across, down = scale * width, scale * height
-    left, top = (image.width - across) / 2, (image.height - down) / 2
-    box = (left, top, left + across, top + down)
-    resized = image.resize((width, height), _pillow().Resampling.LANCZOS, box=box)
-    return np.asarray(resized, np.uint8)
+    across, down = round(scale * width), round(scale * height)
+    left, top = (image.width - across) // 2, (image.height - down) // 2
+    middle = image.crop((left, top, left + across, top + down))
+    return np.asarray(middle.resize((width, height), pillow().Resampling.LANCZOS), np.uint8)
 
 
-def _pillow() -> Any:
+def pillow() -> Any:
+    """Pillow's module of images.
+
+    Raises:
+        ImportError: it is missing, with the cure.
+    """
     try:
         from PIL import Image
     except ImportError as error:
@@ -248,7 +261,7 @@ def _read_cache(file: Path) -> tuple[np.ndarray, np.ndarray] | None:
     if not file.is_file():
         return None
     try:
-        with np.load(file) as cached:
+        with file.open("rb") as opened, np.load(opened) as cached:
             return cached["frames"], cached["length"]
     except (OSError, ValueError, KeyError, zipfile.BadZipFile):
         file.unlink(missing_ok=True)  # damaged: it is made again

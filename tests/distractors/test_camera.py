@@ -1,0 +1,162 @@
+"""The camera distractor: its box, its walk, and what is still in view."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import pixelbrax_jax
+from pixelbrax_jax import distractors
+from pixelbrax_jax.scene.cameras import aim, named_rigs, rig
+from tests.envs.toy import PARAMS
+
+SCALES = {"easy": 0.1, "medium": 0.2, "hard": 0.3}
+RIG = rig((0.0, -4.0, 1.0), (0.0, 0.0, 0.0), 50.0)
+STEPS = 10_000
+
+
+def walk(camera, params, steps, num=8):
+    """(steps, num) states of the walk."""
+
+    def one(key):
+        def step(state, t):
+            state = camera.advance(state, jax.random.fold_in(key, t), t, params)
+            return state, state
+
+        first = camera.begin(jax.random.fold_in(key, 0), params)
+        return jax.lax.scan(step, first, jnp.arange(1, steps))[1]
+
+    keys = jax.vmap(jax.random.key)(jnp.arange(num))
+    states = jax.jit(jax.vmap(one, out_axes=1))(keys)
+    return jax.tree.map(np.asarray, states)
+
+
+def eye_of(camera, state, params):
+    """World positions of the cameras, (..., 3)."""
+
+    def one(state):
+        return camera.change_params(state, params).rig.eye
+
+    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), state)
+    return np.asarray(jax.jit(jax.vmap(one))(flat)).reshape(*state.radius.shape, 3)
+
+
+@pytest.mark.parametrize("level", SCALES)
+def test_the_walk_stays_in_its_box(level):
+    b = SCALES[level]
+    params = PARAMS.replace(rig=RIG)
+    camera = distractors.Camera(scale=b)
+    states = walk(camera, params, STEPS)
+    angle, tiny = 0.5 * np.pi * b, 1e-5
+    polar = np.arctan2(4.0, 1.0)
+    assert states.radius.min() >= 1 - 0.5 * b - tiny
+    assert states.radius.max() <= 1 + 1.5 * b + tiny
+    for name in ("azimuth", "roll"):
+        assert np.abs(getattr(states, name)).max() <= angle + tiny
+    assert states.polar.min() >= -angle - tiny
+    assert states.polar.max() <= min(angle, 0.5 * np.pi - polar) + tiny
+    # It gets about.
+    assert np.ptp(states.azimuth, axis=0).min() > angle
+    assert np.ptp(states.radius, axis=0).min() > 0.5 * b
+    eyes = eye_of(camera, jax.tree.map(lambda x: x[::50], states), params)
+    assert eyes[..., 2].min() >= -tiny, "above the point it looks at"
+    distance = np.linalg.norm(eyes, axis=-1) / np.linalg.norm(RIG.eye)
+    np.testing.assert_allclose(distance, states.radius[::50], rtol=1e-4)
+
+
+@pytest.mark.parametrize("b", [0.1, 0.3])
+def test_the_walk_keeps_its_speed_limits(b):
+    params = PARAMS.replace(rig=RIG)
+    states = walk(distractors.Camera(scale=b), params, 3000)
+    fastest = 0.4 * b * np.linalg.norm(RIG.eye) / 4.0
+    speed = np.linalg.norm(states.velocity, axis=-1)
+    # Where the box cuts a step short it may also turn it, never lengthen it by much.
+    assert np.quantile(speed, 0.99) <= fastest + 1e-5
+    assert np.abs(states.roll_velocity).max() <= np.pi * b / 50 + 1e-6
+    np.testing.assert_allclose(np.diff(states.roll, axis=0), states.roll_velocity[1:], atol=1e-5)
+
+
+def test_velocities_are_on_a_random_walk():
+    """Far from the box, steps of the velocity have the standard deviation that is documented."""
+    b = 0.3
+    params = PARAMS.replace(rig=RIG)
+    camera = distractors.Camera(scale=b)
+    middle = jnp.float32
+    still = camera.begin(jax.random.key(0), params).replace(
+        radius=middle(1.2),
+        azimuth=middle(0.0),
+        polar=middle(-0.1),
+        roll=middle(0.0),
+        velocity=jnp.zeros(3),
+        roll_velocity=middle(0.0),
+    )
+    keys = jax.vmap(jax.random.key)(jnp.arange(4000))
+    after = jax.jit(jax.vmap(lambda key: camera.advance(still, key, 1, params)))(keys)
+    scaling = float(np.linalg.norm(RIG.eye)) / 4.0
+    np.testing.assert_allclose(np.asarray(after.velocity).std(0), 0.1 * b * scaling, rtol=0.05)
+    np.testing.assert_allclose(np.asarray(after.roll_velocity).std(), np.pi * b / 300, rtol=0.05)
+
+
+def test_starts_are_uniform_in_the_box():
+    camera, params = distractors.Camera(scale=0.2, dynamic=False), PARAMS.replace(rig=RIG)
+    keys = jax.vmap(jax.random.key)(jnp.arange(20_000))
+    states = jax.jit(jax.vmap(lambda key: camera.begin(key, params)))(keys)
+    angle = 0.1 * np.pi
+    for values, low, high in (
+        (states.radius, 0.9, 1.3),
+        (states.azimuth, -angle, angle),
+        (states.roll, -angle, angle),
+    ):
+        np.testing.assert_allclose(np.mean(values), (low + high) / 2, atol=0.01)
+        np.testing.assert_allclose(np.std(values), (high - low) / np.sqrt(12), rtol=0.02)
+    assert not np.asarray(states.velocity).any()
+    later = camera.advance(jax.tree.map(lambda x: x[0], states), keys[0], 1, params)
+    np.testing.assert_array_equal(later.radius, states.radius[0])
+
+
+def test_nothing_moves_at_scale_zero():
+    params = PARAMS.replace(rig=RIG)
+    camera = distractors.Camera(scale=0.0)
+    states = walk(camera, params, 20, num=2)
+    np.testing.assert_allclose(
+        eye_of(camera, states, params), np.broadcast_to(RIG.eye, (19, 2, 3)), atol=1e-5
+    )
+
+
+@pytest.mark.parametrize("task", pixelbrax_jax.list_envs()[:11])
+@pytest.mark.parametrize("name", ["default", "top"])
+def test_every_rig_yields_sound_cameras(task, name):
+    if task.startswith("toy"):
+        pytest.skip("a task of other tests")
+    base = named_rigs(task)[name]
+    params = PARAMS.replace(rig=base)
+    camera = distractors.Camera(scale=0.3)
+    states = walk(camera, params, 200, num=4)
+    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), states)
+    xpos = jnp.zeros((12, 3))
+    xmat = jax.jit(jax.vmap(lambda state: aim(camera.change_params(state, params).rig, xpos).xmat))(
+        flat
+    )
+    identity = np.einsum("nij,nkj->nik", xmat, xmat)
+    np.testing.assert_allclose(identity, np.broadcast_to(np.eye(3), identity.shape), atol=1e-4)
+    assert (np.linalg.det(np.asarray(xmat)) > 0.99).all()
+
+
+def test_roll_turns_the_picture():
+    params = PARAMS.replace(rig=RIG)
+    camera = distractors.Camera(scale=0.3, dynamic=False)
+    state = camera.begin(jax.random.key(0), params).replace(
+        radius=jnp.float32(1), azimuth=jnp.float32(0), polar=jnp.float32(0), roll=jnp.float32(0.3)
+    )
+    plain = aim(RIG, jnp.zeros((1, 3))).xmat
+    turned = aim(camera.change_params(state, params).rig, jnp.zeros((1, 3))).xmat
+    np.testing.assert_allclose(turned[:, 2], plain[:, 2], atol=1e-5)
+    cosine = float(turned[:, 1] @ plain[:, 1])
+    np.testing.assert_allclose(cosine, np.cos(0.3), atol=1e-5)
+
+
+def test_scale_is_checked():
+    with pytest.raises(ValueError, match=r"scale of Camera must lie in \[0, 1\], got -1"):
+        distractors.Camera(scale=-1)

@@ -1,0 +1,181 @@
+"""Distractors together: with each other, with episodes and batches, with make()."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+
+import pixelbrax_jax as pb
+from pixelbrax_jax import distractors
+from pixelbrax_jax.distractors.base import Chain
+from pixelbrax_jax.distractors.presets import resolve
+from pixelbrax_jax.envs.pixel_env import PixelEnv
+from tests.distractors.conftest import SIZE, make_bank, make_clips
+from tests.envs.toy import PARAMS, Ball
+
+ALL = (distractors.Color(), distractors.Camera(scale=0.3), distractors.Video())
+WITH_CLIPS = PARAMS.replace(clips=make_clips())
+ACTIONS = np.random.default_rng(0).uniform(-1, 1, (30, 8, 1)).astype(np.float32)
+
+
+def rollout(chain, mode="next_step", num_envs=8, **options):
+    """Timesteps of thirty steps with episodes of seven."""
+    options = SIZE | {"episode_length": 7, "obs_mode": "both"} | options
+    env = pb.VectorPixelEnv(PixelEnv(Ball(), distractors=chain, **options), num_envs, mode)
+    state, timestep = env.reset(jax.random.key(0), WITH_CLIPS)
+    seen = [timestep]
+    for action in ACTIONS[:, :num_envs]:
+        state, timestep = env.step(state, action, WITH_CLIPS)
+        info = {k: v for k, v in timestep.info.items() if not k.startswith("final")}
+        seen.append(timestep.replace(info=info))
+    return jax.tree.map(lambda *x: np.stack(x), *seen)
+
+
+@pytest.fixture(scope="module")
+def runs():
+    return rollout(ALL), rollout(())
+
+
+def test_state_reward_and_flags_are_the_same_bits(runs):
+    changed, clean = runs
+    np.testing.assert_array_equal(changed.obs["state"], clean.obs["state"])
+    for name in ("reward", "terminated", "truncated"):
+        np.testing.assert_array_equal(getattr(changed, name), getattr(clean, name))
+    for name in ("episode_return", "episode_length", "non_finite"):
+        np.testing.assert_array_equal(changed.info[name], clean.info[name])
+    assert (changed.obs["pixels"] != clean.obs["pixels"]).mean() > 0.8
+
+
+def test_info_tells_of_every_distractor(runs):
+    info = runs[0].info
+    shape = info["episode_length"].shape
+    assert info["color"].shape == (*shape, 3)
+    assert info["camera"].shape == (*shape, 4)
+    assert info["video_clip"].shape == info["video_frame"].shape == shape
+    assert set(runs[1].info) == {"episode_return", "episode_length", "non_finite"}
+
+
+def test_every_episode_and_environment_is_another(runs):
+    info = runs[0].info
+    first = info["episode_length"] == 0
+    # The camera's place at the first frame of each episode of each environment.
+    places = info["camera"][first][:, 1]
+    assert len(places) > 24
+    assert len(np.unique(places)) == len(places)
+
+
+def test_neighbors_do_not_matter(runs):
+    few = rollout(ALL, num_envs=3)
+    for name in ("video_clip", "video_frame"):
+        np.testing.assert_array_equal(few.info[name], runs[0].info[name][:, :3])
+    for name in ("color", "camera"):
+        np.testing.assert_allclose(few.info[name], runs[0].info[name][:, :3], atol=1e-5)
+
+
+def test_other_modes_begin_the_same_episodes(runs):
+    other = rollout(ALL, "same_step")
+
+    def clips(info):
+        return info["video_clip"][:, 0][info["episode_length"][:, 0] == 0].tolist()
+
+    shared = min(len(clips(runs[0].info)), len(clips(other.info)))
+    assert shared >= 3
+    assert clips(runs[0].info)[:shared] == clips(other.info)[:shared]
+
+
+def test_frames_advance_once_for_each_step_under_action_repeat():
+    loop = distractors.Video(dynamics="loop", num_clips=1, random_start=False)
+    seen = rollout((loop,), action_repeat=2, episode_length=100)
+    frames = seen.info["video_frame"][:, 0].tolist()
+    ended = np.flatnonzero(seen.terminated[:, 0])
+    until = ended[0] if len(ended) else len(frames)
+    assert frames[:until] == [t % 5 for t in range(until)]
+
+
+def test_order_of_giving_does_not_matter(runs):
+    reordered = rollout(ALL[::-1])
+    np.testing.assert_array_equal(reordered.obs["pixels"], runs[0].obs["pixels"])
+
+
+def test_two_of_a_kind():
+    with pytest.raises(ValueError, match="two distractors of kind 'color'"):
+        Chain((distractors.Color(), distractors.Color(scale=0.1)))
+
+
+def test_state_observations_carry_no_distractors():
+    env = PixelEnv(Ball(), obs_mode="state", distractors=ALL)
+    state, timestep = env.reset(jax.random.key(0), PARAMS)
+    assert state.distraction == ()
+    assert "color" not in timestep.info
+
+
+def test_a_distractor_of_your_own():
+    class Darkness(distractors.Distractor):
+        kind, stream = "darkness", 9
+
+        def begin(self, key, params):
+            return jax.random.uniform(key)
+
+        def change_frame(self, state, frame, backdrop):
+            return frame.replace(r=state * frame.r, g=state * frame.g, b=state * frame.b)
+
+    env = PixelEnv(Ball(), **SIZE, distractors=(Darkness(), distractors.Color(scale=0.0)))
+    clean = PixelEnv(Ball(), **SIZE)
+    state, _ = env.reset(jax.random.key(0), PARAMS)
+    bare, _ = clean.reset(jax.random.key(0), PARAMS)
+    darkness = state.distraction[-1]
+    np.testing.assert_allclose(
+        env.render(state, PARAMS).r, darkness * clean.render(bare, PARAMS).r, atol=1e-6
+    )
+
+
+def test_presets():
+    assert distractors.preset("paper-video", "ant") == (
+        distractors.Video(mode="overlay", alpha=0.5, dynamics="loop"),
+    )
+    for level, scale, clips in (("easy", 0.1, 4), ("medium", 0.2, 8), ("hard", 0.3, None)):
+        camera, video, color = distractors.preset(f"dcs-{level}", "ant")
+        assert (camera.scale, camera.dynamic) == (scale, True)
+        assert (video.num_clips, video.dynamics, video.ground_alpha) == (clips, "pingpong", 0.3)
+        assert (color.mode, color.dynamics, color.scale) == ("geom", "walk", scale)
+        camera, video, color = distractors.preset(f"dcs-{level}-static", "reacher")
+        assert not camera.dynamic
+        assert (video.dynamics, video.ground_alpha, color.dynamics) == ("static", 0.0, "static")
+    easy, hard = (distractors.preset(f"video-{n}", "ant")[0] for n in ("easy", "hard"))
+    assert (easy.ground_alpha, hard.ground_alpha) == (1.0, 0.0)
+    for name in distractors.PRESETS:
+        assert distractors.preset(name, "ant")
+
+
+def test_names_and_objects_may_be_mixed():
+    assert resolve("color", "ant") == (distractors.Color(),)
+    assert resolve(("video", distractors.Color(scale=0.1)), "ant") == (
+        distractors.Video(),
+        distractors.Color(scale=0.1),
+    )
+    with pytest.raises(ValueError, match=r"unknown distractor: 'dcs-eazy'.*mean 'dcs-easy'"):
+        resolve("dcs-eazy", "ant")
+    with pytest.raises(TypeError, match="a name or a Distractor, got int"):
+        resolve((3,), "ant")
+
+
+def test_make_shares_clips_and_warns_of_procedural_ones():
+    options = {"height": 16, "width": 16}
+    with pytest.warns(distractors.ProceduralClipsWarning, match="not results on DAVIS"):
+        pb.make("inverted_pendulum", distractors="video", **options)
+    _, params = pb.make(
+        "inverted_pendulum", distractors="video", clips="procedural", split="test", **options
+    )
+    _, again = pb.make(
+        "inverted_pendulum", distractors=("video",), clips="procedural", split="test", **options
+    )
+    assert params.clips.words is again.clips.words
+    assert params.clips.words.shape == (8 * 64, 16, 16)
+    _, plain = pb.make("inverted_pendulum", distractors="color", **options)
+    assert plain.clips is None
+    bank = make_bank()
+    _, own = pb.make("inverted_pendulum", distractors="video", clips=bank, **options)
+    assert own.clips.words.shape == (14, 24, 20)
+    with pytest.raises(ValueError, match="unknown split of procedural clips: 'val'"):
+        pb.make("inverted_pendulum", distractors="video", clips="procedural", split="val")

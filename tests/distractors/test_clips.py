@@ -1,0 +1,281 @@
+"""Banks of clips: DAVIS's layout, videos, the cache, procedural clips, and what goes wrong."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pixelbrax_jax import cli, distractors, load_clips
+from pixelbrax_jax.distractors import clips as clips_module
+from pixelbrax_jax.distractors import procedural
+
+LENGTHS = {"bear": 3, "boat": 1, "car-turn": 4}
+VAL = {"blackswan": 2}
+
+
+def color_of(name: str, index: int) -> tuple[int, int, int]:
+    """A color that tells clip and frame."""
+    return (40 * sorted(LENGTHS | VAL).index(name) + 10, 50 * index + 5, 120)
+
+
+@pytest.fixture
+def davis(tmp_path):
+    """A folder in DAVIS's layout: other sizes, one gray clip, hidden files, files out of order."""
+    root = tmp_path / "DAVIS"
+    sets = root / "ImageSets" / "2017"
+    sets.mkdir(parents=True)
+    (sets / "train.txt").write_text("\n".join(LENGTHS) + "\n\n")
+    (sets / "val.txt").write_text("\n".join(VAL))
+    for number, (name, length) in enumerate((LENGTHS | VAL).items()):
+        folder = root / "JPEGImages" / "480p" / name
+        folder.mkdir(parents=True)
+        for index in reversed(range(length)):
+            image = Image.new("RGB", (85 + number, 48), color_of(name, index))
+            image = image.convert("L") if name == "boat" else image
+            image.save(folder / f"{index:05d}.jpg", quality=95)
+        (folder / ".DS_Store").write_bytes(b"\0")
+        (folder / "._00000.jpg").write_bytes(b"not a picture")
+    return root
+
+
+@pytest.fixture(autouse=True)
+def _cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("PIXELBRAX_CACHE", str(tmp_path / "cache"))
+
+
+def test_davis(davis):
+    bank = load_clips(davis, "train", height=12, width=16, progress=False)
+    assert bank.names == tuple(LENGTHS)
+    assert bank.length.tolist() == list(LENGTHS.values())
+    assert bank.first.tolist() == [0, 3, 4]
+    assert bank.frames.shape == (8, 12, 16, 3)
+    for name, first in zip(bank.names, bank.first, strict=True):
+        for index in range(LENGTHS[name]):
+            frame = bank.frames[first + index].astype(int)
+            if name == "boat":
+                assert np.ptp(frame) <= 2, "gray"
+            else:
+                assert np.abs(frame - color_of(name, index)).max() <= 4
+
+
+def test_the_folder_above_will_do(davis):
+    assert load_clips(davis.parent, "test", height=8, width=8).names == ("blackswan",)
+
+
+def test_splits_share_no_clip(davis):
+    train = load_clips(davis, "train", height=8, width=8)
+    test = load_clips(davis, "test", height=8, width=8)
+    assert not set(train.names) & set(test.names)
+    for split in procedural.SPLITS:
+        for other in procedural.SPLITS:
+            if split != other:
+                assert not set(procedural.names(split)) & set(procedural.names(other))
+
+
+def test_words_are_packed_as_frames_are(davis):
+    bank = load_clips(davis, "train", height=6, width=5)
+    clips = bank.to_device()
+    unpacked = np.stack([np.asarray(clips.words) >> shift & 0xFF for shift in (0, 8, 16)], -1)
+    np.testing.assert_array_equal(unpacked, bank.frames)
+    assert clips.words.nbytes == bank.device_bytes
+
+
+def test_pictures_are_cut_to_the_middle_and_scaled_smoothly(tmp_path):
+    folder = tmp_path / "clips" / "one"
+    folder.mkdir(parents=True)
+    pixels = np.zeros((40, 120, 3), np.uint8)
+    pixels[:, 40:80, 0] = 255  # the middle square is red
+    pixels[:20, 40:80, 1] = 200  # and its upper half orange
+    Image.fromarray(pixels).save(folder / "0.png")
+    frame = load_clips(tmp_path / "clips", "all", height=10, width=10).frames[0]
+    assert frame[..., 0].min() == 255
+    assert (frame[:4, :, 1] > 190).all()
+    assert (frame[6:, :, 1] < 10).all()
+    stripes = np.zeros((64, 64, 3), np.uint8)
+    stripes[:, ::2] = 255
+    Image.fromarray(stripes).save(folder / "0.png")
+    frame = load_clips(tmp_path / "clips", "all", height=8, width=8).frames[0]
+    assert np.abs(frame.astype(int) - 127).max() < 12, "fine stripes become gray"
+
+
+# imageio starts FFmpeg at once after the fork, and leaves the closing of its pipes to the collector.
+with_ffmpeg = pytest.mark.filterwarnings(
+    "ignore:os.fork:RuntimeWarning",
+    "ignore:unclosed file:ResourceWarning",
+    "ignore::pytest.PytestUnraisableExceptionWarning",
+)
+
+
+@with_ffmpeg
+def test_a_real_video_file(tmp_path):
+    import imageio.v3 as imageio
+
+    folder = tmp_path / "videos"
+    folder.mkdir()
+    frames = np.zeros((6, 48, 64, 3), np.uint8)
+    for t in range(6):
+        frames[t, :, 10 * t : 10 * t + 10] = 255
+    imageio.imwrite(folder / "bar.mp4", frames, fps=10)
+    bank = load_clips(folder, "all", height=24, width=32)
+    assert bank.names == ("bar",)
+    assert bank.length.tolist() == [6]
+    # The bar moves to the right.
+    centers = (bank.frames.mean((1, 3)) * np.arange(32)).sum(1) / bank.frames.mean((1, 3)).sum(1)
+    assert (np.diff(centers) > 2).all()
+
+
+def test_subfolders_are_splits(tmp_path):
+    for split, color in (("train", "red"), ("test", "blue")):
+        folder = tmp_path / split / "clip"
+        folder.mkdir(parents=True)
+        Image.new("RGB", (8, 8), color).save(folder / "0.png")
+    assert load_clips(tmp_path, "train", height=4, width=4).frames[0, 0, 0].tolist() == [255, 0, 0]
+    assert load_clips(tmp_path, "test", height=4, width=4).frames[0, 0, 0].tolist() == [0, 0, 255]
+    with pytest.raises(ValueError, match=r"unknown split.*'val'.*test, train"):
+        load_clips(tmp_path, "val", height=4, width=4)
+
+
+def test_the_cache_is_read_and_follows_the_files(davis, monkeypatch):
+    first = load_clips(davis, "train", height=8, width=8)
+    decode = clips_module._decode
+    calls = []
+    monkeypatch.setattr(clips_module, "_decode", lambda *a: calls.append(a) or decode(*a))
+    again = load_clips(davis, "train", height=8, width=8)
+    np.testing.assert_array_equal(again.frames, first.frames)
+    assert not calls
+    picture = davis / "JPEGImages" / "480p" / "bear" / "00001.jpg"
+    Image.new("RGB", (85, 48), "white").save(picture)
+    changed = load_clips(davis, "train", height=8, width=8)
+    assert len(calls) == 1
+    assert changed.frames[1].min() > 250
+
+
+def test_a_damaged_cache_is_made_again(davis, tmp_path):
+    first = load_clips(davis, "train", height=8, width=8)
+    (file,) = (tmp_path / "cache").rglob("*.npz")
+    file.write_bytes(file.read_bytes()[:100])
+    np.testing.assert_array_equal(
+        load_clips(davis, "train", height=8, width=8).frames, first.frames
+    )
+    assert not list((tmp_path / "cache").rglob("*.tmp"))
+
+
+@pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="root may write anywhere")
+def test_a_cache_that_cannot_be_written_is_told_of(davis, tmp_path):
+    (tmp_path / "cache").mkdir(mode=0o500)
+    with pytest.warns(UserWarning, match="could not be cached"):
+        load_clips(davis, "train", height=8, width=8)
+
+
+def break_davis(davis, how):
+    clip = davis / "JPEGImages" / "480p" / "bear"
+    if how == "no split file":
+        (davis / "ImageSets" / "2017" / "train.txt").unlink()
+    elif how == "absent clip":
+        clip.rename(davis / "elsewhere")
+    elif how == "no frames":
+        for file in clip.glob("*.jpg"):
+            file.unlink()
+    elif how == "truncated picture":
+        file = clip / "00002.jpg"
+        file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    elif how == "no 480p":
+        (davis / "JPEGImages" / "480p").rename(davis / "JPEGImages" / "1080p")
+
+
+@pytest.mark.parametrize(
+    ("how", "error", "message"),
+    [
+        ("no split file", FileNotFoundError, r"train\.txt is missing.*ImageSets/2017"),
+        ("absent clip", FileNotFoundError, "clip 'bear', listed in .*train.txt, has no folder"),
+        ("no frames", ValueError, "bear has no pictures"),
+        ("truncated picture", ValueError, r"00002\.jpg cannot be read as a picture"),
+        ("no 480p", FileNotFoundError, "480p is missing.*DAVIS-2017 at 480p unpacks into"),
+    ],
+)
+def test_what_is_wrong_is_named(davis, how, error, message):
+    break_davis(davis, how)
+    with pytest.raises(error, match=message):
+        load_clips(davis, "train", height=8, width=8)
+
+
+@with_ffmpeg
+def test_a_file_that_is_no_video(tmp_path):
+    (tmp_path / "broken.mp4").write_bytes(b"this is no video")
+    with pytest.raises(ValueError, match=r"broken\.mp4 cannot be read as a video"):
+        load_clips(tmp_path, "all", height=8, width=8)
+
+
+def test_other_mistakes(davis, tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"no folder of clips at .*nowhere"):
+        load_clips(tmp_path / "nowhere")
+    with pytest.raises(
+        ValueError, match=r"unknown split of .*paper-test, paper-train, test, train"
+    ):
+        load_clips(davis, "val")
+    with pytest.raises(
+        FileNotFoundError, match="clip 'bike-packing', listed in split 'paper-train'"
+    ):
+        load_clips(davis, "paper-train")
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    with pytest.raises(ValueError, match=r"neither videos .* nor folders of pictures"):
+        load_clips(empty, "all")
+    with pytest.raises(
+        MemoryError, match=r"8 frames of 84 x 84 .*max_bytes allows 0 MB.*num_clips"
+    ):
+        load_clips(davis, "train", max_bytes=1000)
+    with pytest.raises(MemoryError, match="max_bytes"):
+        load_clips("procedural", max_bytes=1000)
+    with pytest.raises(ValueError, match="num_clips must be a whole number"):
+        load_clips(davis, num_clips=0)
+    with pytest.raises(ValueError, match="height must be a whole number"):
+        load_clips(davis, height=0)
+
+
+GOLDEN = {
+    "train": "24511de3c1bcafd9",
+    "test": "98d1c8c51561dcd4",
+    "ood": "0904ce7b4db8db58",
+}
+"""SHA-256 of each split's frames at 20 x 24 pixels; another hash means other results."""
+
+
+@pytest.mark.parametrize("split", procedural.SPLITS)
+def test_procedural_clips_are_the_same_everywhere(split):
+    bank = load_clips("procedural", split, height=20, width=24)
+    assert hashlib.sha256(bank.frames.tobytes()).hexdigest()[:16] == GOLDEN[split]
+
+
+@pytest.mark.parametrize("split", procedural.SPLITS)
+def test_procedural_clips_move_and_repeat(split):
+    bank = load_clips("procedural", split, height=32, width=32)
+    for first, length in zip(bank.first, bank.length, strict=True):
+        clip = bank.frames[first : first + length].astype(int)
+        steps = np.abs(np.diff(clip, axis=0)).mean((1, 2, 3))
+        assert (steps > 0.05).all(), "every frame is another"
+        around = np.abs(clip[0] - clip[-1]).mean()
+        assert around < 3 * steps.mean() + 0.5, "the end goes over into the beginning"
+
+
+def test_command(davis, tmp_path, capsys):
+    sheet = tmp_path / "sheet.png"
+    status = cli.main(
+        ["clips", str(davis), "--split", "train", "--size", "16", "--sheet", str(sheet)]
+    )
+    assert status == 0
+    told = capsys.readouterr().out
+    for text in ("3 clips", "8 frames", "bear", "boat", "car-turn", str(sheet)):
+        assert text in told
+    with Image.open(sheet) as picture:
+        assert picture.width > 16 * 4
+    assert cli.main(["clips", str(tmp_path / "nowhere")]) == 1
+    assert "no folder of clips" in capsys.readouterr().err
+
+
+def test_names_of_the_module():
+    assert distractors.load_clips is load_clips
