@@ -193,7 +193,10 @@ class PixelBraxSB3VecEnv(VecEnv):
         for i in rows:
             # A copy: a view would keep the frames of all environments alive.
             infos[i]["terminal_observation"] = jax.tree.map(lambda x, i=i: x[i].copy(), last)
-            infos[i] |= {name: value[i].item() for name, value in final.items()}
+            infos[i] |= {
+                name: value[i].copy() if value.ndim > 1 else value[i].item()
+                for name, value in final.items()
+            }
 
     def get_images(self) -> list[np.ndarray | None]:
         """Pictures of the present states.

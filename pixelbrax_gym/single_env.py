@@ -187,5 +187,6 @@ def check_render_size(height: Any, width: Any) -> tuple[int, int]:
 
 
 def _plain(info: dict[str, Any]) -> dict[str, Any]:
-    """Scalars as Python's own numbers."""
-    return {name: np.asarray(value).item() for name, value in info.items()}
+    """Scalars as Python's own numbers, arrays as NumPy's."""
+    arrays = {name: np.array(value) for name, value in info.items()}
+    return {name: array if array.ndim else array.item() for name, array in arrays.items()}

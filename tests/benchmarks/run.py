@@ -29,6 +29,7 @@ import torch
 
 import pixelbrax_gym
 import pixelbrax_jax
+from pixelbrax_jax import distractors
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -224,6 +225,73 @@ def _wait_for_torch() -> None:
         torch.cuda.synchronize()
 
 
+DISTRACTORS = {
+    "none": (),
+    "color, each frame": (distractors.Color(),),
+    "color, each material": (distractors.Color("geom", "walk", 0.2, "uniform"),),
+    "video overlay": (distractors.Video(mode="overlay"),),
+    "video background": (distractors.Video(ground_alpha=0.3),),
+    "camera": (distractors.Camera(scale=0.2),),
+    "all three": (
+        distractors.Color(),
+        distractors.Video(ground_alpha=0.3),
+        distractors.Camera(scale=0.2),
+    ),
+}
+
+
+def synthetic_bank(size: int = 84) -> distractors.ClipBank:
+    """As many frames as DAVIS-2017's training split has at most: 60 clips of 70."""
+    frames = np.random.default_rng(0).integers(0, 256, (60 * 70, size, size, 3), dtype=np.uint8)
+    length = np.full(60, 70, np.int32)
+    return distractors.ClipBank(frames, length, tuple(map(str, range(60))), "noise", "train")
+
+
+def distractor_costs(num_envs: int, calls: int = 4) -> list[dict]:
+    """Steps per second with and without distractors, all taking turns."""
+    bank = synthetic_bank()
+    started = time.perf_counter()
+    jax.block_until_ready(bank.to_device().words)
+    upload_seconds = time.perf_counter() - started
+    runners, times = {}, {}
+    for name, links in DISTRACTORS.items():
+        env, params = pixelbrax_jax.make("ant", distractors=links, clips=bank)
+        runners[name] = _stepper(env, jax.device_put(params), num_envs, calls)
+        times[name] = []
+        runners[name]()
+    for _ in range(ROUNDS):
+        for name, call in runners.items():
+            started = time.perf_counter()
+            call()
+            times[name].append((time.perf_counter() - started) / calls)
+    return [
+        {
+            "distractors": name,
+            "num_envs": num_envs,
+            "steps_per_second": num_envs / float(np.median(seconds)),
+            "ratio": float(np.median(np.divide(times["none"], seconds))),
+            "bank_bytes": bank.device_bytes,
+            "bank_upload_seconds": upload_seconds,
+        }
+        for name, seconds in times.items()
+    ]
+
+
+def _stepper(env: Any, params: Any, num_envs: int, calls: int) -> Callable[[], Any]:
+    venv = pixelbrax_jax.VectorPixelEnv(env, num_envs)
+    step = jax.jit(venv.step, donate_argnums=0)
+    shape = (calls, num_envs, env.action_size)
+    actions = list(jax.random.uniform(jax.random.key(1), shape, minval=-1.0, maxval=1.0))
+    carry = {"state": venv.reset(jax.random.key(0), params)[0]}
+
+    def call() -> Any:
+        for action in actions:
+            carry["state"], timestep = step(carry["state"], action, params)
+        return jax.block_until_ready(timestep)
+
+    return call
+
+
 def environment(task: str, obs_mode: str, num_envs: int) -> dict:
     """Steps per second of the functional environment from a Python loop."""
     env, params = pixelbrax_jax.make(task, obs_mode=obs_mode)
@@ -311,6 +379,8 @@ def main(arguments: list[str] | None = None) -> dict:
         ("renderer", lambda: renderer("default", shadows=True)),
         ("renderer_reference", renderer_reference),
         ("doors", lambda: doors(256)),
+        ("distractors", lambda: distractor_costs(256)),
+        ("distractors", lambda: distractor_costs(1024)),
     ]
     cases += [
         ("environment", lambda t=task, m=mode, n=n: environment(t, m, n))

