@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 import jax
 import matplotlib
@@ -37,19 +38,35 @@ TASKS = ("halfcheetah", "ant")
 COLUMNS = 6
 
 
-def play(task: str, links: tuple, num_frames: int) -> np.ndarray:
-    """Newest frames of ``COLUMNS / 2`` environments, (num_frames, N, 84, 84, 3) uint8."""
+def simulate(task: str, num_frames: int) -> Any:
+    """States of ``COLUMNS / 2`` environments under random actions, (N, num_frames, ...)."""
+    env, params = pixelbrax_jax.make(task, obs_mode="state")
+
+    def run(key):
+        def step(state, key):
+            action = jax.random.uniform(key, (env.action_size,), minval=-1.0)
+            return env.step(state, action, params)[0], state
+
+        return jax.lax.scan(step, env.reset(key, params)[0], jax.random.split(key, num_frames))[1]
+
+    return jax.jit(jax.vmap(run))(jax.random.split(jax.random.key(1), COLUMNS // 2))
+
+
+def play(task: str, links: tuple, states: Any) -> np.ndarray:
+    """What the agent sees of states, (num_frames, N, 84, 84, 3) uint8."""
     env, params = pixelbrax_jax.make(task, distractors=links, clips="procedural", frame_stack=1)
-    envs = pixelbrax_jax.VectorPixelEnv(env, COLUMNS // 2)
+    chain = env.distractors
 
-    def step(state, key):
-        action = jax.random.uniform(key, (COLUMNS // 2, env.action_size), minval=-1.0)
-        state, timestep = envs.step(state, action, params)
-        return state, timestep.obs
+    def run(states, params):
+        key = states.key[0]
 
-    state, _ = envs.reset(jax.random.key(1), params)
-    keys = jax.random.split(jax.random.key(2), num_frames)
-    return np.asarray(jax.lax.scan(step, state, keys)[1])
+        def step(distraction, state):
+            later = chain.advance(distraction, key, state.step_count + 1, params)
+            return later, env.picture(state.replace(distraction=distraction), params)
+
+        return jax.lax.scan(step, chain.begin(key, params), states)[1]
+
+    return np.asarray(jax.jit(jax.vmap(run, in_axes=(0, None), out_axes=1))(states, params))
 
 
 def levels(frames: dict[tuple[str, str], np.ndarray], path: Path) -> None:
@@ -94,11 +111,10 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--num-frames", type=int, default=40)
     options = parser.parse_args(arguments)
     options.output_dir.mkdir(parents=True, exist_ok=True)
-    frames = {
-        (task, name): play(task, links, options.num_frames)
-        for task in TASKS
-        for name, links in ROWS.items()
-    }
+    frames = {}
+    for task in TASKS:
+        states = simulate(task, options.num_frames)
+        frames |= {(task, name): play(task, links, states) for name, links in ROWS.items()}
     levels(frames, options.output_dir / "levels.png")
     motion(frames, options.output_dir / "motion.gif")
 

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pixelbrax_jax import distractors
+from pixelbrax_jax import distractors, make, place
+from pixelbrax_jax.physics.tasks import TASKS
 from pixelbrax_jax.scene.cameras import aim, named_rigs, rig
 from tests.envs.toy import PARAMS
 
@@ -148,6 +149,35 @@ def test_rigs_of_all_kinds_yield_sound_cameras(task, name):
     identity = np.einsum("nij,nkj->nik", xmat, xmat)
     np.testing.assert_allclose(identity, np.broadcast_to(np.eye(3), identity.shape), atol=1e-4)
     assert (np.linalg.det(np.asarray(xmat)) > 0.99).all()
+
+
+@pytest.mark.parametrize(
+    "task",
+    [
+        task if task == "inverted_pendulum" else pytest.param(task, marks=pytest.mark.slow)
+        for task in TASKS
+    ],
+)
+def test_the_agent_stays_in_view_at_the_easy_level(task):
+    env, params = make(task, obs_mode="state")
+    state, _ = env.reset(jax.random.key(0), params)
+    camera = distractors.Camera(scale=0.1)
+    states = walk(camera, params, 2000, num=4)
+    flat = jax.tree.map(lambda x: x[::20].reshape(-1, *x.shape[2:]), states)
+    geoms = params.geoms
+    moving = np.array([g for g, link in enumerate(geoms.link) if link >= 0])
+
+    def centers_in_view(state_of_camera):
+        """Which geom centers lie in the picture."""
+        rig = camera.change_params(state_of_camera, params).rig
+        scene = place(geoms, rig, params.look, state.physics.xpos, state.physics.xquat)
+        seen = (scene.pos[moving] - scene.camera.pos) @ scene.camera.xmat
+        reach = jnp.tan(jnp.deg2rad(scene.camera.fovy) / 2) * -seen[:, 2:]
+        return (jnp.abs(seen[:, :2]) < reach).all(-1) & (seen[:, 2] < 0)
+
+    inside = np.asarray(jax.jit(jax.vmap(centers_in_view))(flat))
+    assert inside.any(axis=1).all()
+    assert inside.mean() > 0.8
 
 
 def test_roll_turns_the_picture():
