@@ -47,15 +47,19 @@ class Pixels(nn.Module):
             nn.Conv2d(32, 32, 3),
             nn.ReLU(),
             nn.Flatten(),
-            nn.LazyLinear(features),
+            nn.Linear(32 * 4 * 4, features),
             nn.ReLU(),
         )
+        for layer in self.layers:
+            if isinstance(layer, nn.Conv2d | nn.Linear):
+                nn.init.orthogonal_(layer.weight, 2**0.5)
+                nn.init.zeros_(layer.bias)
 
     def forward(self, pixels: torch.Tensor) -> torch.Tensor:
         batch = pixels.shape[:-3]
         # A view in PyTorch's channels_last layout.
         images = pixels.reshape(-1, *pixels.shape[-3:]).permute(0, 3, 1, 2)
-        return self.layers(images.float() / 255.0 - 0.5).unflatten(0, batch)
+        return self.layers(images.float().div_(255.0).sub_(0.5)).unflatten(0, batch)
 
 
 class Policy(nn.Module):
@@ -81,8 +85,8 @@ def make_env(num_envs: int, seed: int, device: torch.device) -> TransformedEnv:
     return TransformedEnv(env, RewardSum())
 
 
-def make_networks(env: TransformedEnv) -> tuple[TensorDictSequential, TensorDictSequential]:
-    """Policy and value function, which share their features."""
+def make_networks(env: TransformedEnv) -> tuple[ProbabilisticActor, ValueOperator, nn.Module]:
+    """Policy, value of features, and value of pixels; all share the features."""
     pixels = TensorDictModule(Pixels(), in_keys=["pixels"], out_keys=["features"])
     head = TensorDictModule(
         Policy(env.action_spec.shape[-1]), in_keys=["features"], out_keys=["loc", "scale"]
@@ -92,12 +96,9 @@ def make_networks(env: TransformedEnv) -> tuple[TensorDictSequential, TensorDict
         in_keys=["loc", "scale"],
         distribution_class=IndependentNormal,
         return_log_prob=True,
-    ).to(env.device)
-    value = TensorDictSequential(pixels, ValueOperator(nn.Linear(128, 1), in_keys=["features"]))
-    value = value.to(env.device)
-    with torch.no_grad():  # gives the lazy layer its size
-        value(actor(env.reset()))
-    return actor, value
+    )
+    value = ValueOperator(nn.Linear(128, 1), in_keys=["features"])
+    return actor.to(env.device), value.to(env.device), TensorDictSequential(pixels, value)
 
 
 @torch.no_grad()
@@ -118,7 +119,7 @@ def evaluate(actor: TensorDictSequential, episodes: int, seed: int, device: torc
 def main(arguments: list[str] | None = None) -> dict:
     """Trains and evaluates; returns the figures that it prints."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--total-steps", type=int, default=1_000_000)
+    parser.add_argument("--total-steps", type=int, default=700_000)
     parser.add_argument("--num-envs", type=int, default=128)
     parser.add_argument("--num-steps", type=int, default=32)
     parser.add_argument("--eval-episodes", type=int, default=20)
@@ -131,7 +132,7 @@ def main(arguments: list[str] | None = None) -> dict:
     torch.manual_seed(options.seed)
 
     env = make_env(options.num_envs, options.seed, device)
-    actor, value = make_networks(env)
+    actor, value, value_of_pixels = make_networks(env)
     batch_size = options.num_envs * options.num_steps
     num_batches = -(-options.total_steps // batch_size)
     collector = Collector(
@@ -141,8 +142,16 @@ def main(arguments: list[str] | None = None) -> dict:
         total_frames=num_batches * batch_size,
         auto_register_policy_transforms=False,  # the policy has no memory
     )
-    advantage = GAE(gamma=0.99, lmbda=0.95, value_network=value, average_gae=True)
-    loss = ClipPPOLoss(actor, value, clip_epsilon=0.2, entropy_bonus=False, critic_coeff=0.5)
+    advantage = GAE(gamma=0.99, lmbda=0.95, value_network=value_of_pixels)
+    loss = ClipPPOLoss(
+        actor,
+        value,  # of the features that the actor has just computed
+        clip_epsilon=0.2,
+        entropy_bonus=False,
+        critic_coeff=0.5,
+        loss_critic_type="l2",
+        normalize_advantage=True,
+    )
     optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3, eps=1e-5)
     schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.0, num_batches)
     minibatches = ReplayBuffer(
@@ -164,7 +173,8 @@ def main(arguments: list[str] | None = None) -> dict:
             batch["next", "reward"] *= 0.05  # keeps values of order 1
             with torch.no_grad():
                 batch = advantage(batch)
-            minibatches.extend(batch.exclude(("next", "pixels")).reshape(-1))
+            keys = ("pixels", "action", "action_log_prob", "advantage", "value_target")
+            minibatches.extend(batch.select(*keys).reshape(-1))
             for _ in range(4):
                 for minibatch in minibatches:
                     losses = loss(minibatch)
