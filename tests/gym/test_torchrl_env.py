@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -18,6 +21,7 @@ from torchrl.envs import (
     TransformedEnv,
     check_env_specs,
 )
+from torchrl.record import CSVLogger, PixelRenderTransform, VideoRecorder
 
 import pixelbrax_gym
 import pixelbrax_jax
@@ -336,6 +340,57 @@ def test_render(make_torchrl):
     pictures = env.render()
     assert pictures.shape == (3, 10, 14, 3)
     assert pictures.dtype == torch.uint8
+
+
+def test_recording(make_torchrl, tmp_path):
+    """Pictures of `render` end up in a video of TorchRL's recorder."""
+    logger = CSVLogger("run", str(tmp_path), video_format="pt")
+    env = TransformedEnv(
+        make_torchrl(render_height=16, render_width=24),
+        Compose(
+            PixelRenderTransform(out_keys=["pictures"]),
+            VideoRecorder(logger, tag="film", in_keys=["pictures"], skip=1),
+        ),
+    )
+    env.rollout(5, policy)
+    env.transform[-1].dump()
+    (film,) = tmp_path.rglob("*.pt")
+    frames = torch.load(film)
+    # A first frame and five more, of all environments in a grid of two by two.
+    assert frames.shape == (1, 6, 3, 2 * 16, 2 * 24)
+    assert frames.dtype == torch.uint8
+    assert frames.float().std() > 10
+
+
+PROCESSES = """
+from functools import partial
+from torchrl.collectors import MultiSyncCollector
+from pixelbrax_gym import PixelBraxTorchRLEnv
+
+if __name__ == "__main__":
+    options = {"height": 8, "width": 8, "obs_mode": "both"}
+    make = partial(PixelBraxTorchRLEnv, "inverted_pendulum", 2, **options)
+    collector = MultiSyncCollector([make, make], frames_per_batch=40, total_frames=80)
+    collector.set_seed(0)
+    for batch in collector:
+        goes_on = ~batch["next", "done"][..., :-1, 0]
+        after, before = batch["next", "observation"][..., :-1, :], batch["observation"][..., 1:, :]
+        same_trajectory = batch["collector", "traj_ids"].diff(dim=-1) == 0
+        assert (after[goes_on & same_trajectory] == before[goes_on & same_trajectory]).all()
+        print(batch.numel())
+    collector.shutdown()
+"""
+
+
+@pytest.mark.slow
+def test_collectors_in_processes_of_their_own(tmp_path):
+    script = tmp_path / "collect.py"
+    script.write_text(PROCESSES)
+    result = subprocess.run(
+        [sys.executable, script], capture_output=True, text=True, check=False, timeout=280
+    )
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.split() == ["40", "40"]
 
 
 def test_infos(make_torchrl):
