@@ -47,7 +47,8 @@ def simulate(task: str, num_frames: int) -> Any:
             action = jax.random.uniform(key, (env.action_size,), minval=-1.0)
             return env.step(state, action, params)[0], state
 
-        return jax.lax.scan(step, env.reset(key, params)[0], jax.random.split(key, num_frames))[1]
+        keys = jax.random.split(jax.random.fold_in(key, 1), num_frames)
+        return jax.lax.scan(step, env.reset(key, params)[0], keys)[1]
 
     return jax.jit(jax.vmap(run))(jax.random.split(jax.random.key(1), COLUMNS // 2))
 
@@ -58,7 +59,7 @@ def play(task: str, links: tuple, states: Any) -> np.ndarray:
     chain = env.distractors
 
     def run(states, params):
-        key = states.key[0]
+        key = jax.random.fold_in(states.key[0], 0)  # that of the first episode
 
         def step(distraction, state):
             later = chain.advance(distraction, key, state.step_count + 1, params)
@@ -75,7 +76,11 @@ def levels(frames: dict[tuple[str, str], np.ndarray], path: Path) -> None:
         len(ROWS), COLUMNS, figsize=(COLUMNS * 1.15 + 1.6, len(ROWS) * 1.15), squeeze=False
     )
     for row, name in enumerate(ROWS):
-        pictures = [picture for task in TASKS for picture in frames[task, name][8]]
+        pictures = [
+            picture
+            for task in TASKS
+            for picture in frames[task, name][min(8, len(frames[task, name]) - 1)]
+        ]
         for column, picture in enumerate(pictures):
             panel = grid[row, column]
             panel.imshow(picture, interpolation="nearest")

@@ -85,7 +85,8 @@ def inspect() -> Machine:
     to_jax: bool | str | None = None
     if versions["torch"] is not None:
         torch_cuda = _attempt(_torch_has_cuda)
-        if jax_error is None and isinstance(torch_cuda, bool):
+        sharing = jax_platform == "cpu" or jax_platform in _GPUS
+        if jax_error is None and sharing and isinstance(torch_cuda, bool):
             to_torch, to_jax = _attempt(_shares_to_torch), _attempt(_shares_to_jax)
     return Machine(
         versions=versions,
@@ -235,7 +236,7 @@ def _about_memory(machine: Machine) -> Iterator[Finding]:
             f"JAX takes {fraction:.0%} of the GPU's memory at its start and leaves torch the rest",
             f"export {_FRACTION}=0.4, or {_PREALLOCATE}=false, before Python starts",
         )
-    else:
+    elif not preallocates or fraction <= 0.5:
         yield Finding("ok", "JAX leaves GPU memory for others")
 
 

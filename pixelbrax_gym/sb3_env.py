@@ -110,10 +110,8 @@ class PixelBraxSB3VecEnv(VecEnv):
         super().__init__(num_envs, space, action_space(env.action_size))
         # SB3's wrappers ask for a number here, beside its lists.
         self.metadata: dict[str, Any] = self.metadata | {"render_fps": self._stateful.fps}
-        ages = np.arange(num_envs) * env.episode_length // num_envs
-        self._ages = ages if stagger else np.zeros(num_envs, int)
-        # Control steps that the present episodes are ahead of themselves.
-        self._ahead = np.zeros(num_envs, int)
+        head_starts = np.arange(num_envs) * env.episode_length // num_envs
+        self._head_starts = head_starts if stagger else None
         self._actions: Any = None
 
     def reset(self) -> Any:
@@ -130,9 +128,8 @@ class PixelBraxSB3VecEnv(VecEnv):
         if any(self._options):
             raise ValueError(f"environments take no options at a reset, got {self._options!r}.")
         outputs = self._stateful.reset(self._seeds)
-        if self._ages.any():
-            self._stateful.age(self._ages)
-        self._ahead = self._ages.copy()
+        if self._head_starts is not None:
+            self._stateful.shorten(self._head_starts)
         self._reset_seeds()
         self.reset_infos = [{} for _ in range(self.num_envs)]
         return self._observations(outputs["obs"])
@@ -188,8 +185,6 @@ class PixelBraxSB3VecEnv(VecEnv):
             for name, value in info["final_info"].items()
             if not name.startswith("_")
         }
-        final["episode_length"] -= self._ahead
-        self._ahead[rows] = 0
         for i in rows:
             # A copy: a view would keep the frames of all environments alive.
             infos[i]["terminal_observation"] = jax.tree.map(lambda x, i=i: x[i].copy(), last)

@@ -115,7 +115,9 @@ class StatefulEnv:
         if self._state is None:
             if not where.all():
                 raise error.ResetNeeded("the first reset must be of all environments.")
-            self.params = jax.device_put(self.params)
+            # Clips are there already, and once for all.
+            clips = self.params.clips
+            self.params = jax.device_put(self.params.replace(clips=None)).replace(clips=clips)
             rng = np.random.default_rng() if rng is None else rng
             first = int(rng.integers(SEEDS - self.num_envs + 1))
             seeds = [first + i if s is None else s for i, s in enumerate(seeds)]
@@ -170,22 +172,20 @@ class StatefulEnv:
         self._done = outputs["done"]
         return outputs
 
-    def age(self, control_steps: np.ndarray) -> None:
+    def shorten(self, control_steps: np.ndarray) -> None:
         """Brings the time limit of the present episodes nearer.
 
         Args:
-            control_steps: (N,) int, as if so many had been taken already. ``episode_length`` in
-                ``info`` counts them too.
+            control_steps: (N,) int, by how much, at least 0 and less than the limit.
 
         Raises:
             ResetNeeded: before the first reset.
             ClosedEnvironmentError: after ``close``.
             RuntimeError: this process is a fork that cannot run JAX.
         """
-        self._check_ready("age")
+        self._check_ready("shorten")
         assert self._state is not None
-        step_count = self._state.step_count + jnp.asarray(control_steps, jnp.int32)
-        self._state = self._state.replace(step_count=step_count)
+        self._state = self._state.replace(head_start=jnp.asarray(control_steps, jnp.int32))
 
     def render(self, height: int, width: int) -> jax.Array:
         """Pictures of the present states, at any size.
@@ -369,7 +369,8 @@ def _make(
     # What exists can be named in a fork without starting JAX. The worker then fails in reset(),
     # where Gymnasium's AsyncVectorEnv passes errors on; from here it would only see a lost pipe.
     made = registry.make(task, **options)
-    if known is not None:
+    # Clips would be put on the device, which starts JAX.
+    if known is not None and made[1].clips is None:
         _made.add(known)
     return made
 

@@ -1,10 +1,10 @@
-"""One way to reject an unknown name, and one to reject what is not a count."""
+"""One way each to reject an unknown name, what is not a count, and what is not a share."""
 
 from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
-from numbers import Integral
+from numbers import Integral, Real
 
 
 def check_choice(what: str, value: object, allowed: Iterable[str]) -> str:
@@ -48,3 +48,21 @@ def check_whole(what: str, value: object) -> int:
     if isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= 1:
         return int(value)
     raise ValueError(f"{what} must be a whole number of at least 1, got {value!r}.")
+
+
+def check_share(what: str, value: object) -> float:
+    """``value`` if it is a number in [0, 1].
+
+    Args:
+        what: what the value stands for, as the message should call it.
+        value: what the user gave.
+
+    Returns:
+        ``value`` as Python's own.
+
+    Raises:
+        ValueError: otherwise, naming the value.
+    """
+    if isinstance(value, Real) and not isinstance(value, bool) and 0.0 <= float(value) <= 1.0:
+        return float(value)
+    raise ValueError(f"{what} must lie in [0, 1], got {value!r}.")

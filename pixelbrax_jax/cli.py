@@ -39,9 +39,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _add_clips(commands: Any) -> None:
     command = commands.add_parser(
         "clips",
-        help="read and cache the videos of a distractor, and show them",
-        description="Reads the clips of a folder (DAVIS-2017, video files or folders of "
-        "pictures), or makes procedural ones, caches them, and tells what there is.",
+        help="prepare the videos of a distractor, and show them",
+        description="Reads and caches the clips of a folder (DAVIS-2017, video files or folders "
+        "of pictures), or makes procedural ones, and tells what there is.",
     )
     command.add_argument("source", help="a folder, or 'procedural'")
     command.add_argument("--split", default="train", help="train, test, ... (default: train)")
@@ -65,6 +65,8 @@ def _clips(options: argparse.Namespace) -> int:
             num_clips=options.num_clips,
             cache_dir=options.cache_dir,
         )
+        if options.sheet:
+            contact_sheet(bank).save(options.sheet)
     except (OSError, ValueError, MemoryError, ImportError) as error:
         sys.stderr.write(f"pixelbrax clips: {error}\n")
         return 1
@@ -75,7 +77,6 @@ def _clips(options: argparse.Namespace) -> int:
         f"pixels, {bank.device_bytes / 1e6:.1f} MB on the device\n"
     )
     if options.sheet:
-        contact_sheet(bank).save(options.sheet)
         sys.stdout.write(f"contact sheet in {options.sheet}\n")
     return 0
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache, lru_cache, partial
 from pathlib import Path
+from weakref import WeakValueDictionary
 
 import jax
 import numpy as np
@@ -93,7 +94,7 @@ def make(
     action_repeat: int = 1,
     episode_length: int = 1000,
     renderer: str = "fused",
-    distractors: str | Distractor | Iterable[str | Distractor] = (),
+    distractors: str | Distractor | Iterable[str | Distractor] | None = (),
     clips: str | Path | ClipBank | None = None,
     split: str = "train",
 ) -> tuple[PixelEnv, EnvParams]:
@@ -148,6 +149,8 @@ def make(
     )
     videos = [link for link in env.distractors.links if isinstance(link, Video)]
     bank = _clips(clips, split, env.height, env.width, videos[0].num_clips) if videos else None
+    if clips is not None and not videos and env.obs_mode != "state":
+        raise ValueError("clips are given, but no video is: add 'video' to the distractors.")
     rig = make_rig(task, camera, _fallback_rig(task))
     if not rig.link < len(env.physics.link_names):
         raise ValueError(
@@ -168,6 +171,8 @@ def _clips(
     """Clips on the device; equal ones are there once."""
     if isinstance(clips, ClipBank):
         bank = clips
+        if split not in ("train", bank.split):
+            raise ValueError(f"split={split!r}, but the clips are of split {bank.split!r}.")
     else:
         if clips is None:
             warn_procedural()
@@ -176,9 +181,15 @@ def _clips(
     return _on_device(bank)
 
 
-@lru_cache(maxsize=8)
+# Weakly, so that clips leave the device with the last environment that shows them.
+_resident: WeakValueDictionary[str, Clips] = WeakValueDictionary()
+
+
 def _on_device(bank: ClipBank) -> Clips:
-    return bank.to_device()
+    clips = _resident.get(bank.digest)
+    if clips is None:
+        clips = _resident[bank.digest] = bank.to_device()
+    return clips
 
 
 @cache

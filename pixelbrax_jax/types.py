@@ -226,6 +226,8 @@ class EnvState(struct.PyTreeNode):
         key: typed PRNG key of the environment; never changes.
         episode: () uint32, index of the current episode, 0 first.
         step_count: () int32, control steps taken in this episode.
+        head_start: () int32, control steps by which the time limit comes early in this episode;
+            0 unless somebody has set it.
         episode_return: () float32, sum of rewards of this episode.
         done: () bool, the episode has ended and the next call must begin a new one.
         distraction: states of the distractors, a tuple.
@@ -236,6 +238,7 @@ class EnvState(struct.PyTreeNode):
     key: jax.Array
     episode: jax.Array
     step_count: jax.Array
+    head_start: jax.Array
     episode_return: jax.Array
     done: jax.Array
     distraction: Any = ()

@@ -63,8 +63,9 @@ class Distractor:
 
         Args:
             state: at this frame.
-            frame: a band of rows.
-            backdrop: the same rows of the backdrop, if there is one.
+            frame: a band of some rows; observations are drawn band by band.
+            backdrop: the same rows of the backdrop, if there is one. What differs from pixel to
+                pixel, such as noise, belongs there.
         """
         del state, backdrop
         return frame
@@ -91,12 +92,17 @@ class Chain:
             distractors: any of them.
 
         Raises:
-            ValueError: two are of one kind.
+            ValueError: two are of one kind or draw from one stream.
+            TypeError: one is no distractor, or cannot be hashed.
         """
+        for distractor in distractors:
+            _check(distractor)
         kinds = [distractor.kind for distractor in distractors]
         for kind in kinds:
             if kinds.count(kind) > 1:
                 raise ValueError(f"there are two distractors of kind {kind!r}; give one of them.")
+        if len({distractor.stream for distractor in distractors}) < len(kinds):
+            raise ValueError(f"the distractors {', '.join(kinds)} must differ in their streams.")
         known = {kind: place for place, kind in enumerate(self._ORDER)}
         self.links = tuple(sorted(distractors, key=lambda d: known.get(d.kind, len(known))))
 
@@ -146,3 +152,27 @@ class Chain:
     @staticmethod
     def _key(key: jax.Array, link: Distractor, frame: jax.Array | int) -> jax.Array:
         return jax.random.fold_in(jax.random.fold_in(key, link.stream), frame)
+
+
+def _check(distractor: object) -> None:
+    """Rejects what a program cannot be compiled for.
+
+    Raises:
+        TypeError: it is no distractor, or cannot be hashed.
+        ValueError: its stream is not a number of its own.
+    """
+    if not isinstance(distractor, Distractor):
+        raise TypeError(
+            f"expected a Distractor, got {type(distractor).__name__}; names are for "
+            "pixelbrax_jax.make."
+        )
+    name = type(distractor).__name__
+    if not isinstance(getattr(distractor, "kind", None), str):
+        raise TypeError(f"{name} needs a kind, a name of its own.")
+    stream = getattr(distractor, "stream", None)
+    if not isinstance(stream, int) or stream < 1:
+        raise ValueError(f"{name} needs a stream, a whole number of at least 1, got {stream!r}.")
+    try:
+        hash(distractor)
+    except TypeError as error:
+        raise TypeError(f"{name} cannot be hashed; make it a frozen dataclass.") from error

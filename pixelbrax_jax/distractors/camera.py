@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from pixelbrax_jax import spatial
+from pixelbrax_jax.choices import check_share
 from pixelbrax_jax.distractors.base import Distractor
 from pixelbrax_jax.types import CameraRig, EnvParams
 
@@ -58,7 +59,8 @@ class Camera(Distractor):
 
     Source: the Distracting Control Suite, arXiv 2101.02722 and its code, at scales 0.1, 0.2 and
     0.3. Two differences: distances are relative to the point that our camera rigs look at, not
-    to the agent's center of mass; and the suite's limit of the azimuth, which is never
+    to the agent's center of mass (of a plain ``types.Camera`` that point is 1 m ahead; give a
+    ``CameraRig`` instead); and the suite's limit of the azimuth, which is never
     reached from where its cameras stand, is left out.
 
     Attributes:
@@ -78,8 +80,7 @@ class Camera(Distractor):
         Raises:
             ValueError: the scale is out of range.
         """
-        if not 0.0 <= self.scale <= 1.0:
-            raise ValueError(f"scale of Camera must lie in [0, 1], got {self.scale!r}.")
+        check_share("scale of Camera", self.scale)
 
     def begin(self, key: jax.Array, params: EnvParams) -> CameraState:
         """A place drawn from the box, and a velocity."""
@@ -165,9 +166,12 @@ class Camera(Distractor):
 
 def _spherical(away: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Distance, azimuth and polar angle of a vector."""
-    away = jnp.asarray(away)
-    across = jnp.hypot(away[0], away[1])
-    return jnp.linalg.norm(away), jnp.arctan2(away[1], away[0]), jnp.arctan2(across, away[2])
+    x, y, z = jnp.asarray(away)
+    # Straight above, where neither the azimuth nor the square root has a derivative.
+    pole = (x == 0.0) & (y == 0.0)
+    across = jnp.where(pole, 0.0, jnp.sqrt(jnp.where(pole, 1.0, x * x + y * y)))
+    azimuth = jnp.arctan2(jnp.where(pole, 0.0, y), jnp.where(pole, 1.0, x))
+    return jnp.sqrt(x * x + y * y + z * z), azimuth, jnp.arctan2(across, z)
 
 
 def _cartesian(radius: jax.Array, azimuth: jax.Array, polar: jax.Array) -> jax.Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -10,7 +11,7 @@ import warnings
 import zipfile
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,28 @@ class ClipBank:
     source: str
     split: str
 
+    def __post_init__(self) -> None:
+        """Checks that the parts agree.
+
+        Raises:
+            ValueError: they do not; the message says how.
+        """
+        shape, dtype = np.shape(self.frames), getattr(self.frames, "dtype", None)
+        if len(shape) != 4 or shape[-1] != 3 or dtype != np.uint8:
+            raise ValueError(f"frames must be (T, H, W, 3) uint8, got {shape} {dtype}.")
+        length = np.asarray(self.length)
+        if length.shape != (len(self.names),) or length.size == 0 or length.min() < 1:
+            raise ValueError(f"length must have a number of at least 1 for each of {self.names}.")
+        if length.sum() != shape[0]:
+            raise ValueError(f"lengths add up to {length.sum()}, but there are {shape[0]} frames.")
+
+    @cached_property
+    def digest(self) -> str:
+        """A hash of the content."""
+        content = hashlib.sha256(repr((self.frames.shape, self.length.tolist())).encode())
+        content.update(np.ascontiguousarray(self.frames).data)
+        return content.hexdigest()
+
     @property
     def first(self) -> np.ndarray:
         """(C,) int32, index of each clip's first frame."""
@@ -62,10 +85,10 @@ class ClipBank:
 
     def to_device(self) -> Clips:
         """The clips as ``EnvParams.clips`` wants them, on JAX's default device."""
-        rgb = self.frames.astype(np.uint32)
-        words = rgb[..., 0] | rgb[..., 1] << 8 | rgb[..., 2] << 16
+        pixels = np.zeros((*self.frames.shape[:3], 4), np.uint8)
+        pixels[..., :3] = self.frames
         return Clips(
-            words=jnp.asarray(words),
+            words=jnp.asarray(pixels.view("<u4")[..., 0]),
             first=jnp.asarray(self.first),
             length=jnp.asarray(self.length, jnp.int32),
         )
@@ -125,6 +148,7 @@ def load_clips(
     _check_size(pictures, height, width, max_bytes)
     home = _cache_home(cache_dir) / f"{_digest(sources, height, width)}.npz"
     frames, length = _read_cache(home) or _decode(sources, height, width, max_bytes, progress)
+    _check_size(len(frames), height, width, max_bytes)
     _write_cache(home, frames, length)
     return ClipBank(frames, length, tuple(s.name for s in sources), str(folder), split)
 
@@ -132,6 +156,7 @@ def load_clips(
 @lru_cache(maxsize=8)
 def _procedural(names: tuple[str, ...], split: str, height: int, width: int) -> ClipBank:
     frames = np.concatenate([procedural.clip(name, height, width) for name in names])
+    frames.flags.writeable = False  # shared by all who ask
     length = np.full(len(names), procedural.FRAMES, np.int32)
     return ClipBank(frames, length, names, "procedural", split)
 
@@ -143,7 +168,7 @@ def warn_procedural() -> None:
         "on DAVIS. Say clips='procedural' if that is what you want, or clips='<folder of "
         "DAVIS-2017>'.",
         ProceduralClipsWarning,
-        stacklevel=3,
+        stacklevel=4,
     )
 
 
@@ -153,7 +178,7 @@ def _check_size(frames: int, height: int, width: int, max_bytes: int) -> None:
         raise MemoryError(
             f"{frames} frames of {height} x {width} pixels take {needed / 1e6:.0f} MB on the "
             f"device, and max_bytes allows {max_bytes / 1e6:.0f} MB; take fewer clips "
-            "(num_clips), smaller pictures, or raise max_bytes."
+            "(num_clips), smaller pictures, or load_clips(..., max_bytes=...)."
         )
 
 
@@ -163,7 +188,7 @@ def _decode(
     clips: list[np.ndarray] = []
     total = 0
     for source in _with_progress(sources, progress):
-        frames = _frames(source, height, width)
+        frames = _frames(source, height, width, max_bytes)
         if not frames:
             raise ValueError(f"{source.files[0]} has no frames; remove it.")
         clips.append(np.stack(frames))
@@ -182,10 +207,10 @@ def _with_progress(sources: list[folders.Source], progress: bool) -> Iterable[fo
     return tqdm(sources, desc="reading clips", unit="clip", leave=False)
 
 
-def _frames(source: folders.Source, height: int, width: int) -> list[np.ndarray]:
+def _frames(source: folders.Source, height: int, width: int, max_bytes: int) -> list[np.ndarray]:
     """The clip's frames at the wanted size."""
     if source.is_video:
-        return _video_frames(source.files[0], height, width)
+        return _video_frames(source.files[0], height, width, max_bytes)
     frames = []
     for file in source.files:
         try:
@@ -198,7 +223,7 @@ def _frames(source: folders.Source, height: int, width: int) -> list[np.ndarray]
     return frames
 
 
-def _video_frames(file: Path, height: int, width: int) -> list[np.ndarray]:
+def _video_frames(file: Path, height: int, width: int, max_bytes: int) -> list[np.ndarray]:
     try:
         import imageio.v3 as imageio
     except ImportError as error:
@@ -209,11 +234,13 @@ def _video_frames(file: Path, height: int, width: int) -> list[np.ndarray]:
     with warnings.catch_warnings():
         # FFmpeg is started as a process of its own at once, which is safe beside JAX's threads.
         warnings.filterwarnings("ignore", r"os\.fork\(\) was called", RuntimeWarning)
+        frames: list[np.ndarray] = []
         try:
-            return [
-                _fit(image_module.fromarray(np.asarray(frame)).convert("RGB"), height, width)
-                for frame in imageio.imiter(file)
-            ]
+            for frame in imageio.imiter(file):
+                image = image_module.fromarray(np.asarray(frame)).convert("RGB")
+                frames.append(_fit(image, height, width))
+                _check_size(len(frames), height, width, max_bytes)
+            return frames
         except (OSError, RuntimeError, StopIteration) as error:
             raise ValueError(f"{file} cannot be read as a video ({error}).") from error
 
@@ -263,8 +290,11 @@ def _read_cache(file: Path) -> tuple[np.ndarray, np.ndarray] | None:
     try:
         with file.open("rb") as opened, np.load(opened) as cached:
             return cached["frames"], cached["length"]
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile):
-        file.unlink(missing_ok=True)  # damaged: it is made again
+    except (EOFError, ValueError, KeyError, zipfile.BadZipFile):
+        with contextlib.suppress(OSError):
+            file.unlink(missing_ok=True)  # damaged: it is made again
+        return None
+    except OSError:  # cannot be read now; the clips themselves can
         return None
 
 
@@ -278,8 +308,10 @@ def _write_cache(file: Path, frames: np.ndarray, length: np.ndarray) -> None:
         with tempfile.NamedTemporaryFile(dir=file.parent, suffix=".tmp", delete=False) as opened:
             half = Path(opened.name)
             np.savez(opened, frames=frames, length=length)
+        half.chmod(0o644)  # others may share the cache
         half.replace(file)
     except OSError as error:
         if half is not None:
-            half.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                half.unlink(missing_ok=True)
         warnings.warn(f"clips could not be cached in {file.parent} ({error}).", stacklevel=3)

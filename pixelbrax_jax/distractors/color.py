@@ -8,7 +8,7 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
-from pixelbrax_jax.choices import check_choice
+from pixelbrax_jax.choices import check_choice, check_share
 from pixelbrax_jax.distractors.base import Distractor
 from pixelbrax_jax.types import EnvParams, Frame, GeomKind
 
@@ -29,7 +29,8 @@ class Color(Distractor):
     [0, 1]; the ground shifts by what its material shifts by.
 
     An amount x is drawn from a normal distribution of standard deviation ``scale``, or from a
-    uniform one on [-scale, scale], by ``dynamics``:
+    uniform one on [-scale, scale], cut to where colors stay in [0, 1] for materials. When, is
+    decided by ``dynamics``:
 
     * ``"static"``: once for each episode,
     * ``"iid"``: anew for each frame,
@@ -64,16 +65,13 @@ class Color(Distractor):
         check_choice("mode of Color", self.mode, MODES)
         check_choice("dynamics of Color", self.dynamics, DYNAMICS)
         check_choice("distribution of Color", self.distribution, DISTRIBUTIONS)
-        if not 0.0 <= self.scale <= 1.0:
-            raise ValueError(f"scale of Color must lie in [0, 1], got {self.scale!r}.")
+        check_share("scale of Color", self.scale)
 
     def begin(self, key: jax.Array, params: EnvParams) -> jax.Array:
         """The shift: (3,) of the frame, or (M, 3) of the materials."""
-        shape = (3,) if self.mode == "frame" else params.geoms.rgb.shape
-        shift = self._draw(key, shape)
+        shift = self._draw(key, params)
         # A walk starts inside the box that it stays in.
-        shift = jnp.clip(shift, -self.scale, self.scale) if self.dynamics == "walk" else shift
-        return self._within(shift, params)
+        return self._in_box(shift, params) if self.dynamics == "walk" else shift
 
     def advance(
         self, state: jax.Array, key: jax.Array, frame: jax.Array, params: EnvParams
@@ -83,20 +81,21 @@ class Color(Distractor):
         if self.dynamics == "static":
             return state
         if self.dynamics == "iid":
-            return self._within(self._draw(key, state.shape), params)
+            return self._draw(key, params)
         step = _WALK * self.scale * jax.random.normal(key, state.shape)
-        return self._within(jnp.clip(state + step, -self.scale, self.scale), params)
+        return self._in_box(state + step, params)
 
     def change_params(self, state: jax.Array, params: EnvParams) -> EnvParams:
         """Materials and ground in other colors."""
         if self.mode == "frame":
             return params
         geoms, look = params.geoms, params.look
-        planes = [m for k, m in zip(geoms.kind, geoms.material, strict=True) if k == GeomKind.PLANE]
-        if planes:
-            ground = jnp.clip(look.ground_rgb + state[planes[0]], 0.0, 1.0)
-            look = look.replace(ground_rgb=ground)
-        return params.replace(geoms=geoms.replace(rgb=geoms.rgb + state), look=look)
+        plane = _plane_material(params)
+        if plane is not None:
+            look = look.replace(ground_rgb=look.ground_rgb + state[plane])
+        # A plane may share its material with other geoms, which have less room.
+        rgb = jnp.clip(geoms.rgb + state, 0.0, 1.0)
+        return params.replace(geoms=geoms.replace(rgb=rgb), look=look)
 
     def change_frame(self, state: jax.Array, frame: Frame, backdrop: jax.Array | None) -> Frame:
         """The frame with the offset."""
@@ -113,14 +112,35 @@ class Color(Distractor):
         """``color``: the shift."""
         return {"color": state}
 
-    def _draw(self, key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
+    def _draw(self, key: jax.Array, params: EnvParams) -> jax.Array:
+        low, high = self._room(params)
         if self.distribution == "normal":
-            return self.scale * jax.random.normal(key, shape)
-        return jax.random.uniform(key, shape, minval=-self.scale, maxval=self.scale)
+            return jnp.clip(self.scale * jax.random.normal(key, low.shape), low, high)
+        low, high = jnp.maximum(low, -self.scale), jnp.minimum(high, self.scale)
+        return jax.random.uniform(key, low.shape, minval=low, maxval=high)
 
-    def _within(self, shift: jax.Array, params: EnvParams) -> jax.Array:
-        """A shift of materials that leaves no color outside [0, 1]."""
+    def _in_box(self, shift: jax.Array, params: EnvParams) -> jax.Array:
+        low, high = self._room(params)
+        return jnp.clip(shift, jnp.maximum(low, -self.scale), jnp.minimum(high, self.scale))
+
+    def _room(self, params: EnvParams) -> tuple[jax.Array, jax.Array]:
+        """Bounds of a shift: of materials, those that leave every color in [0, 1]."""
         if self.mode == "frame":
-            return shift
+            # The sum is clipped, and not the shift.
+            return jnp.full(3, -jnp.inf), jnp.full(3, jnp.inf)
         rgb = jnp.asarray(params.geoms.rgb)
-        return jnp.clip(rgb + shift, 0.0, 1.0) - rgb
+        low, high = -rgb, 1.0 - rgb
+        plane = _plane_material(params)
+        if plane is not None:
+            # Planes are drawn in the ground's colors, not in their own.
+            ground = jnp.asarray(params.look.ground_rgb)
+            low, high = low.at[plane].set(-ground.min(0)), high.at[plane].set(1 - ground.max(0))
+        return low, high
+
+
+def _plane_material(params: EnvParams) -> int | None:
+    """The material of the first plane."""
+    for kind, material in zip(params.geoms.kind, params.geoms.material, strict=True):
+        if kind == GeomKind.PLANE:
+            return material
+    return None

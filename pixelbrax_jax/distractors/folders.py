@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -110,13 +111,18 @@ def _davis(root: Path, split: str) -> list[Source]:
 
 
 def _plain(folder: Path, split: str) -> list[Source]:
-    parts = [p.name for p in _entries(folder) if p.is_dir() and not _pictures(p)]
-    names = parts or ["all"]
-    check_choice(f"split of {folder}", split, names)
+    # A folder of pictures is a clip; one that holds clips is a split; others do not matter.
+    parts = [p.name for p in _entries(folder) if p.is_dir() and _holds_clips(p)]
+    if parts and _holds_clips(folder):
+        raise ValueError(
+            f"{folder} has clips beside the folders {', '.join(parts)} that hold clips too; move "
+            "them into a folder of their own."
+        )
+    check_choice(f"split of {folder}", split, parts or ["all"])
     home = folder / split if parts else folder
     sources = []
     for entry in _entries(home):
-        if entry.is_dir():
+        if entry.is_dir() and _pictures(entry):
             sources.append(_sequence(entry))
         elif entry.suffix.lower() in VIDEOS:
             sources.append(Source(entry.stem, (entry,)))
@@ -124,6 +130,13 @@ def _plain(folder: Path, split: str) -> list[Source]:
         kinds = ", ".join(sorted(VIDEOS))
         raise ValueError(f"{home} has neither videos ({kinds}) nor folders of pictures.")
     return sources
+
+
+def _holds_clips(folder: Path) -> bool:
+    return any(
+        _pictures(entry) if entry.is_dir() else entry.suffix.lower() in VIDEOS
+        for entry in _entries(folder)
+    )
 
 
 def _sequence(folder: Path) -> Source:
@@ -139,5 +152,12 @@ def _pictures(folder: Path) -> list[Path]:
 
 
 def _entries(folder: Path) -> list[Path]:
-    """By name; what begins with a dot is not meant."""
-    return sorted(p for p in folder.iterdir() if not p.name.startswith("."))
+    """By name, 2 before 10; what begins with a dot is not meant."""
+    return sorted(
+        (p for p in folder.iterdir() if not p.name.startswith(".")), key=lambda p: _natural(p.name)
+    )
+
+
+def _natural(name: str) -> list[tuple[int, int, str]]:
+    parts = re.split(r"(\d+)", name)
+    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts]

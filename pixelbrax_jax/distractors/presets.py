@@ -77,12 +77,12 @@ def preset(name: str, task: str) -> tuple[Distractor, ...]:
 
 
 def resolve(
-    distractors: str | Distractor | Iterable[str | Distractor], task: str
+    distractors: str | Distractor | Iterable[str | Distractor] | None, task: str
 ) -> tuple[Distractor, ...]:
     """What the user gave, as distractors.
 
     Args:
-        distractors: a name or a distractor, or several.
+        distractors: a name or a distractor, or several, or None.
         task: the task.
 
     Returns:
@@ -92,6 +92,8 @@ def resolve(
         ValueError: a name is unknown.
         TypeError: something is neither a name nor a distractor.
     """
+    if distractors is None:
+        return ()
     given = (distractors,) if isinstance(distractors, (str, Distractor)) else tuple(distractors)
     resolved: list[Distractor] = []
     for item in given:

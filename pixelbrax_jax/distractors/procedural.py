@@ -153,8 +153,9 @@ def _blobs(x: np.ndarray, y: np.ndarray, draw: _Draws) -> list[np.ndarray]:
         plane = np.zeros(np.broadcast_shapes(x.shape, y.shape))
         for k in range(number):
             shift = reach[k] * (_wave(phases[k] + frame / FRAMES) - 0.5)
-            square = (x - centers[k, 0] - shift[0]) ** 2 + (y - centers[k, 1] - shift[1]) ** 2
-            fall = np.maximum(1.0 - square / radii[k] ** 2, 0.0)
+            dx, dy = x - centers[k, 0] - shift[0], y - centers[k, 1] - shift[1]
+            square = dx * dx + dy * dy
+            fall = np.maximum(1.0 - square / (radii[k] * radii[k]), 0.0)
             plane = np.maximum(plane, heights[k] * fall * fall)
         planes.append(plane)
     return planes

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from pixelbrax_jax.choices import check_choice, check_whole
+from pixelbrax_jax.choices import check_choice, check_share, check_whole
 from pixelbrax_jax.distractors.base import Distractor
 from pixelbrax_jax.types import Clips, EnvParams, Frame
 
@@ -84,9 +84,10 @@ class Video(Distractor):
         """
         check_choice("mode of Video", self.mode, MODES)
         check_choice("dynamics of Video", self.dynamics, DYNAMICS)
-        for name, value in (("alpha", self.share), ("ground_alpha", self.ground_alpha)):
-            if not 0.0 <= value <= 1.0:
-                raise ValueError(f"{name} of Video must lie in [0, 1], got {value!r}.")
+        check_share("alpha of Video", self.share)
+        check_share("ground_alpha of Video", self.ground_alpha)
+        if self.mode == "overlay" and self.ground_alpha != 1.0:
+            raise ValueError("ground_alpha of Video means something with mode='background' alone.")
         if self.num_clips is not None:
             check_whole("num_clips of Video", self.num_clips)
 

@@ -232,6 +232,7 @@ class PixelEnv:
             key=key,
             episode=episode,
             step_count=jnp.int32(0),
+            head_start=jnp.int32(0),
             episode_return=jnp.float32(0.0),
             done=jnp.bool_(False),
             distraction=self.distractors.begin(episode_key, params),
@@ -251,7 +252,7 @@ class PixelEnv:
             count += jnp.where(over, 0, 1)
             return (physics, reward, count, over | moved.terminated | (count >= limit)), None
 
-        limit = self.episode_length
+        limit = self.episode_length - state.head_start
         if self.action_repeat == 1:
             physics = self.physics.step(state.physics, action)
             reward, count = physics.reward, state.step_count + 1
@@ -311,7 +312,7 @@ class PixelEnv:
             obs=self.obs(state),
             reward=reward,
             terminated=terminated,
-            truncated=~terminated & (state.step_count >= self.episode_length),
+            truncated=~terminated & (state.step_count + state.head_start >= self.episode_length),
             info={
                 "episode_return": state.episode_return,
                 "episode_length": state.step_count,

@@ -193,6 +193,19 @@ def test_roll_turns_the_picture():
     np.testing.assert_allclose(cosine, np.cos(0.3), atol=1e-5)
 
 
+def test_gradients_are_finite_straight_above():
+    above = rig((0.0, 0.0, 3.0), (0.0, 0.0, 0.0), 50.0, up=(0.0, 1.0, 0.0))
+    camera = distractors.Camera(scale=0.3)
+
+    def place_of_eye(eye):
+        params = PARAMS.replace(rig=above.replace(eye=eye))
+        state = camera.begin(jax.random.key(0), params)
+        state = camera.advance(state, jax.random.key(1), 1, params)
+        return camera.change_params(state, params).rig.eye.sum()
+
+    assert np.isfinite(jax.grad(place_of_eye)(jnp.asarray(above.eye))).all()
+
+
 def test_scale_is_checked():
     with pytest.raises(ValueError, match=r"scale of Camera must lie in \[0, 1\], got -1"):
         distractors.Camera(scale=-1)

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
+
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from PIL import Image
 
 import pixelbrax_jax as pb
 from pixelbrax_jax import distractors
@@ -93,6 +98,20 @@ def test_frames_advance_once_for_each_step_under_action_repeat():
     assert frames[:until] == [t % 5 for t in range(until)]
 
 
+def test_an_early_time_limit_does_not_move_the_video():
+    loop = distractors.Video(dynamics="loop", num_clips=1, random_start=False)
+    env = PixelEnv(Ball(), **SIZE, episode_length=6, distractors=(loop,))
+    state, _ = env.reset(jax.random.key(0), WITH_CLIPS)
+    state = state.replace(head_start=jnp.int32(3))
+    for step in (1, 2, 3):
+        state, timestep = env.step(state, jnp.zeros(1), WITH_CLIPS)
+        assert int(timestep.info["video_frame"]) == step
+        assert int(timestep.info["episode_length"]) == step
+    assert timestep.truncated
+    state, timestep = env.next_episode(state, WITH_CLIPS)
+    assert int(state.head_start) == 0
+
+
 def test_order_of_giving_does_not_matter(runs):
     reordered = rollout(ALL[::-1])
     np.testing.assert_array_equal(reordered.obs["pixels"], runs[0].obs["pixels"])
@@ -101,6 +120,31 @@ def test_order_of_giving_does_not_matter(runs):
 def test_two_of_a_kind():
     with pytest.raises(ValueError, match="two distractors of kind 'color'"):
         Chain((distractors.Color(), distractors.Color(scale=0.1)))
+
+
+def test_what_cannot_work_together_is_refused():
+    class Nameless(distractors.Distractor):
+        pass
+
+    class Twin(distractors.Distractor):
+        kind, stream = "twin", 1
+
+    class Reset(distractors.Distractor):
+        kind, stream = "reset", 0
+
+    class Unhashable(distractors.Distractor):
+        kind, stream = "unhashable", 50
+        __hash__ = None
+
+    for given, error, message in (
+        (("color",), TypeError, "expected a Distractor, got str; names are for"),
+        ((Nameless(),), TypeError, "Nameless needs a kind"),
+        ((Reset(),), ValueError, "Reset needs a stream, a whole number of at least 1, got 0"),
+        ((Twin(), distractors.Color()), ValueError, "twin, color must differ in their streams"),
+        ((Unhashable(),), TypeError, "Unhashable cannot be hashed; make it a frozen"),
+    ):
+        with pytest.raises(error, match=message):
+            Chain(given)
 
 
 def test_state_observations_carry_no_distractors():
@@ -160,10 +204,29 @@ def test_names_and_objects_may_be_mixed():
         resolve((3,), "ant")
 
 
+def test_clips_of_a_folder_are_on_the_device_once(tmp_path, monkeypatch):
+    monkeypatch.setenv("PIXELBRAX_CACHE", str(tmp_path / "cache"))
+    (tmp_path / "clips" / "one").mkdir(parents=True)
+    Image.new("RGB", (8, 8), "red").save(tmp_path / "clips" / "one" / "0.png")
+    options = {"height": 8, "width": 8, "distractors": "video"}
+
+    def make():
+        source = {"clips": tmp_path / "clips", "split": "all"}
+        return pb.make("inverted_pendulum", **source, **options)[1].clips
+
+    one, other = make(), make()
+    assert one.words is other.words
+    clips = weakref.ref(one)
+    del one, other
+    gc.collect()
+    assert clips() is None, "clips leave with the last who shows them"
+
+
 def test_make_shares_clips_and_warns_of_procedural_ones():
     options = {"height": 16, "width": 16}
-    with pytest.warns(distractors.ProceduralClipsWarning, match="not results on DAVIS"):
+    with pytest.warns(distractors.ProceduralClipsWarning, match="not results on DAVIS") as told:
         pb.make("inverted_pendulum", distractors="video", **options)
+    assert told[0].filename == __file__
     _, params = pb.make(
         "inverted_pendulum", distractors="video", clips="procedural", split="test", **options
     )
@@ -177,5 +240,10 @@ def test_make_shares_clips_and_warns_of_procedural_ones():
     bank = make_bank()
     _, own = pb.make("inverted_pendulum", distractors="video", clips=bank, **options)
     assert own.clips.words.shape == (14, 24, 20)
+    assert pb.make("inverted_pendulum", distractors=None, **options)[1].clips is None
+    with pytest.raises(ValueError, match="clips are given, but no video"):
+        pb.make("inverted_pendulum", distractors="color", clips="procedural", **options)
+    with pytest.raises(ValueError, match="split='test', but the clips are of split 'train'"):
+        pb.make("inverted_pendulum", distractors="video", clips=bank, split="test", **options)
     with pytest.raises(ValueError, match="unknown split of procedural clips: 'val'"):
         pb.make("inverted_pendulum", distractors="video", clips="procedural", split="val")

@@ -15,6 +15,13 @@ from pixelbrax_jax import cli, distractors, load_clips
 from pixelbrax_jax.distractors import clips as clips_module
 from pixelbrax_jax.distractors import procedural
 
+# imageio starts FFmpeg at once after the fork, and never closes its pipes itself.
+with_ffmpeg = pytest.mark.filterwarnings(
+    "ignore:os.fork:RuntimeWarning",
+    "ignore:unclosed file:ResourceWarning",
+    "ignore::pytest.PytestUnraisableExceptionWarning",
+)
+
 LENGTHS = {"bear": 3, "boat": 1, "car-turn": 4}
 VAL = {"blackswan": 2}
 
@@ -104,14 +111,6 @@ def test_pictures_are_cut_to_the_middle_and_scaled_smoothly(tmp_path):
     assert np.abs(frame.astype(int) - 127).max() < 12, "fine stripes become gray"
 
 
-# imageio starts FFmpeg at once after the fork, and never closes its pipes itself.
-with_ffmpeg = pytest.mark.filterwarnings(
-    "ignore:os.fork:RuntimeWarning",
-    "ignore:unclosed file:ResourceWarning",
-    "ignore::pytest.PytestUnraisableExceptionWarning",
-)
-
-
 @with_ffmpeg
 def test_a_real_video_file(tmp_path):
     import imageio.v3 as imageio
@@ -128,6 +127,42 @@ def test_a_real_video_file(tmp_path):
     # The bar moves to the right.
     centers = (bank.frames.mean((1, 3)) * np.arange(32)).sum(1) / bank.frames.mean((1, 3)).sum(1)
     assert (np.diff(centers) > 2).all()
+
+
+def test_pictures_come_in_the_order_of_their_numbers(tmp_path):
+    folder = tmp_path / "clips" / "one"
+    folder.mkdir(parents=True)
+    (tmp_path / "clips" / "__MACOSX").mkdir()
+    for number in range(12):
+        Image.new("RGB", (4, 4), (20 * number, 0, 0)).save(folder / f"{number}.png")
+    frames = load_clips(tmp_path / "clips", "all", height=2, width=2).frames
+    assert frames[:, 0, 0, 0].tolist() == [20 * number for number in range(12)]
+
+
+@with_ffmpeg
+def test_a_cached_video_obeys_the_limit_too(tmp_path):
+    import imageio.v3 as imageio
+
+    (tmp_path / "videos").mkdir()
+    imageio.imwrite(tmp_path / "videos" / "a.mp4", np.zeros((8, 32, 32, 3), np.uint8), fps=10)
+    for _ in range(2):
+        with pytest.raises(MemoryError, match="max_bytes"):
+            load_clips(tmp_path / "videos", "all", height=16, width=16, max_bytes=3000)
+        assert len(load_clips(tmp_path / "videos", "all", height=16, width=16).frames) == 8
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"frames": np.zeros((3, 4, 4, 3))}, r"\(T, H, W, 3\) uint8, got .*float64"),
+        ({"length": np.array([1, 1])}, "add up to 2, but there are 3 frames"),
+        ({"length": np.array([3, 0])}, "at least 1 for each"),
+    ],
+)
+def test_banks_are_checked(changes, message):
+    parts = {"frames": np.zeros((3, 4, 4, 3), np.uint8), "length": np.array([1, 2])}
+    with pytest.raises(ValueError, match=message):
+        distractors.ClipBank(**(parts | changes), names=("a", "b"), source="x", split="train")
 
 
 def test_subfolders_are_splits(tmp_path):
@@ -156,10 +191,11 @@ def test_the_cache_is_read_and_follows_the_files(davis, monkeypatch):
     assert changed.frames[1].min() > 250
 
 
-def test_a_damaged_cache_is_made_again(davis, tmp_path):
+@pytest.mark.parametrize("length", [0, 100])
+def test_a_damaged_cache_is_made_again(davis, tmp_path, length):
     first = load_clips(davis, "train", height=8, width=8)
     (file,) = (tmp_path / "cache").rglob("*.npz")
-    file.write_bytes(file.read_bytes()[:100])
+    file.write_bytes(file.read_bytes()[:length])
     np.testing.assert_array_equal(
         load_clips(davis, "train", height=8, width=8).frames, first.frames
     )
@@ -290,6 +326,9 @@ def test_command(davis, tmp_path, capsys):
         assert picture.width > 16 * 4
     assert cli.main(["clips", str(tmp_path / "nowhere")]) == 1
     assert "no folder of clips" in capsys.readouterr().err
+    nowhere = str(tmp_path / "nowhere" / "sheet.png")
+    assert cli.main(["clips", str(davis), "--size", "8", "--sheet", nowhere]) == 1
+    assert "nowhere" in capsys.readouterr().err
 
 
 def test_names_of_the_module():

@@ -105,8 +105,8 @@ def test_paper_color_is_one_offset_for_each_frame():
 def test_materials_keep_colors_in_range(dynamics, distribution):
     color = distractors.Color("geom", dynamics, 0.6, distribution)
     shifts = walk(color, steps=20, num=200)
-    rgb = PARAMS.geoms.rgb + shifts
     assert shifts.shape[-2:] == PARAMS.geoms.rgb.shape
+    rgb = (PARAMS.geoms.rgb + shifts)[..., 1, :]
     assert rgb.min() >= 0.0
     assert rgb.max() <= 1.0 + 1e-6
     # Each material of its own.
@@ -120,6 +120,32 @@ def test_geom_colors_change_things_and_not_the_sky():
         np.testing.assert_array_equal(frame.r[sky], clean.r[sky])
         assert (np.asarray(frame.g)[ball] != np.asarray(clean.g)[ball]).all()
         assert (np.asarray(frame.g)[clean.ground] != np.asarray(clean.g)[clean.ground]).any()
+
+
+def test_the_ground_has_room_of_its_own():
+    """A plane's own color is not drawn: white as it may be, the ground lightens and darkens."""
+    white = PARAMS.geoms.rgb.copy()
+    white[0] = 1.0
+    params = PARAMS.replace(geoms=PARAMS.geoms.replace(rgb=white))
+    for distribution in ("uniform", "normal"):
+        color = distractors.Color("geom", "static", 0.2, distribution)
+        shifts = np.asarray(jax.jit(jax.vmap(lambda key, c=color: c.begin(key, params)))(KEYS))
+        assert abs((shifts[:, 0] > 0).mean() - 0.5) < 0.02
+        if distribution == "uniform":
+            assert (shifts != 0).all(), "nothing piles up on a bound"
+        changed = jax.jit(jax.vmap(lambda s, c=color: c.change_params(s, params)))(shifts[:500])
+        assert np.min(changed.look.ground_rgb) >= 0.0
+        assert np.max(changed.look.ground_rgb) <= 1.0
+        assert np.max(changed.geoms.rgb) <= 1.0
+
+
+def test_uniform_materials_are_uniform_in_the_room_they_have():
+    color = distractors.Color("geom", "static", 0.3, "uniform")
+    shifts = starts(color)[:, 1]
+    rgb = PARAMS.geoms.rgb[1]
+    low, high = np.maximum(-0.3, -rgb), np.minimum(0.3, 1 - rgb)
+    np.testing.assert_allclose(shifts.mean(0), (low + high) / 2, atol=0.005)
+    np.testing.assert_allclose(shifts.std(0), (high - low) / np.sqrt(12), rtol=0.02)
 
 
 def test_environments_differ():
@@ -136,6 +162,7 @@ def test_environments_differ():
         ({"distribution": "gauss"}, "unknown distribution of Color"),
         ({"scale": 2.0}, r"scale of Color must lie in \[0, 1\], got 2.0"),
         ({"scale": float("nan")}, r"scale of Color must lie in \[0, 1\], got nan"),
+        ({"scale": "0.3"}, r"scale of Color must lie in \[0, 1\], got '0.3'"),
     ],
 )
 def test_options_are_checked(options, message):

@@ -149,6 +149,7 @@ def test_no_clips():
         ({"dynamics": "ping-pong"}, "Did you mean 'pingpong'"),
         ({"alpha": 1.5}, r"alpha of Video must lie in \[0, 1\], got 1.5"),
         ({"ground_alpha": -0.1}, r"ground_alpha of Video must lie in \[0, 1\], got -0.1"),
+        ({"mode": "overlay", "ground_alpha": 0.0}, "mode='background' alone"),
         ({"num_clips": 0}, "num_clips of Video must be a whole number of at least 1, got 0"),
     ],
 )

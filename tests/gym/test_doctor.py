@@ -68,7 +68,13 @@ def test_a_healthy_machine():
             "install it again",
         ),
         (
-            {"jax_platform": "tpu", "torch_cuda": False, "has_nvidia": False, "to_torch": None},
+            {
+                "jax_platform": "tpu",
+                "torch_cuda": False,
+                "has_nvidia": False,
+                "to_torch": None,
+                "to_jax": None,
+            },
             "note",
             "cannot share the memory of a tpu",
             "output='numpy'",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import gymnasium
 import jax
 import numpy as np
@@ -28,6 +30,25 @@ def test_forked_workers_name_the_cure():
             env.reset(seed=0)
     finally:
         env.close(terminate=True)
+
+
+def test_forked_workers_do_not_touch_clips():
+    """They would be put on the device while the environment is made, where no error gets out."""
+    options = SIZE | {"distractors": "video", "clips": "procedural"}
+    gymnasium.make(ID, **options)  # known before the fork
+    child, parent = os.pipe()
+    pid = os.fork()
+    if pid == 0:
+        try:
+            gymnasium.make(ID, **options)
+            message = "made"
+        except RuntimeError as error:
+            message = str(error)
+        os.write(parent, message.encode())
+        os._exit(0)
+    os.waitpid(pid, 0)
+    assert os.read(child, 10_000).decode().startswith("PixelBrax was forked")
+    os.close(child), os.close(parent)
 
 
 @pytest.mark.slow
