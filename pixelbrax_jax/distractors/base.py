@@ -53,9 +53,22 @@ class Distractor:
         del state
         return params
 
-    def backdrop(self, state: Any, params: EnvParams, height: int, width: int) -> jax.Array | None:
-        """A picture that ``change_frame`` mixes in, (height, width) packed uint32, or None."""
-        del state, params, height, width
+    def backdrop(
+        self, state: Any, params: EnvParams, rows: jax.Array, height: int, width: int
+    ) -> jax.Array | None:
+        """Rows of a picture that ``change_frame`` mixes in.
+
+        Args:
+            state: at this frame.
+            params: of the environment.
+            rows: (R,) int32, which rows, in [0, height).
+            height: pixels of the whole picture.
+            width: pixels.
+
+        Returns:
+            (R, width) packed uint32, or None.
+        """
+        del state, params, rows, height, width
         return None
 
     def change_frame(self, state: Any, frame: Frame, backdrop: jax.Array | None) -> Frame:
@@ -126,11 +139,16 @@ class Chain:
         return params
 
     def backdrops(
-        self, states: tuple[Any, ...], params: EnvParams, height: int, width: int
+        self,
+        states: tuple[Any, ...],
+        params: EnvParams,
+        rows: jax.Array,
+        height: int,
+        width: int,
     ) -> tuple[jax.Array | None, ...]:
-        """The pictures to mix in."""
+        """The pictures to mix in, (R, width) each."""
         return tuple(
-            link.backdrop(state, params, height, width)
+            link.backdrop(state, params, rows, height, width)
             for link, state in zip(self.links, states, strict=True)
         )
 

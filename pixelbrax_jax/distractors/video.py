@@ -124,18 +124,20 @@ class Video(Distractor):
             frame=frame_index(self.dynamics, length, state.start, state.direction, frame)
         )
 
-    def backdrop(self, state: VideoState, params: EnvParams, height: int, width: int) -> jax.Array:
-        """The clip's frame, its nearest pixels where the picture is of another size."""
+    def backdrop(
+        self, state: VideoState, params: EnvParams, rows: jax.Array, height: int, width: int
+    ) -> jax.Array:
+        """Rows of the clip's frame, its nearest pixels where the picture is of another size."""
         clips = _clips(params)
         index = jnp.asarray(clips.first)[state.clip] + state.frame
-        words = jax.lax.dynamic_index_in_dim(clips.words, index, keepdims=False)
-        if words.shape == (height, width):
-            return words
-        rows, columns = (
-            (np.arange(wanted) * 2 + 1) * present // (2 * wanted)
-            for wanted, present in zip((height, width), words.shape, strict=True)
-        )
-        return words[rows][:, columns]
+        words = jnp.asarray(clips.words)
+        _, present_height, present_width = words.shape
+        if present_height != height:
+            rows = (2 * rows + 1) * present_height // (2 * height)
+        picture = words[index, rows]
+        if present_width == width:
+            return picture
+        return picture[:, (2 * np.arange(width) + 1) * present_width // (2 * width)]
 
     def change_frame(self, state: VideoState, frame: Frame, backdrop: jax.Array | None) -> Frame:
         """The frame with the video in it."""

@@ -195,7 +195,8 @@ class PixelEnv:
         """
         height, width = self._size(height, width)
         frame = render(self._scene(state, params), height, width, self.renderer)
-        backdrops = self.distractors.backdrops(state.distraction, params, height, width)
+        rows = jnp.arange(height)
+        backdrops = self.distractors.backdrops(state.distraction, params, rows, height, width)
         return self.distractors.change_frame(state.distraction, frame, backdrops)
 
     @partial(jax.jit, static_argnums=(0, 3, 4))
@@ -285,17 +286,14 @@ class PixelEnv:
         num_bands = max(2, round(height / _BAND_ROWS))
         rows = -(-height // num_bands)
 
-        def in_bands(picture: jax.Array) -> jax.Array:
-            missing = num_bands * rows - height
-            return jnp.pad(picture, ((0, missing), (0, 0))).reshape(num_bands, rows, width)
-
-        def band(inputs: Any) -> jax.Array:
-            first_row, backdrops = inputs
+        def band(first_row: jax.Array) -> jax.Array:
             frame = render(scene, height, width, self.renderer, first_row=first_row, num_rows=rows)
+            # The last band may reach beyond the picture.
+            within = jnp.minimum(first_row + jnp.arange(rows), height - 1)
+            backdrops = self.distractors.backdrops(state.distraction, params, within, height, width)
             return observe.pack(self.distractors.change_frame(state.distraction, frame, backdrops))
 
-        backdrops = self.distractors.backdrops(state.distraction, params, height, width)
-        words = jax.lax.map(band, (jnp.arange(num_bands) * rows, jax.tree.map(in_bands, backdrops)))
+        words = jax.lax.map(band, jnp.arange(num_bands) * rows)
         return words.reshape(-1, width)[:height]
 
     def show(self, state: EnvState, params: EnvParams, first: jax.Array) -> EnvState:

@@ -247,15 +247,17 @@ def synthetic_bank(size: int = 84) -> distractors.ClipBank:
     return distractors.ClipBank(frames, length, tuple(map(str, range(60))), "noise", "train")
 
 
-def distractor_costs(num_envs: int, calls: int = 4) -> list[dict]:
+def distractor_costs(num_envs: int) -> list[dict]:
     """Steps per second with and without distractors, all taking turns."""
+    calls = max(1, 4096 // num_envs)
     bank = synthetic_bank()
     started = time.perf_counter()
     jax.block_until_ready(bank.to_device().words)
     upload_seconds = time.perf_counter() - started
     runners, times = {}, {}
     for name, links in DISTRACTORS.items():
-        env, params = pixelbrax_jax.make("ant", distractors=links, clips=bank)
+        plays = any(isinstance(link, distractors.Video) for link in links)
+        env, params = pixelbrax_jax.make("ant", distractors=links, clips=bank if plays else None)
         runners[name] = _stepper(env, jax.device_put(params), num_envs, calls)
         times[name] = []
         runners[name]()

@@ -18,17 +18,22 @@ OPTIONS = {"episode_length": 20, "frame_stack": 2}
 STEPS = 70
 
 
+def copy(frame):
+    """A NumPy array of its own, from any framework's."""
+    return np.asarray(frame).copy()
+
+
 class Episodes:
     """Frames of each environment, episode by episode."""
 
     def __init__(self, obs):
-        self.rows = [[[np.array(frame)]] for frame in obs]
+        self.rows = [[[copy(frame)]] for frame in obs]
 
     def goes_on(self, i, frame):
-        self.rows[i][-1].append(np.array(frame))
+        self.rows[i][-1].append(copy(frame))
 
     def begins(self, i, frame):
-        self.rows[i].append([np.array(frame)])
+        self.rows[i].append([copy(frame)])
 
     @property
     def complete(self):
