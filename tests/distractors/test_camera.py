@@ -43,7 +43,9 @@ def eye_of(camera, state, params):
     return np.asarray(jax.jit(jax.vmap(one))(flat)).reshape(*state.radius.shape, 3)
 
 
-@pytest.mark.parametrize("level", SCALES)
+@pytest.mark.parametrize(
+    "level", ["hard", *(pytest.param(name, marks=pytest.mark.slow) for name in ("easy", "medium"))]
+)
 def test_the_walk_stays_in_its_box(level):
     b = SCALES[level]
     params = PARAMS.replace(rig=RIG)

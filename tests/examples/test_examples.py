@@ -22,6 +22,7 @@ def load(name):
     return module
 
 
+@pytest.mark.slow  # `make demo` runs it in full
 def test_train_inverted_pendulum(tmp_path):
     figures = load("train_inverted_pendulum").main(
         [
@@ -46,6 +47,8 @@ def test_torchrl_ppo(tmp_path):
     assert figures["eval_return_mean"] > 0
 
 
+# Stable-Baselines3's progress bar warns that a part of tqdm is young.
+@pytest.mark.filterwarnings("ignore:rich is experimental")
 def test_sb3_ppo(tmp_path):
     arguments = ["--output-dir", str(tmp_path), "--total-steps", "256"]
     figures = load("sb3_ppo").main([*arguments, *SMALL])
@@ -62,6 +65,7 @@ def test_skrl_ppo(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:rich is experimental")
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("name", ["torchrl_ppo", "sb3_ppo"])
 def test_agents_learn(name, tmp_path):
