@@ -383,14 +383,18 @@ def spread_seeds(seed: int, num_envs: int) -> list[int]:
     Raises:
         TypeError: it is not a whole number.
     """
-    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)):
-        raise TypeError(f"a seed must be a whole number, got {seed!r}.")
-    return [(int(seed) + i) % SEEDS for i in range(num_envs)]
+    first = _whole_seed(seed)
+    return [(first + i) % SEEDS for i in range(num_envs)]
 
 
 def _check_seed(seed: Any) -> int:
-    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)):
-        raise TypeError(f"a seed must be a whole number, got {seed!r}.")
+    seed = _whole_seed(seed)
     if not 0 <= seed < SEEDS:
         raise ValueError(f"seeds must lie in [0, 2**32), got {seed}.")
+    return seed
+
+
+def _whole_seed(seed: Any) -> int:
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)):
+        raise TypeError(f"a seed must be a whole number, got {seed!r}.")
     return int(seed)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from pixelbrax_jax.distractors import ClipBank
@@ -20,3 +21,18 @@ def make_bank(lengths=(5, 1, 8), height=24, width=20):
 
 def make_clips(**options) -> Clips:
     return jax.tree.map(np.asarray, make_bank(**options).to_device())
+
+
+def walk(distractor, params, steps, num):
+    """States after the first frame of episodes of ``steps`` frames, (steps - 1, num, ...)."""
+
+    def one(key):
+        def step(state, t):
+            state = distractor.advance(state, jax.random.fold_in(key, t), t, params)
+            return state, state
+
+        first = distractor.begin(jax.random.fold_in(key, 0), params)
+        return jax.lax.scan(step, first, jnp.arange(1, steps))[1]
+
+    keys = jax.vmap(jax.random.key)(jnp.arange(num))
+    return jax.tree.map(np.asarray, jax.jit(jax.vmap(one, out_axes=1))(keys))

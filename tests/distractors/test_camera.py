@@ -10,27 +10,12 @@ import pytest
 from pixelbrax_jax import distractors, make, place
 from pixelbrax_jax.physics.tasks import TASKS
 from pixelbrax_jax.scene.cameras import aim, named_rigs, rig
+from tests.distractors.conftest import walk
 from tests.envs.toy import PARAMS
 
 SCALES = {"easy": 0.1, "medium": 0.2, "hard": 0.3}
 RIG = rig((0.0, -4.0, 1.0), (0.0, 0.0, 0.0), 50.0)
 STEPS = 10_000
-
-
-def walk(camera, params, steps, num=8):
-    """(steps, num) states of the walk."""
-
-    def one(key):
-        def step(state, t):
-            state = camera.advance(state, jax.random.fold_in(key, t), t, params)
-            return state, state
-
-        first = camera.begin(jax.random.fold_in(key, 0), params)
-        return jax.lax.scan(step, first, jnp.arange(1, steps))[1]
-
-    keys = jax.vmap(jax.random.key)(jnp.arange(num))
-    states = jax.jit(jax.vmap(one, out_axes=1))(keys)
-    return jax.tree.map(np.asarray, states)
 
 
 def eye_of(camera, state, params):
@@ -50,7 +35,7 @@ def test_the_walk_stays_in_its_box(level):
     b = SCALES[level]
     params = PARAMS.replace(rig=RIG)
     camera = distractors.Camera(scale=b)
-    states = walk(camera, params, STEPS)
+    states = walk(camera, params, STEPS, num=8)
     angle, tiny = 0.5 * np.pi * b, 1e-5
     polar = np.arctan2(4.0, 1.0)
     assert states.radius.min() >= 1 - 0.5 * b - tiny
@@ -71,7 +56,7 @@ def test_the_walk_stays_in_its_box(level):
 @pytest.mark.parametrize("b", [0.1, 0.3])
 def test_the_walk_keeps_its_speed_limits(b):
     params = PARAMS.replace(rig=RIG)
-    states = walk(distractors.Camera(scale=b), params, 3000)
+    states = walk(distractors.Camera(scale=b), params, 3000, num=8)
     fastest = 0.4 * b * np.linalg.norm(RIG.eye) / 4.0
     speed = np.linalg.norm(states.velocity, axis=-1)
     # Where the box cuts a step short it may also turn it, never lengthen it by much.

@@ -9,7 +9,7 @@ import pytest
 
 from pixelbrax_jax import VectorPixelEnv, distractors
 from pixelbrax_jax.envs.pixel_env import PixelEnv
-from tests.distractors.conftest import SIZE
+from tests.distractors.conftest import SIZE, walk
 from tests.envs.toy import PARAMS, Ball
 
 KEYS = jax.vmap(jax.random.key)(jnp.arange(20_000))
@@ -17,20 +17,6 @@ KEYS = jax.vmap(jax.random.key)(jnp.arange(20_000))
 
 def starts(color):
     return np.asarray(jax.jit(jax.vmap(lambda key: color.begin(key, PARAMS)))(KEYS))
-
-
-def walk(color, steps, num=500):
-    """(steps, num, ...) shifts."""
-
-    def one(key):
-        def step(state, t):
-            state = color.advance(state, jax.random.fold_in(key, t), t, PARAMS)
-            return state, state
-
-        first = color.begin(jax.random.fold_in(key, 0), PARAMS)
-        return jax.lax.scan(step, first, jnp.arange(1, steps))[1]
-
-    return np.asarray(jax.jit(jax.vmap(one, out_axes=1))(KEYS[:num]))
 
 
 @pytest.mark.parametrize("scale", [0.1, 0.3])
@@ -51,20 +37,20 @@ def test_uniform_offsets():
 
 
 def test_iid_frames_are_independent():
-    shifts = walk(distractors.Color(scale=0.3), steps=50)
+    shifts = walk(distractors.Color(scale=0.3), PARAMS, steps=50, num=500)
     np.testing.assert_allclose(shifts.std(), 0.3, rtol=0.02)
     correlation = np.corrcoef(shifts[:-1].ravel(), shifts[1:].ravel())[0, 1]
     assert abs(correlation) < 0.02
 
 
 def test_a_static_color_stays():
-    shifts = walk(distractors.Color(scale=0.3, dynamics="static"), steps=10)
+    shifts = walk(distractors.Color(scale=0.3, dynamics="static"), PARAMS, steps=10, num=500)
     assert (shifts == shifts[0]).all()
     assert len(np.unique(shifts[0, :, 0])) == 500
 
 
 def test_a_walk_takes_small_steps_and_stays_in_its_box():
-    shifts = walk(distractors.Color(scale=0.2, dynamics="walk"), steps=2000, num=50)
+    shifts = walk(distractors.Color(scale=0.2, dynamics="walk"), PARAMS, steps=2000, num=50)
     assert np.abs(shifts).max() <= 0.2 + 1e-6
     steps = np.diff(shifts, axis=0)
     inside = np.abs(shifts[:-1]) < 0.15
@@ -104,7 +90,7 @@ def test_paper_color_is_one_offset_for_each_frame():
 @pytest.mark.parametrize("distribution", ["normal", "uniform"])
 def test_materials_keep_colors_in_range(dynamics, distribution):
     color = distractors.Color("geom", dynamics, 0.6, distribution)
-    shifts = walk(color, steps=20, num=200)
+    shifts = walk(color, PARAMS, steps=20, num=200)
     assert shifts.shape[-2:] == PARAMS.geoms.rgb.shape
     rgb = (PARAMS.geoms.rgb + shifts)[..., 1, :]
     assert rgb.min() >= 0.0
