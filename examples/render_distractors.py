@@ -19,6 +19,7 @@ from PIL import Image
 
 import pixelbrax_jax
 from pixelbrax_jax import distractors
+from pixelbrax_jax.distractors.presets import resolve
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -55,7 +56,10 @@ def simulate(task: str, num_frames: int) -> Any:
 
 def play(task: str, links: tuple, states: Any) -> np.ndarray:
     """What the agent sees of states, (num_frames, N, 84, 84, 3) uint8."""
-    env, params = pixelbrax_jax.make(task, distractors=links, clips="procedural", frame_stack=1)
+    links = resolve(links, task)
+    plays = any(isinstance(link, distractors.Video) for link in links)
+    clips = "procedural" if plays else None
+    env, params = pixelbrax_jax.make(task, distractors=links, clips=clips, frame_stack=1)
     chain = env.distractors
 
     def run(states, params):
@@ -113,7 +117,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Writes both pictures."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--output-dir", type=Path, default=Path("docs/images/distractors"))
-    parser.add_argument("--num-frames", type=int, default=40)
+    parser.add_argument("--num-frames", type=int, default=24)
     options = parser.parse_args(arguments)
     options.output_dir.mkdir(parents=True, exist_ok=True)
     frames = {}
