@@ -11,6 +11,9 @@ ARGS ?=
 RUN := $(VENV)/bin/python
 PIP := $(RUN) -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
+# Two processes; a file of tests stays in one of them, because its tests share programs.
+WORKERS := -n 2 --dist loadfile
+
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .PHONY: help demo test test-slow lint format bench docs docs-serve clean
@@ -23,10 +26,10 @@ demo: $(VENV)/.installed-demo ## train a PyTorch agent from pixels; results in r
 	$(RUN) examples/train_inverted_pendulum.py --output-dir runs/demo $(ARGS)
 
 test: $(VENV)/.installed-dev ## run the tests that take minutes at most
-	$(RUN) -m pytest -m "not slow and not gpu" $(ARGS)
+	$(RUN) -m pytest $(WORKERS) -m "not slow and not gpu" $(ARGS)
 
 test-slow: $(VENV)/.installed-dev ## run the tests that take longer
-	$(RUN) -m pytest -m "slow and not gpu" $(ARGS)
+	$(RUN) -m pytest $(WORKERS) -m "slow and not gpu" $(ARGS)
 
 lint: $(VENV)/.installed-dev ## check style, types and spelling
 	$(RUN) -m ruff check .
@@ -48,7 +51,7 @@ docs-serve: $(VENV)/.installed-docs ## read the documentation in a browser while
 	NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs serve
 
 clean: ## remove the environment, builds and caches; keeps runs/
-	rm -rf $(VENV) .venv-ci build dist site .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) .venv-ci build dist site .jax_cache .mypy_cache .pytest_cache .ruff_cache
 	find pixelbrax_jax pixelbrax_gym tests examples -name __pycache__ -prune -exec rm -rf {} +
 
 # One environment for all; each set of extras is installed when it is first needed, and again

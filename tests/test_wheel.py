@@ -43,9 +43,13 @@ print("works", version("pixelbrax"))
 """
 
 
+OURS = ("PYTHONPATH", "VIRTUAL_ENV", "JAX_COMPILATION_CACHE_DIR")
+"""Variables of the tests' own environment."""
+
+
 def run(*command: str | Path, cwd: Path) -> str:
     """Output of a command that knows nothing of the environment the tests run in."""
-    environ = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "VIRTUAL_ENV")}
+    environ = {k: v for k, v in os.environ.items() if k not in OURS}
     result = subprocess.run(
         [str(part) for part in command],
         cwd=cwd,

@@ -156,6 +156,10 @@ class VectorPixelEnv:
         info = {**first.info, "final_obs": timestep.obs, "final_info": timestep.info}
         return state, timestep.replace(obs=first.obs, info=info)
 
+    def obs(self, state: EnvState) -> Any:
+        """Observations of the states, with a leading axis N."""
+        return jax.vmap(self.env.obs)(state)
+
     def _env_keys(self, key: jax.Array) -> jax.Array:
         if getattr(key, "shape", ()) == ():
             check_key(key)

@@ -1,0 +1,1 @@
+"""Agents that learn from pixels, written in JAX: PPO, PPG and DCPG."""

@@ -1,0 +1,75 @@
+"""Distributions over actions, in closed form."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+_LOG_2PI = 1.8378770664093453
+
+
+class Normal(struct.PyTreeNode):
+    """Independent normal distributions, over raw actions.
+
+    The environment gets ``action(raw)``: the raw action itself, which the environment clips to
+    [-1, 1], or its ``tanh``. Probabilities are always of the raw action that was drawn; a
+    clipped action with the density of an unclipped one would bias the gradient.
+
+    Attributes:
+        mean: (..., A) float32.
+        std: (..., A) float32, positive.
+        squash: static; whether the action is ``tanh(raw)``.
+    """
+
+    mean: jax.Array
+    std: jax.Array
+    squash: bool = struct.field(pytree_node=False)
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        """A raw action, (..., A)."""
+        return self.mean + self.std * jax.random.normal(key, self.mean.shape)
+
+    def action(self, raw: jax.Array) -> jax.Array:
+        """What the environment gets for a raw action."""
+        return jnp.tanh(raw) if self.squash else raw
+
+    def log_prob(self, raw: jax.Array) -> jax.Array:
+        """(...) logarithm of the density of ``action(raw)``.
+
+        With a = tanh(u), ``log p(a) = log N(u) - sum 2 (log 2 - u - softplus(-2 u))``, the
+        stable form of ``log(1 - tanh^2 u)`` (Haarnoja et al., arXiv 1801.01290, appendix C).
+        """
+        scaled = (raw - self.mean) / self.std
+        log_prob = -0.5 * scaled**2 - jnp.log(self.std) - 0.5 * _LOG_2PI
+        if self.squash:
+            log_prob -= _log_slope(raw)
+        return log_prob.sum(-1)
+
+    def entropy(self, key: jax.Array) -> jax.Array:
+        """(...) differential entropy of the action, in nats.
+
+        Exact without squashing; with it the mean of ``log(1 - tanh^2 u)`` is estimated from one
+        draw.
+
+        Args:
+            key: for that draw.
+        """
+        entropy = (jnp.log(self.std) + 0.5 * (1.0 + _LOG_2PI)).sum(-1)
+        if self.squash:
+            entropy += _log_slope(self.sample(key)).sum(-1)
+        return entropy
+
+    def kl_to(self, new: Normal) -> jax.Array:
+        """(...) Kullback-Leibler divergence KL(self || new), in nats.
+
+        ``sum [log(s_n / s_o) + (s_o^2 + (m_o - m_n)^2) / (2 s_n^2) - 1/2]``. A squashing that
+        both share does not change it.
+        """
+        distance = (self.std**2 + (self.mean - new.mean) ** 2) / (2.0 * new.std**2)
+        return (jnp.log(new.std) - jnp.log(self.std) + distance - 0.5).sum(-1)
+
+
+def _log_slope(raw: jax.Array) -> jax.Array:
+    """``log(1 - tanh^2 u)``, each coordinate."""
+    return 2.0 * (jnp.log(2.0) - raw - jax.nn.softplus(-2.0 * raw))
