@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -115,7 +116,7 @@ class ActorOutput(struct.PyTreeNode):
     """
 
     policy: Normal
-    value: jax.Array | None
+    value: Any
     features: jax.Array
 
 

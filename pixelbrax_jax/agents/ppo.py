@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from pixelbrax_jax.agents import algorithm
 from pixelbrax_jax.agents.algorithm import Algorithm, TrainState, train_function
 from pixelbrax_jax.agents.config import TrainConfig, check_positive, make_env
+from pixelbrax_jax.agents.distributions import Normal
 from pixelbrax_jax.agents.losses import (
     Batch,
     Metrics,
@@ -20,7 +21,7 @@ from pixelbrax_jax.agents.losses import (
     policy_loss,
     value_loss,
 )
-from pixelbrax_jax.agents.networks import Actor, Critic
+from pixelbrax_jax.agents.networks import Actor, ActorOutput, Critic
 from pixelbrax_jax.agents.optimizer import Networks, Optimizer
 from pixelbrax_jax.agents.rollout import Decision, Environments, Rollout, minibatch_times
 from pixelbrax_jax.choices import check_choice, check_whole
@@ -96,7 +97,7 @@ def make_ppo(config: PPOConfig, envs: Environments) -> Algorithm:
         )
 
         def loss(networks: Networks, batch: Batch, key: jax.Array) -> tuple[jax.Array, Metrics]:
-            policy, value = agent(networks, batch)
+            policy, value = agent(networks, batch.pixels, batch.state)
             loss, facts = policy_loss(policy, batch, config, key)
             if config.clip_value:
                 error = clipped_value_loss(value, batch, config.clip_coef)
@@ -145,52 +146,62 @@ class ActorCritic:
         self._envs = envs
         self._shared = shared
         self._detach = detach_value
-        self.actor = Actor(
+        self._actor = Actor(
             config.encoder,
             envs.env.action_size,
             config.policy,
             config.initial_std,
             has_value=shared or has_value,
         )
-        self.critic = Critic(config.encoder, sees_state=config.state_critic)
+        self._critic = Critic(config.encoder, sees_state=config.state_critic)
 
     def init(self, key: jax.Array) -> Networks:
         """Fresh parameters."""
         spec = self._envs.env.obs_spec
         spec = spec if isinstance(spec, dict) else {"pixels": spec}
-        inputs = {name: jnp.zeros((1, *s.shape), s.dtype) for name, s in spec.items()}
+        inputs: dict[str, Any] = {
+            name: jnp.zeros((1, *s.shape), s.dtype) for name, s in spec.items()
+        }
         actor_key, critic_key = jax.random.fold_in(key, 0), jax.random.fold_in(key, 1)
-        networks = {"actor": self.actor.init(actor_key, inputs["pixels"])}
+        networks = {"actor": self._actor.init(actor_key, inputs["pixels"])}
         if not self._shared:
-            networks["critic"] = self.critic.init(critic_key, **inputs)
+            networks["critic"] = self._critic.init(
+                critic_key, inputs["pixels"], inputs.get("state")
+            )
         return networks
 
-    def __call__(self, networks: Networks, batch: Batch) -> tuple[Any, jax.Array]:
-        """Policy and value of a batch."""
-        output = self.actor.apply(networks["actor"], batch.pixels, self._detach)
-        if self._shared:
-            return output.policy, output.value
-        return output.policy, self.critic.apply(networks["critic"], batch.pixels, batch.state)
+    def actor(self, params: Any, pixels: jax.Array, detach_value: bool = False) -> ActorOutput:
+        """What the actor says of (B, H, W, 3 K) pixels."""
+        output: ActorOutput = self._actor.apply(params, pixels, detach_value)  # type: ignore[assignment]
+        return output
+
+    def critic(self, params: Any, pixels: jax.Array, state: jax.Array | None) -> jax.Array:
+        """(B,) values that the separate critic gives pixels, or states."""
+        value: jax.Array = self._critic.apply(params, pixels, state)  # type: ignore[assignment]
+        return value
+
+    def __call__(
+        self, networks: Networks, pixels: jax.Array, state: jax.Array | None
+    ) -> tuple[Normal, jax.Array]:
+        """Policy and value of (B, H, W, 3 K) pixels, and (B, S) states if the critic sees them."""
+        output = self.actor(networks["actor"], pixels, self._detach)
+        if not self._shared:
+            return output.policy, self.critic(networks["critic"], pixels, state)
+        return output.policy, output.value
 
     def decide(self, networks: Networks) -> Callable[..., Decision]:
         """What `rollout.collect` asks."""
 
         def decide(pixels: jax.Array, state: jax.Array | None, key: jax.Array) -> Decision:
-            output = self.actor.apply(networks["actor"], pixels)
-            if self._shared:
-                value = output.value
-            else:
-                value = self.critic.apply(networks["critic"], pixels, state)
-            raw = output.policy.sample(key)
-            return Decision(raw, output.policy.action(raw), output.policy.log_prob(raw), value)
+            policy, value = self(networks, pixels, state)
+            raw = policy.sample(key)
+            return Decision(raw, policy.action(raw), policy.log_prob(raw), value)
 
         return decide
 
-    def act(
-        self, networks: Networks, pixels: jax.Array, key: jax.Array | None = None
-    ) -> jax.Array:
+    def act(self, networks: Networks, pixels: jax.Array, key: jax.Array | None = None) -> jax.Array:
         """Actions, (N, A); the mean ones without a key."""
-        policy = self.actor.apply(networks["actor"], pixels).policy
+        policy = self.actor(networks["actor"], pixels).policy
         return policy.action(policy.mean if key is None else policy.sample(key))
 
 

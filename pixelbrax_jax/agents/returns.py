@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -41,7 +43,7 @@ def gae(
     following = jnp.concatenate([value[1:], last_value[None]])
     delta = reward + gamma * jnp.where(terminated, 0.0, following) - value
 
-    def backwards(later: jax.Array, now: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, ...]:
+    def backwards(later: jax.Array, now: tuple[jax.Array, jax.Array]) -> tuple[Any, jax.Array]:
         delta, over = now
         advantage = delta + gamma * gae_lambda * jnp.where(over, 0.0, later)
         return advantage, advantage

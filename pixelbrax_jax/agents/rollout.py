@@ -132,10 +132,11 @@ def collect(
     def step(carry: tuple[EnvState, jax.Array], number: jax.Array) -> tuple[Any, Any]:
         env_state, age = carry
         pixels, state = split_obs(envs.obs(env_state))
-        choice = decide(shifted(pixels, shift, random_shift), state, jax.random.fold_in(key, number))
+        seen = shifted(pixels, shift, random_shift)
+        choice = decide(seen, state, jax.random.fold_in(key, number))
         begins = env_state.done
         env_state, timestep = envs.step(env_state, choice.action, env_params)
-        seen = (pixels[..., -3:], age, state)
+        kept = (pixels[..., -3:], age, state)
         facts = (
             choice.raw,
             choice.log_prob,
@@ -148,18 +149,17 @@ def collect(
             timestep.info["episode_length"],
         )
         age = jnp.where(begins, 0, jnp.minimum(age + 1, stack - 1))
-        return (env_state, age), (seen, facts)
+        return (env_state, age), (kept, facts)
 
     # The stack that is there already needs no frames of before to be left out: an episode that
     # has just begun repeats its first frame in it.
     start = (env_state, jnp.full(num_envs, stack - 1))
-    (env_state, _), (seen, facts) = jax.lax.scan(step, start, jnp.arange(num_steps))
-    newest, age, state = seen
+    (env_state, _), (kept, facts) = jax.lax.scan(step, start, jnp.arange(num_steps))
+    newest, age, state = kept
     pixels, last_state = split_obs(envs.obs(env_state))
-    last = decide(shifted(pixels, shift, random_shift), last_state, jax.random.fold_in(key, num_steps))
-    frames = Frames(
-        pixels=jnp.concatenate([before, newest]), age=age, shift=shift, state=state
-    )
+    last_seen = shifted(pixels, shift, random_shift)
+    last = decide(last_seen, last_state, jax.random.fold_in(key, num_steps))
+    frames = Frames(pixels=jnp.concatenate([before, newest]), age=age, shift=shift, state=state)
     raw, log_prob, value, *rest = facts
     return env_state, Rollout(frames, raw, log_prob, value, last.value, *rest)
 
