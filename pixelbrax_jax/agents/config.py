@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
+from numbers import Integral, Real
 from typing import Any
 
 from pixelbrax_jax.agents.networks import ENCODERS, POLICIES, SMALLEST
@@ -107,8 +109,9 @@ class TrainConfig:
             check_share(name, getattr(self, name))
         for name in ("learning_rate", "initial_std", "adam_eps"):
             check_positive(name, getattr(self, name))
-        for name in ("max_grad_norm", "ent_coef", "random_shift"):
+        for name in ("max_grad_norm", "ent_coef"):
             check_positive(name, getattr(self, name), or_zero=True)
+        check_count("random_shift", self.random_shift)
         if self.memory_budget_gb is not None:
             check_positive("memory_budget_gb", self.memory_budget_gb)
         smallest = SMALLEST[self.encoder]
@@ -159,15 +162,26 @@ def describe(config: TrainConfig) -> dict[str, Any]:
     return {name: list(v) if isinstance(v, tuple) else v for name, v in values.items()}
 
 
-def check_positive(name: str, value: float, or_zero: bool = False) -> None:
-    """Rejects what is not a positive number.
+def check_positive(name: str, value: object, or_zero: bool = False) -> None:
+    """Rejects what is not a positive, finite number.
 
     Raises:
         ValueError: otherwise, naming the setting.
     """
-    if not (value >= 0 if or_zero else value > 0):
-        wanted = "at least 0" if or_zero else "positive"
+    known = isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
+    if not (known and (value > 0 or (or_zero and value == 0))):  # type: ignore[operator]
+        wanted = "a number of at least 0" if or_zero else "a positive number"
         raise ValueError(f"{name} must be {wanted}, got {value!r}.")
+
+
+def check_count(name: str, value: object) -> None:
+    """Rejects what is not a whole number of at least 0.
+
+    Raises:
+        ValueError: otherwise, naming the setting.
+    """
+    if not isinstance(value, Integral) or isinstance(value, bool) or value < 0:
+        raise ValueError(f"{name} must be a whole number of at least 0, got {value!r}.")
 
 
 def check_divides(whole: str, size: int, part: str, count: int) -> None:

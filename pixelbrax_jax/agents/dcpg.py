@@ -68,10 +68,14 @@ class DCPGConfig(TrainConfig):
         check_share("target_rate", self.target_rate)
         phasic.check_phases(self, self.num_policy_phases, self.aux_epochs, self.aux_minibatches)
         if self.state_critic and not self.decoupled:
-            raise ValueError("state_critic needs decoupled=True: else there is no critic apart.")
+            raise ValueError(
+                "state_critic needs decoupled=True, got False: else there is no critic apart."
+            )
         if self.dynamics_coef and self.num_steps * self.num_policy_phases == self.aux_minibatches:
             raise ValueError(
-                "dynamics_coef needs chunks of at least 2 steps: lower aux_minibatches."
+                f"dynamics_coef={self.dynamics_coef} needs at least 2 steps in a chunk, got 1: "
+                f"aux_minibatches={self.aux_minibatches} must be less than num_steps * "
+                f"num_policy_phases={self.num_steps * self.num_policy_phases}."
             )
 
 

@@ -50,7 +50,7 @@ class Optimizer:
         networks, moments, norms = dict(networks), dict(moments), {}
         rate = self.learning_rate(iteration)
         for name, gradient in gradients.items():
-            norm = norms[name] = optax.global_norm(gradient)
+            norm = norms[name] = optax.tree.norm(gradient)
             if self._config.max_grad_norm:
                 scale = jnp.minimum(1.0, self._config.max_grad_norm / (norm + 1e-6))
                 gradient = jax.tree.map(lambda g, scale=scale: g * scale, gradient)

@@ -167,6 +167,8 @@ def auxiliary_phase(
     num_rollouts = buffer.returns.shape[0]
     parts = num_minibatches // num_rollouts
     optimizer = Optimizer(config)
+    # The step size of the rollout before: after the last one, that of the next would be 0.
+    iteration = state.iteration - 1
 
     def old_policy(_: None, number: jax.Array) -> tuple[None, tuple[jax.Array, jax.Array]]:
         chunk = _chunk(config, buffer, jnp.full(config.num_envs, number), parts, None)
@@ -184,7 +186,7 @@ def auxiliary_phase(
         chunk = _chunk(config, buffer, which, parts, Normal(mean, std, squash))
         gradients, facts = jax.grad(loss, has_aux=True)(networks, chunk, key)
         gradients = {name: gradients[name] for name in moments}
-        networks, moments, norms = optimizer.step(networks, moments, gradients, state.iteration)
+        networks, moments, norms = optimizer.step(networks, moments, gradients, iteration)
         facts |= {f"auxiliary/grad_norm/{name}": norm for name, norm in norms.items()}
         return (after_step(networks), moments), facts
 

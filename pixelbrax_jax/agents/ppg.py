@@ -9,7 +9,7 @@ import jax
 
 from pixelbrax_jax.agents import algorithm, phasic
 from pixelbrax_jax.agents.algorithm import Algorithm, TrainState, train_function
-from pixelbrax_jax.agents.config import TrainConfig, check_positive, make_env
+from pixelbrax_jax.agents.config import TrainConfig, check_count, check_positive, make_env
 from pixelbrax_jax.agents.losses import Batch, Metrics, mean, policy_loss, value_loss
 from pixelbrax_jax.agents.optimizer import Networks, Optimizer
 from pixelbrax_jax.agents.ppo import ActorCritic, epochs
@@ -54,11 +54,14 @@ class PPGConfig(TrainConfig):
         check_choice("layout", self.layout, LAYOUTS)
         check_whole("policy_epochs", self.policy_epochs)
         check_whole("value_epochs", self.value_epochs)
-        for name in ("vf_coef", "beta_clone", "aux_value_coef", "aux_epochs"):
+        check_count("aux_epochs", self.aux_epochs)
+        for name in ("vf_coef", "beta_clone", "aux_value_coef"):
             check_positive(name, getattr(self, name), or_zero=True)
         phasic.check_phases(self, self.num_policy_phases, self.aux_epochs, self.aux_minibatches)
         if self.state_critic and self.layout != "dual":
-            raise ValueError("state_critic needs layout='dual': it has no encoder to share.")
+            raise ValueError(
+                f"state_critic needs layout='dual', got {self.layout!r}: it has no encoder to share."
+            )
 
 
 def make_train(
@@ -124,17 +127,21 @@ def make_ppg(config: PPGConfig, envs: Environments) -> Algorithm:
 
         # Passes that both make are made together, then those that one makes alone.
         together = min(config.policy_epochs, config.value_epochs)
-        plan = [(improve_both, together)]
-        plan.append((improve_policy, config.policy_epochs - together))
-        plan.append((improve_value, config.value_epochs - together))
         networks, moments = state.networks, state.moments
-        for part, (loss, number) in enumerate(plan):
+        plan = (
+            (improve_both, together, tuple(networks)),
+            (improve_policy, config.policy_epochs - together, ("actor",)),
+            (improve_value, config.value_epochs - together, ("critic" if dual else "actor",)),
+        )
+        for part, (loss, number, learners) in enumerate(plan):
             if number:
                 part_key = key if part == 0 else jax.random.fold_in(key, part)
                 experience = (rollout, advantage, returns)
-                networks, moments, facts = epochs(
-                    config, loss, networks, moments, experience, number, part_key, before
+                learning = {name: moments[name] for name in learners}
+                networks, learning, facts = epochs(
+                    config, loss, networks, learning, experience, number, part_key, before
                 )
+                moments = moments | learning
                 metrics |= facts
         slot = before % config.num_policy_phases
         state = state.replace(

@@ -59,7 +59,9 @@ class PPOConfig(TrainConfig):
         if self.target_kl is not None:
             check_positive("target_kl", self.target_kl)
         if self.state_critic and self.layout == "shared":
-            raise ValueError("state_critic needs layout='separate': it has no encoder to share.")
+            raise ValueError(
+                "state_critic needs layout='separate', got 'shared': it has no encoder to share."
+            )
 
 
 def make_train(
@@ -226,7 +228,7 @@ def epochs(
         config: settings.
         loss: of networks, a batch and a key.
         networks: parameters.
-        moments: of the optimiser.
+        moments: of the optimiser; networks that have none here stay as they are.
         experience: rollout, advantages and returns.
         number: of passes.
         key: of this update alone.
@@ -245,6 +247,8 @@ def epochs(
         times, key = inputs
         batch = batch_at(config, *experience, times)
         gradients, facts = jax.grad(loss, has_aux=True)(networks, batch, key)
+        # A gradient of 0 would not do: Adam goes on for a while in the direction it had.
+        gradients = {name: gradients[name] for name in moments}
         new, new_moments, norms = optimizer.step(networks, moments, gradients, iteration)
         facts |= {f"grad_norm/{name}": norm for name, norm in norms.items()}
         if target_kl is None:

@@ -1,0 +1,286 @@
+"""Where training stands, on disk: written whole or not at all, and read back to the bit."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import orbax.checkpoint as ocp
+
+from pixelbrax_jax.agents.config import TrainConfig, describe
+
+FORMAT = 1
+"""Number of the format; raised when what is stored changes its meaning."""
+
+_FREE = ("total_steps", "memory_budget_gb", "clips")
+"""Settings that a run may go on with although they differ."""
+
+_ROOM = 1.2
+"""Free bytes on the disk that are asked for, in sizes of a checkpoint."""
+
+Tree = TypeVar("Tree")
+
+
+class CheckpointError(RuntimeError):
+    """A checkpoint cannot be written or read; the message says why and what to do."""
+
+
+class Checkpoints:
+    """The checkpoints of one run.
+
+    Each is a folder named by the number of control steps. It appears under that name only when
+    it is complete, so that a run that is killed while writing leaves the one before.
+
+    Attributes:
+        folder: where they are.
+    """
+
+    def __init__(
+        self, folder: str | Path, config: TrainConfig, algorithm: str, *, keep: int = 3
+    ) -> None:
+        """Opens the folder, which is made if need be.
+
+        Args:
+            folder: where the checkpoints are.
+            config: settings, stored with every checkpoint.
+            algorithm: name of the algorithm, stored likewise.
+            keep: how many of the latest are kept, besides the best one.
+
+        Raises:
+            CheckpointError: the folder cannot be written to.
+        """
+        self.folder = Path(folder).absolute()
+        self._about = {"format": FORMAT, "algorithm": algorithm, "config": describe(config)}
+        self._free = _FREE if not config.anneal else tuple(n for n in _FREE if n != "total_steps")
+        check_writable(self.folder)
+        policy = ocp.checkpoint_managers
+        best = policy.BestN(
+            get_metric_fn=lambda m: m["score"], n=1, keep_checkpoints_without_metrics=False
+        )
+        options = ocp.CheckpointManagerOptions(
+            preservation_policy=policy.AnyPreservationPolicy(
+                [policy.LatestN(keep), best]
+            ),
+            cleanup_tmp_directories=True,
+        )
+        self._manager = ocp.CheckpointManager(self.folder, options=options)
+
+    def steps(self) -> list[int]:
+        """Control steps of all checkpoints, ascending."""
+        return sorted(self._manager.all_steps())
+
+    def best(self) -> int | None:
+        """Control steps of the checkpoint with the highest score; None if none has a score."""
+        scores = {steps: read_about(self.folder, steps)["score"] for steps in self.steps()}
+        scores = {steps: score for steps, score in scores.items() if score is not None}
+        return max(scores, key=lambda steps: (scores[steps], steps)) if scores else None
+
+    def save(self, state: Any, steps: int, score: float | None) -> None:
+        """Begins to write a checkpoint; training may go on meanwhile.
+
+        Args:
+            state: any pytree of arrays.
+            steps: control steps so far.
+            score: the higher, the better; None if it is not known.
+
+        Raises:
+            CheckpointError: the disk is full, or cannot be written to.
+        """
+        leaves = _plain(state)
+        size = sum(leaf.nbytes for leaf in leaves.values())
+        free = shutil.disk_usage(self.folder).free
+        if free < _ROOM * size:
+            raise CheckpointError(
+                f"a checkpoint takes {size / 1e9:.2f} GB, but {self.folder} has only "
+                f"{free / 1e9:.2f} GB free. Make room, or give another --output-dir."
+            )
+        about = self._about | {"steps": steps, "score": score}
+        arguments = ocp.args.Composite(
+            state=ocp.args.StandardSave(leaves), about=ocp.args.JsonSave(about)
+        )
+        metrics = None if score is None else {"score": score}
+        try:
+            self._manager.save(steps, args=arguments, metrics=metrics, force=True)
+        except OSError as error:
+            raise CheckpointError(f"cannot write a checkpoint to {self.folder}: {error}") from error
+
+    def wait(self) -> None:
+        """Returns when everything is written.
+
+        Raises:
+            CheckpointError: it could not be.
+        """
+        try:
+            self._manager.wait_until_finished()
+        except OSError as error:
+            raise CheckpointError(f"cannot write a checkpoint to {self.folder}: {error}") from error
+
+    def restore(self, template: Tree, steps: int | None = None) -> Tree:
+        """The state of a checkpoint.
+
+        Args:
+            template: a state of the same shapes, or its ``jax.eval_shape``.
+            steps: of which checkpoint; None takes the latest.
+
+        Returns:
+            The state, equal to the bit to what was saved.
+
+        Raises:
+            CheckpointError: there is none, or it is of another configuration or format.
+        """
+        steps = self._which(steps)
+        self._check(steps)
+        wanted = _plain(template)
+        targets = {
+            name: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=_sharding(leaf))
+            for name, leaf in wanted.items()
+        }
+        leaves = self._manager.restore(
+            steps, args=ocp.args.Composite(state=ocp.args.StandardRestore(targets))
+        )["state"]
+        return _typed(template, leaves)
+
+    def close(self) -> None:
+        """Waits for what is being written, and lets go of the folder."""
+        self.wait()
+        self._manager.close()
+
+    def _which(self, steps: int | None) -> int:
+        known = self.steps()
+        if not known:
+            raise CheckpointError(f"there is no checkpoint in {self.folder}.")
+        if steps is not None and steps not in known:
+            raise CheckpointError(
+                f"there is no checkpoint of {steps} steps in {self.folder}; there are those of "
+                f"{', '.join(map(str, known))}."
+            )
+        return known[-1] if steps is None else steps
+
+    def _check(self, steps: int) -> None:
+        about = read_about(self.folder, steps)
+        if about["algorithm"] != self._about["algorithm"]:
+            raise CheckpointError(
+                f"{self.folder} is a run of {about['algorithm']}, not of "
+                f"{self._about['algorithm']}; give another --output-dir."
+            )
+        old, new = about["config"], self._about["config"]
+        other = [
+            f"{name}: {old.get(name)!r} there, {new.get(name)!r} here"
+            for name in sorted(old.keys() | new.keys())
+            if old.get(name) != new.get(name) and name not in self._free
+        ]
+        if other:
+            raise CheckpointError(
+                f"the checkpoint in {self.folder} has other settings: {'; '.join(other)}. "
+                "Use the same ones, or another --output-dir."
+            )
+
+
+def read_about(folder: str | Path, steps: int | None = None) -> dict[str, Any]:
+    """What is stored beside a checkpoint's arrays: algorithm, config, steps, score.
+
+    Args:
+        folder: of the checkpoints.
+        steps: of which one; None takes the latest.
+
+    Raises:
+        CheckpointError: there is none, or it is of another format.
+    """
+    folder = Path(folder)
+    known = sorted(int(path.name) for path in folder.glob("*") if path.name.isdigit())
+    if not known:
+        raise CheckpointError(f"there is no checkpoint in {folder}.")
+    path = folder / str(known[-1] if steps is None else steps) / "about" / "metadata"
+    if not path.exists():
+        raise CheckpointError(f"there is no checkpoint in {path.parents[1]}.")
+    about: dict[str, Any] = json.loads(path.read_text("utf-8"))
+    if about.get("format") != FORMAT:
+        raise CheckpointError(
+            f"{path.parents[1]} has format {about.get('format')!r}, this version reads {FORMAT}."
+        )
+    return about
+
+
+def read_networks(folder: str | Path, template: Tree, steps: int | None = None) -> Tree:
+    """Parameters alone, of a checkpoint of any settings with equal networks.
+
+    Args:
+        folder: of the checkpoints.
+        template: networks of the same shapes, or their ``jax.eval_shape``.
+        steps: of which checkpoint; None takes the latest.
+
+    Raises:
+        CheckpointError: there is none, or its networks have other shapes.
+    """
+    about = read_about(folder, steps)
+    path = Path(folder).absolute() / str(about["steps"]) / "state"
+    wanted = _plain({"networks": template})
+    restored = ocp.PyTreeCheckpointer().restore(path)
+    for name, leaf in wanted.items():
+        if name not in restored or restored[name].shape != leaf.shape:
+            found = restored[name].shape if name in restored else "nothing"
+            raise CheckpointError(f"{path.parent}: {name} is {found}, not {leaf.shape}.")
+    leaves = {name: jnp.asarray(restored[name]) for name in wanted}
+    return _typed({"networks": template}, leaves)["networks"]
+
+
+def check_writable(folder: Path) -> None:
+    """Rejects a folder that cannot be made or written to.
+
+    Raises:
+        CheckpointError: naming the folder and the reason.
+    """
+    probe = folder / ".writable"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe.write_bytes(b"")
+        probe.unlink()
+    except OSError as error:
+        raise CheckpointError(
+            f"cannot write to {folder}: {error.strerror or error}. Give another --output-dir."
+        ) from error
+
+
+def _plain(tree: Any) -> dict[str, Any]:
+    """Leaves by their place, keys as numbers; without empty arrays, which tell nothing."""
+    leaves = {}
+    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            leaf = (
+                jax.eval_shape(jax.random.key_data, leaf)
+                if isinstance(leaf, jax.ShapeDtypeStruct)
+                else jax.random.key_data(leaf)
+            )
+        if leaf.size:
+            leaves[jax.tree_util.keystr(path, simple=True, separator=".")] = leaf
+    return leaves
+
+
+def _typed(template: Tree, leaves: dict[str, Any]) -> Tree:
+    """The tree that `_plain` took apart."""
+
+    def leaf(path: Any, like: Any) -> Any:
+        if not like.size:
+            return jnp.zeros(like.shape, like.dtype)
+        value = leaves[jax.tree_util.keystr(path, simple=True, separator=".")]
+        if jnp.issubdtype(like.dtype, jax.dtypes.prng_key):
+            return jax.random.wrap_key_data(value)
+        return value
+
+    return jax.tree_util.tree_map_with_path(leaf, template)
+
+
+def _sharding(leaf: Any) -> Any:
+    if getattr(leaf, "sharding", None) is not None:
+        return leaf.sharding
+    return jax.sharding.SingleDeviceSharding(jax.devices()[0])
+
+
+def nbytes(tree: Any) -> int:
+    """Bytes of all arrays of a tree, or of its ``jax.eval_shape``."""
+    return sum(int(np.prod(leaf.shape)) * leaf.dtype.itemsize for leaf in _plain(tree).values())

@@ -1,0 +1,361 @@
+"""A training run: iterations, and between them logs, evaluations and checkpoints."""
+
+from __future__ import annotations
+
+import math
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from pixelbrax_jax.agents.algorithm import Algorithm, TrainState
+from pixelbrax_jax.agents.checkpoint import Checkpoints, nbytes
+from pixelbrax_jax.agents.config import check_positive, describe
+from pixelbrax_jax.agents.evaluate import Evaluator, Result, make_splits
+from pixelbrax_jax.agents.export import save_policy
+from pixelbrax_jax.agents.metrics import MetricsWriter, together
+from pixelbrax_jax.choices import check_choice, check_whole
+from pixelbrax_jax.types import EnvParams
+
+RESUME = ("never", "latest")
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """What is done around the training; nothing here changes a bit of it."""
+
+    output_dir: str = "runs/train"
+    """Folder of logs, checkpoints and the policy."""
+    seed: int = 0
+    """Seed of the run."""
+    resume: str = "never"
+    """``latest`` goes on from the latest checkpoint in the folder, if there is one."""
+    log_training_metrics: bool = True
+    """Whether metrics of the training itself are logged."""
+    log_every: int = 1
+    """Iterations that one record sums up."""
+    num_evals: int = 0
+    """Evaluations, evenly over the run, the last at its end; 0 never makes such environments."""
+    eval_episodes: int = 32
+    """Episodes of an evaluation, for each split."""
+    checkpoint_every: int = 0
+    """Control steps between checkpoints; 0 writes one at the end."""
+    keep_checkpoints: int = 3
+    """Latest checkpoints that are kept, besides the best."""
+    wandb_project: str | None = None
+    """Project of Weights & Biases; none writes nothing there."""
+    progress: bool = True
+    """Whether a progress bar is shown."""
+
+    def __post_init__(self) -> None:
+        """Checks the settings.
+
+        Raises:
+            ValueError: a setting is out of range; the message says what is allowed.
+        """
+        check_choice("resume", self.resume, RESUME)
+        for name in ("log_every", "eval_episodes", "keep_checkpoints"):
+            check_whole(name, getattr(self, name))
+        for name in ("seed", "num_evals", "checkpoint_every"):
+            check_positive(name, getattr(self, name), or_zero=True)
+
+
+class TrainingDivergedError(RuntimeError):
+    """A loss or a gradient is not finite."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a run leaves.
+
+    Attributes:
+        state: where training stands.
+        metrics: the last record of the training; empty if none was logged.
+        evaluations: the last results, by split.
+        interrupted: whether it was stopped before its end.
+    """
+
+    state: TrainState
+    metrics: dict[str, float]
+    evaluations: dict[str, Result]
+    interrupted: bool
+
+
+def run(
+    algorithm: Algorithm,
+    env_params: EnvParams,
+    options: RunConfig,
+    *,
+    report: Callable[[str], None] = lambda line: None,
+) -> Outcome:
+    """Trains to the end, or until it is interrupted.
+
+    Ctrl-C, or SIGTERM, lets the iteration finish, writes a checkpoint and returns.
+
+    Args:
+        algorithm: with its settings.
+        env_params: of its environments.
+        options: what is done around it.
+        report: gets lines about what is going on.
+
+    Raises:
+        CheckpointError: the folder cannot be written to, or holds another run.
+        MemoryError: what must be stored would not fit.
+        TrainingDivergedError: a loss is not finite; the last good checkpoint stays.
+    """
+    config, folder = algorithm.config, Path(options.output_dir)
+    key = jax.random.key(options.seed)
+    template = jax.eval_shape(algorithm.init, key, env_params)
+    check_memory(algorithm, template, report)
+    checkpoints = Checkpoints(
+        folder / "checkpoints", config, algorithm.name, keep=options.keep_checkpoints
+    )
+    try:
+        if options.resume == "latest" and checkpoints.steps():
+            state = checkpoints.restore(template)
+            report(f"going on from the checkpoint of {int(state.steps)} steps")
+        else:
+            if checkpoints.steps():
+                raise FileExistsError(
+                    f"{checkpoints.folder} has checkpoints of an earlier run: go on with "
+                    "--resume latest, or give another --output-dir."
+                )
+            state = jax.jit(algorithm.init)(key, env_params)
+        return _Run(algorithm, env_params, options, checkpoints, report).until_end(state)
+    finally:
+        checkpoints.close()
+
+
+class _Run:
+    """The loop over iterations."""
+
+    def __init__(
+        self,
+        algorithm: Algorithm,
+        env_params: EnvParams,
+        options: RunConfig,
+        checkpoints: Checkpoints,
+        report: Callable[[str], None],
+    ) -> None:
+        self._algorithm = algorithm
+        self._config = algorithm.config
+        self._params = env_params
+        self._options = options
+        self._checkpoints = checkpoints
+        self._report = report
+        # The state before an iteration is not needed after it: its memory is used again.
+        self._iterate = jax.jit(algorithm.iterate, donate_argnums=0)
+        if algorithm.auxiliary is not None:
+            self._auxiliary = jax.jit(algorithm.auxiliary, donate_argnums=0)
+        self._evaluators: dict[str, Evaluator] = {}
+        if options.num_evals:
+            for split, (env, params) in make_splits(self._config).items():
+                self._evaluators[split] = Evaluator(
+                    algorithm, env, params, num_episodes=options.eval_episodes
+                )
+        self._pending: list[dict[str, Any]] = []
+        self._record: dict[str, float] = {}
+        self._results: dict[str, Result] = {}
+
+    def until_end(self, state: TrainState) -> Outcome:
+        steps, total = int(state.steps), self._config.num_iterations
+        per_iteration, options = self._config.steps_per_iteration, self._options
+        last_saved = steps
+        writer = MetricsWriter(
+            Path(options.output_dir),
+            describe(self._config),
+            first_step=steps,
+            wandb_project=options.wandb_project,
+        )
+        try:
+            with _interruptible() as interrupted, _bar(options.progress, total) as bar:
+                bar.update(steps // per_iteration)
+                began, began_steps = time.perf_counter(), steps
+                for number in range(steps // per_iteration + 1, total + 1):
+                    state, steps = self._one(state, number), number * per_iteration
+                    bar.update(1)
+                    stop, end = bool(interrupted), number == total
+                    evaluates = self._evaluates_after(number)
+                    saves = end or stop or self._saves_after(steps, last_saved)
+                    if number % options.log_every == 0 or evaluates or saves:
+                        self._settle(steps)
+                        seconds = time.perf_counter() - began
+                        if options.log_training_metrics:
+                            self._record["speed/steps_per_second"] = (
+                                steps - began_steps
+                            ) / seconds
+                            writer.write(steps, self._record)
+                        bar.show(self._record)
+                    if evaluates and not stop:
+                        writer.write(steps, self._evaluate(state))
+                    if saves:
+                        self._checkpoints.save(state, steps, self._score())
+                        last_saved = steps
+                    if number % options.log_every == 0 or evaluates or saves:
+                        began, began_steps = time.perf_counter(), steps
+                    if stop:
+                        self._report(f"stopped after {steps} steps; go on with --resume latest")
+                        break
+                save_policy(
+                    self._algorithm, state.networks, Path(options.output_dir) / "policy.jax"
+                )
+                return Outcome(state, self._record, self._results, bool(interrupted))
+        finally:
+            writer.close()
+
+    def _one(self, state: TrainState, number: int) -> TrainState:
+        """Iteration ``number``, from 1, and the auxiliary phase if it is due."""
+        state, metrics = self._iterate(state, self._params)
+        phases = self._algorithm.num_phases
+        if phases and number % phases == 0:
+            state, more = self._auxiliary(state)
+            metrics |= more
+        self._pending.append(metrics)
+        return state
+
+    def _settle(self, steps: int) -> None:
+        """Puts the metrics of the latest iterations together, and looks at them.
+
+        Raises:
+            TrainingDivergedError: one is not finite.
+        """
+        if not self._pending:
+            return
+        records = jax.device_get(self._pending)
+        self._pending = []
+        for record in records:
+            bad = [name for name, value in record.items() if not np.isfinite(value).all()]
+            if bad:
+                saved = self._checkpoints.steps()
+                kept = f"the checkpoint of {saved[-1]} steps is good" if saved else "none was saved"
+                raise TrainingDivergedError(
+                    f"not finite within the iterations before step {steps}: {', '.join(bad)}. "
+                    f"In {self._checkpoints.folder} {kept}. A lower learning_rate may help."
+                )
+        self._record = together(records)
+
+    def _evaluates_after(self, number: int) -> bool:
+        evals, total = self._options.num_evals, self._config.num_iterations
+        return bool(evals) and number * evals // total > (number - 1) * evals // total
+
+    def _saves_after(self, steps: int, last_saved: int) -> bool:
+        every = self._options.checkpoint_every
+        return bool(every) and steps // every > last_saved // every
+
+    def _evaluate(self, state: TrainState) -> dict[str, float]:
+        record = {}
+        for split, evaluator in self._evaluators.items():
+            result = self._results[split] = evaluator(state.networks)
+            record[f"eval/{split}/return"] = result.mean
+            record[f"eval/{split}/standard_error"] = result.standard_error
+            record[f"eval/{split}/length"] = float(result.lengths.mean())
+            self._report(
+                f"{split}: return {result.mean:.1f} +- {result.standard_error:.1f} (standard error)"
+            )
+        return record
+
+    def _score(self) -> float | None:
+        """By which the best checkpoint is chosen: clean evaluation, else training's returns."""
+        if self._results:
+            return self._results["clean"].mean
+        return self._record.get("episode/return")
+
+
+def check_memory(
+    algorithm: Algorithm, template: TrainState, report: Callable[[str], None]
+) -> None:
+    """Tells what will be stored, and rejects what would not fit.
+
+    Args:
+        algorithm: with its settings.
+        template: ``jax.eval_shape`` of its state.
+        report: gets the figures.
+
+    Raises:
+        MemoryError: it is more than ``memory_budget_gb``, or than the device has.
+    """
+    config = algorithm.config
+    frame = config.num_envs * config.height * config.width * 3
+    rollout = frame * (config.num_steps + config.frame_stack - 1)
+    buffer = nbytes(template.buffer)
+    stored = rollout + nbytes(template)
+    report(
+        f"stored: rollout {rollout / 1e9:.2f} GB, auxiliary buffer {buffer / 1e9:.2f} GB, all "
+        f"state {nbytes(template) / 1e9:.2f} GB"
+    )
+    budget = config.memory_budget_gb
+    limit = budget * 1e9 if budget is not None else _device_memory()
+    if stored > limit:
+        raise MemoryError(
+            f"rollout and state take {stored / 1e9:.2f} GB, of {limit / 1e9:.2f} GB that may be "
+            f"used. Lower num_envs, num_steps{', num_policy_phases' if buffer else ''} or the size "
+            "of the pictures, or raise memory_budget_gb."
+        )
+
+
+def _device_memory() -> float:
+    """Bytes that JAX may use on its first device; no bound where nobody tells."""
+    statistics = jax.devices()[0].memory_stats() or {}
+    if "bytes_limit" in statistics:
+        return float(statistics["bytes_limit"])
+    try:
+        import psutil
+    except ImportError:
+        return math.inf
+    return float(psutil.virtual_memory().available)
+
+
+@contextmanager
+def _interruptible() -> Iterator[list[int]]:
+    """A list that is filled when somebody asks the process to stop; asked twice, it stops."""
+    asked: list[int] = []
+
+    def ask(number: int, frame: Any) -> None:
+        del frame
+        if asked:
+            raise KeyboardInterrupt
+        asked.append(number)
+
+    before = {}
+    for number in (signal.SIGINT, signal.SIGTERM):
+        try:
+            before[number] = signal.signal(number, ask)
+        except ValueError:  # Only the main thread may.
+            continue
+    try:
+        yield asked
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+class _Bar:
+    """tqdm's progress bar, or nothing."""
+
+    def __init__(self, bar: Any) -> None:
+        self._bar = bar
+
+    def update(self, number: int) -> None:
+        if self._bar is not None:
+            self._bar.update(number)
+
+    def show(self, record: dict[str, float]) -> None:
+        if self._bar is not None and "episode/return" in record:
+            self._bar.set_postfix(episode_return=f"{record['episode/return']:.1f}")
+
+
+@contextmanager
+def _bar(shown: bool, total: int) -> Iterator[_Bar]:
+    if not shown:
+        yield _Bar(None)
+        return
+    from tqdm import tqdm
+
+    with tqdm(total=total, unit="iteration") as bar:
+        yield _Bar(bar)
