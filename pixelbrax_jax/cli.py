@@ -32,6 +32,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     command.set_defaults(run=_doctor)
     _add_clips(commands)
+    # Its options are the fields of the settings' classes, which tyro reads by itself.
+    commands.add_parser("train", help="train an agent: train ppo --help", add_help=False)
+    _add_record(commands)
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    if arguments[:1] == ["train"]:
+        return _train(arguments[1:])
     options = parser.parse_args(arguments)
     return int(options.run(options))
 
@@ -79,6 +85,39 @@ def _clips(options: argparse.Namespace) -> int:
     if options.sheet:
         sys.stdout.write(f"contact sheet in {options.sheet}\n")
     return 0
+
+
+def _train(arguments: list[str]) -> int:
+    try:
+        from pixelbrax_jax.agents.command import train
+    except ImportError as error:
+        sys.stderr.write(f"pixelbrax train: {error}; it needs the extra train\n")
+        return 1
+    return train(arguments)
+
+
+def _add_record(commands: Any) -> None:
+    command = commands.add_parser(
+        "record",
+        help="film a trained agent",
+        description="Plays several episodes of a checkpoint side by side and writes an MP4.",
+    )
+    command.add_argument("folder", help="output folder of a training run")
+    command.add_argument("--output", help="default: videos/<steps>.mp4 in the run's folder")
+    command.add_argument("--steps", type=int, help="of which checkpoint (default: the latest)")
+    command.add_argument("--best", action="store_true", help="take the best checkpoint")
+    command.add_argument("--split", default="train", help="clean, train or test (default: train)")
+    command.add_argument("--grid", type=int, default=3, help="episodes a side (default: 3)")
+    command.add_argument("--size", type=int, default=168, help="pixels of one (default: 168)")
+    command.add_argument("--num-frames", type=int, default=300, help="at most (default: 300)")
+    command.add_argument("--seed", type=int, default=0, help="of the episodes (default: 0)")
+    command.set_defaults(run=_record)
+
+
+def _record(options: argparse.Namespace) -> int:
+    from pixelbrax_jax.agents.record import record
+
+    return record(options)
 
 
 def _version() -> str:

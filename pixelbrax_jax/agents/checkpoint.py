@@ -12,8 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
-from pixelbrax_jax.agents.config import TrainConfig, describe
-
 FORMAT = 1
 """Number of the format; raised when what is stored changes its meaning."""
 
@@ -41,13 +39,13 @@ class Checkpoints:
     """
 
     def __init__(
-        self, folder: str | Path, config: TrainConfig, algorithm: str, *, keep: int = 3
+        self, folder: str | Path, settings: dict[str, Any], algorithm: str, *, keep: int = 3
     ) -> None:
         """Opens the folder, which is made if need be.
 
         Args:
             folder: where the checkpoints are.
-            config: settings, stored with every checkpoint.
+            settings: by name, stored with every checkpoint.
             algorithm: name of the algorithm, stored likewise.
             keep: how many of the latest are kept, besides the best one.
 
@@ -55,17 +53,15 @@ class Checkpoints:
             CheckpointError: the folder cannot be written to.
         """
         self.folder = Path(folder).absolute()
-        self._about = {"format": FORMAT, "algorithm": algorithm, "config": describe(config)}
-        self._free = _FREE if not config.anneal else tuple(n for n in _FREE if n != "total_steps")
+        self._about: dict[str, Any] = {"format": FORMAT, "algorithm": algorithm, "config": settings}
+        self._free = tuple(n for n in _FREE if n != "total_steps" or not settings.get("anneal"))
         check_writable(self.folder)
         policy = ocp.checkpoint_managers
         best = policy.BestN(
             get_metric_fn=lambda m: m["score"], n=1, keep_checkpoints_without_metrics=False
         )
         options = ocp.CheckpointManagerOptions(
-            preservation_policy=policy.AnyPreservationPolicy(
-                [policy.LatestN(keep), best]
-            ),
+            preservation_policy=policy.AnyPreservationPolicy([policy.LatestN(keep), best]),
             cleanup_tmp_directories=True,
         )
         self._manager = ocp.CheckpointManager(self.folder, options=options)
@@ -220,11 +216,16 @@ def read_networks(folder: str | Path, template: Tree, steps: int | None = None) 
     about = read_about(folder, steps)
     path = Path(folder).absolute() / str(about["steps"]) / "state"
     wanted = _plain({"networks": template})
-    restored = ocp.PyTreeCheckpointer().restore(path)
+    reader = ocp.Checkpointer(ocp.PyTreeCheckpointHandler())
+    stored = reader.metadata(path).item_metadata.tree
     for name, leaf in wanted.items():
-        if name not in restored or restored[name].shape != leaf.shape:
-            found = restored[name].shape if name in restored else "nothing"
+        if name not in stored or tuple(stored[name].shape) != leaf.shape:
+            found = tuple(stored[name].shape) if name in stored else "missing"
             raise CheckpointError(f"{path.parent}: {name} is {found}, not {leaf.shape}.")
+    as_numpy = {name: ocp.RestoreArgs(restore_type=np.ndarray) for name in wanted}
+    restored = reader.restore(
+        path, args=ocp.args.PyTreeRestore(wanted, restore_args=as_numpy, partial_restore=True)
+    )
     leaves = {name: jnp.asarray(restored[name]) for name in wanted}
     return _typed({"networks": template}, leaves)["networks"]
 

@@ -13,6 +13,7 @@ import numpy as np
 from pixelbrax_jax.agents.algorithm import Algorithm
 from pixelbrax_jax.agents.config import TrainConfig, make_env
 from pixelbrax_jax.agents.optimizer import Networks
+from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.types import EnvParams, EnvState
 
@@ -44,7 +45,7 @@ class Result:
         return float(self.returns.std(ddof=1) / np.sqrt(len(self.returns)))
 
 
-def make_splits(config: TrainConfig) -> dict[str, tuple[VectorPixelEnv | Any, EnvParams]]:
+def make_splits(config: TrainConfig) -> dict[str, tuple[PixelEnv, EnvParams]]:
     """Environments to evaluate in, by name of the split.
 
     ``clean`` has no distractors, ``train`` those of the training, and ``test`` the same with

@@ -20,7 +20,8 @@ def together(records: list[Mapping[str, Any]]) -> dict[str, float]:
     iterations. Without a finished episode there is no return and no length.
 
     Args:
-        records: metrics of iterations; some may have more names than others.
+        records: metrics of iterations; some may have more names than others. Of several runs
+            they have a leading axis; the summary is over all of them, with each run's return.
     """
     names = {name: None for record in records for name in record}
     values = {
@@ -32,6 +33,9 @@ def together(records: list[Mapping[str, Any]]) -> dict[str, float]:
     if count:
         summary["episode/return"] = float(values["episode/return_sum"].sum()) / count
         summary["episode/length"] = float(values["episode/length_sum"].sum()) / count
+        counts, sums = values["episode/count"].sum(0), values["episode/return_sum"].sum(0)
+        for run in np.flatnonzero(counts) if np.ndim(counts) else ():
+            summary[f"episode/return/run_{run}"] = float(sums[run] / counts[run])
     return summary | {n: float(v.mean()) for n, v in values.items() if n not in _SUMS}
 
 

@@ -60,7 +60,7 @@ class PPGConfig(TrainConfig):
         phasic.check_phases(self, self.num_policy_phases, self.aux_epochs, self.aux_minibatches)
         if self.state_critic and self.layout != "dual":
             raise ValueError(
-                f"state_critic needs layout='dual', got {self.layout!r}: it has no encoder to share."
+                f"state_critic needs layout='dual', got {self.layout!r}: no encoder is shared."
             )
 
 

@@ -17,9 +17,11 @@ import numpy as np
 from pixelbrax_jax.agents.algorithm import Algorithm, TrainState
 from pixelbrax_jax.agents.checkpoint import Checkpoints, nbytes
 from pixelbrax_jax.agents.config import check_positive, describe
-from pixelbrax_jax.agents.evaluate import Evaluator, Result, make_splits
+from pixelbrax_jax.agents.evaluate import Evaluator, Result, interquartile_mean, make_splits
 from pixelbrax_jax.agents.export import save_policy
 from pixelbrax_jax.agents.metrics import MetricsWriter, together
+from pixelbrax_jax.agents.optimizer import Networks
+from pixelbrax_jax.agents.seeds import keys_of, of_seed, over_seeds
 from pixelbrax_jax.choices import check_choice, check_whole
 from pixelbrax_jax.types import EnvParams
 
@@ -34,6 +36,8 @@ class RunConfig:
     """Folder of logs, checkpoints and the policy."""
     seed: int = 0
     """Seed of the run."""
+    num_seeds: int = 1
+    """Runs in one program, of the seeds ``seed``, ``seed`` + 1, ..."""
     resume: str = "never"
     """``latest`` goes on from the latest checkpoint in the folder, if there is one."""
     log_training_metrics: bool = True
@@ -60,7 +64,7 @@ class RunConfig:
             ValueError: a setting is out of range; the message says what is allowed.
         """
         check_choice("resume", self.resume, RESUME)
-        for name in ("log_every", "eval_episodes", "keep_checkpoints"):
+        for name in ("num_seeds", "log_every", "eval_episodes", "keep_checkpoints"):
             check_whole(name, getattr(self, name))
         for name in ("seed", "num_evals", "checkpoint_every"):
             check_positive(name, getattr(self, name), or_zero=True)
@@ -87,12 +91,16 @@ class Outcome:
     interrupted: bool
 
 
+def _silent(line: str) -> None:
+    del line
+
+
 def run(
     algorithm: Algorithm,
     env_params: EnvParams,
     options: RunConfig,
     *,
-    report: Callable[[str], None] = lambda line: None,
+    report: Callable[[str], None] = _silent,
 ) -> Outcome:
     """Trains to the end, or until it is interrupted.
 
@@ -109,17 +117,23 @@ def run(
         MemoryError: what must be stored would not fit.
         TrainingDivergedError: a loss is not finite; the last good checkpoint stays.
     """
-    config, folder = algorithm.config, Path(options.output_dir)
+    folder = Path(options.output_dir)
     key = jax.random.key(options.seed)
+    if options.num_seeds > 1:
+        algorithm = over_seeds(algorithm)
+        key = keys_of(options.seed, options.num_seeds)
     template = jax.eval_shape(algorithm.init, key, env_params)
     check_memory(algorithm, template, report)
     checkpoints = Checkpoints(
-        folder / "checkpoints", config, algorithm.name, keep=options.keep_checkpoints
+        folder / "checkpoints",
+        describe(algorithm.config) | {"seed": options.seed, "num_seeds": options.num_seeds},
+        algorithm.name,
+        keep=options.keep_checkpoints,
     )
     try:
         if options.resume == "latest" and checkpoints.steps():
             state = checkpoints.restore(template)
-            report(f"going on from the checkpoint of {int(state.steps)} steps")
+            report(f"going on from the checkpoint of {_steps(algorithm, state)} steps")
         else:
             if checkpoints.steps():
                 raise FileExistsError(
@@ -164,7 +178,7 @@ class _Run:
         self._results: dict[str, Result] = {}
 
     def until_end(self, state: TrainState) -> Outcome:
-        steps, total = int(state.steps), self._config.num_iterations
+        steps, total = _steps(self._algorithm, state), self._config.num_iterations
         per_iteration, options = self._config.steps_per_iteration, self._options
         last_saved = steps
         writer = MetricsWriter(
@@ -187,9 +201,7 @@ class _Run:
                         self._settle(steps)
                         seconds = time.perf_counter() - began
                         if options.log_training_metrics:
-                            self._record["speed/steps_per_second"] = (
-                                steps - began_steps
-                            ) / seconds
+                            self._record["speed/steps_per_second"] = (steps - began_steps) / seconds
                             writer.write(steps, self._record)
                         bar.show(self._record)
                     if evaluates and not stop:
@@ -202,9 +214,8 @@ class _Run:
                     if stop:
                         self._report(f"stopped after {steps} steps; go on with --resume latest")
                         break
-                save_policy(
-                    self._algorithm, state.networks, Path(options.output_dir) / "policy.jax"
-                )
+                for networks, name in self._policies(state):
+                    save_policy(self._algorithm, networks, Path(options.output_dir) / name)
                 return Outcome(state, self._record, self._results, bool(interrupted))
         finally:
             writer.close()
@@ -248,10 +259,27 @@ class _Run:
         every = self._options.checkpoint_every
         return bool(every) and steps // every > last_saved // every
 
+    def _policies(self, state: TrainState) -> Iterator[tuple[Networks, str]]:
+        """Networks of each seed, and the name of its policy's file."""
+        if self._options.num_seeds == 1:
+            yield state.networks, "policy.jax"
+            return
+        for i in range(self._options.num_seeds):
+            yield of_seed(state.networks, i), f"policy_seed{self._options.seed + i}.jax"
+
     def _evaluate(self, state: TrainState) -> dict[str, float]:
         record = {}
         for split, evaluator in self._evaluators.items():
-            result = self._results[split] = evaluator(state.networks)
+            runs = [evaluator(networks) for networks, _ in self._policies(state)]
+            if len(runs) > 1:
+                middle = interquartile_mean(np.array([run.mean for run in runs]))
+                record[f"eval/{split}/iqm"] = middle.value
+                record[f"eval/{split}/iqm_low"] = middle.low
+                record[f"eval/{split}/iqm_high"] = middle.high
+            result = self._results[split] = Result(
+                returns=np.concatenate([run.returns for run in runs]),
+                lengths=np.concatenate([run.lengths for run in runs]),
+            )
             record[f"eval/{split}/return"] = result.mean
             record[f"eval/{split}/standard_error"] = result.standard_error
             record[f"eval/{split}/length"] = float(result.lengths.mean())
@@ -267,9 +295,12 @@ class _Run:
         return self._record.get("episode/return")
 
 
-def check_memory(
-    algorithm: Algorithm, template: TrainState, report: Callable[[str], None]
-) -> None:
+def _steps(algorithm: Algorithm, state: TrainState) -> int:
+    """Control steps so far; all seeds are equally far."""
+    return int(np.ravel(state.iteration)[0]) * algorithm.config.steps_per_iteration
+
+
+def check_memory(algorithm: Algorithm, template: TrainState, report: Callable[[str], None]) -> None:
     """Tells what will be stored, and rejects what would not fit.
 
     Args:
@@ -282,7 +313,7 @@ def check_memory(
     """
     config = algorithm.config
     frame = config.num_envs * config.height * config.width * 3
-    rollout = frame * (config.num_steps + config.frame_stack - 1)
+    rollout = frame * (config.num_steps + config.frame_stack - 1) * template.iteration.size
     buffer = nbytes(template.buffer)
     stored = rollout + nbytes(template)
     report(

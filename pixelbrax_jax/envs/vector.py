@@ -160,10 +160,19 @@ class VectorPixelEnv:
         """Observations of the states, with a leading axis N."""
         return jax.vmap(self.env.obs)(state)
 
+    @staticmethod
+    def keys_of(key: jax.Array, num_envs: int) -> jax.Array:
+        """Keys of environments 0, 1, ...: (num_envs,) ``fold_in(key, i)``.
+
+        Raises:
+            TypeError: ``key`` is not a single typed key.
+        """
+        check_key(key)
+        return jax.vmap(partial(jax.random.fold_in, key))(jnp.arange(num_envs))
+
     def _env_keys(self, key: jax.Array) -> jax.Array:
         if getattr(key, "shape", ()) == ():
-            check_key(key)
-            return jax.vmap(partial(jax.random.fold_in, key))(jnp.arange(self.num_envs))
+            return self.keys_of(key, self.num_envs)
         check_key(key, (self.num_envs,))
         return key
 

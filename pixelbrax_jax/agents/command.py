@@ -1,0 +1,122 @@
+"""``pixelbrax train``: settings from the command line, then a run."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import fields, make_dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import tyro
+
+from pixelbrax_jax.agents.checkpoint import CheckpointError
+from pixelbrax_jax.agents.config import TrainConfig, make_env
+from pixelbrax_jax.agents.presets import CONFIGS, MAKERS, PRESETS, preset
+from pixelbrax_jax.agents.train import RunConfig, TrainingDivergedError, run
+from pixelbrax_jax.envs.sharded import AXIS, ShardedVectorEnv
+from pixelbrax_jax.envs.vector import VectorPixelEnv
+
+INTERRUPTED = 130
+"""Exit status of a run that was stopped by Ctrl-C, as shells have it."""
+
+
+def train(arguments: list[str]) -> int:
+    """Runs the command.
+
+    Args:
+        arguments: those behind ``pixelbrax train``.
+
+    Returns:
+        The exit status: 0 when all is well, 1 for an error that is told, 130 when stopped.
+    """
+    first = argparse.ArgumentParser(prog="pixelbrax train", add_help=False)
+    first.add_argument("algorithm", choices=sorted(CONFIGS))
+    first.add_argument("--preset", choices=sorted(PRESETS), default="default")
+    if not arguments or arguments[0] in ("-h", "--help"):
+        sys.stdout.write(
+            "usage: pixelbrax train {"
+            + ",".join(CONFIGS)
+            + "} [--preset {"
+            + ",".join(PRESETS)
+            + "}] [options]\n\nAll options: pixelbrax train ppo --help\n"
+        )
+        return 0
+    chosen, rest = first.parse_known_args(arguments)
+    try:
+        config, options = parse(chosen.algorithm, chosen.preset, rest)
+        return _run(chosen.algorithm, config, options)
+    except (
+        CheckpointError,
+        TrainingDivergedError,
+        ValueError,
+        OSError,
+        MemoryError,
+        ImportError,
+    ) as error:
+        sys.stderr.write(f"pixelbrax train: {error}\n")
+        return 1
+
+
+def parse(algorithm: str, name: str, arguments: list[str]) -> tuple[TrainConfig, RunConfig]:
+    """Settings of an algorithm and of the run, from options over a preset.
+
+    Args:
+        algorithm: its name.
+        name: of the preset.
+        arguments: options, as ``--num-envs 64``.
+
+    Raises:
+        ValueError: a setting is out of range.
+        SystemExit: an option is unknown.
+    """
+    defaults = preset(algorithm, name)
+    options = RunConfig(output_dir=f"runs/{algorithm}")
+    # One flat list of options for both.
+    parts: dict[str, Any] = {"config": defaults, "options": options}
+    flat: Any = tyro.conf.OmitArgPrefixes
+    kinds = [(part, flat[type(value)]) for part, value in parts.items()]
+    command = make_dataclass("Train", kinds)
+    parsed = tyro.cli(
+        command,
+        prog=f"pixelbrax train {algorithm}",
+        description=f"Trains {algorithm.upper()} from pixels. --preset "
+        f"{{{','.join(PRESETS)}}} changes the defaults.",
+        default=command(**parts),
+        args=arguments,
+    )
+    return parsed.config, parsed.options
+
+
+def _run(algorithm: str, config: TrainConfig, options: RunConfig) -> int:
+    def report(line: str) -> None:
+        if jax.process_index() == 0:
+            sys.stderr.write(f"{line}\n")
+
+    env, env_params = make_env(config)
+    devices = jax.device_count()
+    if devices > 1:
+        mesh = jax.make_mesh((devices,), (AXIS,))
+        envs: Any = ShardedVectorEnv(env, config.num_envs, mesh)
+    else:
+        envs = VectorPixelEnv(env, config.num_envs)
+    report(
+        f"{algorithm} on {config.task}, {config.num_envs} environments, {devices} "
+        f"{jax.default_backend()} device{'s' * (devices > 1)}, {config.num_iterations} iterations "
+        f"of {config.steps_per_iteration} control steps; into {Path(options.output_dir).resolve()}"
+    )
+    outcome = run(MAKERS[algorithm](config, envs), env_params, options, report=report)
+    return INTERRUPTED if outcome.interrupted else 0
+
+
+def load_config(about: dict[str, Any]) -> TrainConfig:
+    """The settings that are stored with a checkpoint."""
+    kind = CONFIGS[about["algorithm"]]
+    names = {field.name for field in fields(kind)}
+    values: dict[str, Any] = {
+        name: tuple(value) if isinstance(value, list) else value
+        for name, value in about["config"].items()
+        if name in names
+    }
+    return replace(kind(), **values)

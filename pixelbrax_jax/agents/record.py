@@ -1,0 +1,131 @@
+"""``pixelbrax record``: a trained agent on film."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import warnings
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from pixelbrax_jax.agents.checkpoint import CheckpointError, read_about, read_networks
+from pixelbrax_jax.agents.command import load_config
+from pixelbrax_jax.agents.evaluate import make_splits
+from pixelbrax_jax.agents.presets import MAKERS
+from pixelbrax_jax.agents.seeds import of_seed
+from pixelbrax_jax.choices import check_choice, check_whole
+from pixelbrax_jax.envs.vector import VectorPixelEnv
+
+
+def record(options: argparse.Namespace) -> int:
+    """Runs the command; see ``pixelbrax record --help``.
+
+    Returns:
+        The exit status.
+    """
+    try:
+        path = film(
+            options.folder,
+            output=options.output,
+            steps=options.steps,
+            best=options.best,
+            split=options.split,
+            grid=options.grid,
+            size=options.size,
+            num_frames=options.num_frames,
+            seed=options.seed,
+        )
+    except (CheckpointError, ValueError, OSError, ImportError) as error:
+        sys.stderr.write(f"pixelbrax record: {error}\n")
+        return 1
+    sys.stdout.write(f"{path}\n")
+    return 0
+
+
+def film(
+    folder: str | Path,
+    *,
+    output: str | Path | None = None,
+    steps: int | None = None,
+    best: bool = False,
+    split: str = "train",
+    grid: int = 3,
+    size: int = 168,
+    num_frames: int = 300,
+    seed: int = 0,
+) -> Path:
+    """Writes an MP4 of ``grid`` x ``grid`` episodes, side by side.
+
+    Args:
+        folder: output folder of a training run.
+        output: of the film; None puts it into the run's folder.
+        steps: of which checkpoint; None takes the latest.
+        best: whether the best checkpoint is taken.
+        split: ``"clean"``, ``"train"`` or ``"test"``; without distractors all are clean.
+        grid: episodes a side.
+        size: pixels of one episode, square.
+        num_frames: at most.
+        seed: of the episodes.
+
+    Returns:
+        The film's path.
+
+    Raises:
+        CheckpointError: there is no such checkpoint.
+        ValueError: an option is out of range.
+    """
+    import imageio.v2 as imageio
+
+    check_whole("grid", grid)
+    check_whole("size", size)
+    check_whole("num_frames", num_frames)
+    checkpoints = Path(folder) / "checkpoints"
+    if best:
+        steps = _best(checkpoints)
+    about = read_about(checkpoints, steps)
+    config = load_config(about)
+    splits = make_splits(config)
+    check_choice("split", split, ("clean", "train", "test"))
+    env, params = splits.get(split, splits["clean"])
+    algorithm = MAKERS[about["algorithm"]](config, VectorPixelEnv(env, config.num_envs))
+    envs = VectorPixelEnv(env, grid * grid)
+
+    num_seeds = about["config"].get("num_seeds", 1)
+    key = jax.random.key(0)
+    keys = jax.random.split(key, num_seeds) if num_seeds > 1 else key
+    init = jax.vmap(algorithm.init, in_axes=(0, None)) if num_seeds > 1 else algorithm.init
+    template = jax.eval_shape(init, keys, params).networks
+    networks = read_networks(checkpoints, template, about["steps"])
+    networks = of_seed(networks, 0) if num_seeds > 1 else networks
+
+    @jax.jit
+    def step(state: Any, params: Any) -> tuple[Any, jax.Array]:
+        action = algorithm.act(networks, envs.obs(state))
+        state, _ = envs.step(state, action, params)
+        draw = jax.vmap(lambda state: env.picture(state, params, size, size))
+        return state, draw(state)
+
+    path = Path(output) if output else Path(folder) / "videos" / f"{about['steps']}.mp4"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    state, _ = envs.reset(jax.random.key(seed), params)
+    fps = max(1, round(1.0 / env.dt))
+    writer: Any = imageio.get_writer(path, fps=min(fps, 60), macro_block_size=1)
+    with writer, warnings.catch_warnings():
+        # Python warns of a fork beside JAX's threads; the child becomes ffmpeg at once.
+        warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)
+        for _ in range(num_frames):
+            state, pictures = step(state, params)
+            tiles = np.asarray(pictures).reshape(grid, grid, size, size, 3)
+            writer.append_data(np.concatenate(np.concatenate(tiles, axis=1), axis=1))
+    return path
+
+
+def _best(checkpoints: Path) -> int | None:
+    """Control steps of the checkpoint with the highest score; None takes the latest."""
+    names = [path.name for path in checkpoints.glob("*") if path.name.isdigit()]
+    scores = {int(name): read_about(checkpoints, int(name))["score"] for name in names}
+    known = {steps: score for steps, score in scores.items() if score is not None}
+    return max(known, key=lambda steps: known[steps]) if known else None
