@@ -15,7 +15,7 @@ from pixelbrax_jax.agents.checkpoint import CheckpointError
 from pixelbrax_jax.agents.config import TrainConfig, make_env
 from pixelbrax_jax.agents.presets import CONFIGS, MAKERS, PRESETS, preset
 from pixelbrax_jax.agents.train import RunConfig, TrainingDivergedError, run
-from pixelbrax_jax.envs.sharded import AXIS, ShardedVectorEnv
+from pixelbrax_jax.envs.sharded import ShardedVectorEnv, make_env_mesh
 from pixelbrax_jax.envs.vector import VectorPixelEnv
 
 INTERRUPTED = 130
@@ -34,6 +34,9 @@ def train(arguments: list[str]) -> int:
     first = argparse.ArgumentParser(prog="pixelbrax train", add_help=False)
     first.add_argument("algorithm", choices=sorted(CONFIGS))
     first.add_argument("--preset", choices=sorted(PRESETS), default="default")
+    first.add_argument("--coordinator", help="host:port of process 0, of several processes")
+    first.add_argument("--num-processes", type=int, default=1)
+    first.add_argument("--process-id", type=int, default=0)
     if not arguments or arguments[0] in ("-h", "--help"):
         sys.stdout.write(
             "usage: pixelbrax train {"
@@ -44,6 +47,8 @@ def train(arguments: list[str]) -> int:
         )
         return 0
     chosen, rest = first.parse_known_args(arguments)
+    if chosen.coordinator is not None:
+        jax.distributed.initialize(chosen.coordinator, chosen.num_processes, chosen.process_id)
     try:
         config, options = parse(chosen.algorithm, chosen.preset, rest)
         return _run(chosen.algorithm, config, options)
@@ -82,7 +87,8 @@ def parse(algorithm: str, name: str, arguments: list[str]) -> tuple[TrainConfig,
         command,
         prog=f"pixelbrax train {algorithm}",
         description=f"Trains {algorithm.upper()} from pixels. --preset "
-        f"{{{','.join(PRESETS)}}} changes the defaults.",
+        f"{{{','.join(PRESETS)}}} changes the defaults; --coordinator HOST:PORT --num-processes P "
+        "--process-id I spreads a run over P processes.",
         default=command(**parts),
         args=arguments,
     )
@@ -97,8 +103,7 @@ def _run(algorithm: str, config: TrainConfig, options: RunConfig) -> int:
     env, env_params = make_env(config)
     devices = jax.device_count()
     if devices > 1:
-        mesh = jax.make_mesh((devices,), (AXIS,))
-        envs: Any = ShardedVectorEnv(env, config.num_envs, mesh)
+        envs: Any = ShardedVectorEnv(env, config.num_envs, make_env_mesh())
     else:
         envs = VectorPixelEnv(env, config.num_envs)
     report(

@@ -110,6 +110,16 @@ class MetricsWriter:
             self._wandb.finish()
 
 
+class NoWriter:
+    """What processes other than the first write: nothing."""
+
+    def write(self, steps: int, record: Mapping[str, float]) -> None:
+        """Nothing."""
+
+    def close(self) -> None:
+        """Nothing."""
+
+
 def read_metrics(path: str | Path) -> list[dict[str, float]]:
     """All records of a ``metrics.jsonl``; a last line that was cut off is left out."""
     records = []

@@ -13,15 +13,17 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from pixelbrax_jax.agents.algorithm import Algorithm, TrainState
 from pixelbrax_jax.agents.checkpoint import Checkpoints, nbytes
 from pixelbrax_jax.agents.config import check_positive, describe
 from pixelbrax_jax.agents.evaluate import Evaluator, Result, interquartile_mean, make_splits
 from pixelbrax_jax.agents.export import save_policy
-from pixelbrax_jax.agents.metrics import MetricsWriter, together
+from pixelbrax_jax.agents.metrics import MetricsWriter, NoWriter, together
 from pixelbrax_jax.agents.optimizer import Networks
 from pixelbrax_jax.agents.seeds import keys_of, of_seed, over_seeds
+from pixelbrax_jax.agents.sharding import everywhere, state_shardings
 from pixelbrax_jax.choices import check_choice, check_whole
 from pixelbrax_jax.types import EnvParams
 
@@ -123,6 +125,17 @@ def run(
         algorithm = over_seeds(algorithm)
         key = keys_of(options.seed, options.num_seeds)
     template = jax.eval_shape(algorithm.init, key, env_params)
+    mesh: Mesh | None = getattr(algorithm.envs, "mesh", None)
+    shardings, same = None, None
+    if mesh is not None:
+        shardings = state_shardings(mesh, template, options.num_seeds)
+        same = NamedSharding(mesh, PartitionSpec())
+        env_params = everywhere(mesh, env_params)
+        template = jax.tree.map(
+            lambda leaf, sharding: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding),
+            template,
+            shardings,
+        )
     check_memory(algorithm, template, report)
     checkpoints = Checkpoints(
         folder / "checkpoints",
@@ -140,8 +153,10 @@ def run(
                     f"{checkpoints.folder} has checkpoints of an earlier run: go on with "
                     "--resume latest, or give another --output-dir."
                 )
-            state = jax.jit(algorithm.init)(key, env_params)
-        return _Run(algorithm, env_params, options, checkpoints, report).until_end(state)
+            init = jax.jit(lambda params: algorithm.init(key, params), out_shardings=shardings)
+            state = init(env_params)
+        placed = None if mesh is None else (shardings, same)
+        return _Run(algorithm, env_params, options, checkpoints, report, placed).until_end(state)
     finally:
         checkpoints.close()
 
@@ -156,6 +171,7 @@ class _Run:
         options: RunConfig,
         checkpoints: Checkpoints,
         report: Callable[[str], None],
+        placed: Any,
     ) -> None:
         self._algorithm = algorithm
         self._config = algorithm.config
@@ -164,9 +180,9 @@ class _Run:
         self._checkpoints = checkpoints
         self._report = report
         # The state before an iteration is not needed after it: its memory is used again.
-        self._iterate = jax.jit(algorithm.iterate, donate_argnums=0)
+        self._iterate = jax.jit(algorithm.iterate, donate_argnums=0, out_shardings=placed)
         if algorithm.auxiliary is not None:
-            self._auxiliary = jax.jit(algorithm.auxiliary, donate_argnums=0)
+            self._auxiliary = jax.jit(algorithm.auxiliary, donate_argnums=0, out_shardings=placed)
         self._evaluators: dict[str, Evaluator] = {}
         if options.num_evals:
             for split, (env, params) in make_splits(self._config).items():
@@ -181,14 +197,17 @@ class _Run:
         steps, total = _steps(self._algorithm, state), self._config.num_iterations
         per_iteration, options = self._config.steps_per_iteration, self._options
         last_saved = steps
-        writer = MetricsWriter(
-            Path(options.output_dir),
-            describe(self._config),
-            first_step=steps,
-            wandb_project=options.wandb_project,
-        )
+        first = jax.process_index() == 0
+        writer: Any = NoWriter()
+        if first:
+            writer = MetricsWriter(
+                Path(options.output_dir),
+                describe(self._config),
+                first_step=steps,
+                wandb_project=options.wandb_project,
+            )
         try:
-            with _interruptible() as interrupted, _bar(options.progress, total) as bar:
+            with _interruptible() as interrupted, _bar(options.progress and first, total) as bar:
                 bar.update(steps // per_iteration)
                 began, began_steps = time.perf_counter(), steps
                 for number in range(steps // per_iteration + 1, total + 1):
@@ -214,7 +233,7 @@ class _Run:
                     if stop:
                         self._report(f"stopped after {steps} steps; go on with --resume latest")
                         break
-                for networks, name in self._policies(state):
+                for networks, name in self._policies(state) if first else ():
                     save_policy(self._algorithm, networks, Path(options.output_dir) / name)
                 return Outcome(state, self._record, self._results, bool(interrupted))
         finally:
@@ -261,11 +280,12 @@ class _Run:
 
     def _policies(self, state: TrainState) -> Iterator[tuple[Networks, str]]:
         """Networks of each seed, and the name of its policy's file."""
+        networks = jax.device_get(state.networks)
         if self._options.num_seeds == 1:
-            yield state.networks, "policy.jax"
+            yield networks, "policy.jax"
             return
         for i in range(self._options.num_seeds):
-            yield of_seed(state.networks, i), f"policy_seed{self._options.seed + i}.jax"
+            yield of_seed(networks, i), f"policy_seed{self._options.seed + i}.jax"
 
     def _evaluate(self, state: TrainState) -> dict[str, float]:
         record = {}

@@ -6,7 +6,7 @@ from functools import partial
 from typing import Any
 
 import jax
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import AxisType, Mesh, PartitionSpec
 
 from pixelbrax_jax.choices import check_whole
 from pixelbrax_jax.envs.pixel_env import PixelEnv
@@ -15,6 +15,16 @@ from pixelbrax_jax.types import EnvParams, EnvState, Timestep
 
 AXIS = "envs"
 """Name of the mesh axis along which environments are spread."""
+
+
+def make_env_mesh(num_devices: int | None = None) -> Mesh:
+    """A mesh of devices along the axis ``"envs"``, whose shardings the compiler propagates.
+
+    Args:
+        num_devices: how many; None takes all, those of other processes too.
+    """
+    num_devices = jax.device_count() if num_devices is None else num_devices
+    return jax.make_mesh((num_devices,), (AXIS,), axis_types=(AxisType.Auto,))
 
 
 class ShardedVectorEnv:
@@ -37,7 +47,7 @@ class ShardedVectorEnv:
         Args:
             env: the environment.
             num_envs: N, a multiple of the number of devices.
-            mesh: of ``jax.make_mesh((D,), ("envs",))``.
+            mesh: of `make_env_mesh`.
             autoreset_mode: as of ``VectorPixelEnv``.
 
         Raises:
