@@ -4,18 +4,20 @@
 
 Real observations of HalfCheetah and Ant under procedural clips: ``levels.png`` has a row for each
 preset and a column for each of six environments, ``motion.gif`` shows some of them in time.
+``--tasks ant --presets dcs-easy dcs-hard --num-frames 8`` draws fewer in less time.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
 import matplotlib
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 
 import pixelbrax_jax
 from pixelbrax_jax import distractors
@@ -36,11 +38,18 @@ ROWS: dict[str, tuple] = {
 }
 MOVING = ("paper-color", "paper-video", "video-hard", "dcs-easy", "dcs-medium", "dcs-hard")
 TASKS = ("halfcheetah", "ant")
-COLUMNS = 6
+EACH = 3  # environments of a task
+SIZE = 84  # pixels that agents get
+SHOWN = 8  # the frame in levels.png: by then what moves has moved
+SEED = 4  # agents of this one do not stretch beyond the picture
+STAR = 2  # the environment in motion.gif: its viewpoint strays further with every level
+
+ZOOM, GAP, CAPTION = 2, 4, 20  # pixels in motion.gif
+COLORS = 128  # well chosen ones are as near as the 256 of Pillow's default, and take less space
 
 
 def simulate(task: str, num_frames: int) -> Any:
-    """States of ``COLUMNS / 2`` environments under random actions, (N, num_frames, ...)."""
+    """States of ``EACH`` environments under random actions, (N, num_frames, ...)."""
     env, params = pixelbrax_jax.make(task, obs_mode="state")
 
     def run(key):
@@ -51,15 +60,17 @@ def simulate(task: str, num_frames: int) -> Any:
         keys = jax.random.split(jax.random.fold_in(key, 1), num_frames)
         return jax.lax.scan(step, env.reset(key, params)[0], keys)[1]
 
-    return jax.jit(jax.vmap(run))(jax.random.split(jax.random.key(1), COLUMNS // 2))
+    return jax.jit(jax.vmap(run))(jax.random.split(jax.random.key(SEED), EACH))
 
 
 def play(task: str, links: tuple, states: Any) -> np.ndarray:
-    """What the agent sees of states, (num_frames, N, 84, 84, 3) uint8."""
+    """What the agent sees of states, (num_frames, N, SIZE, SIZE, 3) uint8."""
     links = resolve(links, task)
     plays = any(isinstance(link, distractors.Video) for link in links)
     clips = "procedural" if plays else None
-    env, params = pixelbrax_jax.make(task, distractors=links, clips=clips, frame_stack=1)
+    env, params = pixelbrax_jax.make(
+        task, distractors=links, clips=clips, frame_stack=1, height=SIZE, width=SIZE
+    )
     chain = env.distractors
 
     def run(states, params):
@@ -74,58 +85,70 @@ def play(task: str, links: tuple, states: Any) -> np.ndarray:
     return np.asarray(jax.jit(jax.vmap(run, in_axes=(0, None), out_axes=1))(states, params))
 
 
-def levels(frames: dict[tuple[str, str], np.ndarray], path: Path) -> None:
-    """One row for each preset, with its name."""
+def levels(frames: dict[str, np.ndarray], path: Path) -> None:
+    """One row for each preset, with its name; ``frames`` are (num_frames, columns, ...)."""
+    num_frames, columns = next(iter(frames.values())).shape[:2]
     figure, grid = plt.subplots(
-        len(ROWS), COLUMNS, figsize=(COLUMNS * 1.15 + 1.6, len(ROWS) * 1.15), squeeze=False
+        len(frames), columns, figsize=(columns * 1.15 + 1.6, len(frames) * 1.15), squeeze=False
     )
-    for row, name in enumerate(ROWS):
-        pictures = [
-            picture
-            for task in TASKS
-            for picture in frames[task, name][min(8, len(frames[task, name]) - 1)]
-        ]
-        for column, picture in enumerate(pictures):
+    for row, (name, pictures) in enumerate(frames.items()):
+        for column, picture in enumerate(pictures[min(SHOWN, num_frames - 1)]):
             panel = grid[row, column]
             panel.imshow(picture, interpolation="nearest")
             panel.set(xticks=[], yticks=[])
             for side in panel.spines.values():
                 side.set_visible(False)
-        label = {"rotation": 0, "ha": "right", "va": "center"}
-        grid[row, 0].set_ylabel(name, **label)
+        grid[row, 0].set_ylabel(name, rotation=0, ha="right", va="center")
     figure.subplots_adjust(
-        left=0.19, right=0.995, top=0.998, bottom=0.002, wspace=0.03, hspace=0.03
+        left=1.6 / figure.get_figwidth(),
+        right=0.995,
+        top=0.998,
+        bottom=0.002,
+        wspace=0.03,
+        hspace=0.03,
     )
     figure.savefig(path, dpi=100)
     plt.close(figure)
 
 
-def motion(frames: dict[tuple[str, str], np.ndarray], path: Path) -> None:
-    """Some presets side by side, in time."""
-    rows = [[frames[task, name][:, 0] for name in MOVING] for task in TASKS]
-    film = np.concatenate([np.concatenate(row, axis=2) for row in rows], axis=1)
-    pictures = [
-        Image.fromarray(picture).resize(
-            (picture.shape[1] * 3 // 2, picture.shape[0] * 3 // 2), Image.Resampling.NEAREST
-        )
-        for picture in film
-    ]
-    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=60, loop=0)
+def motion(frames: dict[str, np.ndarray], path: Path) -> None:
+    """Presets side by side, each below its name, in time; a row for each task."""
+    font = ImageFont.load_default(size=14)
+    side = ZOOM * SIZE
+    films = {name: film[:, STAR::EACH] for name, film in frames.items()}
+    num_frames, rows = next(iter(films.values())).shape[:2]
+    width = len(films) * (side + GAP) - GAP
+    pictures = []
+    for t in range(num_frames):
+        picture = Image.new("RGB", (width, CAPTION + rows * (side + GAP) - GAP), "white")
+        drawing = ImageDraw.Draw(picture)
+        for column, (name, film) in enumerate(films.items()):
+            left = column * (side + GAP)
+            drawing.text((left + side / 2, CAPTION / 2), name, "black", font, anchor="mm")
+            for row, pixels in enumerate(film[t]):
+                tile = pixels.repeat(ZOOM, axis=0).repeat(ZOOM, axis=1)
+                picture.paste(Image.fromarray(tile), (left, CAPTION + row * (side + GAP)))
+        pictures.append(picture.quantize(COLORS, kmeans=2))
+    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=80, loop=0)
 
 
-def main(arguments: list[str] | None = None) -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Writes both pictures."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--output-dir", type=Path, default=Path("docs/images/distractors"))
-    parser.add_argument("--num-frames", type=int, default=24)
+    parser.add_argument("--num-frames", type=int, default=18)
+    parser.add_argument("--tasks", nargs="+", default=TASKS, choices=pixelbrax_jax.list_envs())
+    parser.add_argument("--presets", nargs="+", default=list(ROWS), choices=list(ROWS))
     options = parser.parse_args(arguments)
     options.output_dir.mkdir(parents=True, exist_ok=True)
-    frames = {}
-    for task in TASKS:
-        states = simulate(task, options.num_frames)
-        frames |= {(task, name): play(task, links, states) for name, links in ROWS.items()}
+    states = {task: simulate(task, options.num_frames) for task in options.tasks}
+    frames = {
+        name: np.concatenate([play(task, ROWS[name], states[task]) for task in states], axis=1)
+        for name in options.presets
+    }
     levels(frames, options.output_dir / "levels.png")
-    motion(frames, options.output_dir / "motion.gif")
+    moving = {name: film for name, film in frames.items() if name in MOVING}
+    motion(moving or frames, options.output_dir / "motion.gif")
 
 
 if __name__ == "__main__":

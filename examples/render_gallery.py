@@ -1,6 +1,7 @@
 """One real frame per task, for the gallery of the documentation.
 
     python examples/render_gallery.py --output-dir docs/images/gallery
+    python examples/render_gallery.py --output-dir runs/gallery --tasks ant reacher
 
 Each picture is the environment's after a few random actions; the strip shows, side by side, what
 the agent gets (84 x 84, enlarged), the default look with shadows, and the original look.
@@ -9,6 +10,7 @@ the agent gets (84 x 84, enlarged), the default look with shadows, and the origi
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
 import imageio.v2 as imageio
@@ -44,23 +46,25 @@ def strip(task: str, num_steps: int) -> np.ndarray:
 
 
 def overview(strips: list[np.ndarray], columns: int = 6) -> np.ndarray:
-    """The middle pictures of all strips at half size, in rows of ``columns``."""
-    start = SIZE + GAP
+    """The middle pictures of all strips at half size, in rows of at most ``columns``."""
+    start, columns = SIZE + GAP, min(columns, len(strips))
     tiles = [picture[::2, start : start + SIZE : 2] for picture in strips]
     tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % columns)
     rows = [np.concatenate(tiles[k : k + columns], axis=1) for k in range(0, len(tiles), columns)]
     return np.concatenate(rows, axis=0)
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """Writes one PNG a task."""
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Writes one PNG a task, and one of all."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--output-dir", default="docs/images/gallery")
     parser.add_argument("--num-steps", type=int, default=8)
+    tasks = pixelbrax_jax.list_envs()
+    parser.add_argument("--tasks", nargs="+", default=tasks, choices=tasks)
     options = parser.parse_args(arguments)
     output = Path(options.output_dir)
     output.mkdir(parents=True, exist_ok=True)
-    strips = {task: strip(task, options.num_steps) for task in pixelbrax_jax.list_envs()}
+    strips = {task: strip(task, options.num_steps) for task in options.tasks}
     for task, picture in strips.items():
         imageio.imwrite(output / f"{task}.png", picture)
     imageio.imwrite(output / "overview.png", overview(list(strips.values())))

@@ -8,11 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pixelbrax_jax.extras import install_extra
+
 try:
     import torch
     import torch.utils.dlpack
 except ImportError as error:
-    raise ImportError('torch is not installed; try: pip install "pixelbrax[torch]"') from error
+    raise ImportError(f"torch is not installed; try: {install_extra('torch')}") from error
 
 
 def to_torch(tree: Any) -> Any:

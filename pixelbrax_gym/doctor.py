@@ -10,9 +10,13 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from pixelbrax_jax.extras import install_extra
+
 _PACKAGES = ("pixelbrax", "jax", "jaxlib", "brax", "mujoco", "gymnasium", "numpy")
 _OPTIONAL = {"torch": "torch", "torchrl": "torchrl", "stable-baselines3": "sb3"}
 """Package -> the extra that brings it."""
+
+_JAX_ON_CUDA = install_extra("cuda12", "cuda13")
 
 _GL_LIBRARIES = ("libGL.", "libEGL.", "libOSMesa.", "libGLX.")
 
@@ -140,7 +144,7 @@ def _about_packages(machine: Machine) -> Iterator[Finding]:
     yield Finding("ok", f"Python {platform.python_version()}, {here}")
     for name, extra in _OPTIONAL.items():
         if machine.versions[name] is None:
-            cure = f'pip install "pixelbrax[{extra}]", should you want it'
+            cure = f"{install_extra(extra)}, should you want it"
             yield Finding("note", f"{name} is not installed", cure)
 
 
@@ -150,7 +154,7 @@ def _about_devices(machine: Machine) -> Iterator[Finding]:
             "trouble",
             f"JAX finds no device to compute on: {machine.jax_error}",
             "unset JAX_PLATFORMS, or install the jax release that goes with your driver: "
-            'pip install "pixelbrax[cuda12]" or "pixelbrax[cuda13]"',
+            + _JAX_ON_CUDA,
         )
         return
     yield Finding("ok", f"JAX computes on {machine.jax_device}")
@@ -159,9 +163,8 @@ def _about_devices(machine: Machine) -> Iterator[Finding]:
         yield Finding(
             "trouble",
             "there is an NVIDIA GPU, but JAX does not use it",
-            'pip install "pixelbrax[cuda12]" or "pixelbrax[cuda13]", as nvidia-smi tells the CUDA '
-            "version; unset JAX_PLATFORMS; and import jax before torch, whose CUDA libraries may "
-            "hide JAX's",
+            f"{_JAX_ON_CUDA}, as nvidia-smi tells the CUDA version; unset JAX_PLATFORMS; and "
+            "import jax before torch, whose CUDA libraries may hide JAX's",
         )
     if machine.torch_cuda is None:
         return
@@ -182,7 +185,7 @@ def _about_devices(machine: Machine) -> Iterator[Finding]:
         yield Finding(
             "trouble",
             "torch uses CUDA and JAX the CPU: frames are drawn slowly and must be copied",
-            'pip install "pixelbrax[cuda12]" or "pixelbrax[cuda13]"',
+            _JAX_ON_CUDA,
         )
     elif on_gpu and not machine.torch_cuda:
         yield Finding(

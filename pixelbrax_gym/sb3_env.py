@@ -9,11 +9,13 @@ import gymnasium
 import jax
 import numpy as np
 
+from pixelbrax_jax.extras import install_extra
+
 try:
     from stable_baselines3.common.vec_env import VecEnv
 except ImportError as missing:
     raise ImportError(
-        'Stable-Baselines3 is not installed; try: pip install "pixelbrax[sb3]"'
+        f"Stable-Baselines3 is not installed; try: {install_extra('sb3')}"
     ) from missing
 
 from pixelbrax_gym.dlpack import to_host
@@ -88,7 +90,8 @@ class PixelBraxSB3VecEnv(VecEnv):
                 ``action_repeat`` and ``episode_length``.
 
         Raises:
-            ValueError: an option is unknown or out of range; the message lists what is allowed.
+            TypeError: an option is unknown; the message lists those there are.
+            ValueError: an option is out of range; the message lists what is allowed.
             RuntimeError: this process is a fork that cannot run JAX.
         """
         if render_mode is not None:

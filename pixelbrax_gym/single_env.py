@@ -68,7 +68,8 @@ class PixelBraxEnv(gymnasium.Env):
                 ``action_repeat`` and ``episode_length``.
 
         Raises:
-            ValueError: an option is unknown or out of range; the message lists what is allowed.
+            TypeError: an option is unknown; the message lists those there are.
+            ValueError: an option is out of range; the message lists what is allowed.
             ImportError: a package is missing that ``output`` or ``render_mode`` needs.
             RuntimeError: this process is a fork that cannot run JAX.
         """

@@ -15,7 +15,7 @@ from gymnasium import error
 from pixelbrax_gym.actions import as_actions, name_rows
 from pixelbrax_gym.fork import check_not_forked, is_forked
 from pixelbrax_jax import PixelEnv, VectorPixelEnv, registry
-from pixelbrax_jax.choices import check_choice, check_whole
+from pixelbrax_jax.choices import check_options, check_whole
 from pixelbrax_jax.types import EnvParams, EnvState, Timestep
 
 SEEDS = 2**32
@@ -66,7 +66,8 @@ class StatefulEnv:
             also_allowed: option names of the caller, for the message about an unknown one.
 
         Raises:
-            ValueError: an option is unknown or out of range; the message lists what is allowed.
+            TypeError: an option is unknown; the message lists those there are.
+            ValueError: an option is out of range; the message lists what is allowed.
             RuntimeError: this process is a fork that cannot run JAX.
         """
         self.env, self.params = _make(task, dict(options), max_episode_steps, also_allowed)
@@ -348,8 +349,7 @@ def _make(
     also_allowed: Sequence[str],
 ) -> tuple[PixelEnv, EnvParams]:
     allowed = list(inspect.signature(registry.make).parameters)[1:]
-    for name in options:
-        check_choice("option", name, [*allowed, *also_allowed])
+    check_options(options, [*allowed, *also_allowed])
     if max_episode_steps not in (None, -1):
         if "episode_length" in options:
             raise ValueError(

@@ -7,15 +7,15 @@ from typing import Any
 import numpy as np
 from gymnasium import error
 
+from pixelbrax_jax.extras import install_extra
+
 try:
     import torch
     from tensordict import TensorDict, TensorDictBase
     from torchrl.data import Unbounded
     from torchrl.envs import EnvBase
 except ImportError as missing:
-    raise ImportError(
-        'TorchRL is not installed; try: pip install "pixelbrax[torchrl]"'
-    ) from missing
+    raise ImportError(f"TorchRL is not installed; try: {install_extra('torchrl')}") from missing
 
 from pixelbrax_gym.actions import name_rows
 from pixelbrax_gym.dlpack import default_torch_device, to_torch
@@ -81,7 +81,8 @@ class PixelBraxTorchRLEnv(EnvBase):
                 ``action_repeat`` and ``episode_length``.
 
         Raises:
-            ValueError: an option is unknown or out of range; the message lists what is allowed.
+            TypeError: an option is unknown; the message lists those there are.
+            ValueError: an option is out of range; the message lists what is allowed.
             RuntimeError: this process is a fork that cannot run JAX.
         """
         check_not_forked()

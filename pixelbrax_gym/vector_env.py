@@ -101,7 +101,8 @@ class PixelBraxVectorEnv(gymnasium.vector.VectorEnv):
                 ``action_repeat`` and ``episode_length``.
 
         Raises:
-            ValueError: an option is unknown or out of range; the message lists what is allowed.
+            TypeError: an option is unknown; the message lists those there are.
+            ValueError: an option is out of range; the message lists what is allowed.
             ImportError: torch is missing and wanted.
             RuntimeError: this process is a fork that cannot run JAX.
         """

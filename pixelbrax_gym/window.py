@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from pixelbrax_jax.extras import install_extra
+
 
 class Window:
     """Shows pictures on the screen, no faster than a given rate."""
@@ -24,7 +26,7 @@ class Window:
             import pygame
         except ImportError as error:
             raise ImportError(
-                "render_mode='human' needs pygame; try: pip install \"pixelbrax[human]\""
+                f"render_mode='human' needs pygame; try: {install_extra('human')}"
             ) from error
         self._pygame, self._title, self._fps = pygame, title, fps
         self._screen: Any = None

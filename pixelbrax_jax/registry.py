@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from pixelbrax_jax import spatial
-from pixelbrax_jax.choices import check_choice
+from pixelbrax_jax.choices import check_choice, checks_options
 from pixelbrax_jax.distractors.base import Distractor
 from pixelbrax_jax.distractors.clips import ClipBank, load_clips, warn_procedural
 from pixelbrax_jax.distractors.presets import resolve
@@ -79,6 +79,7 @@ def register(
     _REGISTRY[name] = _Entry(build, None if camera is None else make_rig(name, camera))
 
 
+@checks_options
 def make(
     task: str,
     *,
@@ -128,6 +129,7 @@ def make(
 
     Raises:
         ValueError: a name is unknown or a number out of range; the message lists what is allowed.
+        TypeError: there is no such option; the message lists them and names the nearest one.
         FileNotFoundError: clips are missing.
         MemoryError: the clips would take too much memory.
     """

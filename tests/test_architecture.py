@@ -15,13 +15,14 @@ from packaging.requirements import Requirement
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("pixelbrax_jax", "pixelbrax_gym")
 
-FOUNDATIONS = {"types", "spatial", "choices"}
+FOUNDATIONS = {"types", "spatial", "choices", "extras"}
 DRAWING_ROOMS = {"physics", "scene", "renderer", "distractors"}
 """They never import each other; `envs` joins them."""
 
 ALLOWED: dict[str, set[str]] = {
     "pixelbrax_jax.types": set(),
     "pixelbrax_jax.choices": set(),
+    "pixelbrax_jax.extras": set(),
     "pixelbrax_jax.spatial": {"pixelbrax_jax.types"},
     **{
         f"pixelbrax_jax.{room}": {f"pixelbrax_jax.{name}" for name in FOUNDATIONS}
@@ -44,12 +45,13 @@ ALLOWED: dict[str, set[str]] = {
         "pixelbrax_jax.registry",
         "pixelbrax_jax.types",
         "pixelbrax_jax.choices",
+        "pixelbrax_jax.extras",
     },
 }
 """Room -> the rooms that it may import besides itself."""
 
 HOMES: dict[str, set[str]] = {
-    "brax": {"pixelbrax_jax/physics/brax_physics.py"},
+    "brax": {"pixelbrax_jax/physics/brax_physics.py", "pixelbrax_jax/envs/brax_env.py"},
     "torch": {
         "pixelbrax_gym/dlpack.py",
         "pixelbrax_gym/doctor.py",
@@ -63,7 +65,7 @@ HOMES: dict[str, set[str]] = {
 }
 """Third party -> the only files that may import it."""
 
-_DISTRIBUTIONS = {"PIL": "pillow"}
+_DISTRIBUTIONS = {"PIL": "pillow", "orbax": "orbax-checkpoint", "tensorboardX": "tensorboardx"}
 """Import name -> what is installed, where the two differ."""
 
 NO_NAMES = {"utils", "helpers", "common", "misc"}
@@ -164,6 +166,8 @@ def test_every_third_party_is_declared():
     used = {_DISTRIBUTIONS.get(name, name.replace("_", "-")) for name in third_parties(ROOT)}
     # TorchRL pins the release of tensordict that goes with it.
     used -= {"tensordict"}
+    # Written to only by who has it.
+    used -= {"wandb"}
     assert used <= core | extras, f"not declared: {used - core - extras}"
     assert core <= used, f"declared but not imported: {core - used}"
 

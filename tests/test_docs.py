@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import inspect
 import re
 import shlex
 import textwrap
@@ -159,10 +160,10 @@ def test_the_table_of_tasks_is_true():
 
 
 def test_the_table_of_options_is_true():
-    defaults = pixelbrax_jax.make.__kwdefaults__
+    options = inspect.signature(pixelbrax_jax.make).parameters
     for names, values, _ in table_of("options"):
         for option, value in zip(names.split(", "), values.split(", "), strict=True):
-            assert repr(defaults[option]).replace("'", '"') == value, option
+            assert repr(options[option].default).replace("'", '"') == value, option
 
 
 def test_blocks_are_found():

@@ -352,7 +352,7 @@ def check_memory(algorithm: Algorithm, template: TrainState, report: Callable[[s
 
 def _device_memory() -> float:
     """Bytes that JAX may use on its first device; no bound where nobody tells."""
-    statistics = jax.devices()[0].memory_stats() or {}
+    statistics = jax.local_devices()[0].memory_stats() or {}
     if "bytes_limit" in statistics:
         return float(statistics["bytes_limit"])
     try:

@@ -6,10 +6,12 @@ import contextlib
 import hashlib
 import json
 import os
+import sys
 import tempfile
 import warnings
 import zipfile
 from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -20,6 +22,7 @@ import numpy as np
 
 from pixelbrax_jax.choices import check_choice, check_whole
 from pixelbrax_jax.distractors import folders, procedural
+from pixelbrax_jax.extras import install_extra
 from pixelbrax_jax.types import Clips
 
 MAX_BYTES = 2 * 1024**3
@@ -27,6 +30,9 @@ MAX_BYTES = 2 * 1024**3
 
 _CACHE_VERSION = 1
 """Raised when the same files would give other pixels."""
+
+_NOT_THE_USER = {"pixelbrax_jax", "pixelbrax_gym", "gymnasium", "stable_baselines3", "torchrl"}
+"""Packages between a user's line and ``load_clips``."""
 
 
 class ProceduralClipsWarning(UserWarning):
@@ -162,14 +168,27 @@ def _procedural(names: tuple[str, ...], split: str, height: int, width: int) -> 
 
 
 def warn_procedural() -> None:
-    """Says, once for each place in the code, that these clips are not DAVIS."""
+    """Says, once for each place in the user's code, that these clips are not DAVIS."""
     warnings.warn(
         "the background plays procedural clips, as no clips= were given; results are not results "
         "on DAVIS. Say clips='procedural' if that is what you want, or clips='<folder of "
         "DAVIS-2017>'.",
         ProceduralClipsWarning,
-        stacklevel=4,
+        stacklevel=_stacklevel_of_the_user(),
     )
+
+
+def _stacklevel_of_the_user() -> int:
+    """What ``warnings.warn`` wants in the calling function to point at the user's own line.
+
+    An environment is made at many depths: by ``make``, by Gymnasium's, by the class of a door.
+    """
+    level, frame = 1, sys._getframe(1)
+    while frame.f_globals.get("__name__", "").partition(".")[0] in _NOT_THE_USER:
+        if frame.f_back is None:
+            return 1
+        level, frame = level + 1, frame.f_back
+    return level
 
 
 def _check_size(frames: int, height: int, width: int, max_bytes: int) -> None:
@@ -211,25 +230,25 @@ def _frames(source: folders.Source, height: int, width: int, max_bytes: int) -> 
     """The clip's frames at the wanted size."""
     if source.is_video:
         return _video_frames(source.files[0], height, width, max_bytes)
-    frames = []
-    for file in source.files:
-        try:
-            with pillow().open(file) as image:
-                frames.append(_fit(image.convert("RGB"), height, width))
-        except OSError as error:
-            raise ValueError(
-                f"{file} cannot be read as a picture ({error}); unpack it again."
-            ) from error
-    return frames
+    with ThreadPoolExecutor() as pool:  # Pillow decodes and scales without Python's lock
+        return list(pool.map(lambda file: _picture(file, height, width), source.files))
+
+
+def _picture(file: Path, height: int, width: int) -> np.ndarray:
+    try:
+        with pillow().open(file) as image:
+            return _fit(image.convert("RGB"), height, width)
+    except OSError as error:
+        raise ValueError(
+            f"{file} cannot be read as a picture ({error}); unpack it again."
+        ) from error
 
 
 def _video_frames(file: Path, height: int, width: int, max_bytes: int) -> list[np.ndarray]:
     try:
         import imageio.v3 as imageio
     except ImportError as error:
-        raise ImportError(
-            'reading videos needs imageio; try: pip install "pixelbrax[clips]"'
-        ) from error
+        raise ImportError(f"reading videos needs imageio; try: {install_extra('clips')}") from error
     image_module = pillow()
     with warnings.catch_warnings():
         # FFmpeg is started as a process of its own at once, which is safe beside JAX's threads.
@@ -264,7 +283,7 @@ def pillow() -> Any:
         from PIL import Image
     except ImportError as error:
         raise ImportError(
-            'reading pictures needs Pillow; try: pip install "pixelbrax[clips]"'
+            f"reading pictures needs Pillow; try: {install_extra('clips')}"
         ) from error
     return Image
 
@@ -279,8 +298,10 @@ def _digest(sources: list[folders.Source], height: int, width: int) -> str:
     digest = hashlib.sha256(json.dumps([_CACHE_VERSION, height, width]).encode())
     for source in sources:
         digest.update(json.dumps([source.name, len(source.files)]).encode())
+        # One after the other: threads would wait for Python's lock longer than for a hash.
         for file in source.files:
-            digest.update(hashlib.sha256(file.read_bytes()).digest())
+            with file.open("rb") as opened:  # a film need not fit into memory
+                digest.update(hashlib.file_digest(opened, "sha256").digest())
     return digest.hexdigest()[:32]
 
 
@@ -314,4 +335,7 @@ def _write_cache(file: Path, frames: np.ndarray, length: np.ndarray) -> None:
         if half is not None:
             with contextlib.suppress(OSError):
                 half.unlink(missing_ok=True)
-        warnings.warn(f"clips could not be cached in {file.parent} ({error}).", stacklevel=3)
+        warnings.warn(
+            f"clips could not be cached in {file.parent} ({error}).",
+            stacklevel=_stacklevel_of_the_user(),
+        )

@@ -191,6 +191,26 @@ def test_the_cache_is_read_and_follows_the_files(davis, monkeypatch):
     assert changed.frames[1].min() > 250
 
 
+def test_a_change_that_keeps_size_and_time_is_seen(tmp_path):
+    file = tmp_path / "clips" / "one" / "0.bmp"
+    file.parent.mkdir(parents=True)
+    frames = []
+    for color in ("red", "blue"):
+        Image.new("RGB", (8, 8), color).save(file)
+        os.utime(file, ns=(10**18, 10**18))
+        frames.append(load_clips(tmp_path / "clips", "all", height=4, width=4).frames[0, 0, 0])
+    assert [frame.tolist() for frame in frames] == [[255, 0, 0], [0, 0, 255]]
+
+
+def test_the_cache_knows_clips_that_were_moved(davis, tmp_path, monkeypatch):
+    first = load_clips(davis, "train", height=8, width=8)
+    monkeypatch.setattr(clips_module, "_decode", None)
+    moved = davis.rename(tmp_path / "elsewhere")
+    again = load_clips(moved, "train", height=8, width=8)
+    np.testing.assert_array_equal(again.frames, first.frames)
+    assert again.source == str(moved)
+
+
 @pytest.mark.parametrize("length", [0, 100])
 def test_a_damaged_cache_is_made_again(davis, tmp_path, length):
     first = load_clips(davis, "train", height=8, width=8)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -212,6 +214,20 @@ class TestMake:
     def test_unknown_names_list_what_is_allowed(self, options, message):
         with pytest.raises(ValueError, match=message):
             pixelbrax_jax.make(**({"task": "ant"} | options))
+
+    def test_a_misspelt_option_is_named(self):
+        message = r"unknown option: 'heigth'; allowed: .*, width\. Did you mean 'height'\?"
+        with pytest.raises(TypeError, match=message):
+            pixelbrax_jax.make("ant", heigth=84)
+        with pytest.raises(TypeError, match=r"unknown option: 'zzz'; allowed: .*, width\.$"):
+            pixelbrax_jax.make("ant", zzz=84)
+
+    def test_the_signature_is_there_for_editors(self):
+        parameters = inspect.signature(pixelbrax_jax.make).parameters
+        assert next(iter(parameters)) == "task"
+        assert parameters["height"].default == 84
+        assert parameters["height"].annotation == "int"
+        assert "Calls with equal options share one environment" in pixelbrax_jax.make.__doc__
 
     def test_a_rig_must_follow_a_link_that_exists(self):
         rig = pixelbrax_jax.rig((0, -3, 1), (0, 0, 0), 40.0, link=99)

@@ -7,7 +7,9 @@ import json
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image, ImageSequence
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -20,6 +22,13 @@ def load(name):
     sys.modules[name] = module
     spec.loader.exec_module(module)
     return module
+
+
+def pictures_in(path):
+    """All pictures of a file, (num_frames, height, width, 3) uint8."""
+    with Image.open(path) as opened:
+        frames = [np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(opened)]
+    return np.stack(frames)
 
 
 @pytest.mark.slow  # `make demo` runs it in full
@@ -71,3 +80,51 @@ def test_skrl_ppo(tmp_path):
 def test_agents_learn(name, tmp_path):
     figures = load(name).main(["--output-dir", str(tmp_path)])
     assert figures["eval_return_mean"] >= 500
+
+
+def test_render_gallery(tmp_path):
+    load("render_gallery").main(
+        ["--output-dir", str(tmp_path), "--num-steps", "1", "--tasks", "inverted_pendulum"]
+    )
+    assert {path.name for path in tmp_path.iterdir()} == {"inverted_pendulum.png", "overview.png"}
+    (strip,) = pictures_in(tmp_path / "inverted_pendulum.png")
+    assert strip.shape == (336, 3 * 336 + 2 * 8, 3)
+    small, shaded, original = strip[:, :336], strip[:, 344:680], strip[:, 688:]
+    # What the agent sees is enlarged four times, the others are drawn at their size.
+    np.testing.assert_array_equal(small, small[::4, ::4].repeat(4, axis=0).repeat(4, axis=1))
+    assert (shaded != shaded[::4, ::4].repeat(4, axis=0).repeat(4, axis=1)).any()
+    for picture in (small, shaded, original):
+        assert picture.std() > 10
+    assert np.abs(shaded.astype(int) - original).mean() > 10, "two looks"
+    (overview,) = pictures_in(tmp_path / "overview.png")
+    np.testing.assert_array_equal(overview, shaded[::2, ::2])
+
+
+def test_render_distractors(tmp_path):
+    presets = ["none", "paper-color", "dcs-hard"]
+    load("render_distractors").main(
+        [
+            *("--output-dir", str(tmp_path), "--num-frames", "3"),
+            *("--tasks", "inverted_pendulum", "--presets", *presets),
+        ]
+    )
+    assert {path.name for path in tmp_path.iterdir()} == {"levels.png", "motion.gif"}
+    (levels,) = pictures_in(tmp_path / "levels.png")
+    assert levels.shape == (345, 505, 3), "three rows, and three environments beside their names"
+    plain, color, hard = levels[:115, 160:], levels[115:230, 160:], levels[230:, 160:]
+    for row, name in zip((plain, color, hard), presets, strict=True):
+        assert row.std() > 10, name
+    assert (plain != color).any(axis=2).mean() > 0.8
+    assert (plain != hard).any(axis=2).mean() > 0.8
+    names = levels[:, :155]
+    assert names.min() < 100, "legible"
+    assert names[:, :2].min() == 255, "not cut"
+
+    # Only what changes from frame to frame is shown in motion.
+    film = pictures_in(tmp_path / "motion.gif")
+    assert film.shape == (3, 20 + 168, 168 + 4 + 168, 3)
+    assert film[:, :20].min() < 100, "names"
+    assert film[:, 20:, :168].std() > 10
+    assert film[:, 20:, -168:].std() > 10
+    steps = np.abs(np.diff(film.astype(int), axis=0)).mean((1, 2, 3))
+    assert (steps > 1).all()

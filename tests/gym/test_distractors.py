@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
+
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -9,7 +12,7 @@ import torch
 import pixelbrax_gym
 from pixelbrax_jax import distractors
 from tests.distractors.conftest import make_bank
-from tests.gym.conftest import SIZE, TASK
+from tests.gym.conftest import ID, SIZE, TASK
 
 ALL = (
     distractors.Video(mode="overlay"),
@@ -72,3 +75,24 @@ def test_render_shows_them(make_vector):
 def test_mistakes_are_told_before_anything_is_compiled(options, message):
     with pytest.raises((ValueError, FileNotFoundError), match=message):
         pixelbrax_gym.PixelBraxVectorEnv(TASK, 2, **SIZE, **options)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda **options: pixelbrax_gym.PixelBraxEnv(TASK, **options),
+        lambda **options: pixelbrax_gym.PixelBraxVectorEnv(TASK, 2, **options),
+        lambda **options: pixelbrax_gym.PixelBraxTorchRLEnv(TASK, 2, **options),
+        lambda **options: pixelbrax_gym.PixelBraxSB3VecEnv(TASK, 2, **options),
+        lambda **options: gymnasium.make(ID, **options),
+        lambda **options: gymnasium.make_vec(ID, num_envs=2, **options),
+        lambda **options: gymnasium.make_vec(ID, num_envs=1, vectorization_mode="sync", **options),
+    ],
+)
+def test_the_warning_about_clips_points_at_the_line_of_the_user(make):
+    with pytest.warns(distractors.ProceduralClipsWarning) as told:
+        make(**SIZE, distractors="video").close()
+    (warning,) = told
+    assert warning.filename == __file__
+    first = make.__code__.co_firstlineno
+    assert first <= warning.lineno < first + len(inspect.getsource(make).splitlines())

@@ -46,13 +46,13 @@ def test_a_healthy_machine():
             {"jax_platform": "cpu", "jax_device": "cpu:0", "torch_cuda": False},
             "trouble",
             "NVIDIA GPU, but JAX does not use it",
-            "pixelbrax[cuda12]",
+            ".[cuda12]",
         ),
         (
             {"jax_platform": "cpu", "has_nvidia": False},
             "trouble",
             "torch uses CUDA and JAX the CPU",
-            "pixelbrax[cuda12]",
+            ".[cuda12]",
         ),
         ({"torch_cuda": False}, "trouble", "JAX uses the GPU and torch cannot", "torch built for"),
         (
@@ -98,7 +98,7 @@ def test_a_healthy_machine():
             {"versions": HEALTHY.versions | {"torchrl": None}},
             "note",
             "torchrl is not installed",
-            "pixelbrax[torchrl]",
+            ".[torchrl]",
         ),
     ],
 )

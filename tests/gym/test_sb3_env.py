@@ -313,15 +313,15 @@ def test_use_out_of_order(make_sb3):
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("options", "error", "message"),
     [
-        ({"heigth": 12}, "unknown option: 'heigth'.*Did you mean 'height'"),
-        ({"num_envs": 0}, "at least 1, got 0"),
-        ({"render_mode": "human"}, "rgb_array"),
+        ({"heigth": 12}, TypeError, "unknown option: 'heigth'.*Did you mean 'height'"),
+        ({"num_envs": 0}, ValueError, "at least 1, got 0"),
+        ({"render_mode": "human"}, ValueError, "rgb_array"),
     ],
 )
-def test_options_are_checked(options, message):
-    with pytest.raises(ValueError, match=message):
+def test_options_are_checked(options, error, message):
+    with pytest.raises(error, match=message):
         pixelbrax_gym.PixelBraxSB3VecEnv(TASK, **options)
 
 

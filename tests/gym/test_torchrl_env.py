@@ -459,7 +459,7 @@ def test_use_out_of_order(make_torchrl):
 
 
 def test_options_are_checked():
-    with pytest.raises(ValueError, match=r"unknown option: 'heigth'.*Did you mean 'height'"):
+    with pytest.raises(TypeError, match=r"unknown option: 'heigth'.*Did you mean 'height'"):
         pixelbrax_gym.PixelBraxTorchRLEnv(TASK, 2, heigth=12)
 
 

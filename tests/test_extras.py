@@ -1,0 +1,73 @@
+"""What is missing is named, with an extra that exists and one way to install it."""
+
+from __future__ import annotations
+
+import importlib
+import re
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from pixelbrax_gym import doctor, window
+from pixelbrax_jax import load_clips
+from pixelbrax_jax.distractors import clips
+from pixelbrax_jax.extras import install_extra
+
+ROOT = Path(__file__).parents[1]
+SOURCES = [*(ROOT / "pixelbrax_jax").rglob("*.py"), *(ROOT / "pixelbrax_gym").rglob("*.py")]
+
+
+def test_the_command():
+    assert install_extra("sb3") == 'pip install -e ".[sb3]" in your clone of PixelBrax'
+    assert install_extra("cuda12", "cuda13") == (
+        'pip install -e ".[cuda12]" or pip install -e ".[cuda13]" in your clone of PixelBrax'
+    )
+
+
+def test_there_is_one_place_that_says_how():
+    command = re.compile(r"pip install.*(\.|pixelbrax)\[")
+    places = {path.name for path in SOURCES if command.search(path.read_text("utf-8"))}
+    assert places == {"extras.py"}
+
+
+def test_extras_that_are_named_exist():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    calls = re.findall(r"install_extra\(([^)]*)\)", "".join(p.read_text("utf-8") for p in SOURCES))
+    named = {name for call in calls for name in re.findall(r"""["'](\w+)["']""", call)}
+    named |= set(doctor._OPTIONAL.values())
+    assert {"torch", "clips", "cuda13"} <= named
+    assert named <= set(project["optional-dependencies"])
+
+
+@pytest.mark.parametrize(
+    ("absent", "door", "extra"),
+    [
+        ("torch", "pixelbrax_gym.dlpack", "torch"),
+        ("torchrl.envs", "pixelbrax_gym.torchrl_env", "torchrl"),
+        ("stable_baselines3.common.vec_env", "pixelbrax_gym.sb3_env", "sb3"),
+    ],
+)
+def test_a_framework_that_is_missing(monkeypatch, absent, door, extra):
+    monkeypatch.setitem(sys.modules, absent, None)
+    monkeypatch.delitem(sys.modules, door, raising=False)
+    with pytest.raises(ImportError, match=rf"is not installed; try: .*\[{extra}\]"):
+        importlib.import_module(door)
+
+
+def test_a_reader_that_is_missing(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "PIL", None)
+    with pytest.raises(ImportError, match=r"pictures needs Pillow; try: .*\[clips\]"):
+        clips.pillow()
+    monkeypatch.setitem(sys.modules, "imageio", None)
+    monkeypatch.setitem(sys.modules, "imageio.v3", None)
+    (tmp_path / "film.mp4").write_bytes(b"")
+    with pytest.raises(ImportError, match=r"videos needs imageio; try: .*\[clips\]"):
+        load_clips(tmp_path, "all", cache_dir=tmp_path, progress=False)
+
+
+def test_a_window_without_pygame(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    with pytest.raises(ImportError, match=r"needs pygame; try: .*\[human\]"):
+        window.Window("Ant", 20)
