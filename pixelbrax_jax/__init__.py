@@ -2,6 +2,8 @@
 
 from pixelbrax_jax import distractors as distractors
 from pixelbrax_jax.distractors import load_clips as load_clips
+from pixelbrax_jax.envs.brax_env import BraxPixelEnv as BraxPixelEnv
+from pixelbrax_jax.envs.brax_env import wrap_fresh_episodes as wrap_fresh_episodes
 from pixelbrax_jax.envs.check import check_env as check_env
 from pixelbrax_jax.envs.pixel_env import PixelEnv as PixelEnv
 from pixelbrax_jax.envs.vector import AUTORESET_MODES as AUTORESET_MODES

@@ -1,4 +1,4 @@
-"""Brax's tasks and engines behind the ``Physics`` interface; the only file that imports Brax."""
+"""Brax's tasks and engines behind the ``Physics`` interface; no other file simulates with Brax."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from pixelbrax_jax.physics.compatibility import (
     accept_old_clip,
     import_silenced,
     known_warnings_silenced,
+    load_onto_own_device,
     loading_silenced,
 )
 from pixelbrax_jax.physics.geoms import VISIBLE_GROUPS, Color, read_geoms
@@ -28,6 +29,7 @@ with import_silenced():
     from brax import envs, fluid
     from brax.envs.wrappers import training
     from brax.io import mjcf
+    from mujoco.mjx._src import io as mjx_io
 
 if TYPE_CHECKING:
     from pixelbrax_jax.physics.mjcf_task import MjcfTask
@@ -334,6 +336,7 @@ def load_brax_env(name: str, backend: str, **options: Any) -> envs.Env:
     Returns:
         The environment.
     """
+    load_onto_own_device(mjx_io)
     with loading_silenced():
         return envs.get_environment(name, backend=backend, **options)
 

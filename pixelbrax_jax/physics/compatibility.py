@@ -11,13 +11,15 @@ import inspect
 import io
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from types import ModuleType
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 _KNOWN_WARNINGS: tuple[tuple[str, type[Warning]], ...] = (
     # Brax, at every load of a model.
@@ -105,3 +107,57 @@ def accept_old_clip(module: ModuleType) -> None:
     """
     if "a_min" not in inspect.signature(jnp.clip).parameters and vars(module)["jp"] is jnp:
         vars(module)["jp"] = _NumpyWithOldClip()
+
+
+class _JaxWithReplicated:
+    """``jax`` that still has ``device_put_replicated``."""
+
+    @staticmethod
+    def device_put_replicated(x: Any, devices: Sequence[jax.Device]) -> Any:
+        """``x`` with a new leading axis, one row on each device."""
+        sharding = NamedSharding(Mesh(np.array(devices), ("row",)), PartitionSpec("row"))
+
+        def put(leaf: jax.typing.ArrayLike) -> jax.Array:
+            rows = jnp.broadcast_to(leaf, (len(devices), *jnp.shape(leaf)))
+            return jax.device_put(rows, sharding)
+
+        return jax.tree.map(put, x)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(jax, name)
+
+
+def accept_device_put_replicated(module: ModuleType) -> None:
+    """Lets one module call ``jax.device_put_replicated``, which JAX no longer has.
+
+    Brax's trainers do. Only the name ``jax`` inside ``module`` is replaced, and only where JAX
+    lacks the function, so a call that used to raise now works and every other call in the
+    process is untouched.
+
+    Args:
+        module: a module that knows JAX as ``jax``.
+    """
+    if not hasattr(jax, "device_put_replicated") and vars(module)["jax"] is jax:
+        vars(module)["jax"] = _JaxWithReplicated()
+
+
+class _JaxOfThisProcess:
+    """``jax`` whose devices are those of this process."""
+
+    devices = staticmethod(jax.local_devices)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(jax, name)
+
+
+def load_onto_own_device(module: ModuleType) -> None:
+    """Lets one module put arrays on a device of this process.
+
+    MuJoCo XLA puts models on ``jax.devices()[0]``, which in a run of several processes is a device
+    of the first one, where no other process can read it.
+
+    Args:
+        module: a module that knows JAX as ``jax``.
+    """
+    if jax.process_count() > 1 and vars(module)["jax"] is jax:
+        vars(module)["jax"] = _JaxOfThisProcess()

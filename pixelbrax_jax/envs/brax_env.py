@@ -1,0 +1,227 @@
+"""A pixel environment as one of Brax's own, for Brax's trainers."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pixelbrax_jax.envs.pixel_env import PixelEnv
+from pixelbrax_jax.envs.vector import VectorPixelEnv
+from pixelbrax_jax.physics.compatibility import accept_device_put_replicated, import_silenced
+from pixelbrax_jax.types import EnvParams, Timestep
+
+with import_silenced():
+    from brax.envs.base import Env, State, Wrapper
+    from brax.envs.wrappers.training import EpisodeWrapper, VmapWrapper
+
+PIXELS = "pixels/view_0"
+"""Name of the picture in an observation; Brax takes what begins with ``pixels/`` for pictures."""
+
+_LEVEL = np.float32(1 / 255)
+"""One of the 255 steps from black to white. It is multiplied with: where XLA divides by a constant,
+the last bit is the compiler's choice."""
+
+_NO_LIMIT = 2**31 - 1
+"""Control steps that no episode lasts."""
+
+
+class BraxPixelEnv(Env):
+    """A ``PixelEnv`` with its parameters as a ``brax.envs.Env``.
+
+    As everywhere in Brax, the environment itself has no time limit: ``done`` is the task's own
+    termination, and Brax's ``EpisodeWrapper`` counts calls of ``step`` and sets
+    ``info["truncation"]`` at the ``episode_length`` that the trainer was given. The limit of the
+    pixel environment does not apply; as a number of calls it is the attribute
+    ``episode_length``. Likewise repeat actions with ``action_repeat`` of the pixel environment:
+    Brax's would draw frames that nobody sees, and step on beyond a termination.
+
+    Brax's ``AutoResetWrapper`` returns to the first state of the first episode whenever one
+    ends; ``wrap_fresh_episodes`` begins new ones instead.
+
+    Example:
+        >>> env = BraxPixelEnv(*pixelbrax_jax.make("inverted_pendulum"))
+        >>> ppo.train(env, 1_000_000, episode_length=env.episode_length, ...)
+
+    Attributes:
+        env: the pixel environment, a copy without a time limit.
+        sys: its ``EnvParams``, called as what Brax's ``randomization_fn`` is given: that
+            function may randomise them per environment.
+        episode_length: time limit of the given environment, in calls of ``step``.
+    """
+
+    def __init__(self, env: PixelEnv, params: EnvParams) -> None:
+        """Joins the two; compiles nothing.
+
+        Args:
+            env: the pixel environment; never modified.
+            params: what may be randomised.
+
+        Raises:
+            TypeError: ``env`` is not a ``PixelEnv``.
+        """
+        if not isinstance(env, PixelEnv):
+            raise TypeError(f"env must be a PixelEnv, got {type(env).__name__}.")
+        _mend_trainers()
+        self.env = copy.copy(env)
+        self.env.episode_length = _NO_LIMIT
+        self.sys = params
+        self.episode_length = -(-env.episode_length // env.action_repeat)
+
+    def reset(self, rng: jax.Array) -> State:
+        """Begins episode 0 of the environment that ``rng`` stands for.
+
+        Args:
+            rng: one PRNG key, raw as Brax's are or typed.
+
+        Returns:
+            The first state. Its ``pipeline_state`` is the pixel environment's ``EnvState``.
+
+        Raises:
+            TypeError: ``rng`` is not one key.
+        """
+        if not jnp.issubdtype(rng.dtype, jax.dtypes.prng_key):
+            rng = jax.random.wrap_key_data(rng)
+        state, timestep = self.env.reset(rng, self.sys)
+        return State(pipeline_state=state, **self._told(timestep))
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Acts, and draws one frame.
+
+        Args:
+            state: what ``reset`` or ``step`` returned, wrapped or not.
+            action: (A,) float, clipped to [-1, 1].
+
+        Returns:
+            The next state. ``done`` is 1 where the task ended; ``metrics["non_finite"]`` is 1
+            where it did because the physics diverged, hence 0 or 1 summed over an episode.
+
+        Raises:
+            ValueError: ``action`` has another shape.
+            TypeError: ``action`` is not floating point.
+        """
+        pipeline, timestep = self.env.step(state.pipeline_state, action, self.sys)
+        told = self._told(timestep)
+        # Brax's wrappers keep metrics of their own beside ours.
+        told["metrics"] = {**state.metrics, **told["metrics"]}
+        return state.replace(pipeline_state=pipeline, **told)
+
+    def observation(self, obs: Any) -> Any:
+        """An observation of the pixel environment in Brax's form.
+
+        Args:
+            obs: as ``Timestep.obs``, of one environment or many.
+
+        Returns:
+            The array itself with ``obs_mode="state"``. Otherwise a dict with the picture,
+            (..., H, W, 3K) float32 in [0, 1], under ``"pixels/view_0"``, and with ``"both"`` the
+            (..., S) float32 state under ``"state"``.
+        """
+        if self.env.obs_mode == "state":
+            return obs
+        if self.env.obs_mode == "pixels":
+            obs = {"pixels": obs}
+        pixels = obs["pixels"].astype(jnp.float32) * _LEVEL
+        return {PIXELS: pixels} | {name: obs[name] for name in obs if name != "pixels"}
+
+    @property
+    def observation_size(self) -> int | dict[str, tuple[int, ...]]:
+        """S with ``obs_mode="state"``, else the shapes of the dict's entries."""
+        if self.env.obs_mode == "state":
+            return self.env.physics.state_size
+        shapes = jax.eval_shape(self.observation, self.env.obs_spec)
+        return {name: shape.shape for name, shape in shapes.items()}
+
+    @property
+    def action_size(self) -> int:
+        """Length A of an action, a (A,) float32 vector in [-1, 1]."""
+        return self.env.action_size
+
+    @property
+    def backend(self) -> str:
+        """Name of the physics engine."""
+        return self.env.physics.backend
+
+    @property
+    def dt(self) -> float:
+        """Seconds of simulated time per call of ``step``."""
+        return self.env.dt
+
+    def _told(self, timestep: Timestep) -> dict[str, Any]:
+        """The fields of a Brax state that a timestep decides."""
+        return {
+            "obs": self.observation(timestep.obs),
+            "reward": timestep.reward,
+            "done": timestep.terminated.astype(jnp.float32),
+            "metrics": {"non_finite": timestep.info["non_finite"].astype(jnp.float32)},
+        }
+
+
+def wrap_fresh_episodes(
+    env: BraxPixelEnv,
+    episode_length: int = 1000,
+    action_repeat: int = 1,
+    randomization_fn: Any = None,
+) -> Wrapper:
+    """Brax's wrappers for training, but every episode begins from a fresh draw.
+
+    For ``wrap_env_fn`` of Brax's trainers. Episode e of an environment is that of
+    ``PixelEnv.next_episode``. Beginning costs where episodes end, not at every step.
+
+    Args:
+        env: the environment.
+        episode_length: time limit in control steps as Brax counts them: calls of ``step`` of
+            ``env``.
+        action_repeat: as in Brax; see ``BraxPixelEnv`` for why it should be 1.
+        randomization_fn: must be None.
+
+    Returns:
+        The environment for batches.
+
+    Raises:
+        ValueError: ``randomization_fn`` is given.
+        TypeError: ``env`` is wrapped already.
+    """
+    if not isinstance(env, BraxPixelEnv):
+        raise TypeError(f"env must be a bare BraxPixelEnv, got {type(env).__name__}.")
+    if randomization_fn is not None:
+        raise ValueError(
+            "wrap_fresh_episodes begins all episodes with the same EnvParams: leave out "
+            "randomization_fn, or leave out wrap_env_fn."
+        )
+    return _FreshEpisodes(EpisodeWrapper(VmapWrapper(env), episode_length, action_repeat))
+
+
+class _FreshEpisodes(Wrapper):
+    """Begins the next episode in the step that ends one, as ``AutoResetWrapper`` does."""
+
+    def __init__(self, env: Env) -> None:
+        super().__init__(env)
+        # One for each batch size: their compiled programs belong to the object.
+        self._vectors: dict[int, VectorPixelEnv] = {}
+
+    def step(self, state: State, action: jax.Array) -> State:
+        # After a step that ends an episode Brax reads its flag and its count of steps; only the
+        # next step may clear them.
+        steps = jnp.where(state.done, 0.0, state.info["steps"])
+        info = {**state.info, "steps": steps}
+        state = self.env.step(state.replace(done=jnp.zeros_like(state.done), info=info), action)
+        inner, num_envs = self.env.unwrapped, state.done.shape[0]
+        vector = self._vectors.setdefault(num_envs, VectorPixelEnv(inner.env, num_envs))
+        pipeline, timestep = vector.reset_where(state.pipeline_state, state.done > 0.5, inner.sys)
+        return state.replace(pipeline_state=pipeline, obs=inner.observation(timestep.obs))
+
+
+def _mend_trainers() -> None:
+    """Lets Brax's trainers run on current JAX."""
+    # Only now: who does not train with Brax need not wait for its trainers to load.
+    with import_silenced():
+        from brax.training import pmap
+        from brax.training.agents.apg import train as apg
+        from brax.training.agents.ppo import train as ppo
+        from brax.training.agents.sac import train as sac
+    for module in (pmap, apg, ppo, sac):
+        accept_device_put_replicated(module)
