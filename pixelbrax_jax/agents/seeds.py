@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -14,15 +15,29 @@ from pixelbrax_jax.agents.algorithm import Algorithm
 def over_seeds(algorithm: Algorithm) -> Algorithm:
     """The algorithm for (S,) keys, each of which is a run of its own.
 
-    States and metrics get a leading axis S. ``act`` stays that of one run.
+    States and metrics get a leading axis S. ``act`` stays that of one run. On an accelerator the
+    runs go side by side. On a CPU they take turns within the program: convolutions with a kernel
+    for each run are slow there, and gain nothing.
     """
     auxiliary = algorithm.auxiliary
     return replace(
         algorithm,
-        init=jax.vmap(algorithm.init, in_axes=(0, None)),
-        iterate=jax.vmap(algorithm.iterate, in_axes=(0, None)),
-        auxiliary=None if auxiliary is None else jax.vmap(auxiliary),
+        init=_mapped(algorithm.init),
+        iterate=_mapped(algorithm.iterate),
+        auxiliary=None if auxiliary is None else _mapped(auxiliary),
     )
+
+
+def _mapped(function: Callable[..., Any]) -> Callable[..., Any]:
+    """``function`` over the leading axis of its first argument."""
+
+    def mapped(first: Any, *others: Any) -> Any:
+        def one(first: Any) -> Any:
+            return function(first, *others)
+
+        return jax.lax.map(one, first) if jax.default_backend() == "cpu" else jax.vmap(one)(first)
+
+    return mapped
 
 
 def keys_of(seed: int, number: int) -> jax.Array:
