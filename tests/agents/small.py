@@ -1,0 +1,81 @@
+"""The smallest agents that have everything, and what their states are compared by."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pixelbrax_jax import PixelEnv, VectorPixelEnv
+from pixelbrax_jax.agents.algorithm import Algorithm, TrainState
+from tests.envs.toy import PARAMS, Ball
+
+OPTIONS = {"height": 18, "width": 18, "frame_stack": 2, "episode_length": 5}
+SMALL = OPTIONS | {
+    "encoder": "small",
+    "num_envs": 4,
+    "num_steps": 8,
+    "num_minibatches": 2,
+    "random_shift": 1,
+    # A few iterations with steps that show.
+    "total_steps": 4 * 8 * 5,
+    "learning_rate": 3e-3,
+    "anneal": True,
+}
+PHASIC = {"num_policy_phases": 2, "aux_minibatches": 4, "aux_epochs": 2}
+
+
+def ball_envs() -> VectorPixelEnv:
+    """What ``SMALL`` names, with the ball."""
+    return VectorPixelEnv(PixelEnv(Ball(), **OPTIONS), SMALL["num_envs"])
+
+
+class Agent:
+    """An algorithm whose parts are compiled once."""
+
+    def __init__(self, algorithm: Algorithm) -> None:
+        self.algorithm = algorithm
+        self.config = algorithm.config
+        self.iterate = jax.jit(lambda state: algorithm.iterate(state, PARAMS))
+        self.auxiliary = jax.jit(algorithm.auxiliary) if algorithm.auxiliary else None
+
+    def init(self, seed: int = 0) -> TrainState:
+        return self.algorithm.init(jax.random.key(seed), PARAMS)
+
+    def run(self, state: TrainState, iterations: int) -> tuple[TrainState, dict[str, Any]]:
+        """As ``train_function`` does; the metrics are the last ones of either phase."""
+        phases, metrics = self.algorithm.num_phases, {}
+        for number in range(iterations):
+            state, facts = self.iterate(state)
+            metrics |= facts
+            if phases and number % phases == phases - 1:
+                state, facts = self.auxiliary(state)
+                metrics |= facts
+        return state, metrics
+
+    def without_steps(self, state: TrainState) -> TrainState:
+        """``state`` after the last iteration: annealed, the step size is 0 from there on."""
+        return state.replace(iteration=jnp.uint32(self.config.num_iterations))
+
+
+def arrays(tree: Any) -> list[np.ndarray]:
+    """All leaves; those of random keys as their words."""
+    return [
+        np.asarray(jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x)
+        for x in jax.tree.leaves(tree)
+    ]
+
+
+def same(one: Any, other: Any) -> bool:
+    """Whether two trees are equal to the last bit."""
+    assert jax.tree.structure(one) == jax.tree.structure(other)
+    return all(np.array_equal(a, b) for a, b in zip(arrays(one), arrays(other), strict=True))
+
+
+def assert_close(one: Any, other: Any, **tolerance: float) -> None:
+    """Two trees are equal up to rounding."""
+    assert jax.tree.structure(one) == jax.tree.structure(other)
+    for a, b in zip(arrays(one), arrays(other), strict=True):
+        np.testing.assert_allclose(a, b, **tolerance)

@@ -1,0 +1,69 @@
+"""``pixelbrax train`` and ``pixelbrax record``: options, errors, exit statuses."""
+
+from __future__ import annotations
+
+import imageio.v3 as imageio
+import pytest
+
+from pixelbrax_jax.agents.command import load_config, parse
+from pixelbrax_jax.agents.config import describe
+from pixelbrax_jax.agents.presets import CONFIGS, PRESETS, preset
+from pixelbrax_jax.cli import main
+
+TINY = (
+    *("--task", "inverted_pendulum", "--height", "18", "--width", "18", "--frame-stack", "1"),
+    *("--encoder", "small", "--num-envs", "2", "--num-steps", "4", "--num-minibatches", "2"),
+    *("--update-epochs", "1", "--total-steps", "16", "--no-progress"),
+)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("algorithm", CONFIGS)
+def test_every_preset_is_valid_and_comes_back_from_json(algorithm, name):
+    config = preset(algorithm, name)
+    stored = {"algorithm": algorithm, "config": describe(config) | {"seed": 3}}
+    assert load_config(stored) == config
+
+
+def test_options_change_a_preset():
+    line = "--task walker2d --distractors video camera --num-seeds 5 --no-normalize-reward"
+    config, options = parse("ppg", "procgen", line.split())
+    assert config.task == "walker2d"
+    assert config.distractors == ("video", "camera")
+    assert config.aux_epochs == 6, "of the preset"
+    assert not config.normalize_reward
+    assert options.num_seeds == 5
+    assert options.output_dir == "runs/ppg"
+
+
+def test_errors_name_the_setting_and_the_cure(capsys):
+    with pytest.raises(SystemExit):
+        main(["train", "ppo", "--num-minibatches", "7"])
+    assert "num_minibatches=7 must divide num_steps=64" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["train", "pppo"])
+    assert "ppo" in capsys.readouterr().err
+    assert main(["train", "ppo", "--task", "antt"]) == 1
+    assert "Did you mean 'ant'?" in capsys.readouterr().err
+    assert main(["record", "/nowhere"]) == 1
+    assert "no checkpoint" in capsys.readouterr().err
+
+
+def test_without_arguments_it_tells_what_there_is(capsys):
+    assert main(["train"]) == 0
+    assert "{ppo,ppg,dcpg}" in capsys.readouterr().out
+
+
+# imageio never closes FFmpeg's pipes itself.
+@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_run_is_evaluated_and_filmed(tmp_path, capsys):
+    folder = str(tmp_path / "run")
+    assert main(["train", "ppo", *TINY, "--output-dir", folder, "--num-evals", "1"]) == 0
+    assert "clean: return" in capsys.readouterr().err
+    film = str(tmp_path / "film.mp4")
+    line = ["record", folder, "--output", film, "--grid", "2", "--size", "32", "--num-frames", "3"]
+    assert main(line) == 0
+    frames = imageio.imread(film)
+    assert frames.shape == (3, 64, 64, 3)
+    assert frames[0].std() > 5, "something is seen"

@@ -1,0 +1,130 @@
+"""Killed runs, several devices, several processes: each in processes of its own."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pixelbrax_jax.agents.checkpoint import Checkpoints
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+
+ROOT = Path(__file__).parents[2]
+PHASIC = "--num-policy-phases 3 --aux-minibatches 3 --aux-epochs 1"
+EXTRA = {"ppo": "--update-epochs 1", "ppg": PHASIC, "dcpg": PHASIC}
+TINY = (
+    "--task inverted_pendulum --height 18 --width 18 --frame-stack 2 --encoder small --num-envs 4 "
+    "--num-steps 8 --num-minibatches 2 --no-progress"
+)
+PER_ITERATION = 32
+
+
+def command(algorithm: str, folder: Path, options: str) -> list[str]:
+    return [
+        *(sys.executable, "-m", "pixelbrax_jax.cli", "train", algorithm),
+        *f"{TINY} {EXTRA[algorithm]} {options}".split(),
+        *("--output-dir", str(folder)),
+    ]
+
+
+def finish(*arguments, **environ) -> None:
+    process = subprocess.run(
+        command(*arguments), cwd=ROOT, env=os.environ | environ, capture_output=True, text=True
+    )
+    assert process.returncode == 0, process.stderr
+
+
+def leaves(folder: Path, steps: int) -> dict[str, np.ndarray]:
+    """All arrays of a checkpoint, by name."""
+    import orbax.checkpoint as ocp
+
+    reader = ocp.Checkpointer(ocp.PyTreeCheckpointHandler())
+    path = folder / "checkpoints" / str(steps) / "state"
+    names = reader.metadata(path).item_metadata.tree
+    as_numpy = {name: ocp.RestoreArgs(restore_type=np.ndarray) for name in names}
+    return reader.restore(path, args=ocp.args.PyTreeRestore(restore_args=as_numpy))
+
+
+@pytest.mark.parametrize("algorithm", EXTRA)
+def test_a_killed_run_ends_as_one_that_never_was(algorithm, tmp_path):
+    """Killed mid rollout, within the buffer, and while a checkpoint is written."""
+    iterations = 60
+    options = f"--total-steps {iterations * PER_ITERATION} --checkpoint-every {PER_ITERATION}"
+    finish(algorithm, tmp_path / "whole", options)
+    killed = tmp_path / "killed"
+    # At a checkpoint of every iteration, any moment is close to one of the three.
+    for least in (4, 14, 29):
+        line = command(algorithm, killed, f"{options} --resume latest")
+        process = subprocess.Popen(line, cwd=ROOT, stderr=subprocess.DEVNULL)
+        while process.poll() is None:
+            # A folder under a temporary name is a checkpoint that is being written.
+            names = [path.name for path in (killed / "checkpoints").glob("*")]
+            written = [int(name) // PER_ITERATION for name in names if name.isdigit()]
+            if max(written, default=0) >= least and (
+                least != 14 or any("tmp" in name for name in names)
+            ):
+                break
+            time.sleep(0.002)
+        assert process.poll() is None, "the run was over before it could be killed"
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    finish(algorithm, killed, f"{options} --resume latest")
+    last = iterations * PER_ITERATION
+    ours, theirs = leaves(killed, last), leaves(tmp_path / "whole", last)
+    assert ours.keys() == theirs.keys()
+    for name, leaf in ours.items():
+        np.testing.assert_array_equal(leaf, theirs[name], err_msg=name)
+
+
+@pytest.mark.parametrize("algorithm", EXTRA)
+def test_four_devices_learn_what_one_learns(algorithm, tmp_path):
+    options = f"--total-steps {4 * PER_ITERATION}"
+    finish(algorithm, tmp_path / "one", options)
+    flags = "--xla_force_host_platform_device_count=4"
+    finish(algorithm, tmp_path / "four", options, XLA_FLAGS=flags)
+    one, four = (leaves(tmp_path / name, 4 * PER_ITERATION) for name in ("one", "four"))
+    assert one.keys() == four.keys()
+    for name, leaf in one.items():
+        if name.startswith("networks."):
+            np.testing.assert_allclose(four[name], leaf, rtol=1e-4, atol=1e-5, err_msg=name)
+
+
+def test_two_processes_learn_what_one_learns(tmp_path):
+    options = f"--total-steps {3 * PER_ITERATION} --num-evals 1 --eval-episodes 2"
+    finish("ppo", tmp_path / "one", options)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    spread = f"{options} --coordinator 127.0.0.1:{port} --num-processes 2 --process-id"
+    processes = [
+        subprocess.Popen(command("ppo", tmp_path / "two", f"{spread} {i}"), cwd=ROOT)
+        for i in range(2)
+    ]
+    assert [process.wait(300) for process in processes] == [0, 0]
+    one, two = (leaves(tmp_path / name, 3 * PER_ITERATION) for name in ("one", "two"))
+    for name, leaf in one.items():
+        if name.startswith("networks."):
+            np.testing.assert_allclose(two[name], leaf, rtol=1e-4, atol=1e-5, err_msg=name)
+
+
+def test_all_checkpoints_of_a_killed_run_are_whole(tmp_path):
+    options = f"--total-steps {400 * PER_ITERATION} --checkpoint-every {PER_ITERATION}"
+    process = subprocess.Popen(command("ppo", tmp_path, options), cwd=ROOT)
+    while not list((tmp_path / "checkpoints").glob("[0-9]*0")):
+        time.sleep(0.05)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    checkpoints = Checkpoints(tmp_path / "checkpoints", {}, "ppo")
+    known = checkpoints.steps()
+    checkpoints.close()
+    assert known
+    for steps in known:
+        assert "networks.actor.params.mean.kernel" in leaves(tmp_path, steps)
