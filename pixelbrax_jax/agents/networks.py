@@ -223,4 +223,21 @@ def _flat(x: jax.Array) -> jax.Array:
 
 
 def _dense(size: int, gain: float = _ROOT_2, name: str | None = None) -> nn.Dense:
-    return nn.Dense(size, kernel_init=nn.initializers.orthogonal(gain), name=name)
+    return nn.Dense(size, kernel_init=_orthogonal(gain), name=name)
+
+
+def _orthogonal(gain: float) -> Callable[..., jax.Array]:
+    """Flax's orthogonal matrices, which may be drawn under ``jax.vmap`` too.
+
+    They are Q of a QR decomposition. On a CPU that of a batch waits for threads which others of
+    its kind may hold while they wait as well: where cores are few, jaxlib 0.10 then stands still
+    for ever. Here a batch is drawn one by one.
+    """
+    initializer = nn.initializers.orthogonal(gain)
+
+    def draw(key: jax.Array, shape: tuple[int, ...], dtype: Any = jnp.float32) -> jax.Array:
+        one_by_one = jax.custom_batching.sequential_vmap(lambda key: initializer(key, shape, dtype))
+        matrix: jax.Array = one_by_one(key)
+        return matrix
+
+    return draw

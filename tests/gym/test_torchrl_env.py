@@ -516,5 +516,5 @@ def test_missing_torchrl_names_the_cure(monkeypatch, package):
 
     monkeypatch.setattr(builtins, "__import__", without)
     monkeypatch.delitem(sys.modules, "pixelbrax_gym.torchrl_env")
-    with pytest.raises(ImportError, match=r'pip install "pixelbrax\[torchrl\]"'):
+    with pytest.raises(ImportError, match=r'pip install -e "\.\[torchrl\]"'):
         importlib.import_module("pixelbrax_gym.torchrl_env")

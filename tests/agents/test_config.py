@@ -1,0 +1,195 @@
+"""Settings: a bad one is told by its name, with its value and with what is allowed."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import fields
+
+import pytest
+
+from pixelbrax_jax.agents.config import TrainConfig, describe, make_env
+from pixelbrax_jax.agents.dcpg import DCPGConfig
+from pixelbrax_jax.agents.ppg import PPGConfig
+from pixelbrax_jax.agents.ppo import PPOConfig
+
+CONFIGS = (PPOConfig, PPGConfig, DCPGConfig)
+
+COUNTS = {
+    "height": CONFIGS,
+    "width": CONFIGS,
+    "frame_stack": CONFIGS,
+    "action_repeat": CONFIGS,
+    "episode_length": CONFIGS,
+    "total_steps": CONFIGS,
+    "num_envs": CONFIGS,
+    "num_steps": CONFIGS,
+    "num_minibatches": CONFIGS,
+    "update_epochs": (PPOConfig, DCPGConfig),
+    "policy_epochs": (PPGConfig,),
+    "value_epochs": (PPGConfig,),
+    "num_policy_phases": (PPGConfig, DCPGConfig),
+    "aux_minibatches": (PPGConfig, DCPGConfig),
+}
+COUNTS_OR_0 = {"random_shift": CONFIGS, "aux_epochs": (PPGConfig,)}
+SHARES = {
+    "gamma": CONFIGS,
+    "gae_lambda": CONFIGS,
+    "clip_coef": CONFIGS,
+    "target_rate": (DCPGConfig,),
+}
+POSITIVE = {
+    "learning_rate": CONFIGS,
+    "initial_std": CONFIGS,
+    "adam_eps": CONFIGS,
+    "memory_budget_gb": CONFIGS,
+    "target_kl": (PPOConfig,),
+}
+POSITIVE_OR_0 = {
+    "max_grad_norm": CONFIGS,
+    "ent_coef": CONFIGS,
+    "vf_coef": CONFIGS,
+    "beta_clone": (PPGConfig, DCPGConfig),
+    "aux_value_coef": (PPGConfig,),
+    "value_distill_coef": (DCPGConfig,),
+    "dynamics_coef": (DCPGConfig,),
+}
+CHOICES = {
+    "encoder": CONFIGS,
+    "policy": CONFIGS,
+    "normalize_advantage": CONFIGS,
+    "layout": (PPOConfig, PPGConfig),
+}
+
+BAD = [
+    *((COUNTS, value, "a whole number of at least 1") for value in (0, -3, 1.5, True, "8")),
+    *((COUNTS_OR_0, value, "a whole number of at least 0") for value in (-1, 1.5, True, "8")),
+    *((SHARES, value, r"lie in \[0, 1\]") for value in (-0.1, 1.5, float("nan"), "1")),
+    *(
+        (POSITIVE, value, "a positive number")
+        for value in (0, -1.0, float("nan"), float("inf"), "1")
+    ),
+    *((POSITIVE_OR_0, value, "at least 0") for value in (-1.0, float("nan"), float("inf"), "1")),
+    *((CHOICES, value, "unknown .*; allowed: .*, ") for value in ("Nonesuch", None, 3)),
+]
+
+
+@pytest.mark.parametrize(("settings", "value", "allowed"), BAD)
+def test_a_bad_setting_is_named_with_its_value_and_what_is_allowed(settings, value, allowed):
+    for name, configs in settings.items():
+        for config in configs:
+            with pytest.raises(ValueError, match=allowed) as info:
+                config(**{name: value})
+            assert name in str(info.value)
+            assert repr(value) in str(info.value)
+
+
+def test_every_number_and_choice_is_checked():
+    unchecked = {
+        # Checked by `make`, which knows the tasks.
+        "task", "backend", "reward_preset", "distractors", "clips",
+        # Truth values.
+        "state_critic", "anneal", "normalize_reward", "clip_value", "decoupled",
+    }  # fmt: skip
+    groups = (COUNTS, COUNTS_OR_0, SHARES, POSITIVE, POSITIVE_OR_0, CHOICES)
+    checked = {(c, name) for group in groups for name, configs in group.items() for c in configs}
+    # DCPG's delayed phase is what it learns values in: it cannot be left out.
+    checked |= {(DCPGConfig, "aux_epochs")}
+    all_of_them = {(c, field.name) for c in CONFIGS for field in fields(c)}
+    assert {name for _, name in all_of_them - checked} == unchecked
+
+
+def test_dcpg_needs_its_delayed_phase():
+    with pytest.raises(ValueError, match="aux_epochs must be a whole number of at least 1, got 0"):
+        DCPGConfig(aux_epochs=0)
+
+
+@pytest.mark.parametrize(
+    ("config", "settings", "message"),
+    [
+        (
+            PPOConfig,
+            {"num_steps": 12, "num_minibatches": 5},
+            "num_minibatches=5 must divide num_steps=12; it may be 1, 2, 3, 4, 6, 12.",
+        ),
+        (
+            PPOConfig,
+            {"encoder": "nature", "height": 40, "width": 35},
+            "encoder 'nature' needs pictures of at least 36 x 36 pixels, got 40 x 35",
+        ),
+        (
+            PPOConfig,
+            {"layout": "shared", "state_critic": True},
+            "state_critic needs layout='separate', got 'shared'",
+        ),
+        (
+            PPGConfig,
+            {"layout": "detach", "state_critic": True},
+            "state_critic needs layout='dual', got 'detach'",
+        ),
+        (DCPGConfig, {"state_critic": True}, "state_critic needs decoupled=True, got False"),
+        *(
+            (config, *case)
+            for config in (PPGConfig, DCPGConfig)
+            for case in (
+                (
+                    {"num_policy_phases": 16, "aux_minibatches": 24},
+                    "aux_minibatches=24 must be a multiple of num_policy_phases=16",
+                ),
+                (
+                    {"num_steps": 64, "num_policy_phases": 2, "aux_minibatches": 6},
+                    "aux_minibatches / num_policy_phases=3 must divide num_steps=64; it may be 1, ",
+                ),
+                (
+                    {"num_policy_phases": 8, "total_steps": 256 * 64 * 7, "aux_minibatches": 8},
+                    f"after every 8 rollouts, and total_steps={256 * 64 * 7} are only 7",
+                ),
+            )
+        ),
+        (
+            DCPGConfig,
+            {"dynamics_coef": 0.5, "aux_minibatches": 1024},
+            "dynamics_coef=0.5 needs at least 2 steps in a chunk, got 1: aux_minibatches=1024 must "
+            "be less than num_steps * num_policy_phases=1024",
+        ),
+    ],
+)
+def test_settings_that_contradict_each_other_are_told(config, settings, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        config(**settings)
+
+
+def test_a_misspelt_choice_is_told_the_nearest():
+    with pytest.raises(ValueError, match="Did you mean 'impala'"):
+        PPOConfig(encoder="impalla")
+
+
+def test_a_run_too_short_for_an_auxiliary_phase_may_do_without_one():
+    config = PPGConfig(total_steps=1, aux_epochs=0)
+    assert config.num_iterations == 1
+
+
+def test_iterations_are_rounded_up_and_count_control_steps():
+    config = TrainConfig(num_envs=3, num_steps=16, action_repeat=4, total_steps=3 * 16 * 4 + 1)
+    assert config.steps_per_iteration == 192
+    assert config.num_iterations == 2
+
+
+@pytest.mark.parametrize("config", CONFIGS)
+def test_a_description_is_json_and_gives_the_settings_back(config):
+    settings = describe(config(distractors=("video", "dcs-easy"), num_envs=7))
+    assert json.loads(json.dumps(settings)) == settings
+    assert config(**settings) == config(**settings)
+    assert settings["num_envs"] == 7
+
+
+def test_the_environment_is_the_one_that_is_described():
+    config = TrainConfig(
+        task="inverted_pendulum", height=20, width=24, frame_stack=2, action_repeat=3,
+        episode_length=50, encoder="small", state_critic=True,
+    )  # fmt: skip
+    env, _ = make_env(config)
+    assert env.obs_spec["pixels"].shape == (20, 24, 6)
+    assert (env.action_repeat, env.episode_length) == (3, 50)
+    # Only a critic that sees it makes the state an observation.
+    assert make_env(config, obs_mode="pixels")[0].obs_spec.shape == (20, 24, 6)

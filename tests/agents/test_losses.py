@@ -1,0 +1,191 @@
+"""Terms of the losses, and the optimiser's step, against plain calculations."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from pixelbrax_jax.agents.config import TrainConfig
+from pixelbrax_jax.agents.distributions import Normal
+from pixelbrax_jax.agents.losses import (
+    Batch,
+    clipped_value_loss,
+    normalized,
+    policy_loss,
+    value_loss,
+)
+from pixelbrax_jax.agents.optimizer import Optimizer
+
+B = 12
+CONFIG = TrainConfig(clip_coef=0.2, ent_coef=0.03, normalize_advantage="none")
+KEY = jax.random.key(0)
+
+
+def batch(seed: int = 0) -> Batch:
+    rng = np.random.default_rng(seed)
+    # A third of the samples teaches nothing.
+    weight = np.arange(B) % 3 > 0
+    numbers = {
+        name: jnp.asarray(rng.normal(size=B), jnp.float32)
+        for name in ("log_prob", "value", "advantage", "returns")
+    }
+    return Batch(
+        pixels=jnp.zeros((B, 1, 1, 3), jnp.uint8), state=None,
+        raw=jnp.asarray(rng.normal(size=(B, 2)), jnp.float32),
+        weight=jnp.asarray(weight, jnp.float32), **numbers,
+    )  # fmt: skip
+
+
+def policy(seed: int = 1) -> Normal:
+    mean = jax.random.normal(jax.random.key(seed), (B, 2))
+    return Normal(mean, jnp.full((B, 2), 0.8), False)
+
+
+def test_the_policy_loss_is_ppo_s():
+    samples, now = batch(), policy()
+    loss, facts = policy_loss(now, samples, CONFIG, KEY)
+    kept = np.asarray(samples.weight) == 1
+    ratio = np.exp(np.asarray(now.log_prob(samples.raw) - samples.log_prob, np.float64))[kept]
+    advantage = np.asarray(samples.advantage, np.float64)[kept]
+    objective = np.minimum(ratio * advantage, np.clip(ratio, 0.8, 1.2) * advantage).mean()
+    entropy = 2 * (np.log(0.8) + 0.5 * np.log(2 * np.pi * np.e))
+    assert float(loss) == pytest.approx(-objective - 0.03 * entropy, rel=1e-5)
+    assert float(facts["policy/entropy"]) == pytest.approx(entropy, rel=1e-5)
+    assert float(facts["policy/approx_kl"]) == pytest.approx(
+        (ratio - 1 - np.log(ratio)).mean(), rel=1e-4
+    )
+    assert float(facts["policy/clip_fraction"]) == pytest.approx((abs(ratio - 1) > 0.2).mean())
+
+
+@pytest.mark.parametrize(
+    ("ratio", "advantage", "goes_on"),
+    [(1.5, 1.0, False), (1.5, -1.0, True), (0.5, 1.0, True), (0.5, -1.0, False), (1.1, 1.0, True)],
+)
+def test_the_gradient_stops_where_the_policy_has_moved_far_enough(ratio, advantage, goes_on):
+    samples = batch()._replace(advantage=jnp.full(B, advantage))
+    config = TrainConfig(ent_coef=0.0, normalize_advantage="none")
+
+    def loss(mean):
+        now = policy().replace(mean=mean)
+        old = jax.lax.stop_gradient(now.log_prob(samples.raw)) - np.log(ratio)
+        return policy_loss(now, samples._replace(log_prob=old), config, KEY)[0]
+
+    assert bool(jnp.any(jax.grad(loss)(policy().mean) != 0)) == goes_on
+
+
+@pytest.mark.parametrize("normalize_advantage", ["none", "minibatch"])
+def test_samples_without_weight_teach_nothing(normalize_advantage):
+    config = TrainConfig(normalize_advantage=normalize_advantage)
+
+    def loss(mean, value, samples):
+        now = policy().replace(mean=mean)
+        return (
+            policy_loss(now, samples, config, KEY)[0]
+            + value_loss(value, samples.returns, samples.weight)
+            + clipped_value_loss(value, samples, 0.2)
+        )
+
+    samples = batch()
+    masked = np.asarray(samples.weight) == 0
+    value = jax.random.normal(jax.random.key(2), (B,))
+    gradients = jax.grad(loss, argnums=(0, 1))(policy().mean, value, samples)
+    for gradient in gradients:
+        assert (np.asarray(gradient)[masked] == 0).all()
+        assert (np.asarray(gradient)[~masked] != 0).any()
+    # Nor do they change what the others teach.
+    other = batch(5)
+    fields = ("raw", "log_prob", "value", "advantage", "returns")
+    changed = {
+        name: jnp.where(
+            masked.reshape(-1, *(1,) * (getattr(samples, name).ndim - 1)),
+            100 * getattr(other, name),
+            getattr(samples, name),
+        )
+        for name in fields
+    }
+    again = jax.grad(loss, argnums=(0, 1))(policy().mean, value, samples._replace(**changed))
+    for one, two in zip(gradients, again, strict=True):
+        np.testing.assert_array_equal(one, two)
+
+
+def test_a_batch_in_which_nothing_counts_has_no_gradient():
+    samples = batch()._replace(weight=jnp.zeros(B))
+    gradient = jax.grad(
+        lambda mean: policy_loss(policy().replace(mean=mean), samples, CONFIG, KEY)[0]
+    )(policy().mean)
+    np.testing.assert_array_equal(gradient, 0)
+
+
+def test_normalized_numbers_have_mean_0_and_deviation_1_where_they_count():
+    samples = batch()
+    kept = np.asarray(samples.weight) == 1
+    result = np.asarray(normalized(5 + 3 * samples.returns, samples.weight))[kept]
+    assert result.mean() == pytest.approx(0, abs=1e-6)
+    assert result.std() == pytest.approx(1, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    # The value was 0 and the return is 1; the loss is half the larger of two squares.
+    ("value", "loss", "slope"),
+    [(0.1, 0.9**2 / 2, -0.9), (0.5, 0.8**2 / 2, 0.0), (-0.5, 1.5**2 / 2, -1.5)],
+)
+def test_a_clipped_value_gains_nothing_beyond_the_bound(value, loss, slope):
+    sample = batch()._replace(value=jnp.zeros(1), returns=jnp.ones(1), weight=jnp.ones(1))
+    actual, gradient = jax.value_and_grad(
+        lambda value: clipped_value_loss(jnp.array([value]), sample, 0.2)
+    )(value)
+    assert float(actual) == pytest.approx(loss)
+    assert float(gradient) == pytest.approx(slope)
+
+
+@pytest.mark.parametrize("max_grad_norm", [0.0, 0.5])
+def test_steps_are_those_of_adam_with_each_network_s_gradient_clipped(max_grad_norm):
+    config = TrainConfig(learning_rate=0.01, adam_eps=1e-5, max_grad_norm=max_grad_norm)
+    optimizer = Optimizer(config)
+    clip = optax.clip_by_global_norm(max_grad_norm) if max_grad_norm else optax.identity()
+    reference = optax.chain(clip, optax.adam(0.01, eps=1e-5))
+    networks = {name: {"w": jnp.ones(3), "b": jnp.zeros(2)} for name in ("one", "other")}
+    moments = optimizer.init(networks)
+    expected, theirs = dict(networks), {n: reference.init(p) for n, p in networks.items()}
+    for t in range(5):
+        # One gradient is far beyond the bound and one far below: they are clipped apart.
+        gradients = {
+            name: jax.tree.map(
+                lambda p, t=t, scale=scale: scale * jnp.cos(t + jnp.arange(p.size)), networks[name]
+            )
+            for name, scale in (("one", 30.0), ("other", 1e-3))
+        }
+        networks, moments, norms = optimizer.step(networks, moments, gradients, jnp.uint32(t))
+        for name, gradient in gradients.items():
+            assert float(norms[name]) == pytest.approx(float(optax.tree.norm(gradient)))
+            updates, theirs[name] = reference.update(gradient, theirs[name])
+            expected[name] = optax.apply_updates(expected[name], updates)
+            for a, b in zip(*map(jax.tree.leaves, (networks[name], expected[name])), strict=True):
+                np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7)
+
+
+def test_networks_without_a_gradient_stay():
+    optimizer = Optimizer(TrainConfig())
+    networks = {name: jnp.ones(3) for name in ("learns", "stays")}
+    moments = optimizer.init(networks)
+    for t in range(3):
+        networks, moments, norms = optimizer.step(
+            networks, moments, {"learns": jnp.ones(3)}, jnp.uint32(t)
+        )
+    assert set(norms) == {"learns"}
+    assert int(moments["learns"].count) == 3
+    assert int(moments["stays"].count) == 0
+    np.testing.assert_array_equal(networks["stays"], 1.0)
+
+
+def test_the_step_size_falls_along_a_line_to_0():
+    config = TrainConfig(anneal=True, learning_rate=0.1, total_steps=256 * 64 * 8)
+    rate = Optimizer(config).learning_rate
+    rates = [float(rate(jnp.uint32(i))) for i in range(10)]
+    np.testing.assert_allclose(rates[:9], 0.1 * (1 - np.arange(9) / 8), atol=1e-8)
+    assert rates[8] == rates[9] == 0.0
+    constant = Optimizer(TrainConfig(learning_rate=0.1)).learning_rate
+    assert float(constant(jnp.uint32(2**31))) == pytest.approx(0.1)

@@ -1,0 +1,268 @@
+"""Layers written anew equal the plain ones; encoders; distributions against integrals."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import linen as nn
+from scipy import integrate, stats
+
+from pixelbrax_jax.agents.convolution import convolve
+from pixelbrax_jax.agents.distributions import Normal
+from pixelbrax_jax.agents.networks import (
+    ENCODERS,
+    POLICIES,
+    SMALLEST,
+    Actor,
+    Critic,
+    max_pool,
+)
+
+
+def plain_max_pool(x):
+    return nn.max_pool(x, (3, 3), strides=(2, 2), padding="SAME")
+
+
+@pytest.mark.parametrize(("height", "width"), [(5, 8), (12, 7)])
+def test_max_pool_is_flax_s_to_the_bit(height, width):
+    x = jax.random.normal(jax.random.key(0), (2, height, width, 3))
+    np.testing.assert_array_equal(max_pool(x), plain_max_pool(x))
+
+
+def test_max_pool_s_gradient_goes_to_the_largest_pixel_without_a_scatter():
+    x = jax.random.normal(jax.random.key(1), (1, 7, 6, 2))
+
+    def gradient(pool):
+        return jax.jit(
+            jax.grad(lambda x: jnp.sum(pool(x) * jnp.arange(1.0, 13.0).reshape(4, 3, 1)))
+        )
+
+    # Without ties there is only one gradient.
+    np.testing.assert_array_equal(gradient(max_pool)(x), gradient(plain_max_pool)(x))
+    wanted = re.compile("select_and_scatter|scatter")
+    assert wanted.search(gradient(plain_max_pool).lower(x).as_text())
+    assert not wanted.search(gradient(max_pool).lower(x).as_text())
+
+
+CONVOLUTIONS = [
+    # size, kernel, stride, padding: of impala, nature, drq and small; a stride of 4 and
+    # one of 2 do not reach the last pixels.
+    (9, 3, 1, "SAME"),
+    (39, 8, 4, "VALID"),
+    (10, 4, 2, "VALID"),
+    (7, 3, 1, "VALID"),
+    (16, 3, 2, "VALID"),
+]
+
+
+@pytest.fixture(scope="module")
+def convolutions():
+    """Value and gradients by case, of ours and of JAX's convolution; in one program."""
+
+    def both(x, weights, slope, stride, padding):
+        pads = jax.lax.padtype_to_pads(x.shape[1:3], weights.shape[:2], (stride,) * 2, padding)
+
+        def ours(x, weights):
+            return convolve(x, weights, stride, tuple(pads))
+
+        def plain(x, weights):
+            layout = ("NHWC", "HWIO", "NHWC")
+            return jax.lax.conv_general_dilated(
+                x, weights, (stride,) * 2, padding, dimension_numbers=layout
+            )
+
+        results = []
+        for function in (ours, plain):
+            value, pull = jax.vjp(function, x, weights)
+            results.append((value, *pull(slope(value.shape))))
+        return tuple(results)
+
+    @jax.jit
+    def run(key):
+        results = {}
+        for case in CONVOLUTIONS:
+            size, kernel, stride, padding = case
+            keys = jax.random.split(key, 3)
+            # Another width than height: the two must not be mixed up.
+            x = jax.random.normal(keys[0], (2, size, size + 1, 3))
+            weights = jax.random.normal(keys[1], (kernel, kernel, 3, 5))
+            slope = partial(jax.random.normal, keys[2])
+            results[str(case)] = both(x, weights, slope, stride, padding)
+        return results
+
+    return run(jax.random.key(5))
+
+
+@pytest.mark.parametrize("case", CONVOLUTIONS)
+def test_convolution_and_its_gradient_are_jax_s(convolutions, case):
+    for actual, expected in zip(*convolutions[str(case)], strict=True):
+        assert actual.shape == expected.shape
+        # Sums of up to some thousand products, in another order.
+        scale = float(jnp.abs(expected).max())
+        np.testing.assert_allclose(actual, expected, rtol=1e-5, atol=1e-5 * scale)
+
+
+def inputs_of_last_layer(name: str, size: int) -> int:
+    """Numbers that an encoder's dense layer gets of square pictures."""
+    pixels = jnp.zeros((1, size, size, 3))
+    params = jax.eval_shape(ENCODERS[name]().init, jax.random.key(0), pixels)["params"]
+    return params["Dense_0"]["kernel"].shape[0]
+
+
+@pytest.mark.parametrize("name", ENCODERS)
+def test_an_encoder_s_smallest_size_is_the_smallest(name):
+    assert inputs_of_last_layer(name, SMALLEST[name]) > 0
+    if SMALLEST[name] > 1:
+        # A convolution that does not fit gives an empty picture: features would be constant.
+        assert inputs_of_last_layer(name, SMALLEST[name] - 1) == 0
+
+
+def test_every_encoder_has_a_smallest_size():
+    assert set(SMALLEST) == set(ENCODERS)
+
+
+# At 84 pixels: 11 x 11 x 32, 7 x 7 x 64, 35 x 35 x 32; at 64: 8 x 8 x 32.
+@pytest.mark.parametrize(
+    ("name", "size", "number"),
+    [("impala", 84, 3872), ("impala", 64, 2048), ("nature", 84, 3136), ("drq", 84, 39200)],
+)
+def test_encoders_have_the_sizes_of_their_papers(name, size, number):
+    assert inputs_of_last_layer(name, size) == number
+
+
+def actor(policy: str, **options) -> tuple[Actor, dict]:
+    network = Actor("small", 2, policy, **options)
+    pixels = jax.random.randint(jax.random.key(3), (4, 18, 18, 3), 0, 256).astype(jnp.uint8)
+    params = network.init(jax.random.key(0), pixels)
+    return network.apply(params, pixels), params
+
+
+@pytest.mark.parametrize("policy", POLICIES)
+def test_a_new_policy_is_near_the_middle_and_as_wide_as_it_should_be(policy):
+    output, _ = actor(policy, initial_std=0.7)
+    assert float(jnp.abs(output.policy.mean).max()) < 0.1
+    # softplus(0) + 0.001 is the start of "deacrep", whatever the setting.
+    expected = np.log(2) + 0.001 if policy == "deacrep" else 0.7
+    np.testing.assert_allclose(output.policy.std, expected, atol=0.03)
+    assert output.policy.squash == (policy == "tanh_gaussian")
+    assert output.value is None
+
+
+def test_a_value_head_changes_nothing_else_of_a_new_actor():
+    without, params = actor("gaussian")
+    output, more = actor("gaussian", has_value=True)
+    np.testing.assert_array_equal(output.policy.mean, without.policy.mean)
+    assert set(more["params"]) - set(params["params"]) == {"value"}
+    assert output.value.shape == (4,)
+
+
+def test_networks_drawn_side_by_side_are_those_drawn_alone():
+    pixels = jnp.zeros((1, 18, 18, 3), jnp.uint8)
+    network = Actor("small", 2, "gaussian")
+    draw = jax.jit(jax.vmap(lambda key: network.init(key, pixels)))
+    keys = jax.random.split(jax.random.key(0), 7)
+    many, one = draw(keys), network.init(keys[3], pixels)
+    for a, b in zip(jax.tree.leaves(many), jax.tree.leaves(one), strict=True):
+        np.testing.assert_allclose(a[3], b, atol=1e-6)
+    # A decomposition of a batch may stand still for ever on a CPU with few cores.
+    program = draw.lower(keys).as_text()
+    calls = [line for line in program.splitlines() if "geqrf" in line]
+    assert calls
+    assert not any("tensor<7x" in line for line in calls)
+
+
+def test_log_std_is_clipped():
+    network = Actor("small", 2, "gaussian")
+    pixels = jnp.zeros((1, 18, 18, 3), jnp.uint8)
+    params = network.init(jax.random.key(0), pixels)
+    params["params"]["log_std"] = jnp.array([-50.0, 50.0])
+    np.testing.assert_allclose(network.apply(params, pixels).policy.std[0], np.exp([-5, 2]))
+
+
+def test_a_critic_of_states_ignores_pixels_and_the_scale_of_states():
+    critic = Critic("small", sees_state=True)
+    pixels = jnp.zeros((3, 18, 18, 3), jnp.uint8)
+    state = jax.random.normal(jax.random.key(1), (3, 5))
+    params = critic.init(jax.random.key(0), pixels, state)
+    value = critic.apply(params, pixels, state)
+    np.testing.assert_array_equal(value, critic.apply(params, pixels + 7, state))
+    np.testing.assert_allclose(value, critic.apply(params, pixels, 1000 * state), atol=1e-4)
+    assert len(set(np.asarray(value).tolist())) == 3
+
+
+MEAN, STD = np.array([0.4, -1.1, 0.0]), np.array([0.3, 1.7, 0.9])
+OTHER_MEAN, OTHER_STD = np.array([0.3, -0.2, 1.0]), np.array([1.5, 0.6, 1.0])
+
+
+def normal(mean=MEAN, std=STD, squash=False) -> Normal:
+    return Normal(jnp.asarray(mean, jnp.float32), jnp.asarray(std, jnp.float32), squash)
+
+
+def test_log_prob_and_entropy_are_scipy_s():
+    raw = np.random.default_rng(0).normal(size=(5, 3))
+    expected = stats.norm(MEAN, STD).logpdf(raw).sum(-1)
+    np.testing.assert_allclose(normal().log_prob(jnp.asarray(raw)), expected, rtol=1e-5)
+    entropy = stats.norm(MEAN, STD).entropy().sum()
+    assert float(normal().entropy(jax.random.key(0))) == pytest.approx(entropy, rel=1e-6)
+
+
+@pytest.mark.parametrize("squash", [False, True])
+def test_kl_is_the_integral_that_defines_it(squash):
+    other = normal(MEAN + OTHER_MEAN, STD * OTHER_STD, squash)
+    expected = 0.0
+    for m, s, n, t in zip(MEAN, STD, other.mean.tolist(), other.std.tolist(), strict=True):
+        old, new = stats.norm(m, s), stats.norm(n, t)
+        expected += integrate.quad(
+            lambda x, p=old, q=new: p.pdf(x) * (p.logpdf(x) - q.logpdf(x)), m - 9 * s, m + 9 * s
+        )[0]
+    old = normal(squash=squash)
+    assert float(old.kl_to(other)) == pytest.approx(expected, rel=1e-5)
+    assert float(old.kl_to(old)) == 0.0
+
+
+def test_the_squashed_density_integrates_to_1_and_to_its_entropy():
+    policy = normal([0.4], [0.8], squash=True)
+    # Equal steps of the raw action: in terms of a = tanh(u) they crowd at the ends.
+    raw = np.linspace(-6.0, 6.0, 4001, dtype=np.float32)
+    action = np.tanh(raw.astype(np.float64))
+    log_prob = np.asarray(policy.log_prob(jnp.asarray(raw)[:, None]), np.float64)
+    density = np.exp(log_prob)
+    assert integrate.trapezoid(density, action) == pytest.approx(1.0, abs=1e-4)
+    entropy = -integrate.trapezoid(density * log_prob, action)
+    keys = jax.random.split(jax.random.key(0), 20_000)
+    drawn = jax.vmap(policy.entropy)(keys)
+    # Four standard errors of the mean of one-draw estimates.
+    assert float(drawn.mean()) == pytest.approx(
+        entropy, abs=4 * float(drawn.std()) / len(keys) ** 0.5
+    )
+
+
+def test_the_squashed_density_stays_finite_far_out():
+    policy = normal([0.0], [5.0], squash=True)
+    far = jnp.array([[-40.0], [40.0]])
+    assert np.isfinite(policy.log_prob(far)).all()
+    gradient = jax.grad(lambda raw: policy.log_prob(raw).sum())(far)
+    assert np.isfinite(gradient).all()
+
+
+def test_the_policy_s_action_is_raw_or_squashed():
+    raw = jnp.array([[2.0, -0.5, 0.0]])
+    np.testing.assert_array_equal(normal().action(raw), raw)
+    np.testing.assert_allclose(normal(squash=True).action(raw), np.tanh(raw), rtol=1e-6)
+
+
+def test_samples_have_the_distribution_that_log_prob_tells():
+    keys = jax.random.split(jax.random.key(4), 4000)
+    drawn = np.asarray(jax.vmap(normal().sample)(keys))
+    for i in range(3):
+        assert stats.kstest(drawn[:, i], stats.norm(MEAN[i], STD[i]).cdf).pvalue > 1e-3
+
+
+def test_every_policy_s_name_is_told_in_its_docstring():
+    assert all(f'"{name}"' in inspect.getdoc(Actor) for name in POLICIES)

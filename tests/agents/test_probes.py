@@ -1,0 +1,111 @@
+"""Agents learn from pixels what is right in tasks whose answer is known.
+
+What is wrong in an agent shows in the task that is about it: a value that does not fit, a
+discount, a credit that goes astray, a time limit taken for an end, a gradient of wrong sign.
+"""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pixelbrax_jax import PixelEnv, VectorPixelEnv
+from pixelbrax_jax.agents.dcpg import DCPGConfig, make_dcpg
+from pixelbrax_jax.agents.networks import Actor, Critic
+from pixelbrax_jax.agents.ppg import PPGConfig, make_ppg
+from pixelbrax_jax.agents.ppo import PPOConfig, make_ppo
+from tests.agents.probes import NAMES, TARGETS, TIME_LIMIT, Probes, true_values
+from tests.envs.toy import PARAMS
+
+GAMMA = 0.7
+SHARED = {
+    "height": 18,
+    "width": 18,
+    "frame_stack": 1,
+    "episode_length": TIME_LIMIT,
+    "encoder": "small",
+    "num_envs": 16,
+    "num_steps": 8,
+    "num_minibatches": 2,
+    "gamma": GAMMA,
+    "initial_std": 0.5,
+    "learning_rate": 3e-3,
+    # What remains of the noise of single minibatches goes with the step size.
+    "anneal": True,
+    "total_steps": 16 * 8 * 60,
+    "normalize_reward": False,
+}
+PHASIC = {"num_policy_phases": 2, "aux_minibatches": 4, "aux_epochs": 4}
+
+AGENTS = {
+    "ppo": (make_ppo, PPOConfig(**SHARED, update_epochs=4)),
+    "ppg": (make_ppg, PPGConfig(**SHARED, **PHASIC, policy_epochs=2, value_epochs=2)),
+    "dcpg": (make_dcpg, DCPGConfig(**SHARED, **PHASIC, update_epochs=2)),
+}
+
+
+@pytest.fixture(scope="module")
+def envs():
+    options = {k: SHARED[k] for k in ("height", "width", "frame_stack", "episode_length")}
+    return VectorPixelEnv(PixelEnv(Probes(), **options), SHARED["num_envs"])
+
+
+@pytest.fixture(scope="module")
+def pictures(envs):
+    """What an agent sees in each place."""
+
+    @jax.jit
+    @jax.vmap
+    def picture(place):
+        state = envs.env.begin(jax.random.key(0), jnp.uint32(0), PARAMS)
+        state = state.replace(physics=Probes.at(place))
+        return envs.env.show(state, PARAMS, jnp.bool_(True)).frames
+
+    return picture(jnp.arange(len(NAMES)))
+
+
+@pytest.fixture(scope="module", params=AGENTS)
+def learned(request, envs, pictures):
+    """Values and mean actions by place, of an agent that has learned."""
+    make, config = AGENTS[request.param]
+    algorithm = make(config, envs)
+    number = algorithm.num_phases or 2
+
+    @jax.jit
+    def phase(state):
+        state, _ = jax.lax.scan(
+            lambda state, _: algorithm.iterate(state, PARAMS), state, length=number
+        )
+        return algorithm.auxiliary(state)[0] if algorithm.auxiliary else state
+
+    state = algorithm.init(jax.random.key(0), PARAMS)
+    for _ in range(config.num_iterations // number):
+        state = phase(state)
+    if "critic" in state.networks:
+        values = Critic("small").apply(state.networks["critic"], pictures)
+    else:
+        actor = Actor("small", 1, config.policy, has_value=True)
+        values = actor.apply(state.networks["actor"], pictures).value
+    actions = algorithm.act(state.networks, pictures)[:, 0]
+    return SimpleNamespace(
+        value=dict(zip(NAMES, np.asarray(values).tolist(), strict=True)),
+        action=dict(zip(NAMES, np.asarray(actions).tolist(), strict=True)),
+    )
+
+
+def test_places_can_be_told_apart(pictures):
+    assert len({np.asarray(picture).tobytes() for picture in pictures}) == len(NAMES)
+
+
+@pytest.mark.parametrize("place", true_values(GAMMA))
+def test_a_place_is_worth_what_it_is(learned, place):
+    assert learned.value[place] == pytest.approx(true_values(GAMMA)[place], abs=0.08)
+
+
+@pytest.mark.parametrize("place", TARGETS)
+def test_the_mean_action_is_the_best_one(learned, place):
+    assert learned.action[place] == pytest.approx(TARGETS[place], abs=0.25)

@@ -1,0 +1,183 @@
+"""Advantages and the scale of rewards, against plain loops."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pixelbrax_jax.agents.counter import StepCounter
+from pixelbrax_jax.agents.returns import RewardScaler, gae
+
+T, N = 40, 16
+GAMMA, LAMBDA = 0.97, 0.9
+
+
+def episodes(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Random ends: terminated, truncated, and valid, as mode ``next_step`` gives them."""
+    terminated, truncated = np.zeros((2, T, N), bool)
+    valid = np.ones((T, N), bool)
+    for i in range(N):
+        # Some environments are in the middle of an end when the rollout begins.
+        begins = i % 4 == 0
+        for t in range(T):
+            valid[t, i] = not begins
+            kind = rng.choice(3, p=[0.7, 0.15, 0.15])
+            terminated[t, i] = not begins and kind == 1
+            truncated[t, i] = not begins and kind == 2
+            begins = terminated[t, i] or truncated[t, i]
+    return terminated, truncated, valid
+
+
+def advantage_by_definition(reward, value, last_value, terminated, truncated) -> np.ndarray:
+    """Exponentially weighted sum of the errors of one episode, from each step to its end."""
+    following = np.concatenate([value[1:], last_value[None]])
+    result = np.zeros((T, N))
+    for i in range(N):
+        for t in range(T):
+            weight = 1.0
+            for k in range(t, T):
+                error = reward[k, i] - value[k, i]
+                if not terminated[k, i]:
+                    error += GAMMA * following[k, i]
+                result[t, i] += weight * error
+                if terminated[k, i] or truncated[k, i]:
+                    break
+                weight *= GAMMA * LAMBDA
+    return result
+
+
+def experience(seed: int):
+    rng = np.random.default_rng(seed)
+    terminated, truncated, valid = episodes(rng)
+    reward = np.where(valid, rng.normal(size=(T, N)), 0.0)
+    value, last_value = rng.normal(size=(T, N)), rng.normal(size=N)
+    return reward, value, last_value, terminated, truncated, valid
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_gae_is_what_its_definition_says(seed):
+    reward, value, last_value, terminated, truncated, valid = experience(seed)
+    assert terminated.any()
+    assert truncated.any()
+    assert not valid.all()
+    assert not (terminated & truncated).any()
+    arrays = (jnp.asarray(x, jnp.float32) for x in (reward, value, last_value))
+    advantage, returns = gae(
+        *arrays, jnp.asarray(terminated), jnp.asarray(truncated), GAMMA, LAMBDA
+    )
+    expected = advantage_by_definition(reward, value, last_value, terminated, truncated)
+    np.testing.assert_allclose(advantage[valid], expected[valid], atol=2e-5)
+    np.testing.assert_allclose(returns[valid], (expected + value)[valid], atol=2e-5)
+
+
+def one_step_advantage(terminated: bool, truncated: bool) -> float:
+    """Of a step with reward 1 and value 2 before an observation whose value is 10."""
+    ones = jnp.ones((1, 1))
+    advantage, _ = gae(
+        ones,
+        2 * ones,
+        10 * ones[0],
+        jnp.full((1, 1), terminated),
+        jnp.full((1, 1), truncated),
+        0.5,
+        0.9,
+    )
+    return float(advantage[0, 0])
+
+
+def test_a_time_limit_keeps_the_future_and_a_termination_ends_it():
+    assert one_step_advantage(False, True) == 1 + 0.5 * 10 - 2
+    assert one_step_advantage(True, False) == 1 - 2
+
+
+def test_the_step_that_begins_an_episode_does_not_reach_the_one_before():
+    reward, value, last_value, terminated, truncated, valid = experience(7)
+    changed = np.where(valid, reward, 1e6)
+    results = [
+        gae(
+            jnp.asarray(r, jnp.float32),
+            jnp.asarray(value, jnp.float32),
+            jnp.asarray(last_value, jnp.float32),
+            jnp.asarray(terminated),
+            jnp.asarray(truncated),
+            GAMMA,
+            LAMBDA,
+        )[0]
+        for r in (reward, changed)
+    ]
+    np.testing.assert_array_equal(results[0][valid], results[1][valid])
+
+
+class Reference:
+    """The scaler, with all returns ever seen in a list."""
+
+    def __init__(self) -> None:
+        self.discounted = np.zeros(N)
+        self.seen: list[float] = []
+
+    def __call__(self, reward, done, valid) -> np.ndarray:
+        for t in range(T):
+            for i in range(N):
+                if not valid[t, i]:
+                    continue
+                self.discounted[i] = GAMMA * self.discounted[i] + reward[t, i]
+                self.seen.append(self.discounted[i])
+                if done[t, i]:
+                    self.discounted[i] = 0.0
+        return np.clip(reward / np.sqrt(np.var(self.seen) + 1e-8), -10, 10)
+
+
+def test_rewards_are_divided_by_the_deviation_of_all_returns_seen():
+    scaler, reference = RewardScaler.start(N), Reference()
+    ended, crossing = np.zeros(N, bool), False
+    for rollout in range(4):
+        reward, _, _, terminated, truncated, valid = experience(rollout)
+        # The step after an end begins an episode, across rollouts too.
+        valid[0] = ~ended
+        terminated[0] &= valid[0]
+        truncated[0] &= valid[0]
+        ended = terminated[-1] | truncated[-1]
+        crossing |= bool((~ended).any())
+        # A mean far from 0 and a growing scale: sums of squares alone would not do.
+        reward = np.where(valid, 5 + (rollout + 1) * reward, 0.0)
+        done = terminated | truncated
+        expected = reference(reward, done, valid)
+        scaler, scaled = scaler(
+            jnp.asarray(reward, jnp.float32), jnp.asarray(done), jnp.asarray(valid), GAMMA
+        )
+        assert int(scaler.count) == len(reference.seen)
+        np.testing.assert_allclose(scaler.mean, np.mean(reference.seen), rtol=1e-5)
+        np.testing.assert_allclose(scaler.scale, np.std(reference.seen), rtol=1e-5)
+        np.testing.assert_allclose(scaled, expected, rtol=1e-5)
+    assert crossing
+
+
+def test_a_reward_never_becomes_more_than_10():
+    reward = jnp.zeros((T, N)).at[-1, 0].set(1e4).at[-1, 1].set(-1e4)
+    done = valid = jnp.ones((T, N), bool)
+    _, scaled = RewardScaler.start(N)(reward, done, valid, GAMMA)
+    assert float(scaled[-1, 0]) == 10.0
+    assert float(scaled[-1, 1]) == -10.0
+
+
+@pytest.mark.parametrize("count", [2**24, 2**32 - 1])
+def test_the_number_of_returns_stays_exact(count):
+    # A float32 count would stand still at 2^24.
+    scaler = RewardScaler.start(N).replace(count=StepCounter.of(count), square=jnp.float32(4.0))
+    valid = jnp.zeros((T, N), bool).at[3, 5].set(True)
+    scaler, _ = jax.jit(RewardScaler.__call__, static_argnums=4)(
+        scaler, jnp.zeros((T, N)), ~valid & False, valid, GAMMA
+    )
+    assert int(scaler.count) == count + 1
+    # One return among so many changes nothing.
+    assert float(scaler.scale) == pytest.approx(2.0, rel=1e-6)
+
+
+def test_a_rollout_without_a_step_that_counts_teaches_nothing():
+    start = RewardScaler.start(N).replace(count=StepCounter.of(9), square=jnp.float32(4.0))
+    nothing = jnp.zeros((T, N), bool)
+    scaler, _ = start(jnp.zeros((T, N)), nothing, nothing, GAMMA)
+    assert int(scaler.count) == 9
+    assert float(scaler.square) == 4.0

@@ -1,0 +1,208 @@
+"""Whole updates of PPO and PPG's policy phase, and whole runs."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pixelbrax_jax.agents.algorithm import train_function
+from pixelbrax_jax.agents.dcpg import DCPGConfig, make_dcpg
+from pixelbrax_jax.agents.losses import value_loss
+from pixelbrax_jax.agents.ppg import PPGConfig, make_ppg
+from pixelbrax_jax.agents.ppo import ActorCritic, PPOConfig, make_ppo
+from tests.agents.small import PHASIC, SMALL, Agent, assert_close, ball_envs, same
+from tests.envs.toy import PARAMS
+
+ITERATIONS = 3
+"""Of a run: an auxiliary phase comes after the second one."""
+
+
+@pytest.fixture(scope="module")
+def envs():
+    return ball_envs()
+
+
+@pytest.fixture(scope="module")
+def ppo(envs):
+    return Agent(make_ppo(PPOConfig(**SMALL, update_epochs=1, vf_coef=1.0), envs))
+
+
+@pytest.fixture(scope="module")
+def ppg(envs):
+    return Agent(make_ppg(PPGConfig(**SMALL, **PHASIC, vf_coef=1.0), envs))
+
+
+@pytest.fixture(scope="module")
+def dcpg(envs):
+    return Agent(make_dcpg(DCPGConfig(**SMALL, **PHASIC), envs))
+
+
+@pytest.fixture(params=["ppo", "ppg", "dcpg"])
+def agent(request):
+    return request.getfixturevalue(request.param)
+
+
+def test_the_same_key_gives_the_same_run_and_another_another(agent):
+    first, facts = agent.run(agent.init(), ITERATIONS)
+    second, more_facts = agent.run(agent.init(), ITERATIONS)
+    assert same(first, second)
+    assert same(facts, more_facts)
+    other, _ = agent.run(agent.init(1), ITERATIONS)
+    assert not same(first.networks, other.networks)
+    assert int(first.steps) == ITERATIONS * agent.config.steps_per_iteration
+    assert int(first.iteration) == ITERATIONS
+
+
+def test_every_iteration_draws_anew(agent):
+    # The same state of everything but the number of the iteration.
+    state = agent.init()
+    first, _ = agent.iterate(state)
+    later, _ = agent.iterate(state.replace(iteration=jnp.uint32(2)))
+    assert not same(first.env_state.physics.engine, later.env_state.physics.engine)
+
+
+def test_minibatches_find_the_policy_and_value_that_played(agent):
+    """What is put together again for the update is what the agent saw, so the ratio is 1."""
+    state = agent.without_steps(agent.run(agent.init(), ITERATIONS)[0])
+    after, facts = agent.iterate(state)
+    # With a step size of 0 every minibatch is a first one.
+    assert same(after.networks, state.networks)
+    assert float(facts["learning_rate"]) == 0.0
+    assert float(facts["policy/clip_fraction"]) == 0.0
+    # Other shapes of a batch may round in another way.
+    assert abs(float(facts["policy/approx_kl"])) < 1e-6
+    if "loss/value_distill" in facts:
+        assert float(facts["loss/value_distill"]) < 1e-10
+
+
+def test_the_step_size_of_a_run_falls_along_a_line(agent):
+    state, rates = agent.init(), []
+    for _ in range(agent.config.num_iterations):
+        state, facts = agent.iterate(state)
+        rates.append(float(facts["learning_rate"]))
+    expected = SMALL["learning_rate"] * np.array([1.0, 0.8, 0.6, 0.4, 0.2])
+    np.testing.assert_allclose(rates, expected, rtol=1e-5)
+
+
+def test_ppg_without_auxiliary_phases_is_ppo(ppo, ppg, envs):
+    config = PPGConfig(**SMALL | PHASIC | {"aux_epochs": 0}, vf_coef=1.0)
+    assert make_ppg(config, envs).num_phases == 0
+
+    def shared(networks):
+        """All but the value head, which PPO's actor does not have."""
+        return {
+            "actor": {k: v for k, v in networks["actor"]["params"].items() if k != "value"},
+            "critic": networks["critic"],
+        }
+
+    one, other = ppo.init(), ppg.init()
+    assert same(shared(one.networks), shared(other.networks))
+    for _ in range(ITERATIONS):
+        one, facts = ppo.iterate(one)
+        other, more_facts = ppg.iterate(other)
+        assert same(shared(one.networks), shared(other.networks))
+        assert same(facts, more_facts)
+    assert same(one.env_state, other.env_state)
+    assert same(one.scaler, other.scaler)
+
+
+def test_ppg_s_actor_keeps_its_value_head_until_the_auxiliary_phase(ppg):
+    state = ppg.init()
+    head = state.networks["actor"]["params"]["value"]
+    for _ in range(2):
+        state, _ = ppg.iterate(state)
+        assert same(state.networks["actor"]["params"]["value"], head)
+    state, _ = ppg.auxiliary(state)
+    learned = state.networks["actor"]["params"]["value"]
+    assert not same(learned, head)
+    # The policy's Adam has never had a gradient of that head, and does not move it now.
+    state, _ = ppg.iterate(state)
+    assert same(state.networks["actor"]["params"]["value"], learned)
+
+
+def test_ppg_s_passes_of_the_value_alone_leave_the_policy_alone(ppg, envs):
+    config = PPGConfig(**SMALL, **PHASIC, vf_coef=1.0, value_epochs=3)
+    longer = Agent(make_ppg(config, envs))
+    state = ppg.init()
+    # Adam's moments are not 0 then, so that it would move what has a gradient of 0.
+    state, _ = ppg.iterate(state)
+    one, _ = ppg.iterate(state)
+    three, _ = longer.iterate(state)
+    assert_close(one.networks["actor"], three.networks["actor"], rtol=1e-4, atol=1e-6)
+    assert_close(one.moments["actor"], three.moments["actor"], rtol=1e-3, atol=1e-6)
+    counts = {name: int(three.moments[name].count) for name in ("actor", "critic")}
+    # One iteration of one pass, and one of one and of three.
+    assert counts == {"actor": 2 + 2, "critic": 2 + 6}
+
+
+def test_an_update_stops_once_the_policy_has_moved_too_far(envs):
+    config = PPOConfig(**SMALL | {"learning_rate": 0.03}, update_epochs=3, target_kl=1e-4)
+    agent = Agent(make_ppo(config, envs))
+    state, facts = agent.iterate(agent.init())
+    # The first of 6 minibatches sees the policy that played; the second one sees that it has
+    # moved, and is the last one that is used.
+    assert {int(moments.count) for moments in state.moments.values()} == {2}
+    assert float(facts["policy/approx_kl"]) > 1e-4 / 2
+    # A policy that does not move never stops.
+    still, facts = agent.iterate(agent.without_steps(state))
+    assert {int(moments.count) for moments in still.moments.values()} == {2 + 6}
+
+
+@pytest.fixture(scope="module")
+def pixels():
+    return jax.random.randint(jax.random.key(0), (6, 18, 18, 6), 0, 256).astype(jnp.uint8)
+
+
+def value_gradient(envs, pixels, **layout):
+    """Gradient of a value loss, by network and layer."""
+    config = PPOConfig(**SMALL)
+    agent = ActorCritic(config, envs, **layout)
+    networks = agent.init(jax.random.key(0))
+
+    @jax.jit
+    @jax.grad
+    def gradient(networks):
+        _, value = agent(networks, pixels, None)
+        return value_loss(value, jnp.ones(6), jnp.ones(6))
+
+    return {
+        (name, layer): any(bool(jnp.any(x != 0)) for x in jax.tree.leaves(slopes))
+        for name, params in gradient(networks).items()
+        for layer, slopes in params["params"].items()
+    }
+
+
+def test_a_separate_value_leaves_the_actor_alone(envs, pixels):
+    moves = value_gradient(envs, pixels, shared=False, has_value=True)
+    assert {name for (name, _), moved in moves.items() if moved} == {"critic"}
+
+
+def test_a_detached_value_moves_its_head_alone(envs, pixels):
+    moves = value_gradient(envs, pixels, shared=True, detach_value=True)
+    assert {layer for (_, layer), moved in moves.items() if moved} == {"value"}
+
+
+def test_a_shared_value_moves_the_encoder_and_no_policy_head(envs, pixels):
+    moves = value_gradient(envs, pixels, shared=True)
+    assert {layer for (_, layer), moved in moves.items() if moved} == {"Small_0", "value"}
+    assert {layer for (_, layer), moved in moves.items() if not moved} == {"mean", "log_std"}
+
+
+def test_a_run_is_its_iterations_and_runs_may_be_mapped_over_keys(ppg):
+    keys = jax.vmap(jax.random.key)(jnp.arange(2))
+    train = train_function(ppg.algorithm, PARAMS)
+    states, metrics = jax.jit(jax.vmap(train))(keys)
+    number = ppg.config.num_iterations
+    assert number % PHASIC["num_policy_phases"], "the last phase is no whole one"
+    for seed in range(2):
+        state, facts = ppg.run(ppg.init(seed), number)
+        one = jax.tree.map(lambda x, seed=seed: x[seed], states)
+        assert int(one.steps) == int(state.steps) == number * ppg.config.steps_per_iteration
+        # Another batch of the same sums is rounded differently, and that adds up.
+        assert_close(one.networks, state.networks, atol=2e-3)
+        for name, fact in facts.items():
+            length = 2 if name.startswith("auxiliary/") else number
+            assert metrics[name].shape == (2, length)
+            np.testing.assert_allclose(metrics[name][seed, -1], fact, rtol=0.02, atol=0.02)
