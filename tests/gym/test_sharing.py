@@ -132,6 +132,6 @@ def test_missing_torch_names_the_cure(monkeypatch):
         return real(name, *args, **kwargs)
 
     monkeypatch.setattr(builtins, "__import__", without_torch)
-    monkeypatch.delitem(sys.modules, "pixelbrax_gym.dlpack")
+    monkeypatch.delitem(sys.modules, "pixelbrax_gym.dlpack", raising=False)
     with pytest.raises(ImportError, match=r'pip install -e "\.\[torch\]"'):
         importlib.import_module("pixelbrax_gym.dlpack")
