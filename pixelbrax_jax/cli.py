@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
+from pixelbrax_jax.extras import install_extra
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command.
@@ -91,7 +93,7 @@ def _train(arguments: list[str]) -> int:
     try:
         from pixelbrax_jax.agents.command import train
     except ImportError as error:
-        sys.stderr.write(f"pixelbrax train: {error}; it needs the extra train\n")
+        sys.stderr.write(f"pixelbrax train: {error}; try: {install_extra('train')}\n")
         return 1
     return train(arguments)
 
@@ -115,8 +117,11 @@ def _add_record(commands: Any) -> None:
 
 
 def _record(options: argparse.Namespace) -> int:
-    from pixelbrax_jax.agents.record import record
-
+    try:
+        from pixelbrax_jax.agents.record import record
+    except ImportError as error:
+        sys.stderr.write(f"pixelbrax record: {error}; try: {install_extra('train')}\n")
+        return 1
     return record(options)
 
 

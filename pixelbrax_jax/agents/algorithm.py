@@ -10,12 +10,13 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from pixelbrax_jax.agents.config import TrainConfig
+from pixelbrax_jax.agents.config import TrainConfig, make_env
 from pixelbrax_jax.agents.counter import StepCounter
 from pixelbrax_jax.agents.losses import Metrics, mean, normalized
 from pixelbrax_jax.agents.optimizer import Networks, Optimizer
 from pixelbrax_jax.agents.returns import RewardScaler, gae
 from pixelbrax_jax.agents.rollout import Decision, Environments, Rollout, collect
+from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.types import EnvParams, EnvState
 
 _ENVS, _NETWORKS, _ACTIONS, _UPDATES, _AUXILIARY = range(5)
@@ -72,6 +73,49 @@ class Algorithm:
     act: Callable[..., jax.Array]
     auxiliary: Callable[[TrainState], tuple[TrainState, Metrics]] | None = None
     num_phases: int = 0
+
+
+def environments(
+    config: TrainConfig, envs: Environments | None, env_params: EnvParams | None
+) -> tuple[Environments, EnvParams]:
+    """The given environments and their parameters, or those that ``config`` names.
+
+    Raises:
+        ValueError: one of the two is given without the other.
+    """
+    if envs is not None and env_params is not None:
+        return envs, env_params
+    if envs is not None or env_params is not None:
+        missing = "envs" if envs is None else "env_params"
+        raise ValueError(f"envs and env_params belong together, got no {missing}.")
+    env, env_params = make_env(config)
+    return VectorPixelEnv(env, config.num_envs), env_params
+
+
+def check_environments(config: TrainConfig, envs: Environments) -> None:
+    """Rejects environments that are not what the settings say.
+
+    Raises:
+        ValueError: naming the setting and both values.
+    """
+    if envs.autoreset_mode != "next_step":
+        raise ValueError(
+            f"autoreset_mode of the environments must be 'next_step', got {envs.autoreset_mode!r}."
+        )
+    spec = envs.env.obs_spec
+    spec = spec["pixels"] if isinstance(spec, dict) else spec
+    found = {
+        "num_envs": (config.num_envs, envs.num_envs),
+        "action_repeat": (config.action_repeat, envs.env.action_repeat),
+        "frame_stack": (config.frame_stack, spec.shape[-1] // 3),
+        "height": (config.height, spec.shape[0]),
+        "width": (config.width, spec.shape[1]),
+    }
+    for name, (wanted, given) in found.items():
+        if wanted != given:
+            raise ValueError(
+                f"{name} is {wanted} in the settings, but {given} in the environments."
+            )
 
 
 def begin(

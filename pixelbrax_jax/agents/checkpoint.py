@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
+from importlib import metadata
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -15,11 +17,14 @@ import orbax.checkpoint as ocp
 FORMAT = 1
 """Number of the format; raised when what is stored changes its meaning."""
 
-_FREE = ("total_steps", "memory_budget_gb", "clips")
+_FREE = ("total_steps", "memory_budget_gb")
 """Settings that a run may go on with although they differ."""
 
 _ROOM = 1.2
 """Free bytes on the disk that are asked for, in sizes of a checkpoint."""
+
+_PACKAGES = ("pixelbrax", "jax", "jaxlib", "brax", "mujoco", "flax", "optax")
+"""Packages whose versions a run's last bits depend on."""
 
 Tree = TypeVar("Tree")
 
@@ -53,7 +58,12 @@ class Checkpoints:
             CheckpointError: the folder cannot be written to.
         """
         self.folder = Path(folder).absolute()
-        self._about: dict[str, Any] = {"format": FORMAT, "algorithm": algorithm, "config": settings}
+        self._about: dict[str, Any] = {
+            "format": FORMAT,
+            "algorithm": algorithm,
+            "config": settings,
+            "versions": _versions(),
+        }
         self._free = tuple(n for n in _FREE if n != "total_steps" or not settings.get("anneal"))
         check_writable(self.folder)
         policy = ocp.checkpoint_managers
@@ -62,6 +72,8 @@ class Checkpoints:
         )
         options = ocp.CheckpointManagerOptions(
             preservation_policy=policy.AnyPreservationPolicy([policy.LatestN(keep), best]),
+            # Without it scores are not written, and a resumed run would drop the best.
+            best_fn=lambda metrics: metrics["score"],
             cleanup_tmp_directories=True,
         )
         self._manager = ocp.CheckpointManager(self.folder, options=options)
@@ -72,9 +84,7 @@ class Checkpoints:
 
     def best(self) -> int | None:
         """Control steps of the checkpoint with the highest score; None if none has a score."""
-        scores = {steps: read_about(self.folder, steps)["score"] for steps in self.steps()}
-        scores = {steps: score for steps, score in scores.items() if score is not None}
-        return max(scores, key=lambda steps: (scores[steps], steps)) if scores else None
+        return best_steps(self.folder)
 
     def save(self, state: Any, steps: int, score: float | None) -> None:
         """Begins to write a checkpoint; training may go on meanwhile.
@@ -141,6 +151,20 @@ class Checkpoints:
         )["state"]
         return _typed(template, leaves)
 
+    def other_versions(self, steps: int | None = None) -> list[str]:
+        """Packages whose versions, and devices whose kind, were others when it was written.
+
+        Args:
+            steps: of which checkpoint; None takes the latest.
+        """
+        old = read_about(self.folder, self._which(steps))["versions"]
+        new = self._about["versions"]
+        return [
+            f"{name} {old.get(name)} there, {new.get(name)} here"
+            for name in sorted(old.keys() | new.keys())
+            if old.get(name) != new.get(name)
+        ]
+
     def close(self) -> None:
         """Waits for what is being written, and lets go of the folder."""
         self.wait()
@@ -177,6 +201,19 @@ class Checkpoints:
             )
 
 
+def best_steps(folder: str | Path) -> int | None:
+    """Control steps of the checkpoint with the highest score; None if none has a score.
+
+    Of equal scores the later one is taken.
+
+    Args:
+        folder: of the checkpoints.
+    """
+    scores = {steps: read_about(folder, steps)["score"] for steps in _all_steps(Path(folder))}
+    scores = {steps: score for steps, score in scores.items() if score is not None}
+    return max(scores, key=lambda steps: (scores[steps], steps)) if scores else None
+
+
 def read_about(folder: str | Path, steps: int | None = None) -> dict[str, Any]:
     """What is stored beside a checkpoint's arrays: algorithm, config, steps, score.
 
@@ -188,7 +225,7 @@ def read_about(folder: str | Path, steps: int | None = None) -> dict[str, Any]:
         CheckpointError: there is none, or it is of another format.
     """
     folder = Path(folder)
-    known = sorted(int(path.name) for path in folder.glob("*") if path.name.isdigit())
+    known = _all_steps(folder)
     if not known:
         raise CheckpointError(f"there is no checkpoint in {folder}.")
     path = folder / str(known[-1] if steps is None else steps) / "about" / "metadata"
@@ -240,7 +277,7 @@ def check_writable(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         probe.write_bytes(b"")
-        probe.unlink()
+        probe.unlink(missing_ok=True)  # Other processes try the same.
     except OSError as error:
         raise CheckpointError(
             f"cannot write to {folder}: {error.strerror or error}. Give another --output-dir."
@@ -252,11 +289,11 @@ def _plain(tree: Any) -> dict[str, Any]:
     leaves = {}
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
         if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
-            leaf = (
-                jax.eval_shape(jax.random.key_data, leaf)
-                if isinstance(leaf, jax.ShapeDtypeStruct)
-                else jax.random.key_data(leaf)
-            )
+            if isinstance(leaf, jax.ShapeDtypeStruct):
+                data = jax.eval_shape(jax.random.key_data, leaf)
+                leaf = jax.ShapeDtypeStruct(data.shape, data.dtype, sharding=leaf.sharding)
+            else:
+                leaf = jax.random.key_data(leaf)
         if leaf.size:
             leaves[jax.tree_util.keystr(path, simple=True, separator=".")] = leaf
     return leaves
@@ -267,13 +304,29 @@ def _typed(template: Tree, leaves: dict[str, Any]) -> Tree:
 
     def leaf(path: Any, like: Any) -> Any:
         if not like.size:
-            return jnp.zeros(like.shape, like.dtype)
+            empty = jax.jit(
+                lambda: jnp.zeros(like.shape, like.dtype), out_shardings=_sharding(like)
+            )
+            return empty()
         value = leaves[jax.tree_util.keystr(path, simple=True, separator=".")]
         if jnp.issubdtype(like.dtype, jax.dtypes.prng_key):
             return jax.random.wrap_key_data(value)
         return value
 
     return jax.tree_util.tree_map_with_path(leaf, template)
+
+
+def _all_steps(folder: Path) -> list[int]:
+    return sorted(int(path.name) for path in folder.glob("*") if path.name.isdigit())
+
+
+def _versions() -> dict[str, str]:
+    """Of packages, and the kind of device."""
+    found = {"device": jax.devices()[0].device_kind}
+    for name in _PACKAGES:
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            found[name] = metadata.version(name)
+    return found
 
 
 def _sharding(leaf: Any) -> Any:

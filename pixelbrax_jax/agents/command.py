@@ -35,8 +35,8 @@ def train(arguments: list[str]) -> int:
     first.add_argument("algorithm", choices=sorted(CONFIGS))
     first.add_argument("--preset", choices=sorted(PRESETS), default="default")
     first.add_argument("--coordinator", help="host:port of process 0, of several processes")
-    first.add_argument("--num-processes", type=int, default=1)
-    first.add_argument("--process-id", type=int, default=0)
+    first.add_argument("--num-processes", type=int)
+    first.add_argument("--process-id", type=int)
     if not arguments or arguments[0] in ("-h", "--help"):
         sys.stdout.write(
             "usage: pixelbrax train {"
@@ -47,9 +47,12 @@ def train(arguments: list[str]) -> int:
         )
         return 0
     chosen, rest = first.parse_known_args(arguments)
-    if chosen.coordinator is not None:
-        jax.distributed.initialize(chosen.coordinator, chosen.num_processes, chosen.process_id)
+    spread = (chosen.coordinator, chosen.num_processes, chosen.process_id)
+    if None in spread and any(given is not None for given in spread):
+        first.error("--coordinator, --num-processes and --process-id belong together")
     try:
+        if chosen.coordinator is not None:
+            jax.distributed.initialize(*spread)
         config, options = parse(chosen.algorithm, chosen.preset, rest)
         return _run(chosen.algorithm, config, options)
     except (
@@ -59,6 +62,7 @@ def train(arguments: list[str]) -> int:
         OSError,
         MemoryError,
         ImportError,
+        jax.errors.JaxRuntimeError,
     ) as error:
         sys.stderr.write(f"pixelbrax train: {error}\n")
         return 1
@@ -116,7 +120,16 @@ def _run(algorithm: str, config: TrainConfig, options: RunConfig) -> int:
 
 
 def load_config(about: dict[str, Any]) -> TrainConfig:
-    """The settings that are stored with a checkpoint."""
+    """The settings that are stored with a checkpoint.
+
+    Raises:
+        CheckpointError: it is of an algorithm that is not known here.
+    """
+    if about["algorithm"] not in CONFIGS:
+        raise CheckpointError(
+            f"the checkpoint is of {about['algorithm']!r}, which is none of {', '.join(CONFIGS)}; "
+            "an algorithm of your own needs a film of your own."
+        )
     kind = CONFIGS[about["algorithm"]]
     names = {field.name for field in fields(kind)}
     values: dict[str, Any] = {

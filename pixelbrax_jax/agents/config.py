@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 from numbers import Integral, Real
 from typing import Any
 
-from pixelbrax_jax.agents.networks import ENCODERS, POLICIES, SMALLEST
+from pixelbrax_jax.agents.networks import ENCODERS, LOG_STD_RANGE, POLICIES, SMALLEST
 from pixelbrax_jax.choices import check_choice, check_share, check_whole
 from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.registry import make
@@ -111,6 +111,12 @@ class TrainConfig:
             check_positive(name, getattr(self, name))
         for name in ("max_grad_norm", "ent_coef"):
             check_positive(name, getattr(self, name), or_zero=True)
+        low, high = (math.exp(x) for x in LOG_STD_RANGE)
+        if not low < self.initial_std < high:
+            raise ValueError(
+                f"initial_std must be between {low:.4f} and {high:.2f}, where standard deviations "
+                f"are kept, got {self.initial_std}."
+            )
         check_count("random_shift", self.random_shift)
         if self.memory_budget_gb is not None:
             check_positive("memory_budget_gb", self.memory_budget_gb)

@@ -14,15 +14,14 @@ import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax.agents import algorithm, phasic
-from pixelbrax_jax.agents.algorithm import Algorithm, TrainState, train_function
-from pixelbrax_jax.agents.config import TrainConfig, check_positive, make_env
+from pixelbrax_jax.agents.algorithm import Algorithm, TrainState, environments, train_function
+from pixelbrax_jax.agents.config import TrainConfig, check_positive
 from pixelbrax_jax.agents.losses import Batch, Metrics, mean, policy_loss, value_loss
 from pixelbrax_jax.agents.networks import Dynamics
 from pixelbrax_jax.agents.optimizer import Networks, Optimizer
 from pixelbrax_jax.agents.ppo import ActorCritic, epochs
 from pixelbrax_jax.agents.rollout import Environments
 from pixelbrax_jax.choices import check_share, check_whole
-from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.types import EnvParams
 
 _PLAYED = ("actor", "critic")
@@ -90,10 +89,11 @@ def make_train(
         config: settings.
         envs: environments of your own; None makes those that ``config`` names.
         env_params: of those.
+
+    Raises:
+        ValueError: one of the two is given without the other.
     """
-    if envs is None or env_params is None:
-        env, env_params = make_env(config)
-        envs = VectorPixelEnv(env, config.num_envs)
+    envs, env_params = environments(config, envs, env_params)
     return train_function(make_dcpg(config, envs), env_params)
 
 
@@ -235,7 +235,7 @@ def dynamics_loss(
     Args:
         dynamics: the head.
         params: of the head.
-        features: (C N, F) float32 of the chunk.
+        features: (N C, F) float32 of the chunk.
         chunk: C steps of N environments.
         key: for the exchange.
 
@@ -245,15 +245,15 @@ def dynamics_loss(
     num_steps = chunk.num_steps
 
     def in_time(rows: jax.Array) -> jax.Array:
-        return rows.reshape(num_steps, -1, *rows.shape[1:])
+        return rows.reshape(-1, num_steps, *rows.shape[1:])
 
     def flat(rows: jax.Array) -> jax.Array:
         return rows.reshape(-1, *rows.shape[2:])
 
-    now, following = flat(in_time(features)[:-1]), flat(in_time(features)[1:])
-    action = flat(in_time(chunk.raw)[:-1])
+    now, following = flat(in_time(features)[:, :-1]), flat(in_time(features)[:, 1:])
+    action = flat(in_time(chunk.raw)[:, :-1])
     # A step that ends an episode returns a true last observation; the one after it begins anew.
-    weight = flat(in_time(chunk.weight)[:-1])
+    weight = flat(in_time(chunk.weight)[:, :-1])
     action_key, following_key = jax.random.split(key)
     others = jax.random.permutation(action_key, len(action))
     strangers = jax.random.permutation(following_key, len(following))

@@ -97,7 +97,7 @@ class Evaluator:
 
             def step(carry: tuple[EnvState, jax.Array, Any]) -> tuple[EnvState, jax.Array, Any]:
                 state, number, (over, returns, lengths) = carry
-                draw = None if deterministic else jax.random.fold_in(key, number)
+                draw = None if deterministic else jax.random.fold_in(draws, number)
                 action = algorithm.act(networks, envs.obs(state), draw)
                 state, timestep = envs.step(state, action, params)
                 # Beyond its end an episode goes on without meaning.
@@ -106,6 +106,8 @@ class Evaluator:
                 over |= timestep.terminated | timestep.truncated
                 return state, number + 1, (over, returns, lengths)
 
+            # Episode i begins from fold_in(key, i).
+            draws = jax.random.fold_in(key, num_episodes)
             state, _ = envs.reset(key, params)
             nothing = jnp.zeros(num_episodes)
             results = (nothing.astype(bool), nothing, nothing.astype(jnp.int32))

@@ -75,7 +75,7 @@ class MetricsWriter:
         self._file = self.path.open("a", encoding="utf-8")
         board = folder / "tensorboard"
         # TensorBoard forgets what an earlier attempt wrote beyond this step.
-        self._board = SummaryWriter(str(board), purge_step=first_step)
+        self._board = SummaryWriter(str(board), purge_step=first_step + 1 if first_step else 0)
         self._wandb = None
         if wandb_project is not None:
             try:

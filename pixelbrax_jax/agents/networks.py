@@ -14,6 +14,9 @@ from flax import struct
 from pixelbrax_jax.agents.convolution import Conv
 from pixelbrax_jax.agents.distributions import Normal
 
+LOG_STD_RANGE = (-5.0, 2.0)
+"""Between which logarithms of standard deviations are kept."""
+
 _ROOT_2 = math.sqrt(2.0)
 
 
@@ -158,11 +161,11 @@ class Actor(nn.Module):
         if self.policy == "deacrep":
             mean = jnp.tanh(mean)
             spread = _dense(self.action_size, 0.01, "spread")(features)
-            std = jax.nn.softplus(jnp.clip(spread, -10.0, 10.0)) + 0.001
+            std = jax.nn.softplus(jnp.clip(spread, -10.0, 2.0)) + 0.001
         else:
             start = nn.initializers.constant(math.log(self.initial_std))
             log_std = self.param("log_std", start, (self.action_size,))
-            std = jnp.broadcast_to(jnp.exp(jnp.clip(log_std, -5.0, 2.0)), mean.shape)
+            std = jnp.broadcast_to(jnp.exp(jnp.clip(log_std, *LOG_STD_RANGE)), mean.shape)
         value = None
         if self.has_value:
             seen = jax.lax.stop_gradient(features) if detach_value else features

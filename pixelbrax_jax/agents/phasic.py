@@ -49,7 +49,7 @@ class Buffer(struct.PyTreeNode):
 
 
 class Chunk(NamedTuple):
-    """B = C N samples, C consecutive steps of each of N environments.
+    """B = N C samples, C consecutive steps of each of N environments, one after the other.
 
     Attributes:
         pixels: (B, H, W, 3 K) uint8.
@@ -173,7 +173,7 @@ def auxiliary_phase(
     def old_policy(_: None, number: jax.Array) -> tuple[None, tuple[jax.Array, jax.Array]]:
         chunk = _chunk(config, buffer, jnp.full(config.num_envs, number), parts, None)
         policy = policy_of(state.networks, chunk.pixels)
-        shape = (chunk.num_steps, config.num_envs, -1)
+        shape = (config.num_envs, chunk.num_steps, -1)
         return None, (policy.mean.reshape(shape), policy.std.reshape(shape))
 
     _, old = jax.lax.scan(old_policy, None, jnp.arange(num_minibatches))
@@ -208,8 +208,8 @@ def _entry(rollout: Rollout, returns: jax.Array) -> Buffer:
 
 
 def _of_each(chunks: jax.Array, which: jax.Array) -> jax.Array:
-    """(Q, C, N, ...) and (N,) -> (C N, ...), of each environment another chunk."""
-    picked = jax.vmap(lambda x, i: x[i], in_axes=(2, 0), out_axes=1)(chunks, which)
+    """(Q, N, C, ...) and (N,) -> (N C, ...), of each environment another chunk."""
+    picked = jax.vmap(lambda x, i: x[i], in_axes=(1, 0))(chunks, which)
     return picked.reshape(-1, *picked.shape[2:])
 
 
@@ -229,7 +229,7 @@ def _chunk(
         return jax.vmap(of_env, in_axes=(2, 0, 0), out_axes=1)(rows, rollout, first)
 
     def flat(rows: jax.Array) -> jax.Array:
-        rows = cut(rows)
+        rows = jnp.moveaxis(cut(rows), 1, 0)
         return rows.reshape(-1, *rows.shape[2:])
 
     frames = buffer.frames

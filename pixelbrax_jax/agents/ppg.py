@@ -8,14 +8,13 @@ from dataclasses import dataclass
 import jax
 
 from pixelbrax_jax.agents import algorithm, phasic
-from pixelbrax_jax.agents.algorithm import Algorithm, TrainState, train_function
-from pixelbrax_jax.agents.config import TrainConfig, check_count, check_positive, make_env
+from pixelbrax_jax.agents.algorithm import Algorithm, TrainState, environments, train_function
+from pixelbrax_jax.agents.config import TrainConfig, check_count, check_positive
 from pixelbrax_jax.agents.losses import Batch, Metrics, mean, policy_loss, value_loss
 from pixelbrax_jax.agents.optimizer import Networks, Optimizer
 from pixelbrax_jax.agents.ppo import ActorCritic, epochs
 from pixelbrax_jax.agents.rollout import Environments
 from pixelbrax_jax.choices import check_choice, check_whole
-from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.types import EnvParams
 
 LAYOUTS = ("dual", "detach", "shared")
@@ -58,6 +57,12 @@ class PPGConfig(TrainConfig):
         for name in ("vf_coef", "beta_clone", "aux_value_coef"):
             check_positive(name, getattr(self, name), or_zero=True)
         phasic.check_phases(self, self.num_policy_phases, self.aux_epochs, self.aux_minibatches)
+        if self.layout != "dual" and self.policy_epochs != self.value_epochs:
+            raise ValueError(
+                f"policy_epochs={self.policy_epochs} and value_epochs={self.value_epochs} may "
+                f"differ with layout='dual' alone, got {self.layout!r}: Adam would move what both "
+                "share in passes of one of them."
+            )
         if self.state_critic and self.layout != "dual":
             raise ValueError(
                 f"state_critic needs layout='dual', got {self.layout!r}: no encoder is shared."
@@ -75,10 +80,11 @@ def make_train(
         config: settings.
         envs: environments of your own; None makes those that ``config`` names.
         env_params: of those.
+
+    Raises:
+        ValueError: one of the two is given without the other.
     """
-    if envs is None or env_params is None:
-        env, env_params = make_env(config)
-        envs = VectorPixelEnv(env, config.num_envs)
+    envs, env_params = environments(config, envs, env_params)
     return train_function(make_ppg(config, envs), env_params)
 
 
@@ -135,7 +141,8 @@ def make_ppg(config: PPGConfig, envs: Environments) -> Algorithm:
         )
         for part, (loss, number, learners) in enumerate(plan):
             if number:
-                part_key = key if part == 0 else jax.random.fold_in(key, part)
+                # Far from the numbers of passes, by which keys are split.
+                part_key = key if part == 0 else jax.random.fold_in(key, 2**31 + part)
                 experience = (rollout, advantage, returns)
                 learning = {name: moments[name] for name in learners}
                 networks, learning, facts = epochs(

@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax.agents import algorithm
-from pixelbrax_jax.agents.algorithm import Algorithm, TrainState, train_function
-from pixelbrax_jax.agents.config import TrainConfig, check_positive, make_env
+from pixelbrax_jax.agents.algorithm import Algorithm, TrainState, environments, train_function
+from pixelbrax_jax.agents.config import TrainConfig, check_positive
 from pixelbrax_jax.agents.distributions import Normal
 from pixelbrax_jax.agents.losses import (
     Batch,
@@ -25,7 +25,6 @@ from pixelbrax_jax.agents.networks import Actor, ActorOutput, Critic
 from pixelbrax_jax.agents.optimizer import Networks, Optimizer
 from pixelbrax_jax.agents.rollout import Decision, Environments, Rollout, minibatch_times
 from pixelbrax_jax.choices import check_choice, check_whole
-from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.types import EnvParams
 
 LAYOUTS = ("separate", "shared")
@@ -75,10 +74,11 @@ def make_train(
         config: settings.
         envs: environments of your own; None makes those that ``config`` names.
         env_params: of those.
+
+    Raises:
+        ValueError: one of the two is given without the other.
     """
-    if envs is None or env_params is None:
-        env, env_params = make_env(config)
-        envs = VectorPixelEnv(env, config.num_envs)
+    envs, env_params = environments(config, envs, env_params)
     return train_function(make_ppo(config, envs), env_params)
 
 
@@ -144,7 +144,11 @@ class ActorCritic:
             shared: whether the critic is the actor's value head.
             detach_value: whether a shared value leaves the encoder alone.
             has_value: whether the actor has a value head although the critic is another network.
+
+        Raises:
+            ValueError: the environments are not what the settings say.
         """
+        algorithm.check_environments(config, envs)
         self._envs = envs
         self._shared = shared
         self._detach = detach_value

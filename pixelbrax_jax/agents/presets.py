@@ -63,7 +63,7 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     "deacrep": {
         "ppo": _DEACREP | {"update_epochs": 1},
         "ppg": _DEACREP | {"aux_epochs": 1, "vf_coef": 0.5},
-        "dcpg": _DEACREP | {"aux_epochs": 1},
+        "dcpg": _DEACREP | {"aux_epochs": 1, "decoupled": True},
     },
     # Moon et al. for Procgen (arXiv 2210.09960), and Cobbe et al. for PPG (arXiv 2009.04416).
     "procgen": {

@@ -11,8 +11,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from pixelbrax_jax.agents.checkpoint import CheckpointError, read_about, read_networks
+from pixelbrax_jax.agents.checkpoint import (
+    CheckpointError,
+    best_steps,
+    read_about,
+    read_networks,
+)
 from pixelbrax_jax.agents.command import load_config
+from pixelbrax_jax.agents.config import make_env
 from pixelbrax_jax.agents.evaluate import make_splits
 from pixelbrax_jax.agents.presets import MAKERS
 from pixelbrax_jax.agents.seeds import of_seed
@@ -84,20 +90,22 @@ def film(
     check_whole("num_frames", num_frames)
     checkpoints = Path(folder) / "checkpoints"
     if best:
-        steps = _best(checkpoints)
+        steps = best_steps(checkpoints)
     about = read_about(checkpoints, steps)
     config = load_config(about)
     splits = make_splits(config)
     check_choice("split", split, ("clean", "train", "test"))
     env, params = splits.get(split, splits["clean"])
-    algorithm = MAKERS[about["algorithm"]](config, VectorPixelEnv(env, config.num_envs))
+    # The networks are those of training, whose environments may show more than pixels.
+    own, own_params = make_env(config)
+    algorithm = MAKERS[about["algorithm"]](config, VectorPixelEnv(own, config.num_envs))
     envs = VectorPixelEnv(env, grid * grid)
 
     num_seeds = about["config"].get("num_seeds", 1)
     key = jax.random.key(0)
     keys = jax.random.split(key, num_seeds) if num_seeds > 1 else key
     init = jax.vmap(algorithm.init, in_axes=(0, None)) if num_seeds > 1 else algorithm.init
-    template = jax.eval_shape(init, keys, params).networks
+    template = jax.eval_shape(init, keys, own_params).networks
     networks = read_networks(checkpoints, template, about["steps"])
     networks = of_seed(networks, 0) if num_seeds > 1 else networks
 
@@ -121,11 +129,3 @@ def film(
             tiles = np.asarray(pictures).reshape(grid, grid, size, size, 3)
             writer.append_data(np.concatenate(np.concatenate(tiles, axis=1), axis=1))
     return path
-
-
-def _best(checkpoints: Path) -> int | None:
-    """Control steps of the checkpoint with the highest score; None takes the latest."""
-    names = [path.name for path in checkpoints.glob("*") if path.name.isdigit()]
-    scores = {int(name): read_about(checkpoints, int(name))["score"] for name in names}
-    known = {steps: score for steps, score in scores.items() if score is not None}
-    return max(known, key=lambda steps: known[steps]) if known else None

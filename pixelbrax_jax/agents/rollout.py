@@ -20,6 +20,7 @@ class Environments(Protocol):
 
     num_envs: int
     env: Any
+    autoreset_mode: str
 
     def reset(self, key: jax.Array, params: EnvParams) -> tuple[EnvState, Timestep]:
         """As ``VectorPixelEnv.reset``."""
@@ -173,19 +174,18 @@ def observations(frames: Frames, times: jax.Array, random_shift: int = 0) -> jax
         random_shift: pixels by which observations were shifted at most.
 
     Returns:
-        (B N, H, W, 3 K) uint8, oldest frame first.
+        (N B, H, W, 3 K) uint8, one environment after the other, oldest frame first.
     """
     stack = frames.pixels.shape[0] - frames.age.shape[0] + 1
     age = jnp.take_along_axis(frames.age, times, axis=0)
     back = jnp.minimum(jnp.arange(stack - 1, -1, -1), age[..., None])
     index = times[..., None] + stack - 1 - back
-    picked = jax.vmap(lambda pixels, index: pixels[index], in_axes=(1, 1), out_axes=1)(
-        frames.pixels, index
-    )
+    picked = jax.vmap(lambda pixels, index: pixels[index], in_axes=1)(frames.pixels, index)
     stacked = jnp.moveaxis(picked, 2, -2)
     stacked = stacked.reshape(*stacked.shape[:-2], 3 * stack)
     if random_shift:
-        stacked = jax.vmap(shifted, in_axes=(0, None, None))(stacked, frames.shift, random_shift)
+        of_times = jax.vmap(shifted, in_axes=(1, None, None), out_axes=1)
+        stacked = of_times(stacked, frames.shift, random_shift)
     return stacked.reshape(-1, *stacked.shape[2:])
 
 
@@ -197,10 +197,10 @@ def at_times(rows: jax.Array, times: jax.Array) -> jax.Array:
         times: (B, N) int32.
 
     Returns:
-        (B N, ...).
+        (N B, ...), one environment after the other: what is spread over devices along
+        environments then stays where it is.
     """
-    index = times.reshape(*times.shape, *(1,) * (rows.ndim - 2))
-    picked = jnp.take_along_axis(rows, index, axis=0)
+    picked = jax.vmap(lambda rows, index: rows[index], in_axes=1)(rows, times)
     return picked.reshape(-1, *rows.shape[2:])
 
 

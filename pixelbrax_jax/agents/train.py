@@ -13,11 +13,12 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from pixelbrax_jax.agents.algorithm import Algorithm, TrainState
 from pixelbrax_jax.agents.checkpoint import Checkpoints, nbytes
-from pixelbrax_jax.agents.config import check_positive, describe
+from pixelbrax_jax.agents.config import check_count, describe
 from pixelbrax_jax.agents.evaluate import Evaluator, Result, interquartile_mean, make_splits
 from pixelbrax_jax.agents.export import save_policy
 from pixelbrax_jax.agents.metrics import MetricsWriter, NoWriter, together
@@ -32,13 +33,13 @@ RESUME = ("never", "latest")
 
 @dataclass(frozen=True)
 class RunConfig:
-    """What is done around the training; nothing here changes a bit of it."""
+    """What is done around the training; nothing but the seeds changes a bit of it."""
 
     output_dir: str = "runs/train"
     """Folder of logs, checkpoints and the policy."""
     seed: int = 0
     """Seed of the run."""
-    num_seeds: int = 1
+    seeds: int = 1
     """Runs in one program, of the seeds ``seed``, ``seed`` + 1, ..."""
     resume: str = "never"
     """``latest`` goes on from the latest checkpoint in the folder, if there is one."""
@@ -66,10 +67,14 @@ class RunConfig:
             ValueError: a setting is out of range; the message says what is allowed.
         """
         check_choice("resume", self.resume, RESUME)
-        for name in ("num_seeds", "log_every", "eval_episodes", "keep_checkpoints"):
+        for name in ("seeds", "log_every", "eval_episodes", "keep_checkpoints"):
             check_whole(name, getattr(self, name))
         for name in ("seed", "num_evals", "checkpoint_every"):
-            check_positive(name, getattr(self, name), or_zero=True)
+            check_count(name, getattr(self, name))
+        if self.seed + self.seeds > 2**32:
+            raise ValueError(
+                f"seeds must be below 2**32, got seed={self.seed} and seeds={self.seeds}."
+            )
 
 
 class TrainingDivergedError(RuntimeError):
@@ -121,14 +126,14 @@ def run(
     """
     folder = Path(options.output_dir)
     key = jax.random.key(options.seed)
-    if options.num_seeds > 1:
+    if options.seeds > 1:
         algorithm = over_seeds(algorithm)
-        key = keys_of(options.seed, options.num_seeds)
+        key = keys_of(options.seed, options.seeds)
     template = jax.eval_shape(algorithm.init, key, env_params)
     mesh: Mesh | None = getattr(algorithm.envs, "mesh", None)
     shardings, same = None, None
     if mesh is not None:
-        shardings = state_shardings(mesh, template, options.num_seeds)
+        shardings = state_shardings(mesh, template, options.seeds)
         same = NamedSharding(mesh, PartitionSpec())
         env_params = everywhere(mesh, env_params)
         template = jax.tree.map(
@@ -139,13 +144,15 @@ def run(
     check_memory(algorithm, template, report)
     checkpoints = Checkpoints(
         folder / "checkpoints",
-        describe(algorithm.config) | {"seed": options.seed, "num_seeds": options.num_seeds},
+        describe(algorithm.config) | {"seed": options.seed, "num_seeds": options.seeds},
         algorithm.name,
         keep=options.keep_checkpoints,
     )
     try:
         if options.resume == "latest" and checkpoints.steps():
             state = checkpoints.restore(template)
+            if others := checkpoints.other_versions():
+                report(f"going on under other versions, so not to the bit: {', '.join(others)}")
             report(f"going on from the checkpoint of {_steps(algorithm, state)} steps")
         else:
             if checkpoints.steps():
@@ -213,9 +220,9 @@ class _Run:
                 for number in range(steps // per_iteration + 1, total + 1):
                     state, steps = self._one(state, number), number * per_iteration
                     bar.update(1)
-                    stop, end = bool(interrupted), number == total
+                    stop, end = _anywhere(bool(interrupted)), number == total
                     evaluates = self._evaluates_after(number)
-                    saves = end or stop or self._saves_after(steps, last_saved)
+                    saves = end or stop or evaluates or self._saves_after(steps, last_saved)
                     if number % options.log_every == 0 or evaluates or saves:
                         self._settle(steps)
                         seconds = time.perf_counter() - began
@@ -223,10 +230,10 @@ class _Run:
                             self._record["speed/steps_per_second"] = (steps - began_steps) / seconds
                             writer.write(steps, self._record)
                         bar.show(self._record)
-                    if evaluates and not stop:
+                    if evaluates:
                         writer.write(steps, self._evaluate(state))
                     if saves:
-                        self._checkpoints.save(state, steps, self._score())
+                        self._checkpoints.save(state, steps, self._score(evaluates))
                         last_saved = steps
                     if number % options.log_every == 0 or evaluates or saves:
                         began, began_steps = time.perf_counter(), steps
@@ -260,13 +267,20 @@ class _Run:
         records = jax.device_get(self._pending)
         self._pending = []
         for record in records:
-            bad = [name for name, value in record.items() if not np.isfinite(value).all()]
+            bad = {n: ~np.isfinite(value) for n, value in record.items()}
+            bad = {n: where for n, where in bad.items() if where.any()}
             if bad:
+                runs = ""
+                if self._options.seeds > 1:
+                    those = np.flatnonzero(np.any(list(bad.values()), axis=0))
+                    names = (str(self._options.seed + int(i)) for i in those)
+                    runs = f" of seed {', '.join(names)}"
                 saved = self._checkpoints.steps()
-                kept = f"the checkpoint of {saved[-1]} steps is good" if saved else "none was saved"
+                kept = f"that of {saved[-1]} steps is good" if saved else "there is none"
                 raise TrainingDivergedError(
-                    f"not finite within the iterations before step {steps}: {', '.join(bad)}. "
-                    f"In {self._checkpoints.folder} {kept}. A lower learning_rate may help."
+                    f"not finite within the iterations before step {steps}{runs}: "
+                    f"{', '.join(bad)}. Of the checkpoints {kept}. Begin anew in another "
+                    "--output-dir; a lower learning_rate or max_grad_norm may help."
                 )
         self._record = together(records)
 
@@ -281,10 +295,10 @@ class _Run:
     def _policies(self, state: TrainState) -> Iterator[tuple[Networks, str]]:
         """Networks of each seed, and the name of its policy's file."""
         networks = jax.device_get(state.networks)
-        if self._options.num_seeds == 1:
+        if self._options.seeds == 1:
             yield networks, "policy.jax"
             return
-        for i in range(self._options.num_seeds):
+        for i in range(self._options.seeds):
             yield of_seed(networks, i), f"policy_seed{self._options.seed + i}.jax"
 
     def _evaluate(self, state: TrainState) -> dict[str, float]:
@@ -301,17 +315,22 @@ class _Run:
                 lengths=np.concatenate([run.lengths for run in runs]),
             )
             record[f"eval/{split}/return"] = result.mean
-            record[f"eval/{split}/standard_error"] = result.standard_error
             record[f"eval/{split}/length"] = float(result.lengths.mean())
-            self._report(
-                f"{split}: return {result.mean:.1f} +- {result.standard_error:.1f} (standard error)"
-            )
+            line = f"{split}: return {result.mean:.1f}"
+            if len(result.returns) > 1:
+                record[f"eval/{split}/standard_error"] = result.standard_error
+                line += f" +- {result.standard_error:.1f} (standard error)"
+            self._report(line)
         return record
 
-    def _score(self) -> float | None:
-        """By which the best checkpoint is chosen: clean evaluation, else training's returns."""
-        if self._results:
-            return self._results["clean"].mean
+    def _score(self, evaluated: bool) -> float | None:
+        """By which the best checkpoint is chosen: one measure for all checkpoints of a run.
+
+        It is the return in clean episodes of this moment, and without evaluations that of the
+        latest training episodes.
+        """
+        if self._options.num_evals:
+            return self._results["clean"].mean if evaluated else None
         return self._record.get("episode/return")
 
 
@@ -334,20 +353,38 @@ def check_memory(algorithm: Algorithm, template: TrainState, report: Callable[[s
     config = algorithm.config
     frame = config.num_envs * config.height * config.width * 3
     rollout = frame * (config.num_steps + config.frame_stack - 1) * template.iteration.size
-    buffer = nbytes(template.buffer)
-    stored = rollout + nbytes(template)
+    buffer, parts = nbytes(template.buffer), _memories(algorithm)
+    # What belongs to environments is spread over the devices; the rest is the same on all.
+    alike = nbytes((template.networks, template.moments, template.aux_moments))
+    stored = alike + (rollout + nbytes(template) - alike) / parts
     report(
         f"stored: rollout {rollout / 1e9:.2f} GB, auxiliary buffer {buffer / 1e9:.2f} GB, all "
         f"state {nbytes(template) / 1e9:.2f} GB"
     )
     budget = config.memory_budget_gb
     limit = budget * 1e9 if budget is not None else _device_memory()
-    if stored > limit:
+    if _anywhere(stored > limit):
+        where = f" in each of {parts} memories" if parts > 1 else ""
         raise MemoryError(
-            f"rollout and state take {stored / 1e9:.2f} GB, of {limit / 1e9:.2f} GB that may be "
-            f"used. Lower num_envs, num_steps{', num_policy_phases' if buffer else ''} or the size "
-            "of the pictures, or raise memory_budget_gb."
+            f"rollout and state take {stored / 1e9:.2f} GB{where}, of {limit / 1e9:.2f} GB that "
+            f"may be used. Lower num_envs, num_steps{', num_policy_phases' if buffer else ''} or "
+            "the size of the pictures, or raise memory_budget_gb."
         )
+
+
+def _memories(algorithm: Algorithm) -> int:
+    """Memories over which environments are spread; devices of a CPU share one."""
+    mesh: Mesh | None = getattr(algorithm.envs, "mesh", None)
+    if mesh is None:
+        return 1
+    return jax.process_count() if jax.default_backend() == "cpu" else int(mesh.size)
+
+
+def _anywhere(here: bool) -> bool:
+    """Whether something is so in any process; they must all go the same way."""
+    if jax.process_count() == 1:
+        return here
+    return bool(multihost_utils.process_allgather(np.array(here)).any())
 
 
 def _device_memory() -> float:

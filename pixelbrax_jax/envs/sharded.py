@@ -37,6 +37,7 @@ class ShardedVectorEnv:
         env: the environment.
         num_envs: N, over all devices.
         mesh: the devices, along an axis ``"envs"``.
+        autoreset_mode: as of ``VectorPixelEnv``.
     """
 
     def __init__(
@@ -56,6 +57,7 @@ class ShardedVectorEnv:
         self.env = env
         self.num_envs = check_whole("num_envs", num_envs)
         self.mesh = mesh
+        self.autoreset_mode = autoreset_mode
         size = mesh.shape[AXIS]
         if num_envs % size:
             raise ValueError(f"num_envs={num_envs} must be a multiple of the {size} devices.")

@@ -26,13 +26,13 @@ def test_every_preset_is_valid_and_comes_back_from_json(algorithm, name):
 
 
 def test_options_change_a_preset():
-    line = "--task walker2d --distractors video camera --num-seeds 5 --no-normalize-reward"
+    line = "--task walker2d --distractors video camera --seeds 5 --no-normalize-reward"
     config, options = parse("ppg", "procgen", line.split())
     assert config.task == "walker2d"
     assert config.distractors == ("video", "camera")
     assert config.aux_epochs == 6, "of the preset"
     assert not config.normalize_reward
-    assert options.num_seeds == 5
+    assert options.seeds == 5
     assert options.output_dir == "runs/ppg"
 
 

@@ -247,20 +247,20 @@ def test_the_dynamics_loss_of_a_guess_is_that_of_three_coins(dynamics):
 
 def test_pairs_that_an_episode_s_end_parts_are_left_out(dynamics):
     head, params, features = dynamics
-    # In time: of the first environment the second step only begins an episode.
-    weight = np.array([[1, 1], [0, 1], [1, 1]]).reshape(-1)
+    # Columns are environments: of the first environment the second step only begins an episode.
+    weight = np.array([[1, 1], [0, 1], [1, 1]]).T.reshape(-1)
 
     @jax.grad
     def gradient(features, weight):
         return dynamics_loss(head, params, features, chunk_of(weight), jax.random.key(0))
 
-    slopes = np.asarray(gradient(features, weight)).reshape(3, 2, 4)
+    slopes = np.asarray(gradient(features, weight)).reshape(2, 3, 4).swapaxes(0, 1)
     assert (slopes != 0).any(-1).all()
     # Nothing is left where no step counts, though the last of them leads nowhere.
-    weight = np.array([[0, 0], [0, 0], [1, 1]]).reshape(-1)
+    weight = np.array([[0, 0], [0, 0], [1, 1]]).T.reshape(-1)
     np.testing.assert_array_equal(gradient(features, weight), 0)
     # The first step of the second environment alone: to its first features no other pair leads.
-    weight = np.array([[0, 1], [0, 0], [1, 1]]).reshape(-1)
-    slopes = np.asarray(gradient(features, weight)).reshape(3, 2, 4)
+    weight = np.array([[0, 1], [0, 0], [1, 1]]).T.reshape(-1)
+    slopes = np.asarray(gradient(features, weight)).reshape(2, 3, 4).swapaxes(0, 1)
     assert (slopes[0, 1] != 0).any()
     assert (slopes[0, 0] == 0).all()

@@ -112,7 +112,10 @@ def test_stacks_put_together_again_are_those_that_were_seen(played):
     for rollout in played.rollouts:
         seen = np.asarray(rollout.value)
         again = played.again(rollout.frames, everything)
-        np.testing.assert_array_equal(np.reshape(again, seen.shape), seen)
+        # One environment after the other.
+        np.testing.assert_array_equal(
+            np.reshape(again, (N, T, *seen.shape[2:])).swapaxes(0, 1), seen
+        )
         assert rollout.frames.pixels.shape == (T + played.stack - 1, N, 10, 12, 3)
     # Stacks across a boundary of episodes have been among them, and they repeat a frame.
     starts = np.argwhere(~of_both(played, "valid")[:-1])
@@ -126,11 +129,11 @@ def test_stacks_put_together_again_are_those_that_were_seen(played):
 def test_stacks_of_any_times_come_in_the_order_asked_for(played):
     rollout = played.rollouts[1]
     times = minibatch_times(jax.random.key(3), T, N, 3)[1]
-    again = np.reshape(played.again(rollout.frames, times), (T // 3, N, 10, 12, -1))
+    again = np.reshape(played.again(rollout.frames, times), (N, T // 3, 10, 12, -1))
     seen = np.asarray(rollout.value)
     for row, per_env in enumerate(np.asarray(times)):
         for i, t in enumerate(per_env):
-            np.testing.assert_array_equal(again[row, i], seen[t, i])
+            np.testing.assert_array_equal(again[i, row], seen[t, i])
 
 
 def test_the_last_observation_is_that_of_the_state_left_behind(played):
@@ -163,11 +166,11 @@ def test_chunks_of_the_buffer_are_the_rollouts(played):
         ("pixels", "value"), ("raw", "raw"), ("returns", "reward"), ("weight", "valid"),
     ):  # fmt: skip
         actual = np.asarray(getattr(chunk, name))
-        actual = actual.reshape(size, N, *actual.shape[1:])
+        actual = actual.reshape(N, size, *actual.shape[1:])
         for i, number in enumerate(which):
             rollout, first = number // parts, number % parts * size
             expected = getattr(played.rollouts[rollout], field)[first : first + size, i]
-            np.testing.assert_array_equal(actual[:, i], expected)
+            np.testing.assert_array_equal(actual[i], expected)
 
 
 def test_an_environment_does_not_depend_on_its_neighbours(played):

@@ -275,7 +275,7 @@ def test_episodes_count_equally_whichever_iteration_they_ended_in():
 
 
 def test_seeds_of_one_program_are_those_of_their_own(whole, tmp_path):
-    both = run(ppg(4), PARAMS, options(tmp_path / "both", num_seeds=2))
+    both = run(ppg(4), PARAMS, options(tmp_path / "both", seeds=2))
     alone = run(ppg(4), PARAMS, options(tmp_path / "alone", seed=1))
     second = jax.tree.map(lambda leaf: leaf[1], both.state.networks)
     for a, b in zip(jax.tree.leaves(second), jax.tree.leaves(alone.state.networks), strict=True):
