@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import shutil
+from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
 from typing import Any, TypeVar
@@ -111,7 +113,8 @@ class Checkpoints:
         )
         metrics = None if score is None else {"score": score}
         try:
-            self._manager.save(steps, args=arguments, metrics=metrics, force=True)
+            with _without_warnings():  # That there is no score is no mistake.
+                self._manager.save(steps, args=arguments, metrics=metrics, force=True)
         except OSError as error:
             raise CheckpointError(f"cannot write a checkpoint to {self.folder}: {error}") from error
 
@@ -318,6 +321,18 @@ def _typed(template: Tree, leaves: dict[str, Any]) -> Tree:
 
 def _all_steps(folder: Path) -> list[int]:
     return sorted(int(path.name) for path in folder.glob("*") if path.name.isdigit())
+
+
+@contextlib.contextmanager
+def _without_warnings() -> Iterator[None]:
+    """Orbax's warnings are not shown."""
+    logger = logging.getLogger("absl")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
 
 
 def _versions() -> dict[str, str]:

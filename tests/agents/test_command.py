@@ -49,6 +49,13 @@ def test_errors_name_the_setting_and_the_cure(capsys):
     assert "no checkpoint" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("given", ["--coordinator h:1 --num-processes 2", "--process-id 1"])
+def test_a_process_is_not_left_alone_silently(given, capsys):
+    with pytest.raises(SystemExit):
+        main(["train", "ppo", *given.split()])
+    assert "belong together" in capsys.readouterr().err
+
+
 def test_without_arguments_it_tells_what_there_is(capsys):
     assert main(["train"]) == 0
     assert "{ppo,ppg,dcpg}" in capsys.readouterr().out
@@ -59,7 +66,9 @@ def test_without_arguments_it_tells_what_there_is(capsys):
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_run_is_evaluated_and_filmed(tmp_path, capsys):
     folder = str(tmp_path / "run")
-    assert main(["train", "ppo", *TINY, "--output-dir", folder, "--num-evals", "1"]) == 0
+    # A critic that sees the state: in the film there are pixels alone.
+    line = ["train", "ppo", *TINY, "--output-dir", folder, "--num-evals", "1", "--state-critic"]
+    assert main(line) == 0
     assert "clean: return" in capsys.readouterr().err
     film = str(tmp_path / "film.mp4")
     line = ["record", folder, "--output", film, "--grid", "2", "--size", "32", "--num-frames", "3"]

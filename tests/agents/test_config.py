@@ -11,7 +11,12 @@ import pytest
 from pixelbrax_jax.agents.config import TrainConfig, describe, make_env
 from pixelbrax_jax.agents.dcpg import DCPGConfig
 from pixelbrax_jax.agents.ppg import PPGConfig
-from pixelbrax_jax.agents.ppo import PPOConfig
+from pixelbrax_jax.agents.ppo import PPOConfig, make_ppo, make_train
+from pixelbrax_jax.agents.presets import CONFIGS as OF_NAME
+from pixelbrax_jax.agents.presets import MAKERS
+from pixelbrax_jax.agents.train import RunConfig
+from pixelbrax_jax.envs.vector import VectorPixelEnv
+from tests.agents.small import SMALL, ball_envs
 
 CONFIGS = (PPOConfig, PPGConfig, DCPGConfig)
 
@@ -127,6 +132,16 @@ def test_dcpg_needs_its_delayed_phase():
             {"layout": "detach", "state_critic": True},
             "state_critic needs layout='dual', got 'detach'",
         ),
+        (
+            PPGConfig,
+            {"layout": "detach", "policy_epochs": 2},
+            "policy_epochs=2 and value_epochs=1 may differ with layout='dual' alone, got 'detach'",
+        ),
+        (
+            PPOConfig,
+            {"initial_std": 8.0},
+            "initial_std must be between 0.0067 and 7.39, where standard deviations are kept",
+        ),
         (DCPGConfig, {"state_critic": True}, "state_critic needs decoupled=True, got False"),
         *(
             (config, *case)
@@ -193,3 +208,44 @@ def test_the_environment_is_the_one_that_is_described():
     assert (env.action_repeat, env.episode_length) == (3, 50)
     # Only a critic that sees it makes the state an observation.
     assert make_env(config, obs_mode="pixels")[0].obs_spec.shape == (20, 24, 6)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"num_envs": 3}, "num_envs is 3 in the settings, but 4 in the environments."),
+        ({"action_repeat": 2}, "action_repeat is 2 in the settings, but 1 in the environments."),
+        ({"frame_stack": 1}, "frame_stack is 1 in the settings, but 2 in the environments."),
+        ({"height": 20}, "height is 20 in the settings, but 18 in the environments."),
+    ],
+)
+@pytest.mark.parametrize("name", MAKERS)
+def test_environments_that_are_not_those_of_the_settings_are_told(name, changes, message):
+    config = OF_NAME[name](**SMALL | {"total_steps": 10_000_000} | changes)
+    with pytest.raises(ValueError, match=re.escape(message)):
+        MAKERS[name](config, ball_envs())
+
+
+def test_environments_must_begin_episodes_in_steps_of_their_own():
+    envs = VectorPixelEnv(ball_envs().env, SMALL["num_envs"], "same_step")
+    with pytest.raises(ValueError, match="must be 'next_step', got 'same_step'"):
+        make_ppo(PPOConfig(**SMALL), envs)
+
+
+def test_environments_come_with_their_parameters():
+    with pytest.raises(ValueError, match="envs and env_params belong together, got no env_params"):
+        make_train(PPOConfig(**SMALL), ball_envs())
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"num_evals": 1.5}, "num_evals must be a whole number of at least 0, got 1.5"),
+        ({"checkpoint_every": -1}, "checkpoint_every must be a whole number of at least 0, got -1"),
+        ({"seed": 2**32 - 1, "seeds": 2}, "seeds must be below 2**32"),
+        ({"resume": "last"}, "Did you mean 'latest'"),
+    ],
+)
+def test_options_of_a_run_out_of_range_are_told(settings, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        RunConfig(**settings)

@@ -15,14 +15,22 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from pixelbrax_jax import PixelEnv
 from pixelbrax_jax.agents import train
-from pixelbrax_jax.agents.checkpoint import CheckpointError, Checkpoints, read_networks
+from pixelbrax_jax.agents.checkpoint import (
+    CheckpointError,
+    Checkpoints,
+    best_steps,
+    read_about,
+    read_networks,
+)
 from pixelbrax_jax.agents.config import describe
 from pixelbrax_jax.agents.export import load_policy, save_policy
 from pixelbrax_jax.agents.metrics import read_metrics, together
 from pixelbrax_jax.agents.ppg import PPGConfig, make_ppg
 from pixelbrax_jax.agents.train import RunConfig, TrainingDivergedError, run
-from tests.agents.small import PARAMS, SMALL, ball_envs, same
+from tests.agents.small import OPTIONS, PARAMS, SMALL, ball_envs, same
+from tests.envs.toy import Ball
 
 PHASES = {"num_policy_phases": 3, "aux_minibatches": 3, "aux_epochs": 1}
 PER_ITERATION = SMALL["num_envs"] * SMALL["num_steps"]
@@ -160,6 +168,42 @@ def test_the_best_and_the_latest_are_kept(tmp_path):
     with pytest.raises(CheckpointError, match="there are those of 2, 8589934592, 8589934597"):
         checkpoints.restore(state, 3)
     checkpoints.close()
+
+
+def test_the_best_outlives_a_resumed_run(tmp_path):
+    state = {"x": jnp.arange(3)}
+    for scores in ((9.0, 1.0), (2.0, 3.0)):
+        checkpoints = Checkpoints(tmp_path, {}, "ppg", keep=1)
+        first = max(checkpoints.steps(), default=0) + 1
+        for steps, score in enumerate(scores, first):
+            checkpoints.save(state, steps, score)
+        checkpoints.close()
+    assert best_steps(tmp_path) == 1
+    again = Checkpoints(tmp_path, {}, "ppg", keep=1)
+    assert again.steps() == [1, 4]
+    again.close()
+
+
+def test_only_evaluations_score_where_there_are_any(tmp_path, monkeypatch):
+    splits = {"clean": (PixelEnv(Ball(), **OPTIONS), PARAMS)}
+    monkeypatch.setattr(train, "make_splits", lambda config: splits)
+    each = options(tmp_path, num_evals=2, eval_episodes=1, checkpoint_every=PER_ITERATION)
+    run(ppg(4), PARAMS, replace(each, keep_checkpoints=9))
+    scores = [read_about(tmp_path / "checkpoints", PER_ITERATION * i)["score"] for i in range(1, 5)]
+    assert [score is not None for score in scores] == [False, True, False, True]
+    evaluations = [r for r in read_metrics(tmp_path / "metrics.jsonl") if "eval/clean/return" in r]
+    assert [r["eval/clean/return"] for r in evaluations] == [scores[1], scores[3]]
+    # Of one episode there is no standard error, and NaN is not JSON.
+    assert "NaN" not in (tmp_path / "metrics.jsonl").read_text()
+
+
+def test_a_run_under_other_versions_is_told(tmp_path):
+    run(ppg(3), PARAMS, options(tmp_path))
+    about = next((tmp_path / "checkpoints").glob("*/about/metadata"))
+    about.write_text(about.read_text().replace(f'"jax": "{jax.__version__}"', '"jax": "0.0.1"'))
+    lines = []
+    run(ppg(4), PARAMS, options(tmp_path, resume="latest"), report=lines.append)
+    assert any(f"jax 0.0.1 there, {jax.__version__} here" in line for line in lines)
 
 
 def test_losses_that_are_not_finite_stop_the_run(tmp_path):
