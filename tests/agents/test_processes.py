@@ -64,7 +64,9 @@ def test_a_killed_run_ends_as_one_that_never_was(algorithm, tmp_path):
     for least in (4, 14, 29):
         line = command(algorithm, killed, f"{options} --resume latest")
         process = subprocess.Popen(line, cwd=ROOT, stderr=subprocess.DEVNULL)
+        end = time.monotonic() + 200
         while process.poll() is None:
+            assert time.monotonic() < end, "no checkpoint came"
             # A folder under a temporary name is a checkpoint that is being written.
             names = [path.name for path in (killed / "checkpoints").glob("*")]
             written = [int(name) // PER_ITERATION for name in names if name.isdigit()]
@@ -97,6 +99,53 @@ def test_four_devices_learn_what_one_learns(algorithm, tmp_path):
             np.testing.assert_allclose(four[name], leaf, rtol=1e-4, atol=1e-5, err_msg=name)
 
 
+def test_a_run_on_four_devices_goes_on_to_the_bit(tmp_path):
+    flags = {"XLA_FLAGS": "--xla_force_host_platform_device_count=4"}
+    finish("ppg", tmp_path / "whole", f"--total-steps {5 * PER_ITERATION}", **flags)
+    finish("ppg", tmp_path / "parts", f"--total-steps {4 * PER_ITERATION}", **flags)
+    line = f"--total-steps {5 * PER_ITERATION} --resume latest"
+    finish("ppg", tmp_path / "parts", line, **flags)
+    ours, theirs = (leaves(tmp_path / name, 5 * PER_ITERATION) for name in ("parts", "whole"))
+    for name, leaf in ours.items():
+        np.testing.assert_array_equal(leaf, theirs[name], err_msg=name)
+
+
+def test_frames_stay_on_their_devices(tmp_path):
+    """What devices tell each other is gradients, not frames."""
+    code = r"""
+import jax, re
+from pixelbrax_jax.agents.config import make_env
+from pixelbrax_jax.agents.ppg import PPGConfig, make_ppg
+from pixelbrax_jax.agents.sharding import everywhere, state_shardings
+from pixelbrax_jax.envs.sharded import ShardedVectorEnv, make_env_mesh
+
+config = PPGConfig(
+    task="inverted_pendulum", height=18, width=18, frame_stack=2, encoder="small", num_envs=8,
+    num_steps=8, num_minibatches=2, num_policy_phases=2, aux_minibatches=4, total_steps=1024,
+    random_shift=1,
+)
+env, params = make_env(config)
+mesh = make_env_mesh()
+algorithm = make_ppg(config, ShardedVectorEnv(env, config.num_envs, mesh))
+params = everywhere(mesh, params)
+template = jax.eval_shape(algorithm.init, jax.random.key(0), params)
+shardings = state_shardings(mesh, template)
+state = jax.tree.map(
+    lambda leaf, sharding: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding),
+    template, shardings,
+)
+jobs = ((algorithm.iterate, (state, params)), (algorithm.auxiliary, (state,)))
+for job, arguments in jobs:
+    text = jax.jit(job).lower(*arguments).compile().as_text()
+    moves = re.compile(r" (all-gather|all-to-all|collective-permute)(-start)?\(")
+    lines = [line for line in text.splitlines() if moves.search(line)]
+    assert not [line for line in lines if "u8[" in line]
+    assert "all-reduce" in text
+"""
+    environ = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=4"}
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT, env=environ)
+
+
 def test_two_processes_learn_what_one_learns(tmp_path):
     options = f"--total-steps {3 * PER_ITERATION} --num-evals 1 --eval-episodes 2"
     finish("ppo", tmp_path / "one", options)
@@ -118,7 +167,10 @@ def test_two_processes_learn_what_one_learns(tmp_path):
 def test_all_checkpoints_of_a_killed_run_are_whole(tmp_path):
     options = f"--total-steps {400 * PER_ITERATION} --checkpoint-every {PER_ITERATION}"
     process = subprocess.Popen(command("ppo", tmp_path, options), cwd=ROOT)
+    end = time.monotonic() + 200
     while not list((tmp_path / "checkpoints").glob("[0-9]*0")):
+        assert process.poll() is None
+        assert time.monotonic() < end, "no checkpoint came"
         time.sleep(0.05)
     process.send_signal(signal.SIGKILL)
     process.wait()
