@@ -13,6 +13,7 @@ import gymnasium
 
 if TYPE_CHECKING:
     from pixelbrax_gym.check import check_vector_env as check_vector_env
+    from pixelbrax_gym.policy import TorchPolicy as TorchPolicy
     from pixelbrax_gym.sb3_env import PixelBraxSB3VecEnv as PixelBraxSB3VecEnv
     from pixelbrax_gym.single_env import PixelBraxEnv as PixelBraxEnv
     from pixelbrax_gym.torchrl_env import PixelBraxTorchRLEnv as PixelBraxTorchRLEnv
@@ -40,6 +41,7 @@ _LAZY = {
     "PixelBraxSB3VecEnv": "pixelbrax_gym.sb3_env",
     "PixelBraxTorchRLEnv": "pixelbrax_gym.torchrl_env",
     "PixelBraxVectorEnv": "pixelbrax_gym.vector_env",
+    "TorchPolicy": "pixelbrax_gym.policy",
     "check_vector_env": "pixelbrax_gym.check",
 }
 

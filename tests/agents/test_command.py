@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import imageio.v3 as imageio
 import pytest
 
@@ -9,6 +11,7 @@ from pixelbrax_jax.agents.command import load_config, parse
 from pixelbrax_jax.agents.config import describe
 from pixelbrax_jax.agents.presets import CONFIGS, PRESETS, preset
 from pixelbrax_jax.cli import main
+from tests.gpu.learning import commands
 
 TINY = (
     *("--task", "inverted_pendulum", "--height", "18", "--width", "18", "--frame-stack", "1"),
@@ -34,6 +37,17 @@ def test_options_change_a_preset():
     assert not config.normalize_reward
     assert options.seeds == 5
     assert options.output_dir == "runs/ppg"
+
+
+@pytest.mark.parametrize("name", commands(1, Path("runs"), "procedural"))
+def test_the_runs_for_a_gpu_are_valid(name):
+    _, algorithm, *line = commands(1, Path("runs"), "procedural")[name]
+    config, options = parse(algorithm, "default", line)
+    assert config.total_steps >= 25_000_000
+    assert options.output_dir == f"runs/{name}"
+    # The largest buffer, that of PPG and DCPG, in bytes.
+    frames = config.num_envs * (config.num_steps + 2) * config.height * config.width * 3
+    assert frames * getattr(config, "num_policy_phases", 0) < 25e9
 
 
 def test_errors_name_the_setting_and_the_cure(capsys):

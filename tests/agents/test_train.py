@@ -14,7 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import torch
 
+from pixelbrax_gym import TorchPolicy
 from pixelbrax_jax import PixelEnv
 from pixelbrax_jax.agents import train
 from pixelbrax_jax.agents.checkpoint import (
@@ -285,6 +287,25 @@ def test_an_exported_policy_acts_without_the_package(whole, tmp_path):
     environ = os.environ | {"PYTHONPATH": ""}
     subprocess.run([sys.executable, "-c", code], check=True, cwd=tmp_path, env=environ)
     np.testing.assert_allclose(np.load(tmp_path / "actions.npy"), expected, rtol=1e-5, atol=1e-6)
+
+
+def test_a_policy_takes_and_gives_tensors(whole):
+    outcome, folder = whole
+    algorithm = ppg(8)
+    shape = algorithm.envs.env.obs_spec.shape
+    pixels = np.random.default_rng(0).integers(0, 256, (5, *shape), np.uint8)
+    policy = TorchPolicy(folder / "policy.jax")
+    action = policy(torch.from_numpy(pixels))
+    assert action.dtype == torch.float32
+    expected = algorithm.act(outcome.state.networks, jnp.asarray(pixels))
+    np.testing.assert_allclose(action.numpy(), expected, rtol=1e-5, atol=1e-6)
+    # A view that is not contiguous is what it shows.
+    turned = torch.from_numpy(pixels).flip(0)[::2]
+    np.testing.assert_allclose(policy(turned).numpy(), expected[::-1][::2], rtol=1e-5, atol=1e-6)
+    with pytest.raises(ValueError, match=r"uint8, got torch.float32"):
+        policy(torch.from_numpy(pixels).float())
+    with pytest.raises(ValueError, match=r"takes \(B, 18, 18, 6\) uint8 pixels, got \(5, 18, 18\)"):
+        policy(torch.from_numpy(pixels[..., 0]))
 
 
 def test_no_policy_is_told(tmp_path):

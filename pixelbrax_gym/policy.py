@@ -1,0 +1,52 @@
+"""A trained JAX policy that takes and gives torch tensors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import jax
+import torch
+
+from pixelbrax_gym.dlpack import to_torch
+from pixelbrax_jax.agents.export import load_policy
+
+
+class TorchPolicy:
+    """The policy of a ``policy.jax``, called with tensors.
+
+    Tensors cross by DLPack, without a copy, on whatever device they are. The policy is compiled
+    once for each number of observations. It has no gradient.
+
+    Example:
+        ``action = TorchPolicy("runs/ppo/policy.jax")(obs)``
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        """Loads the file.
+
+        Args:
+            path: of the file that ``pixelbrax train`` wrote.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            ValueError: it is no policy.
+            ImportError: what reads it is not installed, with the cure.
+        """
+        self._act = load_policy(path)
+
+    def __call__(self, pixels: torch.Tensor) -> torch.Tensor:
+        """The mean actions of observations.
+
+        Args:
+            pixels: (B, H, W, 3 K) uint8, oldest frame first, as environments give them.
+
+        Returns:
+            (B, A) float32 on the same device.
+
+        Raises:
+            ValueError: another dtype or shape.
+        """
+        if pixels.dtype != torch.uint8:
+            raise ValueError(f"pixels must be torch.uint8, got {pixels.dtype}.")
+        action: torch.Tensor = to_torch(self._act(jax.dlpack.from_dlpack(pixels.contiguous())))
+        return action
