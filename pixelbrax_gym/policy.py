@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import jax
-import torch
 
-from pixelbrax_gym.dlpack import to_torch
+from pixelbrax_gym.dlpack import to_torch  # Where torch is missing, it tells the cure.
 from pixelbrax_jax.agents.export import load_policy
+
+if TYPE_CHECKING:
+    import torch
 
 
 class TorchPolicy:
@@ -44,9 +47,7 @@ class TorchPolicy:
             (B, A) float32 on the same device.
 
         Raises:
-            ValueError: another dtype or shape.
+            ValueError: another dtype or shape than that of training.
         """
-        if pixels.dtype != torch.uint8:
-            raise ValueError(f"pixels must be torch.uint8, got {pixels.dtype}.")
         action: torch.Tensor = to_torch(self._act(jax.dlpack.from_dlpack(pixels.contiguous())))
         return action

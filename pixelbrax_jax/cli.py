@@ -113,6 +113,13 @@ def _add_record(commands: Any) -> None:
     command.add_argument("--size", type=int, default=168, help="pixels of one (default: 168)")
     command.add_argument("--num-frames", type=int, default=300, help="at most (default: 300)")
     command.add_argument("--seed", type=int, default=0, help="of the episodes (default: 0)")
+    command.add_argument(
+        "--run",
+        dest="run_index",
+        type=int,
+        default=0,
+        help="which of the runs of --seeds, from 0 (default: 0)",
+    )
     command.set_defaults(run=_record)
 
 

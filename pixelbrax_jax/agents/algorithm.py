@@ -102,8 +102,15 @@ def check_environments(config: TrainConfig, envs: Environments) -> None:
         raise ValueError(
             f"autoreset_mode of the environments must be 'next_step', got {envs.autoreset_mode!r}."
         )
-    spec = envs.env.obs_spec
-    spec = spec["pixels"] if isinstance(spec, dict) else spec
+    specs = envs.env.obs_spec
+    specs = specs if isinstance(specs, dict) else {"pixels": specs}
+    spec = specs.get("pixels")
+    if spec is None or len(spec.shape) != 3 or (config.state_critic and "state" not in specs):
+        wanted = "both" if config.state_critic else "pixels"
+        raise ValueError(
+            f"obs_mode of the environments must be {wanted!r} with "
+            f"state_critic={config.state_critic}; they show {', '.join(specs)}."
+        )
     found = {
         "num_envs": (config.num_envs, envs.num_envs),
         "action_repeat": (config.action_repeat, envs.env.action_repeat),
@@ -111,11 +118,9 @@ def check_environments(config: TrainConfig, envs: Environments) -> None:
         "height": (config.height, spec.shape[0]),
         "width": (config.width, spec.shape[1]),
     }
-    for name, (wanted, given) in found.items():
-        if wanted != given:
-            raise ValueError(
-                f"{name} is {wanted} in the settings, but {given} in the environments."
-            )
+    for name, (told, given) in found.items():
+        if told != given:
+            raise ValueError(f"{name} is {told} in the settings, but {given} in the environments.")
 
 
 def begin(

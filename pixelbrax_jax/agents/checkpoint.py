@@ -16,7 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
-FORMAT = 1
+from pixelbrax_jax.agents.sharding import anywhere
+
+FORMAT = 2
 """Number of the format; raised when what is stored changes its meaning."""
 
 _FREE = ("total_steps", "memory_budget_gb")
@@ -102,7 +104,7 @@ class Checkpoints:
         leaves = _plain(state)
         size = sum(leaf.nbytes for leaf in leaves.values())
         free = shutil.disk_usage(self.folder).free
-        if free < _ROOM * size:
+        if anywhere(free < _ROOM * size):
             raise CheckpointError(
                 f"a checkpoint takes {size / 1e9:.2f} GB, but {self.folder} has only "
                 f"{free / 1e9:.2f} GB free. Make room, or give another --output-dir."
@@ -155,7 +157,7 @@ class Checkpoints:
         return _typed(template, leaves)
 
     def other_versions(self, steps: int | None = None) -> list[str]:
-        """Packages whose versions, and devices whose kind, were others when it was written.
+        """Packages whose versions, and devices whose kind or number, were others then.
 
         Args:
             steps: of which checkpoint; None takes the latest.
@@ -320,7 +322,9 @@ def _typed(template: Tree, leaves: dict[str, Any]) -> Tree:
 
 
 def _all_steps(folder: Path) -> list[int]:
-    return sorted(int(path.name) for path in folder.glob("*") if path.name.isdigit())
+    # Without the file, a folder is one that is being deleted.
+    found = (path for path in folder.glob("*") if path.name.isdigit())
+    return sorted(int(path.name) for path in found if (path / "about" / "metadata").exists())
 
 
 @contextlib.contextmanager
@@ -336,8 +340,9 @@ def _without_warnings() -> Iterator[None]:
 
 
 def _versions() -> dict[str, str]:
-    """Of packages, and the kind of device."""
-    found = {"device": jax.devices()[0].device_kind}
+    """Of packages, and number and kind of devices."""
+    kind = jax.devices()[0].device_kind
+    found = {"devices": f"{jax.device_count()} x {kind}"}
     for name in _PACKAGES:
         with contextlib.suppress(metadata.PackageNotFoundError):
             found[name] = metadata.version(name)

@@ -13,6 +13,7 @@ import numpy as np
 from pixelbrax_jax.agents.algorithm import Algorithm
 from pixelbrax_jax.agents.config import TrainConfig, make_env
 from pixelbrax_jax.agents.optimizer import Networks
+from pixelbrax_jax.choices import check_choice
 from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.types import EnvParams, EnvState
@@ -51,11 +52,21 @@ def make_splits(config: TrainConfig) -> dict[str, tuple[PixelEnv, EnvParams]]:
     ``clean`` has no distractors, ``train`` those of the training, and ``test`` the same with
     clips that training never shows. Without distractors there is only ``clean``.
     """
+    names = SPLITS if config.distractors else SPLITS[:1]
+    return {name: make_split(config, name) for name in names}
+
+
+def make_split(config: TrainConfig, name: str) -> tuple[PixelEnv, EnvParams]:
+    """One of the environments of `make_splits`.
+
+    Raises:
+        ValueError: there is no such split.
+    """
+    check_choice("split", name, SPLITS)
+    clean = {"distractors": (), "clips": None}
+    changes = clean if name == "clean" or not config.distractors else {"split": name}
     # What training sees of the state, evaluation need not.
-    changes: dict[str, dict[str, Any]] = {"clean": {"distractors": (), "clips": None}}
-    if config.distractors:
-        changes |= {"train": {"split": "train"}, "test": {"split": "test"}}
-    return {name: make_env(config, obs_mode="pixels", **c) for name, c in changes.items()}
+    return make_env(config, obs_mode="pixels", **changes)
 
 
 class Evaluator:

@@ -19,7 +19,7 @@ from pixelbrax_jax.agents.checkpoint import (
 )
 from pixelbrax_jax.agents.command import load_config
 from pixelbrax_jax.agents.config import make_env
-from pixelbrax_jax.agents.evaluate import make_splits
+from pixelbrax_jax.agents.evaluate import SPLITS, make_split
 from pixelbrax_jax.agents.presets import MAKERS
 from pixelbrax_jax.agents.seeds import of_seed
 from pixelbrax_jax.choices import check_choice, check_whole
@@ -43,6 +43,7 @@ def record(options: argparse.Namespace) -> int:
             size=options.size,
             num_frames=options.num_frames,
             seed=options.seed,
+            run=options.run_index,
         )
     except (CheckpointError, ValueError, OSError, ImportError) as error:
         sys.stderr.write(f"pixelbrax record: {error}\n")
@@ -62,6 +63,7 @@ def film(
     size: int = 168,
     num_frames: int = 300,
     seed: int = 0,
+    run: int = 0,
 ) -> Path:
     """Writes an MP4 of ``grid`` x ``grid`` episodes, side by side.
 
@@ -69,12 +71,13 @@ def film(
         folder: output folder of a training run.
         output: of the film; None puts it into the run's folder.
         steps: of which checkpoint; None takes the latest.
-        best: whether the best checkpoint is taken.
+        best: whether instead the best checkpoint is taken.
         split: ``"clean"``, ``"train"`` or ``"test"``; without distractors all are clean.
         grid: episodes a side.
         size: pixels of one episode, square.
         num_frames: at most.
         seed: of the episodes.
+        run: which of several runs that were trained together, from 0.
 
     Returns:
         The film's path.
@@ -89,25 +92,33 @@ def film(
     check_whole("size", size)
     check_whole("num_frames", num_frames)
     checkpoints = Path(folder) / "checkpoints"
+    check_choice("split", split, SPLITS)
+    if best and steps is not None:
+        raise ValueError(f"give best or steps, not both; got steps={steps}.")
     if best:
         steps = best_steps(checkpoints)
+        if steps is None:
+            raise CheckpointError(
+                f"no checkpoint in {checkpoints} has a score yet; without --best the latest is "
+                "filmed."
+            )
     about = read_about(checkpoints, steps)
     config = load_config(about)
-    splits = make_splits(config)
-    check_choice("split", split, ("clean", "train", "test"))
-    env, params = splits.get(split, splits["clean"])
+    env, params = make_split(config, split)
     # The networks are those of training, whose environments may show more than pixels.
-    own, own_params = make_env(config)
+    own, own_params = make_env(config, distractors=(), clips=None)
     algorithm = MAKERS[about["algorithm"]](config, VectorPixelEnv(own, config.num_envs))
     envs = VectorPixelEnv(env, grid * grid)
 
-    num_seeds = about["config"].get("num_seeds", 1)
+    num_seeds = about["config"].get("seeds", 1)
     key = jax.random.key(0)
     keys = jax.random.split(key, num_seeds) if num_seeds > 1 else key
     init = jax.vmap(algorithm.init, in_axes=(0, None)) if num_seeds > 1 else algorithm.init
     template = jax.eval_shape(init, keys, own_params).networks
     networks = read_networks(checkpoints, template, about["steps"])
-    networks = of_seed(networks, 0) if num_seeds > 1 else networks
+    if not 0 <= run < num_seeds:
+        raise ValueError(f"run must be from 0 to {num_seeds - 1}, got {run}.")
+    networks = of_seed(networks, run) if num_seeds > 1 else networks
 
     @jax.jit
     def step(state: Any, params: Any) -> tuple[Any, jax.Array]:

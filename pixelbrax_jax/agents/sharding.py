@@ -11,6 +11,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from pixelbrax_jax.envs.sharded import AXIS
@@ -46,3 +47,10 @@ def everywhere(mesh: Mesh, tree: Any) -> Any:
     """The same values on all devices of all processes."""
     same = NamedSharding(mesh, PartitionSpec())
     return jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf), same), tree)
+
+
+def anywhere(here: bool) -> bool:
+    """Whether something is so in any process, when all must go the same way."""
+    if jax.process_count() == 1:
+        return here
+    return bool(multihost_utils.process_allgather(np.array(here)).any())

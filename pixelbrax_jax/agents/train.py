@@ -13,22 +13,25 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from pixelbrax_jax.agents.algorithm import Algorithm, TrainState
-from pixelbrax_jax.agents.checkpoint import Checkpoints, nbytes
+from pixelbrax_jax.agents.checkpoint import CheckpointError, Checkpoints, nbytes
 from pixelbrax_jax.agents.config import check_count, describe
 from pixelbrax_jax.agents.evaluate import Evaluator, Result, interquartile_mean, make_splits
 from pixelbrax_jax.agents.export import save_policy
 from pixelbrax_jax.agents.metrics import MetricsWriter, NoWriter, together
 from pixelbrax_jax.agents.optimizer import Networks
 from pixelbrax_jax.agents.seeds import keys_of, of_seed, over_seeds
-from pixelbrax_jax.agents.sharding import everywhere, state_shardings
+from pixelbrax_jax.agents.sharding import anywhere, everywhere, state_shardings
 from pixelbrax_jax.choices import check_choice, check_whole
+from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.types import EnvParams
 
 RESUME = ("never", "latest")
+
+Splits = dict[str, tuple[PixelEnv, EnvParams]]
+"""Environments to evaluate in, and their parameters, by name."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +55,7 @@ class RunConfig:
     eval_episodes: int = 32
     """Episodes of an evaluation, for each split."""
     checkpoint_every: int = 0
-    """Control steps between checkpoints; 0 writes one at the end."""
+    """Control steps between checkpoints; 0 writes them at evaluations and at the end only."""
     keep_checkpoints: int = 3
     """Latest checkpoints that are kept, besides the best."""
     wandb_project: str | None = None
@@ -108,6 +111,7 @@ def run(
     options: RunConfig,
     *,
     report: Callable[[str], None] = _silent,
+    splits: Splits | None = None,
 ) -> Outcome:
     """Trains to the end, or until it is interrupted.
 
@@ -118,6 +122,9 @@ def run(
         env_params: of its environments.
         options: what is done around it.
         report: gets lines about what is going on.
+        splits: environments to evaluate in, with their parameters, by name; one is ``"clean"``,
+            which chooses the best checkpoint. None makes those that the settings name, which
+            environments of your own are not.
 
     Raises:
         CheckpointError: the folder cannot be written to, or holds another run.
@@ -144,18 +151,24 @@ def run(
     check_memory(algorithm, template, report)
     checkpoints = Checkpoints(
         folder / "checkpoints",
-        describe(algorithm.config) | {"seed": options.seed, "num_seeds": options.seeds},
+        describe(algorithm.config) | {"seed": options.seed, "seeds": options.seeds},
         algorithm.name,
         keep=options.keep_checkpoints,
     )
     try:
-        if options.resume == "latest" and checkpoints.steps():
+        found = bool(checkpoints.steps())
+        if anywhere(found) and anywhere(not found):
+            raise CheckpointError(
+                f"only some processes see checkpoints in {checkpoints.folder}; they must share "
+                "--output-dir."
+            )
+        if options.resume == "latest" and found:
             state = checkpoints.restore(template)
             if others := checkpoints.other_versions():
                 report(f"going on under other versions, so not to the bit: {', '.join(others)}")
             report(f"going on from the checkpoint of {_steps(algorithm, state)} steps")
         else:
-            if checkpoints.steps():
+            if found:
                 raise FileExistsError(
                     f"{checkpoints.folder} has checkpoints of an earlier run: go on with "
                     "--resume latest, or give another --output-dir."
@@ -163,7 +176,10 @@ def run(
             init = jax.jit(lambda params: algorithm.init(key, params), out_shardings=shardings)
             state = init(env_params)
         placed = None if mesh is None else (shardings, same)
-        return _Run(algorithm, env_params, options, checkpoints, report, placed).until_end(state)
+        if options.num_evals and splits is None:
+            splits = make_splits(algorithm.config)
+        loop = _Run(algorithm, env_params, options, checkpoints, report, placed, splits or {})
+        return loop.until_end(state)
     finally:
         checkpoints.close()
 
@@ -179,6 +195,7 @@ class _Run:
         checkpoints: Checkpoints,
         report: Callable[[str], None],
         placed: Any,
+        splits: Splits,
     ) -> None:
         self._algorithm = algorithm
         self._config = algorithm.config
@@ -192,7 +209,7 @@ class _Run:
             self._auxiliary = jax.jit(algorithm.auxiliary, donate_argnums=0, out_shardings=placed)
         self._evaluators: dict[str, Evaluator] = {}
         if options.num_evals:
-            for split, (env, params) in make_splits(self._config).items():
+            for split, (env, params) in splits.items():
                 self._evaluators[split] = Evaluator(
                     algorithm, env, params, num_episodes=options.eval_episodes
                 )
@@ -206,13 +223,20 @@ class _Run:
         last_saved = steps
         first = jax.process_index() == 0
         writer: Any = NoWriter()
+        failure: Exception | None = None
         if first:
-            writer = MetricsWriter(
-                Path(options.output_dir),
-                describe(self._config),
-                first_step=steps,
-                wandb_project=options.wandb_project,
-            )
+            try:
+                writer = MetricsWriter(
+                    Path(options.output_dir),
+                    describe(self._config),
+                    first_step=steps,
+                    wandb_project=options.wandb_project,
+                )
+            except (ImportError, OSError) as error:
+                failure = error
+        if anywhere(failure is not None):
+            raise failure or RuntimeError("process 0 cannot write metrics; it says why.")
+        stopped = False
         try:
             with _interruptible() as interrupted, _bar(options.progress and first, total) as bar:
                 bar.update(steps // per_iteration)
@@ -220,9 +244,10 @@ class _Run:
                 for number in range(steps // per_iteration + 1, total + 1):
                     state, steps = self._one(state, number), number * per_iteration
                     bar.update(1)
-                    stop, end = _anywhere(bool(interrupted)), number == total
+                    end = number == total
+                    stopped = anywhere(bool(interrupted)) and not end
                     evaluates = self._evaluates_after(number)
-                    saves = end or stop or evaluates or self._saves_after(steps, last_saved)
+                    saves = end or stopped or evaluates or self._saves_after(steps, last_saved)
                     if number % options.log_every == 0 or evaluates or saves:
                         self._settle(steps)
                         seconds = time.perf_counter() - began
@@ -230,19 +255,23 @@ class _Run:
                             self._record["speed/steps_per_second"] = (steps - began_steps) / seconds
                             writer.write(steps, self._record)
                         bar.show(self._record)
-                    if evaluates:
+                    if evaluates and not stopped:
                         writer.write(steps, self._evaluate(state))
                     if saves:
-                        self._checkpoints.save(state, steps, self._score(evaluates))
+                        self._checkpoints.save(state, steps, self._score(evaluates and not stopped))
                         last_saved = steps
                     if number % options.log_every == 0 or evaluates or saves:
                         began, began_steps = time.perf_counter(), steps
-                    if stop:
+                    if stopped:
+                        # Whoever is asked to stop may soon be killed: first what is not to be lost.
+                        self._checkpoints.wait()
                         self._report(f"stopped after {steps} steps; go on with --resume latest")
+                        if evaluates:
+                            writer.write(steps, self._evaluate(state))
                         break
                 for networks, name in self._policies(state) if first else ():
                     save_policy(self._algorithm, networks, Path(options.output_dir) / name)
-                return Outcome(state, self._record, self._results, bool(interrupted))
+                return Outcome(state, self._record, self._results, stopped)
         finally:
             writer.close()
 
@@ -363,7 +392,7 @@ def check_memory(algorithm: Algorithm, template: TrainState, report: Callable[[s
     )
     budget = config.memory_budget_gb
     limit = budget * 1e9 if budget is not None else _device_memory()
-    if _anywhere(stored > limit):
+    if anywhere(stored > limit):
         where = f" in each of {parts} memories" if parts > 1 else ""
         raise MemoryError(
             f"rollout and state take {stored / 1e9:.2f} GB{where}, of {limit / 1e9:.2f} GB that "
@@ -378,13 +407,6 @@ def _memories(algorithm: Algorithm) -> int:
     if mesh is None:
         return 1
     return jax.process_count() if jax.default_backend() == "cpu" else int(mesh.size)
-
-
-def _anywhere(here: bool) -> bool:
-    """Whether something is so in any process; they must all go the same way."""
-    if jax.process_count() == 1:
-        return here
-    return bool(multihost_utils.process_allgather(np.array(here)).any())
 
 
 def _device_memory() -> float:

@@ -90,3 +90,11 @@ def test_a_run_is_evaluated_and_filmed(tmp_path, capsys):
     frames = imageio.imread(film)
     assert frames.shape == (3, 64, 64, 3)
     assert frames[0].std() > 5, "something is seen"
+    for wrong, told in (
+        ("--best --steps 16", "give best or steps, not both; got steps=16"),
+        ("--run 1", "run must be from 0 to 0, got 1"),
+        ("--split tset", "Did you mean 'test'?"),
+        ("--steps 3", "there is no checkpoint"),
+    ):
+        assert main(["record", folder, *wrong.split()]) == 1
+        assert told in capsys.readouterr().err

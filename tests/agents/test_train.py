@@ -244,6 +244,26 @@ def test_ctrl_c_writes_a_checkpoint_and_the_run_goes_on(whole, tmp_path):
     assert same(resumed.state, outcome.state)
 
 
+def test_asked_to_stop_in_its_last_iteration_a_run_is_whole(whole, tmp_path):
+    outcome, _ = whole
+    algorithm = ppg(8)
+
+    def iterate(state, params):
+        state, metrics = algorithm.iterate(state, params)
+        jax.debug.callback(lambda n: n == 8 and interrupt(), state.iteration)
+        return state, metrics
+
+    def interrupt():
+        signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
+
+    lines = []
+    late = replace(algorithm, iterate=iterate)
+    ended = run(late, PARAMS, options(tmp_path), report=lines.append)
+    assert not ended.interrupted
+    assert not any("--resume" in line for line in lines)
+    assert same(ended.state, outcome.state)
+
+
 def test_a_folder_that_cannot_be_written_to_is_told_early(tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(CheckpointError, match="--output-dir"):
@@ -302,7 +322,7 @@ def test_a_policy_takes_and_gives_tensors(whole):
     # A view that is not contiguous is what it shows.
     turned = torch.from_numpy(pixels).flip(0)[::2]
     np.testing.assert_allclose(policy(turned).numpy(), expected[::-1][::2], rtol=1e-5, atol=1e-6)
-    with pytest.raises(ValueError, match=r"uint8, got torch.float32"):
+    with pytest.raises(ValueError, match=r"uint8 pixels, got \(5, 18, 18, 6\) float32"):
         policy(torch.from_numpy(pixels).float())
     with pytest.raises(ValueError, match=r"takes \(B, 18, 18, 6\) uint8 pixels, got \(5, 18, 18\)"):
         policy(torch.from_numpy(pixels[..., 0]))
