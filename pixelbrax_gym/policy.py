@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import jax
 
 from pixelbrax_gym.dlpack import to_torch  # Where torch is missing, it tells the cure.
-from pixelbrax_jax.agents.export import load_policy
+from pixelbrax_jax.policy import load_policy
 
 if TYPE_CHECKING:
     import torch

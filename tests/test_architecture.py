@@ -23,6 +23,7 @@ ALLOWED: dict[str, set[str]] = {
     "pixelbrax_jax.types": set(),
     "pixelbrax_jax.choices": set(),
     "pixelbrax_jax.extras": set(),
+    "pixelbrax_jax.policy": {"pixelbrax_jax.extras"},
     "pixelbrax_jax.spatial": {"pixelbrax_jax.types"},
     **{
         f"pixelbrax_jax.{room}": {f"pixelbrax_jax.{name}" for name in FOUNDATIONS}
@@ -42,6 +43,7 @@ ALLOWED: dict[str, set[str]] = {
     },
     "pixelbrax_gym": {
         "pixelbrax_jax",
+        "pixelbrax_jax.policy",
         "pixelbrax_jax.registry",
         "pixelbrax_jax.types",
         "pixelbrax_jax.choices",
@@ -55,6 +57,7 @@ HOMES: dict[str, set[str]] = {
     "torch": {
         "pixelbrax_gym/dlpack.py",
         "pixelbrax_gym/doctor.py",
+        "pixelbrax_gym/policy.py",
         "pixelbrax_gym/torchrl_env.py",
         "pixelbrax_gym/torchrl_specs.py",
     },

@@ -81,9 +81,17 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     # Minutes on two CPU cores.
     "ci": {
         "ppo": _CI | {"layout": "shared", "update_epochs": 3},
-        "ppg": _CI | {"num_policy_phases": 8, "aux_minibatches": 8, "aux_epochs": 2},
+        "ppg": _CI
+        | {
+            "layout": "detach",
+            "policy_epochs": 3,
+            "value_epochs": 3,
+            "num_policy_phases": 8,
+            "aux_minibatches": 8,
+            "aux_epochs": 1,
+        },
         "dcpg": _CI
-        | {"num_policy_phases": 2, "aux_minibatches": 8, "aux_epochs": 3, "update_epochs": 2},
+        | {"num_policy_phases": 2, "aux_minibatches": 8, "aux_epochs": 2, "update_epochs": 2},
     },
 }
 """Changes of the defaults, by name of the preset and of the algorithm."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -16,10 +15,11 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from pixelbrax_jax.agents.algorithm import Algorithm, TrainState
-from pixelbrax_jax.agents.checkpoint import CheckpointError, Checkpoints, nbytes
+from pixelbrax_jax.agents.checkpoint import CheckpointError, Checkpoints
 from pixelbrax_jax.agents.config import check_count, describe
 from pixelbrax_jax.agents.evaluate import Evaluator, Result, interquartile_mean, make_splits
 from pixelbrax_jax.agents.export import save_policy
+from pixelbrax_jax.agents.memory import check_memory
 from pixelbrax_jax.agents.metrics import MetricsWriter, NoWriter, together
 from pixelbrax_jax.agents.optimizer import Networks
 from pixelbrax_jax.agents.seeds import keys_of, of_seed, over_seeds
@@ -366,59 +366,6 @@ class _Run:
 def _steps(algorithm: Algorithm, state: TrainState) -> int:
     """Control steps so far; all seeds are equally far."""
     return int(np.ravel(state.iteration)[0]) * algorithm.config.steps_per_iteration
-
-
-def check_memory(algorithm: Algorithm, template: TrainState, report: Callable[[str], None]) -> None:
-    """Tells what will be stored, and rejects what would not fit.
-
-    Args:
-        algorithm: with its settings.
-        template: ``jax.eval_shape`` of its state.
-        report: gets the figures.
-
-    Raises:
-        MemoryError: it is more than ``memory_budget_gb``, or than the device has.
-    """
-    config = algorithm.config
-    frame = config.num_envs * config.height * config.width * 3
-    rollout = frame * (config.num_steps + config.frame_stack - 1) * template.iteration.size
-    buffer, parts = nbytes(template.buffer), _memories(algorithm)
-    # What belongs to environments is spread over the devices; the rest is the same on all.
-    alike = nbytes((template.networks, template.moments, template.aux_moments))
-    stored = alike + (rollout + nbytes(template) - alike) / parts
-    report(
-        f"stored: rollout {rollout / 1e9:.2f} GB, auxiliary buffer {buffer / 1e9:.2f} GB, all "
-        f"state {nbytes(template) / 1e9:.2f} GB"
-    )
-    budget = config.memory_budget_gb
-    limit = budget * 1e9 if budget is not None else _device_memory()
-    if anywhere(stored > limit):
-        where = f" in each of {parts} memories" if parts > 1 else ""
-        raise MemoryError(
-            f"rollout and state take {stored / 1e9:.2f} GB{where}, of {limit / 1e9:.2f} GB that "
-            f"may be used. Lower num_envs, num_steps{', num_policy_phases' if buffer else ''} or "
-            "the size of the pictures, or raise memory_budget_gb."
-        )
-
-
-def _memories(algorithm: Algorithm) -> int:
-    """Memories over which environments are spread; devices of a CPU share one."""
-    mesh: Mesh | None = getattr(algorithm.envs, "mesh", None)
-    if mesh is None:
-        return 1
-    return jax.process_count() if jax.default_backend() == "cpu" else int(mesh.size)
-
-
-def _device_memory() -> float:
-    """Bytes that JAX may use on its first device; no bound where nobody tells."""
-    statistics = jax.local_devices()[0].memory_stats() or {}
-    if "bytes_limit" in statistics:
-        return float(statistics["bytes_limit"])
-    try:
-        import psutil
-    except ImportError:
-        return math.inf
-    return float(psutil.virtual_memory().available)
 
 
 @contextmanager

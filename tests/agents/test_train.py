@@ -27,10 +27,11 @@ from pixelbrax_jax.agents.checkpoint import (
     read_networks,
 )
 from pixelbrax_jax.agents.config import describe
-from pixelbrax_jax.agents.export import load_policy, save_policy
+from pixelbrax_jax.agents.export import save_policy
 from pixelbrax_jax.agents.metrics import read_metrics, together
 from pixelbrax_jax.agents.ppg import PPGConfig, make_ppg
 from pixelbrax_jax.agents.train import RunConfig, TrainingDivergedError, run
+from pixelbrax_jax.policy import load_policy
 from tests.agents.small import OPTIONS, PARAMS, SMALL, ball_envs, same
 from tests.envs.toy import Ball
 
