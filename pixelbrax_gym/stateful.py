@@ -16,6 +16,7 @@ from pixelbrax_gym.actions import as_actions, name_rows
 from pixelbrax_gym.fork import check_not_forked, is_forked
 from pixelbrax_jax import PixelEnv, VectorPixelEnv, registry
 from pixelbrax_jax.choices import check_options, check_whole
+from pixelbrax_jax.compilation import compiler_options
 from pixelbrax_jax.types import EnvParams, EnvState, Timestep
 
 SEEDS = 2**32
@@ -260,10 +261,11 @@ class _Programs:
 
     def __init__(self, vector: VectorPixelEnv, single: bool) -> None:
         self.vector, self.single = vector, single
-        self.reset = jax.jit(self._reset)
-        self.reset_where = jax.jit(self._reset_where, donate_argnums=0)
-        self.step = jax.jit(self._step, donate_argnums=0)
-        self.step_where = jax.jit(self._step_where, donate_argnums=0)
+        options = compiler_options()
+        self.reset = jax.jit(self._reset, compiler_options=options)
+        self.reset_where = jax.jit(self._reset_where, donate_argnums=0, compiler_options=options)
+        self.step = jax.jit(self._step, donate_argnums=0, compiler_options=options)
+        self.step_where = jax.jit(self._step_where, donate_argnums=0, compiler_options=options)
 
     def _reset(self, seeds: jax.Array, params: EnvParams) -> tuple[EnvState, dict[str, Any]]:
         state, timestep = self.vector.reset(jax.vmap(jax.random.key)(seeds), params)
@@ -339,7 +341,7 @@ def _picture_program(env: PixelEnv, height: int, width: int) -> Any:
     def picture(state: EnvState, params: EnvParams) -> jax.Array:
         return env.picture(state, params, height, width)
 
-    return jax.jit(jax.vmap(picture, in_axes=(0, None)))
+    return jax.jit(jax.vmap(picture, in_axes=(0, None)), compiler_options=compiler_options())
 
 
 def _make(

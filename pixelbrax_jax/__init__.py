@@ -1,6 +1,7 @@
 """PixelBrax: Brax physics seen through a pure-JAX ray-caster."""
 
 from pixelbrax_jax import distractors as distractors
+from pixelbrax_jax.compilation import compiler_options as compiler_options
 from pixelbrax_jax.distractors import load_clips as load_clips
 from pixelbrax_jax.envs.brax_env import BraxPixelEnv as BraxPixelEnv
 from pixelbrax_jax.envs.brax_env import wrap_fresh_episodes as wrap_fresh_episodes

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import subprocess
 import sys
 from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import Any
 
 from pixelbrax_jax.extras import install_extra
@@ -37,9 +39,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # Its options are the fields of the settings' classes, which tyro reads by itself.
     commands.add_parser("train", help="train an agent: train ppo --help", add_help=False)
     _add_record(commands)
+    # Its options are those of the benchmark, which is not part of the package.
+    commands.add_parser("bench", help="measure throughput: bench --help", add_help=False)
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     if arguments[:1] == ["train"]:
         return _train(arguments[1:])
+    if arguments[:1] == ["bench"]:
+        return _bench(arguments[1:])
     options = parser.parse_args(arguments)
     return int(options.run(options))
 
@@ -130,6 +136,18 @@ def _record(options: argparse.Namespace) -> int:
         sys.stderr.write(f"pixelbrax record: {error}; try: {install_extra('train')}\n")
         return 1
     return record(options)
+
+
+def _bench(arguments: list[str]) -> int:
+    root = Path(__file__).parents[1]
+    if not (root / "tests" / "benchmarks" / "run.py").exists():
+        sys.stderr.write(
+            "pixelbrax bench: the benchmark comes with the repository, not with the package; clone "
+            "it and run: make bench\n"
+        )
+        return 1
+    command = [sys.executable, "-m", "tests.benchmarks.run", *arguments]
+    return subprocess.run(command, cwd=root, check=False).returncode
 
 
 def _version() -> str:

@@ -15,7 +15,7 @@ from packaging.requirements import Requirement
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("pixelbrax_jax", "pixelbrax_gym")
 
-FOUNDATIONS = {"types", "spatial", "choices", "extras"}
+FOUNDATIONS = {"types", "spatial", "choices", "extras", "compilation"}
 DRAWING_ROOMS = {"physics", "scene", "renderer", "distractors"}
 """They never import each other; `envs` joins them."""
 
@@ -23,6 +23,7 @@ ALLOWED: dict[str, set[str]] = {
     "pixelbrax_jax.types": set(),
     "pixelbrax_jax.choices": set(),
     "pixelbrax_jax.extras": set(),
+    "pixelbrax_jax.compilation": set(),
     "pixelbrax_jax.policy": {"pixelbrax_jax.extras"},
     "pixelbrax_jax.spatial": {"pixelbrax_jax.types"},
     **{
@@ -47,6 +48,7 @@ ALLOWED: dict[str, set[str]] = {
         "pixelbrax_jax.registry",
         "pixelbrax_jax.types",
         "pixelbrax_jax.choices",
+        "pixelbrax_jax.compilation",
         "pixelbrax_jax.extras",
     },
 }

@@ -14,6 +14,7 @@ from pixelbrax_jax.agents.algorithm import Algorithm
 from pixelbrax_jax.agents.config import TrainConfig, make_env
 from pixelbrax_jax.agents.optimizer import Networks
 from pixelbrax_jax.choices import check_choice
+from pixelbrax_jax.compilation import compiler_options
 from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.types import EnvParams, EnvState
@@ -125,7 +126,9 @@ class Evaluator:
             carry = jax.lax.while_loop(goes_on, step, (state, jnp.int32(0), results))
             return carry[2][1], carry[2][2]
 
-        self._play: Callable[..., tuple[Any, Any]] = jax.jit(play)
+        self._play: Callable[..., tuple[Any, Any]] = jax.jit(
+            play, compiler_options=compiler_options()
+        )
 
     def __call__(self, networks: Networks) -> Result:
         """The episodes of a policy."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 import warnings
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from pixelbrax_jax.agents.evaluate import SPLITS, make_split
 from pixelbrax_jax.agents.presets import MAKERS
 from pixelbrax_jax.agents.seeds import of_seed
 from pixelbrax_jax.choices import check_choice, check_whole
+from pixelbrax_jax.compilation import compiler_options
 from pixelbrax_jax.envs.vector import VectorPixelEnv
 
 
@@ -120,7 +122,7 @@ def film(
         raise ValueError(f"run must be from 0 to {num_seeds - 1}, got {run}.")
     networks = of_seed(networks, run) if num_seeds > 1 else networks
 
-    @jax.jit
+    @partial(jax.jit, compiler_options=compiler_options())
     def step(state: Any, params: Any) -> tuple[Any, jax.Array]:
         action = algorithm.act(networks, envs.obs(state))
         state, _ = envs.step(state, action, params)

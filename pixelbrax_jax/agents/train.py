@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from pixelbrax_jax.agents.optimizer import Networks
 from pixelbrax_jax.agents.seeds import keys_of, of_seed, over_seeds
 from pixelbrax_jax.agents.sharding import anywhere, everywhere, state_shardings
 from pixelbrax_jax.choices import check_choice, check_whole
+from pixelbrax_jax.compilation import compiler_options
 from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.types import EnvParams
 
@@ -204,9 +206,12 @@ class _Run:
         self._checkpoints = checkpoints
         self._report = report
         # The state before an iteration is not needed after it: its memory is used again.
-        self._iterate = jax.jit(algorithm.iterate, donate_argnums=0, out_shardings=placed)
+        compiled = partial(
+            jax.jit, donate_argnums=0, out_shardings=placed, compiler_options=compiler_options()
+        )
+        self._iterate = compiled(algorithm.iterate)
         if algorithm.auxiliary is not None:
-            self._auxiliary = jax.jit(algorithm.auxiliary, donate_argnums=0, out_shardings=placed)
+            self._auxiliary = compiled(algorithm.auxiliary)
         self._evaluators: dict[str, Evaluator] = {}
         if options.num_evals:
             for split, (env, params) in splits.items():

@@ -21,8 +21,8 @@ OBS_MODES = ("pixels", "state", "both")
 _RESET_STREAM = 0
 """Name of the random stream of physics resets, folded into an episode's key."""
 
-_BAND_ROWS = 12
-"""Rows that are drawn at once, about; see `draw_at`."""
+_BANDS = 2
+"""Parts in which a picture is drawn, one above the other; a loop of one turn would be none."""
 
 
 class PixelEnv:
@@ -283,17 +283,25 @@ class PixelEnv:
         scene = self._scene(state, params)
         # A loop over bands of rows is a wall that XLA does not fuse across: without it the
         # renderer is fused into whoever reads the words, and runs again for every reader.
-        num_bands = max(2, round(height / _BAND_ROWS))
-        rows = -(-height // num_bands)
+        rows = -(-height // _BANDS)
 
-        def band(first_row: jax.Array) -> jax.Array:
+        def draw_band(first_row: jax.Array) -> jax.Array:
             frame = render(scene, height, width, self.renderer, first_row=first_row, num_rows=rows)
             # The last band may reach beyond the picture.
             within = jnp.minimum(first_row + jnp.arange(rows), height - 1)
             backdrops = self.distractors.backdrops(state.distraction, params, within, height, width)
             return observe.pack(self.distractors.change_frame(state.distraction, frame, backdrops))
 
-        words = jax.lax.map(band, jnp.arange(num_bands) * rows)
+        def draw_band_apart(first_row: jax.Array) -> jax.Array:
+            # On a CPU, XLA runs in one thread whatever is fused into the write to a loop's
+            # result. It fuses nothing across a conditional either.
+            blank = jnp.zeros((rows, width), jnp.uint32)
+            return jax.lax.cond(first_row >= 0, draw_band, lambda _: blank, first_row)
+
+        def band(first_row: jax.Array) -> jax.Array:
+            return jax.lax.platform_dependent(first_row, cpu=draw_band_apart, default=draw_band)
+
+        words = jax.lax.map(band, jnp.arange(_BANDS) * rows)
         return words.reshape(-1, width)[:height]
 
     def show(self, state: EnvState, params: EnvParams, first: jax.Array) -> EnvState:

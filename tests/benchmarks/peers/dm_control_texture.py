@@ -5,7 +5,7 @@ and uploads it to OpenGL. This measures DM Control's pixels with and without suc
 in an environment of its own, for dm_control wants another MuJoCo than PixelBrax:
 
     python -m venv /tmp/dmc && /tmp/dmc/bin/pip install "dm_control==1.0.50" "mujoco==3.17.0"
-    MUJOCO_GL=osmesa /tmp/dmc/bin/python tests/benchmarks/dm_control_texture.py
+    MUJOCO_GL=osmesa /tmp/dmc/bin/python tests/benchmarks/peers/dm_control_texture.py
 
 It needs an OpenGL library, e.g. Debian's libosmesa6.
 """

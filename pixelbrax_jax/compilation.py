@@ -1,0 +1,38 @@
+"""How XLA is asked to compile programs that draw pictures."""
+
+from __future__ import annotations
+
+import os
+from functools import cache
+
+import jax
+
+_WIDTH = "xla_cpu_prefer_vector_width"
+
+
+@cache
+def compiler_options() -> dict[str, int]:
+    """Options of ``jax.jit`` that make pictures fast on the default device.
+
+    XLA holds back on CPUs with AVX-512 and computes with vectors of 256 bits; with 512 the
+    ray-caster is up to twice as fast there. All other devices need nothing. Whatever PixelBrax
+    compiles by itself for the Gymnasium, TorchRL and Stable-Baselines3 environments and for its
+    agents has these options. A program of your own gets them at its outermost ``jax.jit``, the
+    only one that takes options:
+
+        step = jax.jit(env.step, compiler_options=pixelbrax_jax.compiler_options())
+
+    Options change how XLA rounds: the same program with and without them agrees to rounding
+    errors, not to the bit. A width that ``XLA_FLAGS`` names is kept, for every program alike.
+
+    Returns:
+        The options; empty where there is nothing to gain.
+    """
+    if jax.default_backend() != "cpu" or _WIDTH in os.environ.get("XLA_FLAGS", ""):
+        return {}
+    options = {_WIDTH: 512}
+    try:
+        jax.jit(lambda x: x, compiler_options=options).lower(0).compile()
+    except jax.errors.JaxRuntimeError:  # an XLA that no longer knows the option
+        return {}
+    return options

@@ -1,0 +1,1 @@
+"""Other simulators that draw pictures, each measured in an environment of its own."""

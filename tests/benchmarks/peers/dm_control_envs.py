@@ -1,0 +1,135 @@
+"""DM Control at 84 x 84: one environment alone, or many under Stable-Baselines3's SubprocVecEnv.
+
+    python dm_control_envs.py '{"domain": "cheetah", "processes": 8}'
+
+Each environment step is one control step with one picture; under SubprocVecEnv the last three are
+stacked. Exits with 3 where no OpenGL works.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+TASKS = {"cheetah": "run", "walker": "walk", "quadruped": "walk", "humanoid": "walk"}
+REPETITIONS, SECONDS, SIZE = 5, 3.0, 84
+
+
+def load(domain: str, seed: int) -> Any:
+    from dm_control import suite
+
+    return suite.load(domain, TASKS[domain], task_kwargs={"random": seed})
+
+
+def opengl() -> str:
+    """Chooses an OpenGL that works; the name of its renderer."""
+    import subprocess
+
+    probe = (
+        "from dm_control import suite\n"
+        "from OpenGL import GL\n"
+        "physics = suite.load('cheetah', 'run').physics\n"
+        "physics.render(8, 8)\n"
+        "with physics.contexts.gl.make_current() as context:\n"
+        "    print(context.call(GL.glGetString, GL.GL_RENDERER).decode())\n"
+    )
+    why = ""
+    for name in [os.environ["MUJOCO_GL"]] if "MUJOCO_GL" in os.environ else ["egl", "osmesa"]:
+        environ = os.environ | {"MUJOCO_GL": name}
+        done = subprocess.run(
+            [sys.executable, "-c", probe], env=environ, capture_output=True, text=True, check=False
+        )
+        if done.returncode == 0:
+            os.environ["MUJOCO_GL"] = name
+            return f"{name}: {done.stdout.strip().splitlines()[-1]}"
+        why = done.stderr.strip().splitlines()[-1]
+    print(f"no OpenGL works: {why}", file=sys.stderr)
+    sys.exit(3)
+
+
+def alone(domain: str) -> Callable[[], int]:
+    """One environment in this process; the function takes one step."""
+    env = load(domain, 0)
+    env.reset()
+    spec, rng = env.action_spec(), np.random.default_rng(0)
+
+    def step() -> int:
+        if env.step(rng.uniform(spec.minimum, spec.maximum)).last():
+            env.reset()
+        env.physics.render(SIZE, SIZE, camera_id=0)
+        return 1
+
+    return step
+
+
+def vectorised(domain: str, processes: int) -> Callable[[], int]:
+    """Environments in processes of their own; the function takes one step of all."""
+    import gymnasium
+    from stable_baselines3.common.vec_env import SubprocVecEnv, VecFrameStack
+
+    class Env(gymnasium.Env):
+        def __init__(self, seed: int) -> None:
+            self.env = load(domain, seed)
+            spec = self.env.action_spec()
+            self.action_space = gymnasium.spaces.Box(
+                spec.minimum.astype(np.float32), spec.maximum.astype(np.float32)
+            )
+            self.observation_space = gymnasium.spaces.Box(0, 255, (SIZE, SIZE, 3), np.uint8)
+
+        def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+            self.env.reset()
+            return self.env.physics.render(SIZE, SIZE, camera_id=0), {}
+
+        def step(self, action: np.ndarray) -> Any:
+            step = self.env.step(action)
+            picture = self.env.physics.render(SIZE, SIZE, camera_id=0)
+            return picture, float(step.reward or 0.0), False, bool(step.last()), {}
+
+    makers = [lambda seed=seed: Env(seed) for seed in range(processes)]
+    envs = VecFrameStack(SubprocVecEnv(makers), 3, channels_order="last")
+    envs.reset()
+    rng = np.random.default_rng(0)
+    low, high = envs.action_space.low, envs.action_space.high
+
+    def step() -> int:
+        envs.step(rng.uniform(low, high, (processes, *low.shape)).astype(np.float32))
+        return processes
+
+    return step
+
+
+def main() -> None:
+    arguments = json.loads(sys.argv[1])
+    renderer = opengl()
+    domain, processes = arguments["domain"], arguments["processes"]
+    processes = len(os.sched_getaffinity(0)) if processes == "cores" else processes
+    step = vectorised(domain, processes) if processes else alone(domain)
+    rates = []
+    for repetition in range(1 + REPETITIONS):
+        steps, started = 0, time.perf_counter()
+        while time.perf_counter() - started < SECONDS:
+            steps += step()
+        if repetition:  # the first one warms up
+            rates.append(steps / (time.perf_counter() - started))
+    env = load(domain, 0)
+    from importlib.metadata import version
+
+    values = {
+        "steps_per_second": float(np.median(rates)),
+        "speed": {"median": float(np.median(rates)), "slowest": min(rates), "fastest": max(rates)},
+        "processes": processes,
+        "control_dt": env.control_timestep(),
+        "opengl": renderer,
+        "versions": {name: version(name) for name in ("dm_control", "mujoco")},
+    }
+    print(json.dumps({"values": values}))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,51 @@
+"""An environment for each peer, made when it is first needed."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+
+from tests.benchmarks.cases import PEERS
+
+HOME = Path(__file__).parents[3] / ".venv-peers"
+
+
+class AbsentError(Exception):
+    """A peer that does not run here, with the reason."""
+
+
+@cache
+def peer_python(peer: str) -> str:
+    """The Python that has the peer.
+
+    Args:
+        peer: a key of ``PEERS``.
+
+    Returns:
+        The path of the interpreter.
+
+    Raises:
+        AbsentError: the peer cannot be installed.
+    """
+    home = HOME / peer
+    python = home / "bin" / "python"
+    mark = home / ".installed"
+    wanted = "\n".join(PEERS[peer])
+    if mark.exists() and mark.read_text() == wanted:
+        return str(python)
+    print(f"Installing {peer} into {home} ...", flush=True)
+    try:
+        subprocess.run([sys.executable, "-m", "venv", str(home)], check=True, capture_output=True)
+        subprocess.run(
+            [str(python), "-m", "pip", "install", "--quiet", *PEERS[peer]],
+            check=True,
+            capture_output=True,
+            text=True,
+        )
+    except (OSError, subprocess.CalledProcessError) as error:
+        lines = str(getattr(error, "stderr", "") or error).strip().splitlines()
+        raise AbsentError(f"cannot be installed: {lines[-1] if lines else error}") from error
+    mark.write_text(wanted)
+    return str(python)

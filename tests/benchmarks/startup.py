@@ -1,0 +1,63 @@
+"""Seconds from the import to the first frames."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+SCRIPT = """
+import json, time
+marks = {}
+started = time.perf_counter()
+
+def mark(name):
+    global started
+    now = time.perf_counter()
+    marks[name], started = now - started, time.perf_counter()
+
+import gymnasium
+import pixelbrax_gym
+mark("import")
+envs = gymnasium.make_vec("PixelBrax/TASK-v0", num_envs=16)
+mark("make")
+envs.reset(seed=0)
+mark("first reset")
+envs.step(envs.action_space.sample())
+mark("first step")
+again = gymnasium.make_vec("PixelBrax/TASK-v0", num_envs=16)
+again.reset(seed=0)
+again.step(again.action_space.sample())
+mark("make, reset and step once more")
+print(json.dumps(marks))
+"""
+
+
+def first_frame(task: str, cache: str) -> dict[str, Any]:
+    """Seconds of each stage with 16 environments behind Gymnasium.
+
+    Args:
+        task: the task.
+        cache: JAX's persistent compilation cache: ``"none"``, ``"cold"`` (empty at the start)
+            or ``"warm"`` (filled by an earlier process).
+    """
+    from tests.benchmarks.cases import TASKS
+
+    with tempfile.TemporaryDirectory() as folder:
+        environ = {k: v for k, v in os.environ.items() if not k.startswith("JAX_COMPILATION")}
+        if cache != "none":
+            environ["JAX_COMPILATION_CACHE_DIR"] = str(Path(folder) / "programs")
+            environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.3"
+        for _ in range(2 if cache == "warm" else 1):
+            done = subprocess.run(
+                [sys.executable, "-c", SCRIPT.replace("TASK", TASKS[task])],
+                env=environ,
+                capture_output=True,
+                text=True,
+                check=True,
+            )
+    return {"seconds": json.loads(done.stdout.strip().splitlines()[-1])}

@@ -1,0 +1,191 @@
+"""Frames and steps per second of the renderer and of the environments."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import pixelbrax_jax as pb
+
+REPETITIONS = 5
+SECONDS = 0.5
+"""Least duration of a repetition."""
+
+
+def compiled(function: Callable, *arguments: Any, **jit_options: Any) -> tuple[Any, float]:
+    """The compiled program and the seconds it took to trace and compile."""
+    started = time.perf_counter()
+    options = pb.compiler_options()
+    program = jax.jit(function, compiler_options=options, **jit_options).lower(*arguments).compile()
+    return program, time.perf_counter() - started
+
+
+def rate(run: Callable[[int], Any], least: int = 1) -> dict[str, float]:
+    """Calls per second.
+
+    Args:
+        run: does so many calls and returns something to wait for.
+        least: calls of a repetition, at least.
+
+    Returns:
+        Median, slowest and fastest repetition, and the calls of each.
+    """
+    jax.block_until_ready(run(1))
+    calls = least
+    while True:
+        started = time.perf_counter()
+        jax.block_until_ready(run(calls))
+        seconds = time.perf_counter() - started
+        if seconds >= SECONDS:
+            break
+        calls = max(calls + 1, int(calls * min(10.0, 1.1 * SECONDS / max(seconds, 1e-6))))
+    rates = []
+    for _ in range(REPETITIONS):
+        started = time.perf_counter()
+        jax.block_until_ready(run(calls))
+        rates.append(calls / (time.perf_counter() - started))
+    return {
+        "median": float(np.median(rates)),
+        "slowest": min(rates),
+        "fastest": max(rates),
+        "calls": calls,
+    }
+
+
+def of_program(program: Any, per: int) -> dict[str, float]:
+    """What the compiler says of a program, for each of ``per`` frames or environments."""
+    memory, cost = program.memory_analysis(), program.cost_analysis() or {}
+    return {
+        "temporary_bytes": memory.temp_size_in_bytes / per,
+        "output_bytes": memory.output_size_in_bytes / per,
+        "argument_bytes": memory.argument_size_in_bytes / per,
+        "operations": cost.get("flops", float("nan")) / per,
+        "bytes_accessed": cost.get("bytes accessed", float("nan")) / per,
+    }
+
+
+def renderer(
+    task: str,
+    num_envs: int,
+    size: int = 84,
+    look: str = "default",
+    shadows: bool = False,
+    renderer: str = "fused",
+) -> dict[str, Any]:
+    """The ray-caster alone: packed words from link poses."""
+    env, params = pb.make(
+        task, look=look, shadows=shadows, height=size, width=size, renderer=renderer
+    )
+    states = first_states(env, params, num_envs)
+    program, compile_seconds = compiled(jax.vmap(env.draw, in_axes=(0, None)), states, params)
+
+    def run(calls: int) -> Any:
+        for _ in range(calls):
+            words = program(states, params)
+        return words
+
+    speed = rate(run)
+    return {
+        "frames_per_second": num_envs * speed["median"],
+        "speed": speed,
+        "compile_seconds": compile_seconds,
+        "per_frame": of_program(program, num_envs),
+    }
+
+
+def first_states(env: pb.PixelEnv, params: Any, num_envs: int) -> Any:
+    """States at the start of an episode, without key and frames, which drawing does not read."""
+    keys = jax.random.split(jax.random.key(0), num_envs)
+    begin = jax.jit(jax.vmap(lambda key: env.begin(key, jnp.uint32(0), params)))
+    return begin(keys).replace(key=None, frames=None)
+
+
+def scan(
+    task: str,
+    num_envs: int,
+    obs_mode: str = "pixels",
+    size: int = 84,
+    distractors: str | None = None,
+) -> dict[str, Any]:
+    """Environment steps in one compiled loop, with drawn actions and autoreset.
+
+    Every frame enters the frame stack, which is the loop's state: none can be left out.
+    """
+    env, params = pb.make(
+        task,
+        obs_mode=obs_mode,
+        height=size,
+        width=size,
+        distractors=(distractors,) if distractors else (),
+    )
+    venv = pb.VectorPixelEnv(env, num_envs)
+    state, timestep = venv.reset(jax.random.key(0), params)
+
+    def steps(state: Any, key: jax.Array, params: Any, count: jax.Array) -> Any:
+        def step(_: jax.Array, carry: Any) -> Any:
+            state, key, total = carry
+            key, draw = jax.random.split(key)
+            shape = (num_envs, env.action_size)
+            action = jax.random.uniform(draw, shape, minval=-1.0, maxval=1.0)
+            state, timestep = venv.step(state, action, params)
+            return state, key, total + timestep.reward.sum()
+
+        return jax.lax.fori_loop(0, count, step, (state, key, jnp.float32(0.0)))
+
+    key = jax.random.key(1)
+    program, compile_seconds = compiled(steps, state, key, params, jnp.int32(1), donate_argnums=0)
+    held = sum(leaf.nbytes for leaf in jax.tree.leaves((state, timestep)) if leaf.ndim)
+    carry = {"state": state, "key": key}
+
+    def run(calls: int) -> Any:
+        carry["state"], carry["key"], total = program(
+            carry["state"], carry["key"], params, jnp.int32(calls)
+        )
+        return total
+
+    speed = rate(run)
+    memory = program.memory_analysis()
+    return {
+        "steps_per_second": num_envs * speed["median"],
+        "speed": speed,
+        "compile_seconds": compile_seconds,
+        "backend": env.physics.backend,
+        "control_dt": env.dt,
+        "bytes_per_env": held / num_envs,
+        "temporary_bytes_per_env": memory.temp_size_in_bytes / num_envs,
+    }
+
+
+def sharded(task: str, num_devices: int, num_envs: int = 256) -> dict[str, Any]:
+    """Environments spread over devices; on a CPU these are emulated and share its cores."""
+    from pixelbrax_jax.envs.sharded import ShardedVectorEnv, make_env_mesh
+
+    if jax.device_count() < num_devices:
+        raise RuntimeError(f"there are {jax.device_count()} devices, not {num_devices}.")
+    env, params = pb.make(task)
+    venv = ShardedVectorEnv(env, num_envs, make_env_mesh(num_devices))
+    state, timestep = venv.reset(jax.random.key(0), params)
+    shape = (num_envs, env.action_size)
+    action = jax.random.uniform(jax.random.key(1), shape, minval=-1.0, maxval=1.0)
+    carry = {"state": state}
+
+    def run(calls: int) -> Any:
+        for _ in range(calls):
+            carry["state"], timestep = venv.step(carry["state"], action, params)
+        return timestep
+
+    speed = rate(run)
+    on_each = sum(
+        leaf.addressable_shards[0].data.nbytes for leaf in jax.tree.leaves((state, timestep))
+    )
+    return {
+        "steps_per_second": num_envs * speed["median"],
+        "speed": speed,
+        "num_envs": num_envs,
+        "bytes_on_a_device": on_each,
+    }

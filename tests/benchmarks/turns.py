@@ -1,0 +1,228 @@
+"""Comparisons within one process, where all take turns.
+
+A change of the machine's mood then strikes everyone alike, so that ratios hold where speeds do
+not.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Hashable, Mapping
+from typing import Any
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import torch
+
+import pixelbrax_gym
+import pixelbrax_jax as pb
+from pixelbrax_jax.distractors import Camera, ClipBank, Color, Video
+from tests.benchmarks.cases import TASKS
+
+SECONDS = 60.0
+"""About how long the turns of a comparison take altogether."""
+
+
+def take_turns(runners: Mapping[Hashable, Callable[[], Any]]) -> dict[Any, list[float]]:
+    """Seconds of each runner's turns: at least five, at most 25."""
+    for run in runners.values():
+        run()
+    started = time.perf_counter()
+    times: dict[Any, list[float]] = {key: [] for key in runners}
+    turns = 0
+    while turns < 5 or (turns < 25 and time.perf_counter() - started < SECONDS):
+        turns += 1
+        for key, run in runners.items():
+            began = time.perf_counter()
+            run()
+            times[key].append(time.perf_counter() - began)
+    return times
+
+
+def doors(task: str, num_envs: int) -> list[dict[str, Any]]:
+    """Steps per second of every door to PyTorch, and of the functional environment in Python.
+
+    ``ratio`` is the median of a door's speed over that of the functional loop with the same
+    autoreset mode that waits for each step as the door does. All see the same actions and the same
+    episodes.
+    """
+    calls = max(1, min(20, 2560 // num_envs))
+    action_size = pb.make(task)[0].action_size
+    shape = (calls, num_envs, action_size)
+    actions = np.random.default_rng(0).uniform(-1, 1, shape).astype(np.float32)
+    runners: dict[tuple[str, str], Callable[[], Any]] = {}
+    for mode in ("next_step", "same_step"):
+        runners["JAX loop", mode] = _jax_loop(task, num_envs, mode, actions, waits=True)
+        runners["JAX loop, never waiting", mode] = _jax_loop(
+            task, num_envs, mode, actions, waits=False
+        )
+    for output in ("jax", "torch", "numpy"):
+        runners[f"Gymnasium, {output}", "next_step"] = _gymnasium(task, num_envs, output, actions)
+    runners["TorchRL, _step", "same_step"] = _torchrl(task, num_envs, actions, whole=False)
+    runners["TorchRL, step_and_maybe_reset", "same_step"] = _torchrl(
+        task, num_envs, actions, whole=True
+    )
+    runners["Stable-Baselines3", "same_step"] = _sb3(task, num_envs, actions)
+    times = take_turns(runners)
+    return [
+        {
+            "door": name,
+            "autoreset_mode": mode,
+            "steps_per_second": num_envs * calls / float(np.median(seconds)),
+            "ratio": float(np.median(np.divide(times["JAX loop", mode], seconds))),
+            "turns": len(seconds),
+        }
+        for (name, mode), seconds in times.items()
+    ]
+
+
+def _jax_loop(
+    task: str, num_envs: int, mode: str, actions: np.ndarray, *, waits: bool
+) -> Callable[[], Any]:
+    env, params = pb.make(task)
+    params = jax.device_put(params)
+    venv = pb.VectorPixelEnv(env, num_envs, mode)
+    step = jax.jit(venv.step, donate_argnums=0, compiler_options=pb.compiler_options())
+    keys = jax.vmap(jax.random.key)(jnp.arange(num_envs))
+    carry = {"state": venv.reset(keys, params)[0]}
+    own = [jax.device_put(action) for action in actions]
+
+    def run() -> Any:
+        for action in own:
+            carry["state"], timestep = step(carry["state"], action, params)
+            if waits:
+                jax.block_until_ready(timestep)
+        return jax.block_until_ready(timestep)
+
+    return run
+
+
+def _gymnasium(task: str, num_envs: int, output: str, actions: np.ndarray) -> Callable[[], Any]:
+    name = f"PixelBrax/{TASKS[task]}-v0"
+    envs = gymnasium.make_vec(name, num_envs=num_envs, output=output)
+    first, _ = envs.reset(seed=0)
+    convert: dict[str, Callable[[np.ndarray], Any]] = {
+        "jax": jax.device_put,
+        "torch": lambda action: torch.from_numpy(action).to(first.device),
+        "numpy": np.asarray,
+    }
+    own = [convert[output](action) for action in actions]
+
+    def run() -> Any:
+        for action in own:
+            obs = envs.step(action)[0]
+            if output == "jax":
+                jax.block_until_ready(obs)
+            elif output == "torch":
+                _wait_for_torch()
+        return obs
+
+    return run
+
+
+def _torchrl(task: str, num_envs: int, actions: np.ndarray, *, whole: bool) -> Callable[[], Any]:
+    env = pixelbrax_gym.PixelBraxTorchRLEnv(task, num_envs)
+    env.set_seed(0)
+    carry = {"td": env.reset()}
+    own = [torch.from_numpy(action).to(env.device) for action in actions]
+
+    def run() -> Any:
+        for action in own:
+            td = carry["td"].set("action", action)
+            if whole:
+                _, carry["td"] = env.step_and_maybe_reset(td)
+            else:
+                stepped = env._step(td)
+                if stepped["done"].any():
+                    stepped = env._reset(stepped.select("done").set("_reset", stepped["done"]))
+                carry["td"] = stepped
+            _wait_for_torch()
+        return carry["td"]
+
+    return run
+
+
+def _sb3(task: str, num_envs: int, actions: np.ndarray) -> Callable[[], Any]:
+    env = pixelbrax_gym.PixelBraxSB3VecEnv(task, num_envs)
+    env.seed(0)
+    env.reset()
+
+    def run() -> Any:
+        for action in actions:
+            obs = env.step(action)[0]
+        return obs
+
+    return run
+
+
+def _wait_for_torch() -> None:
+    """On a CPU a tensor is complete when it is handed out."""
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
+
+
+CHAINS = {
+    "none": (),
+    "color, each frame": (Color(),),
+    "color, each material": (Color("geom", "walk", 0.2, "uniform"),),
+    "video overlay": (Video(mode="overlay"),),
+    "video background": (Video(ground_alpha=0.3),),
+    "camera": (Camera(scale=0.2),),
+    "all three": (Color(), Video(ground_alpha=0.3), Camera(scale=0.2)),
+}
+
+
+def synthetic_bank(size: int = 84) -> ClipBank:
+    """As many frames as DAVIS-2017's training split has at most: 60 clips of 70."""
+    frames = np.random.default_rng(0).integers(0, 256, (60 * 70, size, size, 3), dtype=np.uint8)
+    length = np.full(60, 70, np.int32)
+    return ClipBank(frames, length, tuple(map(str, range(60))), "noise", "train")
+
+
+def distractors(task: str, num_envs: int) -> list[dict[str, Any]]:
+    """Steps per second with and without distractors.
+
+    What else goes on in a machine disturbs turns by more than distractors cost. So there are two
+    ratios: of the medians, and of the fastest turns, which were disturbed least.
+    """
+    calls = max(1, 2048 // num_envs)
+    bank = synthetic_bank()
+    started = time.perf_counter()
+    jax.block_until_ready(bank.to_device().words)
+    upload_seconds = time.perf_counter() - started
+    runners = {}
+    for name, links in CHAINS.items():
+        plays = any(isinstance(link, Video) for link in links)
+        env, params = pb.make(task, distractors=links, clips=bank if plays else None)
+        runners[name] = _stepper(env, jax.device_put(params), num_envs, calls)
+    times = take_turns(runners)
+    clean = times["none"]
+    return [
+        {
+            "distractors": name,
+            "steps_per_second": num_envs * calls / float(np.median(seconds)),
+            "ratio": float(np.median(clean) / np.median(seconds)),
+            "ratio_of_fastest": min(clean) / min(seconds),
+            "turns": len(seconds),
+            "bank_bytes": bank.device_bytes,
+            "bank_upload_seconds": upload_seconds,
+        }
+        for name, seconds in times.items()
+    ]
+
+
+def _stepper(env: Any, params: Any, num_envs: int, calls: int) -> Callable[[], Any]:
+    venv = pb.VectorPixelEnv(env, num_envs)
+    step = jax.jit(venv.step, donate_argnums=0, compiler_options=pb.compiler_options())
+    shape = (calls, num_envs, env.action_size)
+    actions = list(jax.random.uniform(jax.random.key(1), shape, minval=-1.0, maxval=1.0))
+    carry = {"state": venv.reset(jax.random.key(0), params)[0]}
+
+    def run() -> Any:
+        for action in actions:
+            carry["state"], timestep = step(carry["state"], action, params)
+        return jax.block_until_ready(timestep)
+
+    return run
