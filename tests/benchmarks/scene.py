@@ -18,7 +18,7 @@ def describe(task: str) -> dict[str, Any]:
 
     Returns:
         ``xml``; ``pos`` (3,) metres and ``quat`` (4,) of the camera in the world frame; ``fovy``
-        in degrees.
+        in degrees; ``qpos``, the joints' positions then.
     """
     file = Path(brax.envs.__file__).parent / "assets" / f"{_FILES.get(task, task)}.xml"
     env, params = pb.make(task)
@@ -32,6 +32,7 @@ def describe(task: str) -> dict[str, Any]:
         "pos": np.asarray(scene.camera.pos).tolist(),
         "quat": quat.tolist(),
         "fovy": float(scene.camera.fovy),
+        "qpos": np.asarray(physics.engine.pipeline.q).tolist(),
     }
 
 

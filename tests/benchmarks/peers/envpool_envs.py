@@ -5,8 +5,10 @@ python envpool_envs.py '{"task": "ant"}'
 
 from __future__ import annotations
 
+import ctypes.util
 import json
 import os
+import subprocess
 import sys
 import time
 
@@ -21,8 +23,27 @@ IDS = {
 REPETITIONS, SECONDS, SIZE = 5, 3.0, 84
 
 
+def with_opengl() -> None:
+    """Runs this script again for each OpenGL until one works, and ends as that run did."""
+    why = "there is no libEGL and no libOSMesa"
+    for library in filter(None, map(ctypes.util.find_library, ("EGL", "OSMesa"))):
+        environ = os.environ | {"LD_PRELOAD": library, "PIXELBRAX_OPENGL": library}
+        done = subprocess.run(
+            [sys.executable, *sys.argv], env=environ, capture_output=True, text=True, check=False
+        )
+        if done.returncode == 0:
+            print(done.stdout.strip().splitlines()[-1])
+            sys.exit(0)
+        why = (done.stderr or done.stdout).strip().splitlines()[-1]
+    print(f"no OpenGL works: {why}", file=sys.stderr)
+    sys.exit(3)
+
+
 def main() -> None:
     from importlib.metadata import version
+
+    if "PIXELBRAX_OPENGL" not in os.environ:
+        with_opengl()
 
     name = IDS[json.loads(sys.argv[1])["task"]]
     try:
@@ -63,6 +84,7 @@ def main() -> None:
             },
             "num_envs": num_envs,
             "observation": list(np.shape(first)),
+            "opengl": os.environ["PIXELBRAX_OPENGL"],
             "versions": {"envpool": version("envpool")},
         }
         if best is None or values["steps_per_second"] > best["steps_per_second"]:
