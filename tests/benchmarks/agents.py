@@ -2,8 +2,9 @@
 
     python -m tests.benchmarks.agents --output docs/benchmarks/agents runs/ppo runs/ppg runs/dcpg
 
-Each folder is the output of one ``pixelbrax train``. Curves are means of the returns of episodes
-that ended in training; nothing is smoothed.
+Each argument is the output folder of one ``pixelbrax train``, or the JSON of an earlier call, whose
+runs are kept. Curves are means of the returns of episodes that ended in training; nothing is
+smoothed.
 """
 
 from __future__ import annotations
@@ -13,6 +14,8 @@ import json
 import platform
 from importlib.metadata import version
 from pathlib import Path
+
+import numpy as np
 
 from pixelbrax_jax.agents.checkpoint import read_about
 from pixelbrax_jax.agents.metrics import read_metrics
@@ -38,23 +41,41 @@ def curve_of(folder: Path) -> dict:
     }
 
 
+def name_of(curve: dict) -> str:
+    """What all seeds of an experiment share."""
+    config = curve["config"]
+    behind = "".join(f", {name}" for name in config["distractors"])
+    return f"{curve['algorithm'].upper()}, {config['task']}{behind}"
+
+
 def plot(curves: list[dict], path: Path) -> None:
-    """Return over steps, a line for each run."""
+    """Return over steps: a thin line for each run, a thick one for the mean over seeds."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(figsize=(6, 3.6), layout="constrained")
-    for curve in curves:
-        config = curve["config"]
-        behind = "".join(f", {name}" for name in config["distractors"])
-        label = f"{curve['algorithm'].upper()}, {config['task']}{behind}, seed {config['seed']}"
-        axes.plot([s / 1e6 for s in curve["steps"]], curve["return"], label=label)
+    figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")
+    for number, name in enumerate(dict.fromkeys(map(name_of, curves))):
+        runs = [curve for curve in curves if name_of(curve) == name]
+        for run in runs:
+            steps = np.divide(run["steps"], 1e6)
+            axes.plot(steps, run["return"], color=f"C{number}", alpha=0.35, linewidth=0.8)
+        common = np.linspace(
+            max(run["steps"][0] for run in runs), min(run["steps"][-1] for run in runs), 60
+        )
+        mean = np.mean([np.interp(common, run["steps"], run["return"]) for run in runs], axis=0)
+        count = f"{len(runs)} seeds" if len(runs) > 1 else "1 seed"
+        axes.plot(common / 1e6, mean, color=f"C{number}", label=f"{name}, {count}")
     axes.set(xlabel="million control steps", ylabel="return of training episodes")
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
     figure.savefig(path, dpi=150)
+
+
+def runs_of(path: Path) -> list[dict]:
+    """The run of a folder, or those of an earlier call's JSON."""
+    return json.loads(path.read_text())["runs"] if path.suffix == ".json" else [curve_of(path)]
 
 
 def main() -> None:
@@ -62,12 +83,13 @@ def main() -> None:
     parser.add_argument("runs", nargs="+", type=Path)
     parser.add_argument("--output", type=Path, required=True, help="without .json or .png")
     options = parser.parse_args()
-    curves = [curve_of(folder) for folder in options.runs]
+    curves = [curve for path in options.runs for curve in runs_of(path)]
     about = {"jax": version("jax"), "brax": version("brax"), "machine": platform.machine()}
     options.output.with_suffix(".json").write_text(json.dumps({"about": about, "runs": curves}))
     plot(curves, options.output.with_suffix(".png"))
     for curve in curves:
-        print(curve["algorithm"], curve["steps_per_second"], "steps/s", curve["evaluation"])
+        speed = f"{curve['steps_per_second']} steps/s"
+        print(name_of(curve), "seed", curve["config"]["seed"], speed, curve["evaluation"])
 
 
 if __name__ == "__main__":
