@@ -1,0 +1,81 @@
+"""Environments over eight devices are those of one device, an eighth on each."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+pytestmark = pytest.mark.slow
+
+SCRIPT = """
+import json, re
+import jax, numpy as np
+import pixelbrax_jax as pb
+from pixelbrax_jax.envs.sharded import ShardedVectorEnv, make_env_mesh
+
+env, params = pb.make("inverted_pendulum", height=16, width=16, frame_stack=2, obs_mode="both")
+NUM_ENVS = 16
+actions = jax.random.uniform(jax.random.key(1), (8, NUM_ENVS, 1), minval=-1.0, maxval=1.0)
+
+def rollout(venv):
+    state, timestep = venv.reset(jax.random.key(0), params)
+    steps = [timestep]
+    for action in actions:
+        state, timestep = venv.step(state, action, params)
+        steps.append(timestep)
+    return state, steps
+
+spread = ShardedVectorEnv(env, NUM_ENVS, make_env_mesh(8))
+state, steps = rollout(spread)
+_, alone = rollout(pb.VectorPixelEnv(env, NUM_ENVS))
+bytes_of = lambda tree, size: sum(size(leaf) for leaf in jax.tree.leaves(tree))
+text = jax.jit(spread.step).lower(state, actions[0], params).compile().as_text()
+far = max(
+    float(np.abs(np.asarray(a.obs["state"]) - np.asarray(b.obs["state"])).max())
+    for a, b in zip(steps, alone)
+)
+pixels = [np.asarray(s.obs["pixels"]).astype(int) for s in steps]
+others = [np.asarray(s.obs["pixels"]).astype(int) for s in alone]
+print(json.dumps({
+    "devices": jax.device_count(),
+    "far": far,
+    "pixels_that_differ": float(np.mean([a != b for a, b in zip(pixels, others)])),
+    "flags": all(bool((np.asarray(a.terminated) == np.asarray(b.terminated)).all())
+                 for a, b in zip(steps, alone)),
+    "all_bytes": bytes_of((state, steps[-1]), lambda leaf: leaf.nbytes),
+    "bytes_of_one": bytes_of((state, steps[-1]),
+                             lambda leaf: leaf.addressable_shards[0].data.nbytes),
+    "collectives": re.findall(r"all-reduce|all-gather|all-to-all|collective-permute", text),
+}))
+"""
+
+
+@pytest.fixture(scope="module")
+def told():
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=8"
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT],
+        env=os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    return json.loads(done.stdout.strip().splitlines()[-1])
+
+
+def test_environments_are_the_same(told):
+    assert told["devices"] == 8
+    assert told["flags"]
+    assert told["far"] < 1e-4
+    assert told["pixels_that_differ"] < 0.01
+
+
+def test_each_device_holds_its_own_and_asks_nobody(told):
+    assert told["bytes_of_one"] * 8 == told["all_bytes"]
+    assert told["collectives"] == []
