@@ -51,7 +51,7 @@ docs-serve: $(VENV)/.installed-docs ## read the documentation in a browser while
 	NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs serve
 
 clean: ## remove the environment, builds and caches; keeps runs/
-	rm -rf $(VENV) .venv-ci build dist site .jax_cache .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) .venv-ci .venv-peers build dist site .jax_cache .mypy_cache .pytest_cache .ruff_cache
 	find pixelbrax_jax pixelbrax_gym tests examples -name __pycache__ -prune -exec rm -rf {} +
 
 # One environment for all; each set of extras is installed when it is first needed, and again

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import os
 import subprocess
 import sys
 from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -146,8 +148,12 @@ def _bench(arguments: list[str]) -> int:
             "it and run: make bench\n"
         )
         return 1
+    if not all(map(find_spec, ("matplotlib", "tqdm", "stable_baselines3", "torchrl"))):
+        sys.stderr.write(f"pixelbrax bench: it needs more packages; try: {install_extra('all')}\n")
+        return 1
+    path = os.pathsep.join(filter(None, (str(root), os.environ.get("PYTHONPATH"))))
     command = [sys.executable, "-m", "tests.benchmarks.run", *arguments]
-    return subprocess.run(command, cwd=root, check=False).returncode
+    return subprocess.run(command, env=os.environ | {"PYTHONPATH": path}, check=False).returncode
 
 
 def _version() -> str:

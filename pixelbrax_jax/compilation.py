@@ -10,12 +10,12 @@ import jax
 _WIDTH = "xla_cpu_prefer_vector_width"
 
 
-@cache
 def compiler_options() -> dict[str, int]:
     """Options of ``jax.jit`` that make pictures fast on the default device.
 
     XLA holds back on CPUs with AVX-512 and computes with vectors of 256 bits; with 512 the
-    ray-caster is up to twice as fast there. All other devices need nothing. Whatever PixelBrax
+    ray-caster is up to twice as fast there. Other CPUs have no such vectors and are not affected;
+    other devices need no options. Whatever PixelBrax
     compiles by itself for the Gymnasium, TorchRL and Stable-Baselines3 environments and for its
     agents has these options. A program of your own gets them at its outermost ``jax.jit``, the
     only one that takes options:
@@ -26,13 +26,18 @@ def compiler_options() -> dict[str, int]:
     errors, not to the bit. A width that ``XLA_FLAGS`` names is kept, for every program alike.
 
     Returns:
-        The options; empty where there is nothing to gain.
+        The options; empty on other devices than CPUs, with a width in ``XLA_FLAGS``, and with an
+        XLA that does not know them.
     """
     if jax.default_backend() != "cpu" or _WIDTH in os.environ.get("XLA_FLAGS", ""):
         return {}
-    options = {_WIDTH: 512}
+    return {_WIDTH: 512} if _is_known(_WIDTH) else {}
+
+
+@cache
+def _is_known(option: str) -> bool:
     try:
-        jax.jit(lambda x: x, compiler_options=options).lower(0).compile()
-    except jax.errors.JaxRuntimeError:  # an XLA that no longer knows the option
-        return {}
-    return options
+        jax.jit(lambda x: x, compiler_options={option: 512}).lower(0).compile()
+    except jax.errors.JaxRuntimeError:
+        return False
+    return True

@@ -33,4 +33,4 @@ def test_an_xla_without_the_option_is_left_alone(monkeypatch):
 
     monkeypatch.setenv("XLA_FLAGS", "")
     monkeypatch.setattr(compilation, "_WIDTH", "xla_cpu_no_such_option")
-    assert compilation.compiler_options.__wrapped__() == {}
+    assert compilation.compiler_options() == {}

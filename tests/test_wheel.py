@@ -43,7 +43,7 @@ print("works", version("pixelbrax"))
 """
 
 
-OURS = ("PYTHONPATH", "VIRTUAL_ENV", "JAX_COMPILATION_CACHE_DIR")
+OURS = ("PYTHONPATH", "VIRTUAL_ENV", "JAX_COMPILATION_CACHE_DIR", "XLA_FLAGS")
 """Variables of the tests' own environment."""
 
 

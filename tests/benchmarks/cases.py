@@ -7,10 +7,33 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-TASKS = {"halfcheetah": "HalfCheetah", "walker2d": "Walker2d", "ant": "Ant", "humanoid": "Humanoid"}
+TASKS = {
+    "halfcheetah": "HalfCheetah",
+    "walker2d": "Walker2d",
+    "ant": "Ant",
+    "humanoid": "Humanoid",
+}
 """Task -> its name in Gymnasium."""
 
+DM_CONTROL = {
+    "halfcheetah": "cheetah",
+    "walker2d": "walker",
+    "ant": "quadruped",
+    "humanoid": "humanoid",
+}
+"""Task -> DM Control's domain of the same class."""
+
 BATCHES = (1, 10, 100, 1000, 4096, 8192)
+
+ORIGINAL = (
+    ("halfcheetah", 4, 12.6),
+    ("halfcheetah", 32, 8.7),
+    ("ant", 4, 4.3),
+    ("humanoid", 4, 4.4),
+    ("walker2d", 4, 13.5),
+)
+"""Task, environments and steps per second of the original (the code of arXiv 2502.00021)
+on two cores of the machine of docs/benchmarks/cpu.md; measured once, apart from this benchmark."""
 
 PEERS: dict[str, tuple[str, ...]] = {
     "dm_control": (
@@ -21,8 +44,8 @@ PEERS: dict[str, tuple[str, ...]] = {
         "torch==2.13.0",
     ),
     "mujoco_warp": ("mujoco-warp==4.0.0", "warp-lang==1.19.0", "mujoco==4.0.0"),
-    "gymnasium": ("gymnasium[mujoco]==1.4.0", "mujoco==3.17.0"),
-    "envpool": ("envpool==1.2.5", "numpy"),
+    "gymnasium": ("gymnasium[mujoco]==1.4.0", "mujoco==3.17.0", "pyopengl"),
+    "envpool": ("envpool==1.2.5",),
 }
 """Peer -> what is installed for it, into an environment of its own."""
 
@@ -36,14 +59,12 @@ class Case:
         measure: ``module.function`` of this package, or ``peers.<name>`` for a script.
         arguments: of that function.
         peer: the peer in whose environment it runs; empty for ours.
-        scene: the task whose model and camera are handed to a peer's script, if any.
     """
 
     group: str
     measure: str
     arguments: Mapping[str, Any] = field(default_factory=dict)
     peer: str = ""
-    scene: str = ""
 
     @property
     def key(self) -> str:
@@ -78,18 +99,26 @@ def sizes() -> Iterator[Case]:
     """Pixels of 64 x 64."""
     for task in TASKS:
         for num_envs in (100, 1000):
-            yield Case("sizes", "throughput.scan", {"task": task, "num_envs": num_envs, "size": 64})
+            where = {"task": task, "num_envs": num_envs, "size": 64}
+            yield Case("sizes", "throughput.scan", where)
+            yield Case("sizes", "throughput.renderer", where)
+
+
+def original() -> Iterator[Case]:
+    """The settings in which the original's speed is known."""
+    for task, num_envs, _ in ORIGINAL:
+        yield Case("original", "throughput.scan", {"task": task, "num_envs": num_envs})
 
 
 def distractors() -> Iterator[Case]:
     """Pixels with each distractor, all taking turns."""
-    for task, num_envs in [("ant", 256), ("ant", 1024), *((t, 1000) for t in TASKS)]:
+    for task, num_envs in [("ant", 256), ("ant", 1024), *((task, 1000) for task in TASKS)]:
         yield Case("distractors", "turns.distractors", {"task": task, "num_envs": num_envs})
 
 
 def doors() -> Iterator[Case]:
     """Every door, all taking turns."""
-    for task, num_envs in [("ant", 256), ("ant", 1), *((t, 1000) for t in TASKS)]:
+    for task, num_envs in [("ant", 256), ("ant", 1), *((task, 1000) for task in TASKS)]:
         yield Case("doors", "turns.doors", {"task": task, "num_envs": num_envs})
 
 
@@ -100,31 +129,26 @@ def startup() -> Iterator[Case]:
 
 
 def devices() -> Iterator[Case]:
-    """The same environments over several emulated devices."""
-    for num_devices in (1, 8):
-        yield Case("devices", "throughput.sharded", {"task": "ant", "num_devices": num_devices})
+    """One device and eight, with as many environments in all, and with as many on each."""
+    for num_devices, num_envs in ((1, 64), (8, 64), (8, 512)):
+        where = {"task": "ant", "num_devices": num_devices, "num_envs": num_envs}
+        yield Case("devices", "throughput.sharded", where)
 
 
 def peers() -> Iterator[Case]:
-    """Others and ourselves, one after the other."""
-    pairs = (("halfcheetah", "cheetah"), ("walker2d", "walker"), ("ant", "quadruped"))
-    for task, domain in (*pairs, ("humanoid", "humanoid")):
+    """Others and ourselves, one after the other; all hand NumPy arrays to Python."""
+    for task in TASKS:
         for num_envs in (256, 1000):
-            where = {"task": task, "num_envs": num_envs}
-            yield Case("peers", "throughput.scan", {**where, "obs_mode": "pixels"})
+            yield Case("peers", "throughput.gymnasium", {"task": task, "num_envs": num_envs})
         for processes in (0, "cores", 32):
-            yield Case(
-                "peers",
-                "peers.dm_control_envs",
-                {"domain": domain, "processes": processes},
-                "dm_control",
-            )
+            where = {"task": task, "domain": DM_CONTROL[task], "processes": processes}
+            yield Case("peers", "peers.dm_control_envs", where, "dm_control")
         yield Case("peers", "peers.gymnasium_envs", {"task": task}, "gymnasium")
         yield Case("peers", "peers.envpool_envs", {"task": task}, "envpool")
-    for num_envs in (256, 1024):
-        where = {"task": "ant", "num_envs": num_envs}
+    for size, num_envs in ((84, 256), (84, 1024), (64, 1024), (64, 8192)):
+        where = {"task": "ant", "num_envs": num_envs, "size": size}
         yield Case("peers", "throughput.renderer", where)
-        yield Case("peers", "peers.mujoco_warp_renderer", where, "mujoco_warp", "ant")
+        yield Case("peers", "peers.mujoco_warp_renderer", where, "mujoco_warp")
 
 
 GROUPS = {
@@ -132,6 +156,7 @@ GROUPS = {
     "startup": startup,
     "doors": doors,
     "distractors": distractors,
+    "original": original,
     "peers": peers,
     "devices": devices,
     "sizes": sizes,

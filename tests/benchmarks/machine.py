@@ -8,8 +8,6 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-import jax
-
 PACKAGES = (
     "pixelbrax",
     "jax",
@@ -26,6 +24,8 @@ PACKAGES = (
 
 def describe() -> dict[str, Any]:
     """Device, processor and versions."""
+    import jax
+
     device = jax.devices()[0]
     return {
         "platform": device.platform,
@@ -33,19 +33,19 @@ def describe() -> dict[str, Any]:
         "devices": jax.device_count(),
         "runtime": device.client.platform_version,
         "processor": _processor(),
-        "cores": _cores(),
-        "system": platform.platform(),
+        "cores": cores(),
+        "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
         "versions": {name: _version(name) for name in PACKAGES},
         "xla_flags": os.environ.get("XLA_FLAGS", ""),
     }
 
 
-def _cores() -> int | None:
-    """Those that this process may use, where the system tells."""
+def cores() -> int:
+    """Cores that this process may use, where the system tells."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
-    return os.cpu_count()
+    return os.cpu_count() or 1
 
 
 def _version(name: str) -> str | None:

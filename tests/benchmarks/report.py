@@ -1,15 +1,16 @@
-"""Results -> a page of tables for the documentation, and plots."""
+"""Results -> a page of tables for the documentation, and a plot."""
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 import matplotlib
 
-from tests.benchmarks.cases import BATCHES, GROUPS, TASKS
+from tests.benchmarks.cases import BATCHES, DM_CONTROL, GROUPS, ORIGINAL, TASKS
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -18,41 +19,77 @@ Row = dict[str, Any]
 
 
 def write(file: Path) -> None:
-    """Writes the page and the plots that belong to the results in ``file``."""
-    report = json.loads(file.read_text())
-    rows = list(report["cases"].values())
+    """Writes the page and the plot that belong to the results in ``file``."""
+    kept = json.loads(file.read_text())
+    known = {case.key for cases in GROUPS.values() for case in cases()}
+    rows = [row for key, row in kept["cases"].items() if key in known]
     plotted = plot(rows, file.with_suffix(".png"))
-    file.with_suffix(".md").write_text(page(report, rows, file, plotted))
+    part = file.with_suffix(".md.part")
+    part.write_text(page(kept["machines"], rows, file.stem, plotted))
+    part.replace(file.with_suffix(".md"))
 
 
-def page(report: Row, rows: list[Row], file: Path, plotted: bool) -> str:
+def page(machines: dict[str, Row], rows: list[Row], name: str, plotted: bool) -> str:
     """The page, in Markdown."""
-    machine = report["machine"]
-    versions = ", ".join(f"{name} {v}" for name, v in machine["versions"].items() if v)
     parts = [
-        f"# Measurements: {machine['platform']}",
-        "Written by `pixelbrax bench`; [Performance](../performance.md) says what it means.",
-        f"{machine['device']} ({machine['processor']}, {machine['cores']} cores), "
-        f"{machine['system']}, Python {machine['python']}; {versions}. "
-        f"XLA_FLAGS: `{machine['xla_flags'] or 'none'}`.",
+        f"# Measurements: {name}",
+        "Written by `pixelbrax bench`. Medians of at least five repetitions of half a second or "
+        "more; compilation is apart, every call is waited for, actions are drawn, and episodes "
+        "begin anew. Each case has a process of its own.",
+        *(_machine(machine) for machine in machines.values()),
     ]
     if plotted:
-        parts.append(f"![Steps per second over the number of environments]({file.stem}.png)")
+        parts.append(f"![Steps per second over the number of environments]({name}.png)")
     for group in GROUPS:
         of_group = [row for row in rows if row["group"] == group]
         if of_group:
             dates = sorted({row["date"][:10] for row in of_group})
-            command = f"`pixelbrax bench --only {group}`, {' and '.join(dates)}."
+            command = f"`pixelbrax bench --only {group}`, {' and '.join(dates)}. {NOTES[group]}"
             parts += [f"## {group.capitalize()}", command, TABLES[group](of_group)]
     missing = [row for row in rows if row["status"] != "ok"]
     if missing:
-        lines = [f"| {_name(row)} | {row['status']} | {row['why'][:160]} |" for row in missing]
-        parts += ["## Not measured", "\n".join(["| case | | why |", "|---|---|---|", *lines])]
+        lines = [(_name(row), row["status"], _line(row["why"])) for row in missing]
+        parts += ["## Not measured", _table(("case", "", "why"), lines)]
     return "\n\n".join(parts) + "\n"
+
+
+NOTES = {
+    "renderer": "From link poses to packed pixels, without physics.",
+    "startup": "16 environments behind Gymnasium; one sample each. `gymnasium` and PixelBrax are "
+    "imported first, JAX and Brax when the environment is made.",
+    "doors": "The ratio is that to the JAX loop with the same autoreset mode, which waits for each "
+    "step; all take turns in one process.",
+    "distractors": "With a bank of 60 clips of 70 frames; all take turns in one process. Ratios "
+    "are to the speed without, of the medians and of the fastest turns.",
+    "original": "A compiled loop of ours in the settings in which the speed of the original is "
+    "known; that was measured apart, on two cores of the same kind.",
+    "peers": "All hand NumPy arrays to Python. Tasks are of the same class, not the same: bodies, "
+    "control steps and simulators differ. OpenGL peers draw textures and shadows, which we do not, "
+    "and would be faster with a GPU; this compares what a machine without one can do. MuJoCo Warp "
+    "draws the same model in the same pose from our camera, without textures and shadows.",
+    "devices": "Emulated devices share the cores of the machine: this shows what is where, and no "
+    "speed.",
+    "sizes": "",
+    "environments": "A compiled loop over steps; nothing leaves it.",
+}
+"""What a part shows and what it does not."""
+
+
+def _machine(machine: Row) -> str:
+    versions = ", ".join(f"{name} {v}" for name, v in machine["versions"].items() if v)
+    return (
+        f"{machine['device']} ({machine['processor']}, {machine['cores']} cores), "
+        f"{machine['system']}, Python {machine['python']}; {versions}. "
+        f"XLA_FLAGS: `{machine['xla_flags'] or 'none'}`."
+    )
 
 
 def _name(row: Row) -> str:
     return " ".join([row["measure"], *(f"{k}={v}" for k, v in row["arguments"].items())])
+
+
+def _line(text: str) -> str:
+    return " ".join(text.split()).replace("|", "/")[-200:]
 
 
 def _table(heads: Iterable[str], lines: Iterable[Iterable[Any]]) -> str:
@@ -63,30 +100,59 @@ def _table(heads: Iterable[str], lines: Iterable[Iterable[Any]]) -> str:
 
 def number(value: float | None) -> str:
     """Three significant digits, thousands apart."""
-    if value is None or value != value:
+    if value is None or not math.isfinite(value):
         return "-"
-    if value >= 1000:
-        digits = max(0, len(str(int(value))) - 3)
-        return f"{round(value, -digits):,.0f}"
-    return f"{value:.3g}"
+    if value == 0:
+        return "0"
+    digits = 2 - math.floor(math.log10(abs(value)))
+    rounded = round(value, digits)
+    return f"{rounded:,.{max(0, digits)}f}"
 
 
 def _ok(rows: list[Row]) -> list[Row]:
     return [row for row in rows if row["status"] == "ok"]
 
 
+def _of(rows: list[Row], measure: str, **arguments: Any) -> Row | None:
+    for row in rows:
+        if row["measure"] == measure and arguments.items() <= row["arguments"].items():
+            return row
+    return None
+
+
+def _value(row: Row | None, name: str) -> float | None:
+    return row["values"][name] if row is not None and row["status"] == "ok" else None
+
+
+def _cell(row: Row | None, name: str) -> str:
+    if row is None:
+        return "not yet"
+    return number(row["values"][name]) if row["status"] == "ok" else str(row["status"])
+
+
+def _ratio(above: float | None, below: float | None) -> str:
+    return number(above / below) if above and below else "-"
+
+
+def _gigabytes(row: Row | None) -> str:
+    if row is None or row["status"] != "ok":
+        return "-"
+    device, host = row["peak_bytes"]["device"], row["peak_bytes"]["host"]
+    return number((device or host) / 1e9)
+
+
 def _renderer(rows: list[Row]) -> str:
     def line(row: Row) -> list[str]:
         values, options = row["values"], dict(row["arguments"])
-        frame, num_envs = values["per_frame"], options.pop("num_envs")
+        num_envs = options.pop("num_envs")
         options.pop("task")
         return [
             ", ".join(f"{k}={v}" for k, v in options.items()) or "default",
             str(num_envs),
             number(values["frames_per_second"]),
             number(values["compile_seconds"]),
-            f"{frame['temporary_bytes'] / frame['output_bytes']:.2f}",
-            number(frame["operations"] / 1e6),
+            number(values["temporary_bytes"] / values["output_bytes"]),
+            number(values["operations_per_frame"] / 1e6),
         ]
 
     heads = (
@@ -100,19 +166,6 @@ def _renderer(rows: list[Row]) -> str:
     return _table(heads, map(line, _ok(rows)))
 
 
-def _of(rows: list[Row], measure: str, **arguments: Any) -> Row | None:
-    for row in rows:
-        if row["measure"] == measure and arguments.items() <= row["arguments"].items():
-            return row
-    return None
-
-
-def _cell(row: Row | None, name: str) -> str:
-    if row is None:
-        return "not yet"
-    return number(row["values"][name]) if row["status"] == "ok" else row["status"]
-
-
 def _environments(rows: list[Row]) -> str:
     lines = []
     for task, title in TASKS.items():
@@ -121,28 +174,22 @@ def _environments(rows: list[Row]) -> str:
             state = _of(rows, "throughput.scan", **where, obs_mode="state")
             pixels = _of(rows, "throughput.scan", **where, obs_mode="pixels")
             frames = _of(rows, "throughput.renderer", **where)
-            if not (state or pixels or frames):
-                continue
-            both = state and pixels and state["status"] == pixels["status"] == "ok"
-            ratio = (
-                pixels["values"]["steps_per_second"] / state["values"]["steps_per_second"]
-                if both
-                else None
-            )
-            fine = pixels is not None and pixels["status"] == "ok"
-            lines.append(
-                [
-                    title,
-                    num_envs,
-                    _cell(pixels, "steps_per_second"),
-                    _cell(state, "steps_per_second"),
-                    number(ratio),
-                    _cell(frames, "frames_per_second"),
-                    _cell(pixels, "compile_seconds"),
-                    number(pixels["values"]["bytes_per_env"] / 1e3) if fine else "",
-                    number(pixels["peak_bytes"]["host"] / 1e9) if fine else "",
-                ]
-            )
+            if state or pixels or frames:
+                speed = _value(pixels, "steps_per_second")
+                held = _value(pixels, "bytes_per_env")
+                lines.append(
+                    [
+                        title,
+                        num_envs,
+                        _cell(pixels, "steps_per_second"),
+                        _cell(state, "steps_per_second"),
+                        _ratio(speed, _value(state, "steps_per_second")),
+                        _cell(frames, "frames_per_second"),
+                        _cell(pixels, "compile_seconds"),
+                        number(held / 1e3 if held else None),
+                        _gigabytes(pixels),
+                    ]
+                )
     heads = (
         "task",
         "environments",
@@ -152,21 +199,35 @@ def _environments(rows: list[Row]) -> str:
         "renderer, frames/s",
         "compilation, s",
         "kB / environment",
-        "peak of the process, GB",
+        "peak memory, GB",
     )
     return _table(heads, lines)
 
 
 def _sizes(rows: list[Row]) -> str:
-    lines = [
-        [
-            TASKS[row["arguments"]["task"]],
-            row["arguments"]["num_envs"],
-            number(row["values"]["steps_per_second"]),
-        ]
-        for row in _ok(rows)
-    ]
-    return _table(("task", "environments", "64 x 64, steps/s"), lines)
+    lines = []
+    for row in rows:
+        if row["measure"] == "throughput.scan":
+            frames = _of(rows, "throughput.renderer", **row["arguments"])
+            lines.append(
+                [
+                    TASKS[row["arguments"]["task"]],
+                    row["arguments"]["num_envs"],
+                    _cell(row, "steps_per_second"),
+                    _cell(frames, "frames_per_second"),
+                ]
+            )
+    return _table(("64 x 64", "environments", "pixels, steps/s", "renderer, frames/s"), lines)
+
+
+def _original(rows: list[Row]) -> str:
+    lines = []
+    for task, num_envs, theirs in ORIGINAL:
+        row = _of(rows, "throughput.scan", task=task, num_envs=num_envs)
+        ours = _value(row, "steps_per_second")
+        cells = (_cell(row, "steps_per_second"), theirs, _ratio(ours, theirs))
+        lines.append((TASKS[task], num_envs, *cells))
+    return _table(("task", "environments", "steps/s", "original", "ratio"), lines)
 
 
 def _turns(what: str, *columns: str) -> Callable[[list[Row]], str]:
@@ -191,10 +252,11 @@ def _turns(what: str, *columns: str) -> Callable[[list[Row]], str]:
 
 
 def _startup(rows: list[Row]) -> str:
-    stages = list(_ok(rows)[0]["values"]["seconds"]) if _ok(rows) else []
+    rows = _ok(rows)
+    stages = list(rows[0]["values"]["seconds"]) if rows else []
     lines = [
         [row["arguments"]["cache"], *(f"{row['values']['seconds'][s]:.1f}" for s in stages)]
-        for row in _ok(rows)
+        for row in rows
     ]
     return _table(("compilation cache", *(f"{stage}, s" for stage in stages)), lines)
 
@@ -203,7 +265,7 @@ def _devices(rows: list[Row]) -> str:
     lines = [
         [
             row["arguments"]["num_devices"],
-            row["values"]["num_envs"],
+            row["arguments"]["num_envs"],
             number(row["values"]["steps_per_second"]),
             number(row["values"]["bytes_on_a_device"] / 1e6),
         ]
@@ -212,57 +274,79 @@ def _devices(rows: list[Row]) -> str:
     return _table(("devices", "environments", "steps/s", "MB on a device"), lines)
 
 
-PAIRS = {"halfcheetah": "cheetah", "walker2d": "walker", "ant": "quadruped", "humanoid": "humanoid"}
-"""Our task -> DM Control's of the same class."""
-
-
 def _peers(rows: list[Row]) -> str:
     lines = []
-    for task, domain in PAIRS.items():
-        ours = [
-            row
-            for row in _ok(rows)
-            if row["measure"] == "throughput.scan" and row["arguments"]["task"] == task
-        ]
-        best = max((row["values"]["steps_per_second"] for row in ours), default=None)
-        lines.append([f"PixelBrax {TASKS[task]}", "-", number(best), "1"])
-        for row in rows:
-            here = {task, domain} & set(row["arguments"].values())
-            if not here or row["measure"] in ("throughput.scan", *_RENDERERS):
+    for task, title in TASKS.items():
+        of_task = [row for row in rows if row["arguments"]["task"] == task]
+        ours = _of(of_task, "throughput.gymnasium", num_envs=256)
+        speed = _value(ours, "steps_per_second")
+        for row in of_task:
+            if row["measure"] in _RENDERERS:
                 continue
             values = row.get("values", {})
-            speed = values.get("steps_per_second")
-            name = row["measure"].removeprefix("peers.").removesuffix("_envs").replace("_", " ")
-            count = values.get("processes", values.get("num_envs", ""))
+            theirs = values.get("steps_per_second")
+            who, count = _who(row, title)
+            dt = values.get("control_dt")
             lines.append(
                 [
-                    f"{name} {row['arguments'].get('domain', task)}",
-                    "alone" if count == 0 else count,
-                    number(speed) if speed else row["status"],
-                    number(best / speed) if best and speed else "",
+                    who,
+                    count,
+                    number(1e3 * dt) if dt else "",
+                    number(theirs) if theirs else row["status"],
+                    _ratio(speed, theirs),
+                    values.get("opengl", ""),
                 ]
             )
-    environments = _table(("steps of", "processes", "steps/s", "PixelBrax is faster by"), lines)
-    lines = [
-        [
-            "MuJoCo Warp" if "warp" in row["measure"] else "PixelBrax",
-            row["arguments"]["num_envs"],
-            _cell(row, "frames_per_second"),
-        ]
-        for row in rows
-        if row["measure"] in _RENDERERS
-    ]
-    renderers = _table(("frames of Ant by", "environments", "frames/s"), lines)
-    return f"{environments}\n\n{renderers}"
+    heads = (
+        "who",
+        "environments",
+        "control step, ms",
+        "steps/s",
+        "PixelBrax at 256 is faster by",
+        "OpenGL",
+    )
+    environments = _table(heads, lines)
+    lines = []
+    for row in rows:
+        if row["measure"] == "peers.mujoco_warp_renderer":
+            where = row["arguments"]
+            ours = _of(rows, "throughput.renderer", **where)
+            cells = [_cell(ours, "frames_per_second"), _cell(row, "frames_per_second")]
+            ratio = _ratio(_value(ours, "frames_per_second"), _value(row, "frames_per_second"))
+            lines.append([where["size"], where["num_envs"], *cells, ratio])
+    heads = ("pixels", "environments", "PixelBrax, frames/s", "MuJoCo Warp, frames/s", "ratio")
+    return f"{environments}\n\nFrames of Ant:\n\n{_table(heads, lines)}\n\n{_peer_versions(rows)}"
 
 
 _RENDERERS = ("throughput.renderer", "peers.mujoco_warp_renderer")
+
+
+def _who(row: Row, title: str) -> tuple[str, str]:
+    values = row.get("values", {})
+    name = row["measure"].split(".")[1]
+    if name == "gymnasium":
+        return f"PixelBrax {title}, Gymnasium", str(row["arguments"]["num_envs"])
+    if name == "dm_control_envs":
+        processes = row["arguments"]["processes"]
+        how = "SubprocVecEnv" if processes else "alone"
+        count = values.get("processes", processes) or 1
+        return f"DM Control {row['arguments']['domain']}, {how}", str(count)
+    if name == "gymnasium_envs":
+        return f"Gymnasium {title}-v5, AsyncVectorEnv", str(values.get("processes", ""))
+    return f"EnvPool {title}-v5", str(values.get("num_envs", ""))
+
+
+def _peer_versions(rows: list[Row]) -> str:
+    versions = {k: v for row in _ok(rows) for k, v in row["values"].get("versions", {}).items()}
+    return f"Peers' versions: {', '.join(f'{k} {v}' for k, v in sorted(versions.items()))}."
+
 
 TABLES: dict[str, Callable[[list[Row]], str]] = {
     "renderer": _renderer,
     "startup": _startup,
     "doors": _turns("door", "ratio"),
     "distractors": _turns("distractors", "ratio", "ratio_of_fastest"),
+    "original": _original,
     "peers": _peers,
     "devices": _devices,
     "sizes": _sizes,
@@ -274,30 +358,32 @@ def plot(rows: list[Row], path: Path) -> bool:
     """Steps per second over the number of environments, one panel a task.
 
     It is Figure 2 of arXiv 2502.00021 redrawn, with state alone and DM Control beside it.
+
+    Returns:
+        Whether there was anything to plot.
     """
-    rows = _ok(rows)
+    rows = [row for row in _ok(rows) if row["group"] in ("environments", "peers")]
     if not any(row["group"] == "environments" for row in rows):
         return False
     figure, panels = plt.subplots(
         1, len(TASKS), figsize=(13, 3.6), sharey=True, layout="constrained"
     )
     for panel, (task, title) in zip(panels, TASKS.items(), strict=True):
+        of_task = [row for row in rows if row["arguments"].get("task") == task]
         for obs_mode, label in (("state", "state only"), ("pixels", "84 x 84 pixels")):
             points = [
                 (row["arguments"]["num_envs"], row["values"]["steps_per_second"])
-                for row in rows
-                if row["group"] == "environments"
-                and row["arguments"].get("obs_mode") == obs_mode
-                and row["arguments"]["task"] == task
+                for row in of_task
+                if row["arguments"].get("obs_mode") == obs_mode
             ]
             panel.loglog(*_columns(points), "o-", label=label)
         points = [
             (max(1, row["values"]["processes"]), row["values"]["steps_per_second"])
-            for row in rows
-            if row["arguments"].get("domain") == PAIRS[task]
+            for row in of_task
+            if row["measure"] == "peers.dm_control_envs"
         ]
         if points:
-            label = f"DM Control {PAIRS[task]}, pixels"
+            label = f"DM Control {DM_CONTROL[task]}, pixels"
             panel.loglog(*_columns(points), "s--", label=label)
         panel.set(title=title, xlabel="environments")
         panel.grid(alpha=0.3, which="both")

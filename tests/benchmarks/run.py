@@ -1,23 +1,26 @@
-"""Measures everything, or parts of it, and writes JSON, a table and plots.
+"""Measures everything, or parts of it, and writes JSON, a page of tables and a plot.
 
-    python -m tests.benchmarks.run                      all; hours
+    python -m tests.benchmarks.run                      all but peers; hours
     python -m tests.benchmarks.run --only renderer      one part; minutes
     python -m tests.benchmarks.run --only peers         others beside us, installed on first use
 
 Each case runs in a process of its own: its peak memory is its own, and one that runs out of memory
-or crashes is recorded as such while the rest goes on. What has been measured is kept; a
-run that is cut short goes on where it stopped, and ``--again`` measures anew.
+or crashes is recorded as such while the rest goes on. What has been measured on the same machine
+with the same versions is kept; a run that is cut short goes on where it stopped, and --again
+measures anew.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -25,11 +28,25 @@ from typing import Any
 from tqdm import tqdm
 
 from tests.benchmarks import report
-from tests.benchmarks.cases import GROUPS, Case
+from tests.benchmarks.cases import GROUPS, TASKS, Case
+from tests.benchmarks.machine import cores
 from tests.benchmarks.peers.install import AbsentError, peer_python
 
 ROOT = Path(__file__).parents[2]
-OUT_OF_MEMORY = ("RESOURCE_EXHAUSTED", "Out of memory", "MemoryError", "bad_alloc")
+OUT_OF_MEMORY = (
+    "resource_exhausted",
+    "out of memory",
+    "out_of_memory",
+    "memoryerror",
+    "bad_alloc",
+    "cannot allocate memory",
+)
+ABSENT = 3
+"""Exit status of a worker that lacks what it is to measure."""
+
+
+class KilledError(Exception):
+    """The system killed a worker, most likely for its memory."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -39,51 +56,55 @@ def main(arguments: list[str] | None = None) -> int:
         arguments: of the command line; None means those of this process.
 
     Returns:
-        The exit status: 1 if a case failed for another reason than memory or an absent peer.
+        The exit status: 1 if a case failed for another reason than memory or something absent.
     """
     parser = argparse.ArgumentParser(
         prog="pixelbrax bench", description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
-    parser.add_argument("--output-dir", type=Path, default=ROOT / "docs" / "benchmarks")
+    parser.add_argument(
+        "--output-dir",
+        type=Path,
+        default=Path("runs/benchmarks"),
+        help="where results are kept (default: runs/benchmarks)",
+    )
     parser.add_argument("--only", nargs="+", choices=GROUPS, help="parts to measure")
-    parser.add_argument("--task", nargs="+", help="only cases of these tasks")
+    parser.add_argument("--peers", action="store_true", help="measure peers too")
+    parser.add_argument("--task", nargs="+", choices=TASKS, help="only cases of these tasks")
     parser.add_argument("--max-envs", type=int, help="only cases of at most so many environments")
     parser.add_argument("--again", action="store_true", help="measure anew what has been measured")
     parser.add_argument("--timeout", type=float, default=900.0, help="seconds of one case at most")
     parser.add_argument("--list", action="store_true", help="list the cases and stop")
     options = parser.parse_args(arguments)
-    cases = [case for case in chosen(options.only or list(GROUPS)) if fits(case, options)]
-    if options.list:
-        print("\n".join(case.key for case in cases))
+    groups = options.only or [group for group in GROUPS if group != "peers" or options.peers]
+    cases = [case for group in groups for case in GROUPS[group]() if fits(case, options)]
+    if options.list or not cases:
+        print("\n".join(case.key for case in cases) or "no case fits")
         return 0
 
-    machine = worker("machine.describe", {}, sys.executable, 120.0)["values"]
+    machine = worker("machine.describe", {}, sys.executable, 300.0)["values"]
     file = options.output_dir / f"{machine['platform']}.json"
-    results = Results(file)
+    results = Results(file, machine)
     todo = [case for case in cases if options.again or not results.has(case)]
     print(f"{len(todo)} of {len(cases)} cases are to be measured; results in {file}")
     failed = False
-    with tqdm(todo, unit="case") as bar:
-        for case in bar:
-            bar.set_postfix_str(case.key)
-            outcome = measure(case, options.timeout)
-            failed |= outcome["status"] == "failed"
-            results.add(case, outcome, machine)
-            tqdm.write(json.dumps({"case": case.key} | outcome))
-    report.write(file)
+    try:
+        with tqdm(todo, unit="case") as bar:
+            for case in bar:
+                bar.set_postfix_str(case.key)
+                outcome = measure(case, options.timeout)
+                failed |= outcome["status"] == "failed"
+                results.add(case, outcome)
+                tqdm.write(json.dumps({"case": case.key} | outcome))
+    finally:
+        if file.exists():
+            report.write(file)
     return int(failed)
-
-
-def chosen(groups: list[str]) -> list[Case]:
-    """The cases of the groups."""
-    return [case for group in groups for case in GROUPS[group]()]
 
 
 def fits(case: Case, options: argparse.Namespace) -> bool:
     """Whether the case is among those that the options ask for."""
-    task = case.arguments.get("task", case.arguments.get("domain"))
     few = options.max_envs is None or case.arguments.get("num_envs", 0) <= options.max_envs
-    return few and (not options.task or task in options.task)
+    return few and (not options.task or case.arguments.get("task") in options.task)
 
 
 def measure(case: Case, timeout: float) -> dict[str, Any]:
@@ -92,15 +113,21 @@ def measure(case: Case, timeout: float) -> dict[str, Any]:
     try:
         python = peer_python(case.peer) if case.peer else sys.executable
         arguments = dict(case.arguments)
-        if case.scene:
-            described = worker("scene.describe", {"task": case.scene}, sys.executable, timeout)
-            arguments["scene"] = described["values"]
+        if case.peer:
+            arguments["cores"] = cores()
+        if case.peer == "mujoco_warp":
+            scene = worker("scene.describe", {"task": arguments["task"]}, sys.executable, timeout)
+            arguments["scene"] = scene["values"]
         outcome = {"status": "ok"} | worker(case.measure, arguments, python, timeout)
     except AbsentError as error:
         outcome = {"status": "absent", "why": str(error)}
     except MemoryError as error:
         outcome = {"status": "out of memory", "why": str(error)}
-    except (RuntimeError, subprocess.TimeoutExpired) as error:
+    except KilledError as error:
+        outcome = {"status": "killed", "why": str(error)}
+    except subprocess.TimeoutExpired:
+        outcome = {"status": "failed", "why": f"took longer than {timeout:.0f} s"}
+    except (RuntimeError, OSError) as error:
         outcome = {"status": "failed", "why": str(error)[-2000:]}
     outcome["seconds"] = round(time.perf_counter() - started, 1)
     return outcome
@@ -110,7 +137,8 @@ def worker(measure: str, arguments: dict[str, Any], python: str, timeout: float)
     """Runs one measurement in a process of its own.
 
     Raises:
-        AbsentError: the peer cannot run here.
+        AbsentError: something to be measured is not here.
+        KilledError: the system killed it.
         MemoryError: there was not enough.
         RuntimeError: it failed otherwise.
         subprocess.TimeoutExpired: it took too long.
@@ -121,49 +149,86 @@ def worker(measure: str, arguments: dict[str, Any], python: str, timeout: float)
         command = [python, script, json.dumps(arguments)]
     else:
         command = [python, "-m", "tests.benchmarks.worker", measure, json.dumps(arguments)]
-    environ = dict(os.environ)
+    # Compilation is to be measured, and errors are to be told in their own words.
+    environ = os.environ | {
+        "JAX_ENABLE_COMPILATION_CACHE": "false",
+        "JAX_TRACEBACK_FILTERING": "off",
+    }
     if "num_devices" in arguments:
         flag = f"--xla_force_host_platform_device_count={arguments['num_devices']}"
         environ["XLA_FLAGS"] = f"{environ.get('XLA_FLAGS', '')} {flag}".strip()
-    done = subprocess.run(
-        command, cwd=ROOT, env=environ, capture_output=True, text=True, timeout=timeout, check=False
-    )
-    if done.returncode == 0:
-        return dict(json.loads(done.stdout.strip().splitlines()[-1]))
-    lines = done.stderr.strip().splitlines()
-    why = lines[-1] if lines else f"exit status {done.returncode}"
-    if done.returncode == -signal.SIGKILL or any(word in done.stderr for word in OUT_OF_MEMORY):
-        raise MemoryError(why)
-    if done.returncode == 3:
+    status, output, errors = run_alone(command, environ, timeout)
+    if status == 0:
+        try:
+            return dict(json.loads(output.strip().splitlines()[-1]))
+        except (ValueError, IndexError) as error:
+            raise RuntimeError(f"its last line is no result: {output[-200:]!r}") from error
+    lines = errors.strip().splitlines()
+    why = lines[-1] if lines else f"exit status {status}"
+    if status == -signal.SIGKILL:
+        raise KilledError("killed by the system, most likely for its memory")
+    if status == ABSENT:
         raise AbsentError(why)
-    raise RuntimeError(why)
+    if any(word in errors.lower() for word in OUT_OF_MEMORY):
+        raise MemoryError(why)
+    raise RuntimeError("\n".join(lines[-20:]) or why)
+
+
+def run_alone(command: list[str], environ: dict[str, str], timeout: float) -> tuple[int, str, str]:
+    """Exit status, output and errors of a command; none of its processes outlives this call."""
+    with subprocess.Popen(
+        command,
+        cwd=ROOT,
+        env=environ,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    ) as process:
+        try:
+            output, errors = process.communicate(timeout=timeout)
+        finally:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+    return process.returncode, output, errors
 
 
 class Results:
     """What has been measured, in a JSON file that is written after every case."""
 
-    def __init__(self, file: Path) -> None:
+    def __init__(self, file: Path, machine: dict[str, Any]) -> None:
         self.file = file
-        self.cases: dict[str, Any] = {}
+        self.machine = hashlib.sha256(json.dumps(machine).encode()).hexdigest()[:8]
+        self.kept: dict[str, Any] = {"machines": {}, "cases": {}}
         if file.exists():
-            self.cases = json.loads(file.read_text())["cases"]
+            kept = json.loads(file.read_text())
+            if not {"machines", "cases"} <= kept.keys():
+                raise ValueError(f"{file} is not a result of this benchmark: move it away.")
+            self.kept = kept
+        self.kept["machines"][self.machine] = machine
 
     def has(self, case: Case) -> bool:
-        """Whether there is nothing more to learn of the case."""
-        return self.cases.get(case.key, {}).get("status") in ("ok", "out of memory")
+        """Whether there is nothing more to learn of the case on this machine."""
+        known = self.kept["cases"].get(case.key, {})
+        learned = known.get("status") in ("ok", "out of memory")
+        return learned and known["machine"] == self.machine
 
-    def add(self, case: Case, outcome: dict[str, Any], machine: dict[str, Any]) -> None:
+    def add(self, case: Case, outcome: dict[str, Any]) -> None:
         """Keeps an outcome. The file is never half written."""
-        self.cases[case.key] = {
+        self.kept["cases"][case.key] = {
             "group": case.group,
             "measure": case.measure,
             "arguments": dict(case.arguments),
+            "machine": self.machine,
             "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M"),
             **outcome,
         }
+        cases = self.kept["cases"].values()
+        used = {known["machine"] for known in cases}
+        self.kept["machines"] = {k: v for k, v in self.kept["machines"].items() if k in used}
         self.file.parent.mkdir(parents=True, exist_ok=True)
         part = self.file.with_suffix(".part")
-        part.write_text(json.dumps({"machine": machine, "cases": self.cases}, indent=1) + "\n")
+        part.write_text(json.dumps(self.kept, indent=1) + "\n")
         part.replace(self.file)
 
 

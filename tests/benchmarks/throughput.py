@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable
 from typing import Any
@@ -11,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import pixelbrax_jax as pb
+from tests.benchmarks.cases import TASKS
 
 REPETITIONS = 5
 SECONDS = 0.5
@@ -25,18 +27,17 @@ def compiled(function: Callable, *arguments: Any, **jit_options: Any) -> tuple[A
     return program, time.perf_counter() - started
 
 
-def rate(run: Callable[[int], Any], least: int = 1) -> dict[str, float]:
+def rate(run: Callable[[int], Any]) -> dict[str, float]:
     """Calls per second.
 
     Args:
         run: does so many calls and returns something to wait for.
-        least: calls of a repetition, at least.
 
     Returns:
         Median, slowest and fastest repetition, and the calls of each.
     """
     jax.block_until_ready(run(1))
-    calls = least
+    calls = 1
     while True:
         started = time.perf_counter()
         jax.block_until_ready(run(calls))
@@ -54,18 +55,6 @@ def rate(run: Callable[[int], Any], least: int = 1) -> dict[str, float]:
         "slowest": min(rates),
         "fastest": max(rates),
         "calls": calls,
-    }
-
-
-def of_program(program: Any, per: int) -> dict[str, float]:
-    """What the compiler says of a program, for each of ``per`` frames or environments."""
-    memory, cost = program.memory_analysis(), program.cost_analysis() or {}
-    return {
-        "temporary_bytes": memory.temp_size_in_bytes / per,
-        "output_bytes": memory.output_size_in_bytes / per,
-        "argument_bytes": memory.argument_size_in_bytes / per,
-        "operations": cost.get("flops", float("nan")) / per,
-        "bytes_accessed": cost.get("bytes accessed", float("nan")) / per,
     }
 
 
@@ -90,12 +79,25 @@ def renderer(
         return words
 
     speed = rate(run)
+    memory = program.memory_analysis()
     return {
         "frames_per_second": num_envs * speed["median"],
         "speed": speed,
         "compile_seconds": compile_seconds,
-        "per_frame": of_program(program, num_envs),
+        "temporary_bytes": memory.temp_size_in_bytes,
+        "output_bytes": memory.output_size_in_bytes,
+        "operations_per_frame": operations(env, states, params) / num_envs,
     }
+
+
+def operations(env: pb.PixelEnv, states: Any, params: Any) -> float:
+    """Floating-point operations of all pictures, as the program is written.
+
+    XLA counts the body of a loop once, however often it runs; here is no loop.
+    """
+    whole = jax.vmap(lambda state: env.render(state, params))
+    cost = jax.jit(whole).lower(states).cost_analysis() or {}
+    return float(cost.get("flops", 0.0))
 
 
 def first_states(env: pb.PixelEnv, params: Any, num_envs: int) -> Any:
@@ -110,19 +112,12 @@ def scan(
     num_envs: int,
     obs_mode: str = "pixels",
     size: int = 84,
-    distractors: str | None = None,
 ) -> dict[str, Any]:
     """Environment steps in one compiled loop, with drawn actions and autoreset.
 
     Every frame enters the frame stack, which is the loop's state: none can be left out.
     """
-    env, params = pb.make(
-        task,
-        obs_mode=obs_mode,
-        height=size,
-        width=size,
-        distractors=(distractors,) if distractors else (),
-    )
+    env, params = pb.make(task, obs_mode=obs_mode, height=size, width=size)
     venv = pb.VectorPixelEnv(env, num_envs)
     state, timestep = venv.reset(jax.random.key(0), params)
 
@@ -141,6 +136,7 @@ def scan(
     program, compile_seconds = compiled(steps, state, key, params, jnp.int32(1), donate_argnums=0)
     held = sum(leaf.nbytes for leaf in jax.tree.leaves((state, timestep)) if leaf.ndim)
     carry = {"state": state, "key": key}
+    del state, timestep
 
     def run(calls: int) -> Any:
         carry["state"], carry["key"], total = program(
@@ -161,31 +157,55 @@ def scan(
     }
 
 
-def sharded(task: str, num_devices: int, num_envs: int = 256) -> dict[str, Any]:
+def gymnasium(task: str, num_envs: int) -> dict[str, Any]:
+    """Steps per second of Gymnasium's vector environment with NumPy output, as peers have it."""
+    from gymnasium import make_vec
+
+    envs = make_vec(f"PixelBrax/{TASKS[task]}-v0", num_envs=num_envs, output="numpy")
+    envs.reset(seed=0)
+    draw = np.random.default_rng(0)
+    shape = (num_envs, *envs.single_action_space.shape)
+
+    def run(calls: int) -> Any:
+        for _ in range(calls):
+            obs = envs.step(draw.uniform(-1.0, 1.0, shape).astype(np.float32))[0]
+        return obs
+
+    speed = rate(run)
+    return {
+        "steps_per_second": num_envs * speed["median"],
+        "speed": speed,
+        "control_dt": envs.unwrapped.env.dt,
+    }
+
+
+def sharded(task: str, num_devices: int, num_envs: int) -> dict[str, Any]:
     """Environments spread over devices; on a CPU these are emulated and share its cores."""
     from pixelbrax_jax.envs.sharded import ShardedVectorEnv, make_env_mesh
 
     if jax.device_count() < num_devices:
-        raise RuntimeError(f"there are {jax.device_count()} devices, not {num_devices}.")
+        sys.stderr.write(f"there are {jax.device_count()} devices, not {num_devices}\n")
+        sys.exit(3)
     env, params = pb.make(task)
     venv = ShardedVectorEnv(env, num_envs, make_env_mesh(num_devices))
+    step = jax.jit(venv.step, donate_argnums=0, compiler_options=pb.compiler_options())
     state, timestep = venv.reset(jax.random.key(0), params)
     shape = (num_envs, env.action_size)
     action = jax.random.uniform(jax.random.key(1), shape, minval=-1.0, maxval=1.0)
-    carry = {"state": state}
-
-    def run(calls: int) -> Any:
-        for _ in range(calls):
-            carry["state"], timestep = venv.step(carry["state"], action, params)
-        return timestep
-
-    speed = rate(run)
     on_each = sum(
         leaf.addressable_shards[0].data.nbytes for leaf in jax.tree.leaves((state, timestep))
     )
+    carry = {"state": state}
+    del state, timestep
+
+    def run(calls: int) -> Any:
+        for _ in range(calls):
+            carry["state"], timestep = step(carry["state"], action, params)
+        return timestep
+
+    speed = rate(run)
     return {
         "steps_per_second": num_envs * speed["median"],
         "speed": speed,
-        "num_envs": num_envs,
         "bytes_on_a_device": on_each,
     }

@@ -1,6 +1,6 @@
 """DM Control at 84 x 84: one environment alone, or many under Stable-Baselines3's SubprocVecEnv.
 
-    python dm_control_envs.py '{"domain": "cheetah", "processes": 8}'
+    python dm_control_envs.py '{"domain": "cheetah", "processes": 8, "cores": 8}'
 
 Each environment step is one control step with one picture; under SubprocVecEnv the last three are
 stacked. Exits with 3 where no OpenGL works.
@@ -48,8 +48,9 @@ def opengl() -> str:
         if done.returncode == 0:
             os.environ["MUJOCO_GL"] = name
             return f"{name}: {done.stdout.strip().splitlines()[-1]}"
-        why = done.stderr.strip().splitlines()[-1]
-    print(f"no OpenGL works: {why}", file=sys.stderr)
+        why += f"\n{name}: {done.stderr.strip()}"
+    print(why[-3000:], file=sys.stderr)
+    print("no OpenGL works", file=sys.stderr)
     sys.exit(3)
 
 
@@ -106,9 +107,11 @@ def vectorised(domain: str, processes: int) -> Callable[[], int]:
 
 def main() -> None:
     arguments = json.loads(sys.argv[1])
+    import dm_control  # noqa: F401  # a missing one is no matter of OpenGL
+
     renderer = opengl()
     domain, processes = arguments["domain"], arguments["processes"]
-    processes = len(os.sched_getaffinity(0)) if processes == "cores" else processes
+    processes = arguments["cores"] if processes == "cores" else processes
     step = vectorised(domain, processes) if processes else alone(domain)
     rates = []
     for repetition in range(1 + REPETITIONS):
@@ -118,6 +121,9 @@ def main() -> None:
         if repetition:  # the first one warms up
             rates.append(steps / (time.perf_counter() - started))
     env = load(domain, 0)
+    env.reset()
+    if np.ptp(env.physics.render(SIZE, SIZE, camera_id=0)) == 0:
+        raise RuntimeError("it draws nothing")
     from importlib.metadata import version
 
     values = {

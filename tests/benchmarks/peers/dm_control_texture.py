@@ -1,11 +1,11 @@
 """What a video background costs in DM Control, where each step uploads a texture.
 
 The Distracting Control Suite (arXiv 2101.02722) writes each video frame into the skybox texture
-and uploads it to OpenGL. This measures DM Control's pixels with and without such an upload. It runs
-in an environment of its own, for dm_control wants another MuJoCo than PixelBrax:
+and uploads it to OpenGL. This measures DM Control's pixels with and without such an upload, in the
+environment that the benchmark makes for it:
 
-    python -m venv /tmp/dmc && /tmp/dmc/bin/pip install "dm_control==1.0.50" "mujoco==3.17.0"
-    MUJOCO_GL=osmesa /tmp/dmc/bin/python tests/benchmarks/peers/dm_control_texture.py
+    pixelbrax bench --only peers --task halfcheetah
+    MUJOCO_GL=osmesa .venv-peers/dm_control/bin/python tests/benchmarks/peers/dm_control_texture.py
 
 It needs an OpenGL library, e.g. Debian's libosmesa6.
 """

@@ -1,14 +1,17 @@
 """Gymnasium's MuJoCo tasks seen through their own renderer, one process a core.
 
-python gymnasium_envs.py '{"task": "ant"}'
+python gymnasium_envs.py '{"task": "ant", "cores": 2}'
 """
 
 from __future__ import annotations
 
 import json
 import os
+import subprocess
 import sys
 import time
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -21,11 +24,36 @@ IDS = {
 REPETITIONS, SECONDS, SIZE = 5, 3.0, 84
 
 
-def make(name: str):
+def make(name: str) -> Any:
+    """An environment whose observations are its pictures."""
     import gymnasium
 
     env = gymnasium.make(name, render_mode="rgb_array", width=SIZE, height=SIZE)
     return gymnasium.wrappers.AddRenderObservation(env)
+
+
+def opengl(name: str) -> str:
+    """Chooses an OpenGL that works; the name of its renderer."""
+    probe = (
+        "import sys; sys.path.insert(0, sys.argv[1])\n"
+        "from gymnasium_envs import make\n"
+        "env = make(sys.argv[2])\n"
+        "env.reset()\n"
+        "from OpenGL import GL\n"
+        "print(GL.glGetString(GL.GL_RENDERER).decode())\n"
+    )
+    why = ""
+    for library in [os.environ["MUJOCO_GL"]] if "MUJOCO_GL" in os.environ else ["egl", "osmesa"]:
+        environ = os.environ | {"MUJOCO_GL": library, "PYOPENGL_PLATFORM": library}
+        command = [sys.executable, "-c", probe, str(Path(__file__).parent), name]
+        done = subprocess.run(command, env=environ, capture_output=True, text=True, check=False)
+        if done.returncode == 0:
+            os.environ |= {"MUJOCO_GL": library, "PYOPENGL_PLATFORM": library}
+            return f"{library}: {done.stdout.strip().splitlines()[-1]}"
+        why += f"\n{library}: {done.stderr.strip()}"
+    print(why[-3000:], file=sys.stderr)
+    print("no OpenGL works", file=sys.stderr)
+    sys.exit(3)
 
 
 def main() -> None:
@@ -33,20 +61,12 @@ def main() -> None:
 
     import gymnasium
 
-    name = IDS[json.loads(sys.argv[1])["task"]]
-    processes = len(os.sched_getaffinity(0))
-    for library in [os.environ["MUJOCO_GL"]] if "MUJOCO_GL" in os.environ else ["egl", "osmesa"]:
-        os.environ["MUJOCO_GL"] = library
-        envs = gymnasium.vector.AsyncVectorEnv([lambda: make(name)] * processes, context="spawn")
-        try:
-            envs.reset(seed=0)
-            break
-        except Exception as error:
-            why = str(error)
-            envs.close(terminate=True)
-    else:
-        print(f"no OpenGL works: {why}", file=sys.stderr)
-        sys.exit(3)
+    arguments = json.loads(sys.argv[1])
+    name, processes = IDS[arguments["task"]], arguments["cores"]
+    renderer = opengl(name)
+    envs = gymnasium.vector.AsyncVectorEnv([lambda: make(name)] * processes, context="spawn")
+    if np.ptp(envs.reset(seed=0)[0]) == 0:
+        raise RuntimeError("it draws nothing")
     rates = []
     for repetition in range(1 + REPETITIONS):
         steps, started = 0, time.perf_counter()
@@ -60,7 +80,7 @@ def main() -> None:
         "steps_per_second": float(np.median(rates)),
         "speed": {"median": float(np.median(rates)), "slowest": min(rates), "fastest": max(rates)},
         "processes": processes,
-        "opengl": os.environ["MUJOCO_GL"],
+        "opengl": renderer,
         "versions": {name: version(name) for name in ("gymnasium", "mujoco")},
     }
     print(json.dumps({"values": values}))

@@ -16,9 +16,8 @@ class AbsentError(Exception):
     """A peer that does not run here, with the reason."""
 
 
-@cache
 def peer_python(peer: str) -> str:
-    """The Python that has the peer.
+    """The Python that has the peer; what cannot be installed is tried once.
 
     Args:
         peer: a key of ``PEERS``.
@@ -29,6 +28,14 @@ def peer_python(peer: str) -> str:
     Raises:
         AbsentError: the peer cannot be installed.
     """
+    found = _install(peer)
+    if isinstance(found, AbsentError):
+        raise found
+    return found
+
+
+@cache
+def _install(peer: str) -> str | AbsentError:
     home = HOME / peer
     python = home / "bin" / "python"
     mark = home / ".installed"
@@ -46,6 +53,6 @@ def peer_python(peer: str) -> str:
         )
     except (OSError, subprocess.CalledProcessError) as error:
         lines = str(getattr(error, "stderr", "") or error).strip().splitlines()
-        raise AbsentError(f"cannot be installed: {lines[-1] if lines else error}") from error
+        return AbsentError(f"cannot be installed: {lines[-1] if lines else error}")
     mark.write_text(wanted)
     return str(python)
