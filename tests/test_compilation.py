@@ -34,3 +34,37 @@ def test_an_xla_without_the_option_is_left_alone(monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", "")
     monkeypatch.setattr(compilation, "_WIDTH", "xla_cpu_no_such_option")
     assert compilation.compiler_options() == {}
+
+
+EVERYTHING = """
+import sys
+import gymnasium, numpy as np, torch
+import pixelbrax_gym
+import pixelbrax_jax as pb
+from pixelbrax_jax.cli import main
+
+assert pb.compiler_options()
+small = {"height": 24, "width": 24}
+envs = gymnasium.make_vec("PixelBrax/InvertedPendulum-v0", num_envs=2, **small)
+envs.reset(seed=0)
+envs.step(envs.action_space.sample())
+td = pixelbrax_gym.PixelBraxTorchRLEnv("inverted_pendulum", 2, **small).rollout(2)
+sb3 = pixelbrax_gym.PixelBraxSB3VecEnv("inverted_pendulum", 2, **small)
+sb3.reset()
+sb3.step(np.zeros((2, 1), np.float32))
+folder = sys.argv[1]
+train = "train ppg --preset ci --height 24 --width 24 --num-envs 4 --num-steps 8 --total-steps 128"
+train += " --num-minibatches 2 --aux-minibatches 2 --num-policy-phases 2 --num-evals 1"
+assert main([*train.split(), "--eval-episodes", "2", "--output-dir", folder]) == 0
+assert main(["record", folder, "--grid", "1", "--size", "32", "--num-frames", "4"]) == 0
+"""
+
+
+@pytest.mark.slow
+def test_everything_runs_with_our_own_options(monkeypatch, tmp_path):
+    # The other tests name a width in XLA_FLAGS; then there are no options.
+    monkeypatch.setenv("XLA_FLAGS", "")
+    command = [sys.executable, "-W", "ignore", "-c", EVERYTHING, str(tmp_path / "run")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=600)
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert list((tmp_path / "run" / "videos").glob("*.mp4"))
