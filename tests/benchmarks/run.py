@@ -81,6 +81,8 @@ def main(arguments: list[str] | None = None) -> int:
         print("\n".join(case.key for case in cases) or "no case fits")
         return 0
 
+    # A worker must not outlive this process and disturb the next one's measurements.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     machine = worker("machine.describe", {}, sys.executable, 300.0)["values"]
     file = options.output_dir / f"{machine['platform']}.json"
     results = Results(file, machine)

@@ -19,7 +19,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from pixelbrax_jax import VectorPixelEnv
+from pixelbrax_jax import VectorPixelEnv, compiler_options
 from pixelbrax_jax.agents.config import make_env
 from pixelbrax_jax.agents.networks import ENCODERS
 from pixelbrax_jax.agents.ppo import PPOConfig, make_ppo
@@ -54,7 +54,8 @@ def measure(encoder: str, num_envs: int, num_steps: int) -> dict[str, Any]:
     programs, compile_seconds, times = {}, {}, {"train": [], "play": []}
     for name, function in (("train", algorithm.iterate), ("play", play)):
         started = time.perf_counter()
-        programs[name] = jax.jit(function).lower(carry[name], params).compile()
+        compiled = jax.jit(function, compiler_options=compiler_options())
+        programs[name] = compiled.lower(carry[name], params).compile()
         compile_seconds[name] = time.perf_counter() - started
         jax.block_until_ready(programs[name](carry[name], params))
     for _ in range(REPETITIONS):
