@@ -239,6 +239,13 @@ def test_a_real_case_runs_in_a_process_of_its_own():
     assert outcome["peak_bytes"]["host"] > 1e8
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("measure", ["throughput.gymnasium", "throughput.scan", "turns.doors"])
+def test_more_real_cases_run(measure):
+    outcome = run.measure(Case("doors", measure, {"task": "walker2d", "num_envs": 2}), 600.0)
+    assert outcome["status"] == "ok", outcome
+
+
 def test_cases_have_names_of_their_own():
     keys = [case.key for group in GROUPS.values() for case in group()]
     assert len(set(keys)) == len(keys)

@@ -161,6 +161,8 @@ def gymnasium(task: str, num_envs: int) -> dict[str, Any]:
     """Steps per second of Gymnasium's vector environment with NumPy output, as peers have it."""
     from gymnasium import make_vec
 
+    import pixelbrax_gym  # noqa: F401  # registers the ids
+
     envs = make_vec(f"PixelBrax/{TASKS[task]}-v0", num_envs=num_envs, output="numpy")
     envs.reset(seed=0)
     draw = np.random.default_rng(0)
@@ -175,7 +177,7 @@ def gymnasium(task: str, num_envs: int) -> dict[str, Any]:
     return {
         "steps_per_second": num_envs * speed["median"],
         "speed": speed,
-        "control_dt": envs.unwrapped.env.dt,
+        "control_dt": pb.make(task)[0].dt,
     }
 
 
