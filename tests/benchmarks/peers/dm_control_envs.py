@@ -11,14 +11,14 @@ from __future__ import annotations
 import json
 import os
 import sys
-import time
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from shared import speed_of
 
 TASKS = {"cheetah": "run", "walker": "walk", "quadruped": "walk", "humanoid": "walk"}
-REPETITIONS, SECONDS, SIZE = 5, 3.0, 84
+SECONDS, SIZE = 3.0, 84
 
 
 def load(domain: str, seed: int) -> Any:
@@ -113,13 +113,7 @@ def main() -> None:
     domain, processes = arguments["domain"], arguments["processes"]
     processes = arguments["cores"] if processes == "cores" else processes
     step = vectorised(domain, processes) if processes else alone(domain)
-    rates = []
-    for repetition in range(1 + REPETITIONS):
-        steps, started = 0, time.perf_counter()
-        while time.perf_counter() - started < SECONDS:
-            steps += step()
-        if repetition:  # the first one warms up
-            rates.append(steps / (time.perf_counter() - started))
+    speed = speed_of(step, SECONDS)
     env = load(domain, 0)
     env.reset()
     if np.ptp(env.physics.render(SIZE, SIZE, camera_id=0)) == 0:
@@ -127,8 +121,8 @@ def main() -> None:
     from importlib.metadata import version
 
     values = {
-        "steps_per_second": float(np.median(rates)),
-        "speed": {"median": float(np.median(rates)), "slowest": min(rates), "fastest": max(rates)},
+        "steps_per_second": speed["median"],
+        "speed": speed,
         "processes": processes,
         "control_dt": env.control_timestep(),
         "opengl": renderer,

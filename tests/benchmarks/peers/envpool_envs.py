@@ -16,18 +16,12 @@ import json
 import os
 import subprocess
 import sys
-import time
 from typing import Any
 
 import numpy as np
+from shared import GYMNASIUM_IDS, speed_of
 
-IDS = {
-    "halfcheetah": "HalfCheetah-v5",
-    "walker2d": "Walker2d-v5",
-    "ant": "Ant-v5",
-    "humanoid": "Humanoid-v5",
-}
-REPETITIONS, SECONDS, SIZE = 5, 2.0, 84
+SECONDS, SIZE = 2.0, 84
 
 
 def with_opengl() -> None:
@@ -65,26 +59,25 @@ def measure(name: str, num_envs: int, batch_size: int, cores: int) -> dict[str, 
         render_height=SIZE,
     )
     space = envs.action_space
-    rng, rates = np.random.default_rng(0), []
+    rng, last = np.random.default_rng(0), {}
     envs.async_reset()
-    for repetition in range(1 + REPETITIONS):
-        steps, started = 0, time.perf_counter()
-        while time.perf_counter() - started < SECONDS:
-            obs, *_, info = envs.recv()
-            action = rng.uniform(space.low, space.high, (batch_size, *space.shape))
-            envs.send(action.astype(space.dtype), info["env_id"])
-            steps += batch_size
-        if repetition:  # the first one warms up
-            rates.append(steps / (time.perf_counter() - started))
-    if np.ptp(obs) == 0:
+
+    def step() -> int:
+        last["obs"], *_, info = envs.recv()
+        action = rng.uniform(space.low, space.high, (batch_size, *space.shape))
+        envs.send(action.astype(space.dtype), info["env_id"])
+        return batch_size
+
+    speed = speed_of(step, SECONDS)
+    if np.ptp(last["obs"]) == 0:
         raise RuntimeError("it draws nothing")
     envs.close()
     return {
-        "steps_per_second": float(np.median(rates)),
-        "speed": {"median": float(np.median(rates)), "slowest": min(rates), "fastest": max(rates)},
+        "steps_per_second": speed["median"],
+        "speed": speed,
         "num_envs": num_envs,
         "batch_size": batch_size,
-        "observation": list(np.shape(obs)),
+        "observation": list(np.shape(last["obs"])),
     }
 
 
@@ -94,7 +87,7 @@ def main() -> None:
     if "PIXELBRAX_OPENGL" not in os.environ:
         with_opengl()
     arguments = json.loads(sys.argv[1])
-    name, cores = IDS[arguments["task"]], arguments["cores"]
+    name, cores = GYMNASIUM_IDS[arguments["task"]], arguments["cores"]
     sizes = ((cores, cores), (4 * cores, 4 * cores), (2 * cores, cores), (4 * cores, cores))
     runs = [measure(name, num_envs, batch_size, cores) for num_envs, batch_size in sizes]
     best = max(runs, key=lambda run: run["steps_per_second"])

@@ -9,19 +9,13 @@ import json
 import os
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from shared import GYMNASIUM_IDS, speed_of
 
-IDS = {
-    "halfcheetah": "HalfCheetah-v5",
-    "walker2d": "Walker2d-v5",
-    "ant": "Ant-v5",
-    "humanoid": "Humanoid-v5",
-}
-REPETITIONS, SECONDS, SIZE = 5, 3.0, 84
+SECONDS, SIZE = 3.0, 84
 
 
 def make(name: str) -> Any:
@@ -62,23 +56,21 @@ def main() -> None:
     import gymnasium
 
     arguments = json.loads(sys.argv[1])
-    name, processes = IDS[arguments["task"]], arguments["cores"]
+    name, processes = GYMNASIUM_IDS[arguments["task"]], arguments["cores"]
     renderer = opengl(name)
     envs = gymnasium.vector.AsyncVectorEnv([lambda: make(name)] * processes, context="spawn")
     if np.ptp(envs.reset(seed=0)[0]) == 0:
         raise RuntimeError("it draws nothing")
-    rates = []
-    for repetition in range(1 + REPETITIONS):
-        steps, started = 0, time.perf_counter()
-        while time.perf_counter() - started < SECONDS:
-            envs.step(envs.action_space.sample())
-            steps += processes
-        if repetition:  # the first one warms up
-            rates.append(steps / (time.perf_counter() - started))
+
+    def step() -> int:
+        envs.step(envs.action_space.sample())
+        return processes
+
+    speed = speed_of(step, SECONDS)
     envs.close()
     values = {
-        "steps_per_second": float(np.median(rates)),
-        "speed": {"median": float(np.median(rates)), "slowest": min(rates), "fastest": max(rates)},
+        "steps_per_second": speed["median"],
+        "speed": speed,
         "processes": processes,
         "opengl": renderer,
         "versions": {name: version(name) for name in ("gymnasium", "mujoco")},
