@@ -143,22 +143,19 @@ class Video(Distractor):
         """The frame with the video in it."""
         del state
         assert backdrop is not None
-        video = [(backdrop >> shift & 0xFF).astype(jnp.float32) / 255.0 for shift in (0, 8, 16)]
-        planes = [
-            self._mix(plane, pixel, frame)
-            for plane, pixel in zip((frame.r, frame.g, frame.b), video, strict=True)
-        ]
-        return frame.replace(r=planes[0], g=planes[1], b=planes[2])
-
-    def _mix(self, plane: jax.Array, video: jax.Array, frame: Frame) -> jax.Array:
-        mixed = plane + self.share * (video - plane)
-        if self.mode == "overlay":
-            return mixed
-        plane = jnp.where(jnp.isinf(frame.depth), mixed, plane)
-        if self.ground_alpha == 1.0:
-            return plane
-        ground = video + self.ground_alpha * (plane - video)
-        return jnp.where(frame.ground, ground, plane)
+        kept: float | jax.Array = 1.0 - self.share
+        if self.mode == "background":
+            kept = jnp.where(jnp.isinf(frame.depth), kept, 1.0)
+            if self.ground_alpha != 1.0:
+                kept = jnp.where(frame.ground, self.ground_alpha, kept)
+        # Where all is kept, the video's share is an exact zero and the pixel stays to the bit.
+        added = (1.0 - kept) * (1.0 / 255.0)
+        video = [(backdrop >> shift & 0xFF).astype(jnp.float32) for shift in (0, 8, 16)]
+        r, g, b = (
+            kept * plane + added * level
+            for plane, level in zip((frame.r, frame.g, frame.b), video, strict=True)
+        )
+        return frame.replace(r=r, g=g, b=b)
 
     def info(self, state: VideoState) -> dict[str, jax.Array]:
         """``video_clip`` and ``video_frame``: which clip, and which of its frames."""

@@ -1,7 +1,8 @@
 """Comparisons within one process, where all take turns.
 
 A change of the machine's mood then strikes everyone alike, so that ratios hold where speeds do
-not.
+not. Turns are short and their order is drawn anew in each round; a ratio is the median over the
+rounds, and its interval tells how far the machine can be trusted.
 """
 
 from __future__ import annotations
@@ -15,42 +16,62 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import torch
+from scipy import stats
 
 import pixelbrax_gym
 import pixelbrax_jax as pb
 from pixelbrax_jax.distractors import Camera, ClipBank, Color, Video
 from tests.benchmarks.cases import TASKS
 
-SECONDS = 60.0
+SECONDS = 90.0
 """About how long the turns of a comparison take altogether."""
 
 
 def take_turns(runners: Mapping[Hashable, Callable[[], Any]]) -> dict[Any, list[float]]:
-    """Seconds of each runner's turns: at least five, at most 25."""
+    """Seconds of each runner's turns, one in each round: at least five rounds, at most 300."""
     for run in runners.values():
         run()
+    order = list(runners)
+    draw = np.random.default_rng(0)
     started = time.perf_counter()
     times: dict[Any, list[float]] = {key: [] for key in runners}
-    turns = 0
-    while turns < 5 or (turns < 25 and time.perf_counter() - started < SECONDS):
-        turns += 1
-        order = list(runners.items())
-        start = turns % len(order)
-        for key, run in order[start:] + order[:start]:
+    rounds = 0
+    while rounds < 5 or (rounds < 300 and time.perf_counter() - started < SECONDS):
+        rounds += 1
+        for place in draw.permutation(len(order)):
+            key = order[place]
             began = time.perf_counter()
-            run()
+            runners[key]()
             times[key].append(time.perf_counter() - began)
     return times
+
+
+def speed_ratio(seconds: list[float], standard: list[float]) -> dict[str, Any]:
+    """How fast a runner is beside a standard, round by round.
+
+    Returns:
+        ``ratio``, the median over the rounds, more than 1 for the faster, and ``interval``, the
+        bounds of its bootstrap interval of 95 %.
+    """
+    ratios = np.divide(standard, seconds)
+    drawn = stats.bootstrap(
+        (ratios,), np.median, method="percentile", n_resamples=2000, rng=np.random.default_rng(0)
+    ).confidence_interval
+    return {"ratio": float(np.median(ratios)), "interval": [float(drawn.low), float(drawn.high)]}
+
+
+def _calls(num_envs: int) -> int:
+    """Steps in a turn, which shall last some hundredths of a second and not much longer."""
+    return max(1, min(100, 512 // num_envs))
 
 
 def doors(task: str, num_envs: int) -> list[dict[str, Any]]:
     """Steps per second of every door to PyTorch, and of the functional environment in Python.
 
-    ``ratio`` is the median of a door's speed over that of the functional loop with the same
-    autoreset mode that waits for each step as the door does. All see the same actions and the same
-    episodes.
+    ``ratio`` is to the functional loop with the same autoreset mode that waits for each step as the
+    door does. All see the same actions and the same episodes.
     """
-    calls = max(1, min(500, 2560 // num_envs))
+    calls = _calls(num_envs)
     action_size = pb.make(task)[0].action_size
     shape = (calls, num_envs, action_size)
     actions = np.random.default_rng(0).uniform(-1, 1, shape).astype(np.float32)
@@ -74,7 +95,7 @@ def doors(task: str, num_envs: int) -> list[dict[str, Any]]:
             "door": name,
             "autoreset_mode": mode,
             "steps_per_second": num_envs * calls / float(np.median(seconds)),
-            "ratio": float(np.median(np.divide(times["JAX loop", mode], seconds))),
+            **speed_ratio(seconds, times["JAX loop", mode]),
             "turns": len(seconds),
         }
         for (name, mode), seconds in times.items()
@@ -191,6 +212,7 @@ def _wait_for_torch() -> None:
 
 CHAINS = {
     "none": (),
+    "none, a second time": (),
     "color, each frame": (Color(),),
     "color, each material": (Color("geom", "walk", 0.2, "uniform"),),
     "video overlay": (Video(mode="overlay"),),
@@ -210,10 +232,10 @@ def synthetic_bank(size: int = 84) -> ClipBank:
 def distractors(task: str, num_envs: int) -> list[dict[str, Any]]:
     """Steps per second with and without distractors.
 
-    What else goes on in a machine disturbs turns by more than distractors cost. So there are two
-    ratios: of the medians, and of the fastest turns, which were disturbed least.
+    The environment without any takes part twice: what lies between the two is not the cost of
+    a distractor.
     """
-    calls = max(1, 2048 // num_envs)
+    calls = _calls(num_envs)
     bank = synthetic_bank()
     started = time.perf_counter()
     jax.block_until_ready(bank.to_device().words)
@@ -229,8 +251,7 @@ def distractors(task: str, num_envs: int) -> list[dict[str, Any]]:
         {
             "distractors": name,
             "steps_per_second": num_envs * calls / float(np.median(seconds)),
-            "ratio": float(np.median(clean) / np.median(seconds)),
-            "ratio_of_fastest": min(clean) / min(seconds),
+            **speed_ratio(seconds, clean),
             "turns": len(seconds),
             "bank_bytes": bank.device_bytes,
             "bank_upload_seconds": upload_seconds,
