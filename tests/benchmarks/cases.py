@@ -116,6 +116,11 @@ def distractors() -> Iterator[Case]:
         yield Case("distractors", "turns.distractors", {"task": task, "num_envs": num_envs})
 
 
+def clips() -> Iterator[Case]:
+    """From a folder of pictures to the device."""
+    yield Case("clips", "bank.load", {"size": 84})
+
+
 def doors() -> Iterator[Case]:
     """Every door, all taking turns."""
     for task, num_envs in [("ant", 256), ("ant", 1), *((task, 1000) for task in TASKS)]:
@@ -156,6 +161,7 @@ GROUPS = {
     "startup": startup,
     "doors": doors,
     "distractors": distractors,
+    "clips": clips,
     "original": original,
     "peers": peers,
     "devices": devices,

@@ -27,7 +27,9 @@ SECONDS = 90.0
 """About how long the turns of a comparison take altogether."""
 
 
-def take_turns(runners: Mapping[Hashable, Callable[[], Any]]) -> dict[Any, list[float]]:
+def take_turns(
+    runners: Mapping[Hashable, Callable[[], Any]], seconds: float = SECONDS
+) -> dict[Any, list[float]]:
     """Seconds of each runner's turns, one in each round: at least five rounds, at most 300."""
     for run in runners.values():
         run()
@@ -36,7 +38,7 @@ def take_turns(runners: Mapping[Hashable, Callable[[], Any]]) -> dict[Any, list[
     started = time.perf_counter()
     times: dict[Any, list[float]] = {key: [] for key in runners}
     rounds = 0
-    while rounds < 5 or (rounds < 300 and time.perf_counter() - started < SECONDS):
+    while rounds < 5 or (rounds < 300 and time.perf_counter() - started < seconds):
         rounds += 1
         for place in draw.permutation(len(order)):
             key = order[place]
@@ -65,7 +67,7 @@ def _calls(num_envs: int) -> int:
     return max(1, min(100, 512 // num_envs))
 
 
-def doors(task: str, num_envs: int) -> list[dict[str, Any]]:
+def doors(task: str, num_envs: int, seconds: float = SECONDS) -> list[dict[str, Any]]:
     """Steps per second of every door to PyTorch, and of the functional environment in Python.
 
     ``ratio`` is to the functional loop with the same autoreset mode that waits for each step as the
@@ -89,16 +91,16 @@ def doors(task: str, num_envs: int) -> list[dict[str, Any]]:
         task, num_envs, actions, whole=True
     )
     runners["Stable-Baselines3", "same_step"] = _sb3(task, num_envs, actions)
-    times = take_turns(runners)
+    times = take_turns(runners, seconds)
     return [
         {
             "door": name,
             "autoreset_mode": mode,
-            "steps_per_second": num_envs * calls / float(np.median(seconds)),
-            **speed_ratio(seconds, times["JAX loop", mode]),
-            "turns": len(seconds),
+            "steps_per_second": num_envs * calls / float(np.median(turns)),
+            **speed_ratio(turns, times["JAX loop", mode]),
+            "turns": len(turns),
         }
-        for (name, mode), seconds in times.items()
+        for (name, mode), turns in times.items()
     ]
 
 
@@ -229,7 +231,7 @@ def synthetic_bank(size: int = 84) -> ClipBank:
     return ClipBank(frames, length, tuple(map(str, range(60))), "noise", "train")
 
 
-def distractors(task: str, num_envs: int) -> list[dict[str, Any]]:
+def distractors(task: str, num_envs: int, seconds: float = SECONDS) -> list[dict[str, Any]]:
     """Steps per second with and without distractors.
 
     The environment without any takes part twice: what lies between the two is not the cost of
@@ -245,18 +247,18 @@ def distractors(task: str, num_envs: int) -> list[dict[str, Any]]:
         plays = any(isinstance(link, Video) for link in links)
         env, params = pb.make(task, distractors=links, clips=bank if plays else None)
         runners[name] = _stepper(env, jax.device_put(params), num_envs, calls)
-    times = take_turns(runners)
+    times = take_turns(runners, seconds)
     clean = times["none"]
     return [
         {
             "distractors": name,
-            "steps_per_second": num_envs * calls / float(np.median(seconds)),
-            **speed_ratio(seconds, clean),
-            "turns": len(seconds),
+            "steps_per_second": num_envs * calls / float(np.median(turns)),
+            **speed_ratio(turns, clean),
+            "turns": len(turns),
             "bank_bytes": bank.device_bytes,
             "bank_upload_seconds": upload_seconds,
         }
-        for name, seconds in times.items()
+        for name, turns in times.items()
     ]
 
 
