@@ -42,6 +42,7 @@ ANSWERS = {
     "throughput.scan": STEPS,
     "throughput.gymnasium": STEPS,
     "throughput.sharded": STEPS,
+    "scaling.training": STEPS,
     "turns.doors": [{"door": "JAX loop", "autoreset_mode": "next_step", **TURN}],
     "turns.distractors": [{"distractors": "camera", **TURN}],
     "bank.load": {"frames": 4200, "file_bytes": 2e8, "bank_bytes": 1e8, "seconds": {"read": 9.0}},

@@ -117,7 +117,8 @@ def run(
 ) -> Outcome:
     """Trains to the end, or until it is interrupted.
 
-    Ctrl-C, or SIGTERM, lets the iteration finish, writes a checkpoint and returns.
+    Ctrl-C, or SIGTERM, lets the iteration finish, and one that waits behind it, writes a
+    checkpoint and returns.
 
     Args:
         algorithm: with its settings.
@@ -288,6 +289,9 @@ class _Run:
             state, more = self._auxiliary(state)
             metrics |= more
         self._pending.append(metrics)
+        # One iteration is under way and the next one waits; were there more, the bar would run
+        # ahead and Ctrl-C would wait for all of them.
+        jax.block_until_ready(self._pending[-2:-1])
         return state
 
     def _settle(self, steps: int) -> None:

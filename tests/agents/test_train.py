@@ -245,6 +245,22 @@ def test_ctrl_c_writes_a_checkpoint_and_the_run_goes_on(whole, tmp_path):
     assert same(resumed.state, outcome.state)
 
 
+def test_ctrl_c_waits_for_no_whole_log_interval(tmp_path):
+    algorithm = ppg(24)
+
+    def iterate(state, params):
+        state, metrics = algorithm.iterate(state, params)
+        jax.debug.callback(lambda n: n == 3 and interrupt(), state.iteration)
+        return state, metrics
+
+    def interrupt():
+        signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
+
+    stopped = run(replace(algorithm, iterate=iterate), PARAMS, options(tmp_path, log_every=24))
+    assert stopped.interrupted
+    assert 3 <= int(stopped.state.steps) // PER_ITERATION <= 6
+
+
 def test_asked_to_stop_in_its_last_iteration_a_run_is_whole(whole, tmp_path):
     outcome, _ = whole
     algorithm = ppg(8)

@@ -4,7 +4,7 @@
 
 Each argument is the output folder of one ``pixelbrax train``, or the JSON of an earlier call, whose
 runs are kept. Curves are means of the returns of episodes that ended in training; nothing is
-smoothed.
+smoothed. What drawn actions reach in the same tasks stands beside them.
 """
 
 from __future__ import annotations
@@ -15,8 +15,10 @@ import platform
 from importlib.metadata import version
 from pathlib import Path
 
+import jax
 import numpy as np
 
+from pixelbrax_jax import VectorPixelEnv, make
 from pixelbrax_jax.agents.checkpoint import read_about
 from pixelbrax_jax.agents.metrics import read_metrics
 
@@ -41,6 +43,33 @@ def curve_of(folder: Path) -> dict:
     }
 
 
+def drawn_actions(task: str, action_repeat: int, episodes: int = 100) -> dict:
+    """Returns of whole episodes under actions drawn uniformly from [-1, 1]."""
+    env, params = make(task, obs_mode="state", action_repeat=action_repeat)
+    envs = VectorPixelEnv(env, episodes, "disabled")
+
+    @jax.jit
+    def play(key, params):
+        def step(state, key):
+            action = jax.random.uniform(key, (episodes, env.action_size), minval=-1.0)
+            state, _ = envs.step(state, action, params)
+            over = state.done
+            return state, (state.episode_return, over)
+
+        first, rest = jax.random.split(key)
+        state, _ = envs.reset(jax.random.split(first, episodes), params)
+        steps = -(-env.episode_length // action_repeat)
+        _, (returns, over) = jax.lax.scan(step, state, jax.random.split(rest, steps))
+        return returns[over.argmax(0), np.arange(episodes)]
+
+    returns = np.asarray(play(jax.random.key(0), params))
+    return {
+        "episodes": episodes,
+        "mean": float(returns.mean()),
+        "standard_error": float(returns.std(ddof=1) / np.sqrt(episodes)),
+    }
+
+
 def name_of(curve: dict) -> str:
     """What all seeds of an experiment share."""
     config = curve["config"]
@@ -48,28 +77,36 @@ def name_of(curve: dict) -> str:
     return f"{curve['algorithm'].upper()}, {config['task']}{behind}"
 
 
-def plot(curves: list[dict], path: Path) -> None:
+def plot(curves: list[dict], drawn: dict[str, dict], path: Path) -> None:
     """Return over steps: a thin line for each run, a thick one for the mean over seeds."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")
-    for number, name in enumerate(dict.fromkeys(map(name_of, curves))):
-        runs = [curve for curve in curves if name_of(curve) == name]
-        for run in runs:
-            steps = np.divide(run["steps"], 1e6)
-            axes.plot(steps, run["return"], color=f"C{number}", alpha=0.35, linewidth=0.8)
-        common = np.linspace(
-            max(run["steps"][0] for run in runs), min(run["steps"][-1] for run in runs), 60
-        )
-        mean = np.mean([np.interp(common, run["steps"], run["return"]) for run in runs], axis=0)
-        count = f"{len(runs)} seeds" if len(runs) > 1 else "1 seed"
-        axes.plot(common / 1e6, mean, color=f"C{number}", label=f"{name}, {count}")
-    axes.set(xlabel="million control steps", ylabel="return of training episodes")
-    axes.grid(alpha=0.3)
-    axes.legend(fontsize=8)
+    tasks = list(dict.fromkeys(curve["config"]["task"] for curve in curves))
+    figure, panels = plt.subplots(
+        1, len(tasks), figsize=(6 * len(tasks), 4), layout="constrained", squeeze=False
+    )
+    names = list(dict.fromkeys(map(name_of, curves)))
+    for task, axes in zip(tasks, panels[0], strict=True):
+        for number, name in enumerate(names):
+            runs = [c for c in curves if name_of(c) == name and c["config"]["task"] == task]
+            if not runs:
+                continue
+            for run in runs:
+                steps = np.divide(run["steps"], 1e6)
+                axes.plot(steps, run["return"], color=f"C{number}", alpha=0.35, linewidth=0.8)
+            common = np.linspace(
+                max(run["steps"][0] for run in runs), min(run["steps"][-1] for run in runs), 60
+            )
+            mean = np.mean([np.interp(common, run["steps"], run["return"]) for run in runs], axis=0)
+            count = f"{len(runs)} seeds" if len(runs) > 1 else "1 seed"
+            axes.plot(common / 1e6, mean, color=f"C{number}", label=f"{name}, {count}")
+        axes.axhline(drawn[task]["mean"], color="gray", linestyle=":", label="drawn actions")
+        axes.set(xlabel="million control steps", ylabel="return of training episodes", title=task)
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize=8)
     figure.savefig(path, dpi=150)
 
 
@@ -84,12 +121,17 @@ def main() -> None:
     parser.add_argument("--output", type=Path, required=True, help="without .json or .png")
     options = parser.parse_args()
     curves = [curve for path in options.runs for curve in runs_of(path)]
+    tasks = {(c["config"]["task"], c["config"]["action_repeat"]) for c in curves}
+    drawn = {task: drawn_actions(task, repeat) for task, repeat in sorted(tasks)}
     about = {"jax": version("jax"), "brax": version("brax"), "machine": platform.machine()}
-    options.output.with_suffix(".json").write_text(json.dumps({"about": about, "runs": curves}))
-    plot(curves, options.output.with_suffix(".png"))
+    options.output.with_suffix(".json").write_text(
+        json.dumps({"about": about, "drawn_actions": drawn, "runs": curves})
+    )
+    plot(curves, drawn, options.output.with_suffix(".png"))
     for curve in curves:
         speed = f"{curve['steps_per_second']} steps/s"
         print(name_of(curve), "seed", curve["config"]["seed"], speed, curve["evaluation"])
+    print("drawn actions", drawn)
 
 
 if __name__ == "__main__":

@@ -138,6 +138,9 @@ def devices() -> Iterator[Case]:
     for num_devices, num_envs in ((1, 64), (8, 64), (8, 512)):
         where = {"task": "ant", "num_devices": num_devices, "num_envs": num_envs}
         yield Case("devices", "throughput.sharded", where)
+    for num_devices, cores, num_envs in ((1, 1, 64), (2, 2, 128), (1, 2, 128), (4, 2, 128)):
+        where = {"num_devices": num_devices, "cores": cores, "num_envs": num_envs}
+        yield Case("devices", "scaling.training", {"task": "inverted_pendulum", **where})
 
 
 def peers() -> Iterator[Case]:

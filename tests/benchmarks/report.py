@@ -69,8 +69,8 @@ NOTES = {
     "control steps and simulators differ. OpenGL peers draw textures and shadows, which we do not, "
     "and would be faster with a GPU; this compares what a machine without one can do. MuJoCo Warp "
     "draws the same model in the same pose from our camera, without textures and shadows.",
-    "devices": "Emulated devices share the cores of the machine: this shows what is where, and no "
-    "speed.",
+    "devices": "Emulated devices share the cores of the machine: the first table shows what is "
+    "where, and no speed. Ideal is the speed of one device on one core times the number of cores.",
     "sizes": "",
     "environments": "A compiled loop over steps; nothing leaves it.",
 }
@@ -288,8 +288,28 @@ def _devices(rows: list[Row]) -> str:
             number(row["values"]["bytes_on_a_device"] / 1e6),
         ]
         for row in _ok(rows)
+        if row["measure"] == "throughput.sharded"
     ]
-    return _table(("devices", "environments", "steps/s", "MB on a device"), lines)
+    stepping = _table(("devices", "environments", "steps/s", "MB on a device"), lines)
+    alone = _value(_of(rows, "scaling.training", num_devices=1, cores=1), "steps_per_second")
+    lines = []
+    for row in _ok(rows):
+        if row["measure"] == "scaling.training":
+            where, speed = row["arguments"], row["values"]["steps_per_second"]
+            share = _ratio(speed, alone and alone * where["cores"])
+            compilation = number(row["values"]["compile_seconds"])
+            lines.append(
+                [
+                    where["num_devices"],
+                    where["cores"],
+                    where["num_envs"],
+                    number(speed),
+                    share,
+                    compilation,
+                ]
+            )
+    heads = ("devices", "cores", "environments", "steps/s", "of ideal", "compilation, s")
+    return f"{stepping}\n\nTraining, PPO's preset `ci`:\n\n{_table(heads, lines)}"
 
 
 def _peers(rows: list[Row]) -> str:

@@ -1,0 +1,59 @@
+"""Training on one device and on several."""
+
+from __future__ import annotations
+
+import os
+import sys
+from dataclasses import replace
+from typing import Any
+
+import jax
+
+from pixelbrax_jax.agents.config import make_env
+from pixelbrax_jax.agents.ppo import make_ppo
+from pixelbrax_jax.agents.presets import preset
+from pixelbrax_jax.agents.sharding import everywhere, state_shardings
+from pixelbrax_jax.envs.sharded import ShardedVectorEnv, make_env_mesh
+from tests.benchmarks.throughput import compiled, rate
+
+
+def training(task: str, num_devices: int, cores: int, num_envs: int) -> dict[str, Any]:
+    """Iterations of PPO's preset ``ci`` with environments spread over emulated devices.
+
+    Args:
+        task: the task.
+        num_devices: devices; the benchmark has XLA emulate as many.
+        cores: of this machine, on which the process may run.
+        num_envs: environments on all devices together.
+    """
+    if hasattr(os, "sched_setaffinity"):
+        allowed = sorted(os.sched_getaffinity(0))
+        if len(allowed) < cores:
+            sys.stderr.write(f"there are {len(allowed)} cores, not {cores}\n")
+            sys.exit(3)
+        # Before JAX makes its threads.
+        os.sched_setaffinity(0, allowed[:cores])
+    config = replace(preset("ppo", "ci"), task=task, num_envs=num_envs)  # type: ignore[arg-type]
+    env, params = make_env(config)
+    mesh = make_env_mesh(num_devices)
+    algorithm = make_ppo(config, ShardedVectorEnv(env, num_envs, mesh))  # type: ignore[arg-type]
+    key = jax.random.key(0)
+    params = everywhere(mesh, params)
+    shardings = state_shardings(mesh, jax.eval_shape(algorithm.init, key, params))
+    init = jax.jit(lambda params: algorithm.init(key, params), out_shardings=shardings)
+    state = init(params)
+    iterate, compile_seconds = compiled(algorithm.iterate, state, params, donate_argnums=0)
+    carry = {"state": state}
+    del state
+
+    def run(calls: int) -> Any:
+        for _ in range(calls):
+            carry["state"], metrics = iterate(carry["state"], params)
+        return metrics
+
+    speed = rate(run)
+    return {
+        "steps_per_second": speed["median"] * config.steps_per_iteration,
+        "speed": speed,
+        "compile_seconds": compile_seconds,
+    }
