@@ -40,6 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     _add_clips(commands)
     # Its options are the fields of the settings' classes, which tyro reads by itself.
     commands.add_parser("train", help="train an agent: train ppo --help", add_help=False)
+    _add_evaluate(commands)
     _add_record(commands)
     # Its options are those of the benchmark, which is not part of the package.
     commands.add_parser("bench", help="measure throughput: bench --help", add_help=False)
@@ -106,21 +107,11 @@ def _train(arguments: list[str]) -> int:
     return train(arguments)
 
 
-def _add_record(commands: Any) -> None:
-    command = commands.add_parser(
-        "record",
-        help="film a trained agent",
-        description="Plays several episodes of a checkpoint side by side and writes an MP4.",
-    )
+def _add_trained(command: argparse.ArgumentParser) -> None:
+    """Options that choose a trained agent."""
     command.add_argument("folder", help="output folder of a training run")
-    command.add_argument("--output", help="default: videos/<steps>.mp4 in the run's folder")
     command.add_argument("--steps", type=int, help="of which checkpoint (default: the latest)")
     command.add_argument("--best", action="store_true", help="take the best checkpoint")
-    command.add_argument("--split", default="train", help="clean, train or test (default: train)")
-    command.add_argument("--grid", type=int, default=3, help="episodes a side (default: 3)")
-    command.add_argument("--size", type=int, default=168, help="pixels of one (default: 168)")
-    command.add_argument("--num-frames", type=int, default=300, help="at most (default: 300)")
-    command.add_argument("--seed", type=int, default=0, help="of the episodes (default: 0)")
     command.add_argument(
         "--run",
         dest="run_index",
@@ -128,6 +119,48 @@ def _add_record(commands: Any) -> None:
         default=0,
         help="which of the runs of --seeds, from 0 (default: 0)",
     )
+
+
+def _add_evaluate(commands: Any) -> None:
+    command = commands.add_parser(
+        "evaluate",
+        help="returns of a trained agent",
+        description="Plays whole episodes of a checkpoint with the mean action, the same ones "
+        "every time, and writes a line of JSON for each split.",
+    )
+    _add_trained(command)
+    command.add_argument("--episodes", type=int, default=32, help="of each split (default: 32)")
+    command.add_argument(
+        "--split",
+        nargs="+",
+        choices=("clean", "train", "test"),
+        help="default: clean, and with distractors train and test too",
+    )
+    command.set_defaults(run=_evaluate)
+
+
+def _evaluate(options: argparse.Namespace) -> int:
+    try:
+        from pixelbrax_jax.agents.evaluate_command import evaluate
+    except ImportError as error:
+        sys.stderr.write(f"pixelbrax evaluate: {error}; try: {install_extra('train')}\n")
+        return 1
+    return evaluate(options)
+
+
+def _add_record(commands: Any) -> None:
+    command = commands.add_parser(
+        "record",
+        help="film a trained agent",
+        description="Plays several episodes of a checkpoint side by side and writes an MP4.",
+    )
+    _add_trained(command)
+    command.add_argument("--output", help="default: videos/<steps>_<split>.mp4 in the folder")
+    command.add_argument("--split", default="train", help="clean, train or test (default: train)")
+    command.add_argument("--grid", type=int, default=3, help="episodes a side (default: 3)")
+    command.add_argument("--size", type=int, default=168, help="pixels of one (default: 168)")
+    command.add_argument("--num-frames", type=int, default=300, help="at most (default: 300)")
+    command.add_argument("--seed", type=int, default=0, help="of the episodes (default: 0)")
     command.set_defaults(run=_record)
 
 

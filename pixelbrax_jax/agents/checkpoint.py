@@ -200,9 +200,12 @@ class Checkpoints:
             if old.get(name) != new.get(name) and name not in self._free
         ]
         if other:
+            why = ""
+            if old.get("total_steps") != new.get("total_steps") and new.get("anneal"):
+                why = "A step size that falls over all of total_steps leaves them fixed. "
             raise CheckpointError(
                 f"the checkpoint in {self.folder} has other settings: {'; '.join(other)}. "
-                "Use the same ones, or another --output-dir."
+                f"{why}Use the same ones, or another --output-dir."
             )
 
 
@@ -235,7 +238,10 @@ def read_about(folder: str | Path, steps: int | None = None) -> dict[str, Any]:
         raise CheckpointError(f"there is no checkpoint in {folder}.")
     path = folder / str(known[-1] if steps is None else steps) / "about" / "metadata"
     if not path.exists():
-        raise CheckpointError(f"there is no checkpoint in {path.parents[1]}.")
+        raise CheckpointError(
+            f"there is no checkpoint in {path.parents[1]}; there are those of "
+            f"{', '.join(map(str, known))} steps."
+        )
     about: dict[str, Any] = json.loads(path.read_text("utf-8"))
     if about.get("format") != FORMAT:
         raise CheckpointError(
@@ -259,15 +265,17 @@ def read_networks(folder: str | Path, template: Tree, steps: int | None = None) 
     path = Path(folder).absolute() / str(about["steps"]) / "state"
     wanted = _plain({"networks": template})
     reader = ocp.Checkpointer(ocp.PyTreeCheckpointHandler())
-    stored = reader.metadata(path).item_metadata.tree
+    with _without_warnings():
+        stored = reader.metadata(path).item_metadata.tree
     for name, leaf in wanted.items():
         if name not in stored or tuple(stored[name].shape) != leaf.shape:
             found = tuple(stored[name].shape) if name in stored else "missing"
             raise CheckpointError(f"{path.parent}: {name} is {found}, not {leaf.shape}.")
     as_numpy = {name: ocp.RestoreArgs(restore_type=np.ndarray) for name in wanted}
-    restored = reader.restore(
-        path, args=ocp.args.PyTreeRestore(wanted, restore_args=as_numpy, partial_restore=True)
-    )
+    with _without_warnings():
+        restored = reader.restore(
+            path, args=ocp.args.PyTreeRestore(wanted, restore_args=as_numpy, partial_restore=True)
+        )
     leaves = {name: jnp.asarray(restored[name]) for name in wanted}
     return _typed({"networks": template}, leaves)["networks"]
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import argparse
 import sys
-from dataclasses import fields, make_dataclass, replace
+from dataclasses import make_dataclass
 from pathlib import Path
 from typing import Any
 
 import jax
 import tyro
+from tqdm import tqdm
 
 from pixelbrax_jax.agents.checkpoint import CheckpointError
 from pixelbrax_jax.agents.config import TrainConfig, make_env
@@ -66,6 +67,11 @@ def train(arguments: list[str]) -> int:
     ) as error:
         sys.stderr.write(f"pixelbrax train: {error}\n")
         return 1
+    except KeyboardInterrupt:
+        sys.stderr.write(
+            "pixelbrax train: stopped at once; what came after the last checkpoint is lost\n"
+        )
+        return INTERRUPTED
 
 
 def parse(algorithm: str, name: str, arguments: list[str]) -> tuple[TrainConfig, RunConfig]:
@@ -102,7 +108,7 @@ def parse(algorithm: str, name: str, arguments: list[str]) -> tuple[TrainConfig,
 def _run(algorithm: str, config: TrainConfig, options: RunConfig) -> int:
     def report(line: str) -> None:
         if jax.process_index() == 0:
-            sys.stderr.write(f"{line}\n")
+            tqdm.write(line, file=sys.stderr)  # above the bar
 
     env, env_params = make_env(config)
     devices = jax.device_count()
@@ -117,24 +123,3 @@ def _run(algorithm: str, config: TrainConfig, options: RunConfig) -> int:
     )
     outcome = run(MAKERS[algorithm](config, envs), env_params, options, report=report)
     return INTERRUPTED if outcome.interrupted else 0
-
-
-def load_config(about: dict[str, Any]) -> TrainConfig:
-    """The settings that are stored with a checkpoint.
-
-    Raises:
-        CheckpointError: it is of an algorithm that is not known here.
-    """
-    if about["algorithm"] not in CONFIGS:
-        raise CheckpointError(
-            f"the checkpoint is of {about['algorithm']!r}, which is none of {', '.join(CONFIGS)}; "
-            "an algorithm of your own needs a film of your own."
-        )
-    kind = CONFIGS[about["algorithm"]]
-    names = {field.name for field in fields(kind)}
-    values: dict[str, Any] = {
-        name: tuple(value) if isinstance(value, list) else value
-        for name, value in about["config"].items()
-        if name in names
-    }
-    return replace(kind(), **values)

@@ -12,17 +12,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from pixelbrax_jax.agents.checkpoint import (
-    CheckpointError,
-    best_steps,
-    read_about,
-    read_networks,
-)
-from pixelbrax_jax.agents.command import load_config
-from pixelbrax_jax.agents.config import make_env
+from pixelbrax_jax.agents.checkpoint import CheckpointError
 from pixelbrax_jax.agents.evaluate import SPLITS, make_split
-from pixelbrax_jax.agents.presets import MAKERS
-from pixelbrax_jax.agents.seeds import of_seed
+from pixelbrax_jax.agents.trained import load_trained
 from pixelbrax_jax.choices import check_choice, check_whole
 from pixelbrax_jax.compilation import compiler_options
 from pixelbrax_jax.envs.vector import VectorPixelEnv
@@ -93,34 +85,11 @@ def film(
     check_whole("grid", grid)
     check_whole("size", size)
     check_whole("num_frames", num_frames)
-    checkpoints = Path(folder) / "checkpoints"
     check_choice("split", split, SPLITS)
-    if best and steps is not None:
-        raise ValueError(f"give best or steps, not both; got steps={steps}.")
-    if best:
-        steps = best_steps(checkpoints)
-        if steps is None:
-            raise CheckpointError(
-                f"no checkpoint in {checkpoints} has a score yet; without --best the latest is "
-                "filmed."
-            )
-    about = read_about(checkpoints, steps)
-    config = load_config(about)
-    env, params = make_split(config, split)
-    # The networks are those of training, whose environments may show more than pixels.
-    own, own_params = make_env(config, distractors=(), clips=None)
-    algorithm = MAKERS[about["algorithm"]](config, VectorPixelEnv(own, config.num_envs))
+    agent = load_trained(folder, steps=steps, best=best, run=run)
+    algorithm, networks = agent.algorithm, agent.networks
+    env, params = make_split(algorithm.config, split)
     envs = VectorPixelEnv(env, grid * grid)
-
-    num_seeds = about["config"].get("seeds", 1)
-    key = jax.random.key(0)
-    keys = jax.random.split(key, num_seeds) if num_seeds > 1 else key
-    init = jax.vmap(algorithm.init, in_axes=(0, None)) if num_seeds > 1 else algorithm.init
-    template = jax.eval_shape(init, keys, own_params).networks
-    networks = read_networks(checkpoints, template, about["steps"])
-    if not 0 <= run < num_seeds:
-        raise ValueError(f"run must be from 0 to {num_seeds - 1}, got {run}.")
-    networks = of_seed(networks, run) if num_seeds > 1 else networks
 
     @partial(jax.jit, compiler_options=compiler_options())
     def step(state: Any, params: Any) -> tuple[Any, jax.Array]:
@@ -129,7 +98,8 @@ def film(
         draw = jax.vmap(lambda state: env.picture(state, params, size, size))
         return state, draw(state)
 
-    path = Path(output) if output else Path(folder) / "videos" / f"{about['steps']}.mp4"
+    name = "_".join([str(agent.steps), split, *([f"run{run}"] if run else [])])
+    path = Path(output) if output else Path(folder) / "videos" / f"{name}.mp4"
     path.parent.mkdir(parents=True, exist_ok=True)
     state, _ = envs.reset(jax.random.key(seed), params)
     fps = max(1, round(1.0 / env.dt))

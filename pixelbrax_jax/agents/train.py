@@ -176,6 +176,8 @@ def run(
                     f"{checkpoints.folder} has checkpoints of an earlier run: go on with "
                     "--resume latest, or give another --output-dir."
                 )
+            if options.resume == "latest":
+                report(f"no checkpoint in {checkpoints.folder}: a new run begins")
             init = jax.jit(lambda params: algorithm.init(key, params), out_shardings=shardings)
             state = init(env_params)
         placed = None if mesh is None else (shardings, same)
@@ -244,7 +246,14 @@ class _Run:
             raise failure or RuntimeError("process 0 cannot write metrics; it says why.")
         stopped = False
         try:
-            with _interruptible() as interrupted, _bar(options.progress and first, total) as bar:
+            if steps // per_iteration >= total:
+                self._report(f"the run has had its {steps} steps")
+            else:
+                self._report("compiling, which may take a minute")
+            with (
+                _interruptible(self._report) as interrupted,
+                _bar(options.progress and first, total) as bar,
+            ):
                 bar.update(steps // per_iteration)
                 began, began_steps = time.perf_counter(), steps
                 for number in range(steps // per_iteration + 1, total + 1):
@@ -277,6 +286,9 @@ class _Run:
                         break
                 for networks, name in self._policies(state) if first else ():
                     save_policy(self._algorithm, networks, Path(options.output_dir) / name)
+                if not stopped:
+                    folder = Path(options.output_dir)
+                    self._report(f"done after {steps} steps; checkpoints and policy in {folder}")
                 return Outcome(state, self._record, self._results, stopped)
         finally:
             writer.close()
@@ -345,6 +357,8 @@ class _Run:
             runs = [evaluator(networks) for networks, _ in self._policies(state)]
             if len(runs) > 1:
                 middle = interquartile_mean(np.array([run.mean for run in runs]))
+                for number, run in enumerate(runs):
+                    record[f"eval/{split}/return/run_{number}"] = run.mean
                 record[f"eval/{split}/iqm"] = middle.value
                 record[f"eval/{split}/iqm_low"] = middle.low
                 record[f"eval/{split}/iqm_high"] = middle.high
@@ -378,7 +392,7 @@ def _steps(algorithm: Algorithm, state: TrainState) -> int:
 
 
 @contextmanager
-def _interruptible() -> Iterator[list[int]]:
+def _interruptible(report: Callable[[str], None]) -> Iterator[list[int]]:
     """A list that is filled when somebody asks the process to stop; asked twice, it stops."""
     asked: list[int] = []
 
@@ -387,6 +401,7 @@ def _interruptible() -> Iterator[list[int]]:
         if asked:
             raise KeyboardInterrupt
         asked.append(number)
+        report("stopping after the iteration under way; asked again, at once, with no checkpoint")
 
     before = {}
     for number in (signal.SIGINT, signal.SIGTERM):

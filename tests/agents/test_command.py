@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import imageio.v3 as imageio
 import pytest
 
-from pixelbrax_jax.agents.command import load_config, parse
+from pixelbrax_jax.agents import command
+from pixelbrax_jax.agents.command import parse
 from pixelbrax_jax.agents.config import describe
 from pixelbrax_jax.agents.presets import CONFIGS, PRESETS, preset
+from pixelbrax_jax.agents.trained import load_config
 from pixelbrax_jax.cli import main
 from tests.gpu.learning import commands
 
@@ -63,6 +66,15 @@ def test_errors_name_the_setting_and_the_cure(capsys):
     assert "no checkpoint" in capsys.readouterr().err
 
 
+def test_stopped_at_once_it_says_so(monkeypatch, capsys):
+    def stopped(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(command, "run", stopped)
+    assert main(["train", "ppo", *TINY]) == 130
+    assert "what came after the last checkpoint is lost" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("given", ["--coordinator h:1 --num-processes 2", "--process-id 1"])
 def test_a_process_is_not_left_alone_silently(given, capsys):
     with pytest.raises(SystemExit):
@@ -83,7 +95,18 @@ def test_a_run_is_evaluated_and_filmed(tmp_path, capsys):
     # A critic that sees the state: in the film there are pixels alone.
     line = ["train", "ppo", *TINY, "--output-dir", folder, "--num-evals", "1", "--state-critic"]
     assert main(line) == 0
-    assert "clean: return" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert "compiling" in told
+    assert "clean: return" in told
+    assert "done after 16 steps" in told
+    evaluation = [json.loads(line) for line in (Path(folder) / "metrics.jsonl").open()][-1]
+    assert main(["evaluate", folder, "--episodes", "32"]) == 0
+    again = json.loads(capsys.readouterr().out)
+    assert again["return"] == evaluation["eval/clean/return"]
+    assert again["standard_error"] == evaluation["eval/clean/standard_error"]
+    assert (again["steps"], again["split"]) == (16, "clean")
+    assert main(["evaluate", folder, "--split", "test"]) == 1
+    assert "there is only 'clean'" in capsys.readouterr().err
     film = str(tmp_path / "film.mp4")
     line = ["record", folder, "--output", film, "--grid", "2", "--size", "32", "--num-frames", "3"]
     assert main(line) == 0
@@ -94,7 +117,7 @@ def test_a_run_is_evaluated_and_filmed(tmp_path, capsys):
         ("--best --steps 16", "give best or steps, not both; got steps=16"),
         ("--run 1", "run must be from 0 to 0, got 1"),
         ("--split tset", "Did you mean 'test'?"),
-        ("--steps 3", "there is no checkpoint"),
+        ("--steps 3", "there are those of 16 steps"),
     ):
         assert main(["record", folder, *wrong.split()]) == 1
         assert told in capsys.readouterr().err

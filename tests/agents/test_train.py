@@ -256,8 +256,13 @@ def test_ctrl_c_waits_for_no_whole_log_interval(tmp_path):
     def interrupt():
         signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
 
-    stopped = run(replace(algorithm, iterate=iterate), PARAMS, options(tmp_path, log_every=24))
+    lines = []
+    slow_to_log = options(tmp_path, log_every=24, resume="latest")
+    changed = replace(algorithm, iterate=iterate)
+    stopped = run(changed, PARAMS, slow_to_log, report=lines.append)
     assert stopped.interrupted
+    assert any("a new run begins" in line for line in lines)
+    assert any("stopping after the iteration under way" in line for line in lines)
     assert 3 <= int(stopped.state.steps) // PER_ITERATION <= 6
 
 

@@ -1,0 +1,51 @@
+"""``pixelbrax evaluate``: returns of a trained agent."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+
+from pixelbrax_jax.agents.checkpoint import CheckpointError
+from pixelbrax_jax.agents.evaluate import SPLITS, Evaluator, make_split, make_splits
+from pixelbrax_jax.agents.trained import load_trained
+from pixelbrax_jax.choices import check_whole
+
+
+def evaluate(options: argparse.Namespace) -> int:
+    """Runs the command; see ``pixelbrax evaluate --help``.
+
+    Returns:
+        The exit status.
+    """
+    try:
+        check_whole("episodes", options.episodes)
+        agent = load_trained(
+            options.folder, steps=options.steps, best=options.best, run=options.run_index
+        )
+        config = agent.algorithm.config
+        names = options.split or [name for name in SPLITS if name in make_splits(config)]
+        for name in names:
+            if name != "clean" and not config.distractors:
+                raise ValueError(
+                    f"split {name!r} is for distractors, and the run had none; there is only "
+                    "'clean'."
+                )
+            env, params = make_split(config, name)
+            evaluator = Evaluator(agent.algorithm, env, params, num_episodes=options.episodes)
+            result = evaluator(agent.networks)
+            line = {
+                "steps": agent.steps,
+                "split": name,
+                "episodes": options.episodes,
+                "return": result.mean,
+                "length": float(result.lengths.mean()),
+            }
+            if options.episodes > 1:
+                line["standard_error"] = result.standard_error
+            sys.stdout.write(json.dumps(line) + "\n")
+            sys.stdout.flush()
+    except (CheckpointError, ValueError, OSError, ImportError) as error:
+        sys.stderr.write(f"pixelbrax evaluate: {error}\n")
+        return 1
+    return 0
