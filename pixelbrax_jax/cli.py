@@ -156,7 +156,9 @@ def _add_record(commands: Any) -> None:
     )
     _add_trained(command)
     command.add_argument("--output", help="default: videos/<steps>_<split>.mp4 in the folder")
-    command.add_argument("--split", default="train", help="clean, train or test (default: train)")
+    command.add_argument(
+        "--split", help="clean, train or test (default: train, or clean without distractors)"
+    )
     command.add_argument("--grid", type=int, default=3, help="episodes a side (default: 3)")
     command.add_argument("--size", type=int, default=168, help="pixels of one (default: 168)")
     command.add_argument("--num-frames", type=int, default=300, help="at most (default: 300)")

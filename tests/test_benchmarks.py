@@ -37,6 +37,7 @@ STEPS = {
     "control_dt": 0.05,
 }
 TURN = {"steps_per_second": 97.0, "ratio": 0.97, "interval": [0.96, 0.98], "turns": 5}
+WALKERS = {"task": "walker2d", "num_envs": 2}
 ANSWERS = {
     "throughput.renderer": RENDERER,
     "throughput.scan": STEPS,
@@ -246,15 +247,19 @@ def test_a_real_case_runs_in_a_process_of_its_own():
 @pytest.mark.parametrize(
     ("measure", "options"),
     [
-        ("throughput.gymnasium", {}),
-        ("throughput.scan", {}),
-        ("turns.doors", {"seconds": 1.0}),
-        ("turns.distractors", {"seconds": 1.0}),
+        ("throughput.gymnasium", WALKERS),
+        ("throughput.scan", WALKERS),
+        ("turns.doors", {**WALKERS, "seconds": 1.0}),
+        ("turns.distractors", {**WALKERS, "seconds": 1.0}),
+        ("bank.load", {"size": 16, "frames": 2}),
+        (
+            "scaling.training",
+            {"task": "inverted_pendulum", "num_devices": 2, "cores": 1, "num_envs": 4},
+        ),
     ],
 )
 def test_more_real_cases_run(measure, options):
-    arguments = {"task": "walker2d", "num_envs": 2, **options}
-    outcome = run.measure(Case("doors", measure, arguments), 900.0)
+    outcome = run.measure(Case("doors", measure, options), 900.0)
     assert outcome["status"] == "ok", outcome
 
 

@@ -16,6 +16,7 @@ from pixelbrax_jax.agents.checkpoint import CheckpointError
 from pixelbrax_jax.agents.config import TrainConfig, make_env
 from pixelbrax_jax.agents.presets import CONFIGS, MAKERS, PRESETS, preset
 from pixelbrax_jax.agents.train import RunConfig, TrainingDivergedError, run
+from pixelbrax_jax.choices import check_whole
 from pixelbrax_jax.envs.sharded import ShardedVectorEnv, make_env_mesh
 from pixelbrax_jax.envs.vector import VectorPixelEnv
 
@@ -38,6 +39,7 @@ def train(arguments: list[str]) -> int:
     first.add_argument("--coordinator", help="host:port of process 0, of several processes")
     first.add_argument("--num-processes", type=int)
     first.add_argument("--process-id", type=int)
+    first.add_argument("--cpu-devices", type=int)
     if not arguments or arguments[0] in ("-h", "--help"):
         sys.stdout.write(
             "usage: pixelbrax train {"
@@ -52,6 +54,8 @@ def train(arguments: list[str]) -> int:
     if None in spread and any(given is not None for given in spread):
         first.error("--coordinator, --num-processes and --process-id belong together")
     try:
+        if chosen.cpu_devices is not None:
+            _emulate(chosen.cpu_devices)
         if chosen.coordinator is not None:
             jax.distributed.initialize(*spread)
         config, options = parse(chosen.algorithm, chosen.preset, rest)
@@ -72,6 +76,21 @@ def train(arguments: list[str]) -> int:
             "pixelbrax train: stopped at once; what came after the last checkpoint is lost\n"
         )
         return INTERRUPTED
+
+
+def _emulate(cpu_devices: int) -> None:
+    """Has JAX show the CPU as several devices, each of which computes in threads of its own.
+
+    Raises:
+        ValueError: the number is below 1, or JAX is at work already.
+    """
+    check_whole("--cpu-devices", cpu_devices)
+    try:
+        jax.config.update("jax_num_cpu_devices", cpu_devices)
+    except RuntimeError as error:
+        raise ValueError(
+            f"--cpu-devices {cpu_devices} comes too late: JAX is at work in this process."
+        ) from error
 
 
 def parse(algorithm: str, name: str, arguments: list[str]) -> tuple[TrainConfig, RunConfig]:
@@ -97,8 +116,9 @@ def parse(algorithm: str, name: str, arguments: list[str]) -> tuple[TrainConfig,
         command,
         prog=f"pixelbrax train {algorithm}",
         description=f"Trains {algorithm.upper()} from pixels. --preset "
-        f"{{{','.join(PRESETS)}}} changes the defaults; --coordinator HOST:PORT --num-processes P "
-        "--process-id I spreads a run over P processes.",
+        f"{{{','.join(PRESETS)}}} changes the defaults; --cpu-devices D spreads the environments "
+        "over D emulated devices, one a core, on a machine without an accelerator; "
+        "--coordinator HOST:PORT --num-processes P --process-id I spreads a run over P processes.",
         default=command(**parts),
         args=arguments,
     )

@@ -53,8 +53,12 @@ def make_splits(config: TrainConfig) -> dict[str, tuple[PixelEnv, EnvParams]]:
     ``clean`` has no distractors, ``train`` those of the training, and ``test`` the same with
     clips that training never shows. Without distractors there is only ``clean``.
     """
-    names = SPLITS if config.distractors else SPLITS[:1]
-    return {name: make_split(config, name) for name in names}
+    return {name: make_split(config, name) for name in splits_of(config)}
+
+
+def splits_of(config: TrainConfig) -> tuple[str, ...]:
+    """Names of the splits that there are."""
+    return SPLITS if config.distractors else SPLITS[:1]
 
 
 def make_split(config: TrainConfig, name: str) -> tuple[PixelEnv, EnvParams]:
@@ -64,8 +68,12 @@ def make_split(config: TrainConfig, name: str) -> tuple[PixelEnv, EnvParams]:
         ValueError: there is no such split.
     """
     check_choice("split", name, SPLITS)
+    if name not in splits_of(config):
+        raise ValueError(
+            f"split {name!r} is for distractors, and the run had none; there is only 'clean'."
+        )
     clean = {"distractors": (), "clips": None}
-    changes = clean if name == "clean" or not config.distractors else {"split": name}
+    changes = clean if name == "clean" else {"split": name}
     # What training sees of the state, evaluation need not.
     return make_env(config, obs_mode="pixels", **changes)
 

@@ -7,7 +7,7 @@ import json
 import sys
 
 from pixelbrax_jax.agents.checkpoint import CheckpointError
-from pixelbrax_jax.agents.evaluate import SPLITS, Evaluator, make_split, make_splits
+from pixelbrax_jax.agents.evaluate import Evaluator, make_split, splits_of
 from pixelbrax_jax.agents.trained import load_trained
 from pixelbrax_jax.choices import check_whole
 
@@ -24,13 +24,7 @@ def evaluate(options: argparse.Namespace) -> int:
             options.folder, steps=options.steps, best=options.best, run=options.run_index
         )
         config = agent.algorithm.config
-        names = options.split or [name for name in SPLITS if name in make_splits(config)]
-        for name in names:
-            if name != "clean" and not config.distractors:
-                raise ValueError(
-                    f"split {name!r} is for distractors, and the run had none; there is only "
-                    "'clean'."
-                )
+        for name in options.split or splits_of(config):
             env, params = make_split(config, name)
             evaluator = Evaluator(agent.algorithm, env, params, num_episodes=options.episodes)
             result = evaluator(agent.networks)

@@ -52,7 +52,7 @@ def film(
     output: str | Path | None = None,
     steps: int | None = None,
     best: bool = False,
-    split: str = "train",
+    split: str | None = None,
     grid: int = 3,
     size: int = 168,
     num_frames: int = 300,
@@ -66,7 +66,7 @@ def film(
         output: of the film; None puts it into the run's folder.
         steps: of which checkpoint; None takes the latest.
         best: whether instead the best checkpoint is taken.
-        split: ``"clean"``, ``"train"`` or ``"test"``; without distractors all are clean.
+        split: ``"clean"``, ``"train"`` or ``"test"``; None takes that of the training.
         grid: episodes a side.
         size: pixels of one episode, square.
         num_frames: at most.
@@ -85,9 +85,11 @@ def film(
     check_whole("grid", grid)
     check_whole("size", size)
     check_whole("num_frames", num_frames)
-    check_choice("split", split, SPLITS)
+    if split is not None:
+        check_choice("split", split, SPLITS)
     agent = load_trained(folder, steps=steps, best=best, run=run)
     algorithm, networks = agent.algorithm, agent.networks
+    split = split or ("train" if algorithm.config.distractors else "clean")
     env, params = make_split(algorithm.config, split)
     envs = VectorPixelEnv(env, grid * grid)
 

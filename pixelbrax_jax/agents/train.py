@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -249,7 +249,7 @@ class _Run:
             if steps // per_iteration >= total:
                 self._report(f"the run has had its {steps} steps")
             else:
-                self._report("compiling, which may take a minute")
+                self._report("compiling")
             with (
                 _interruptible(self._report) as interrupted,
                 _bar(options.progress and first, total) as bar,
@@ -401,7 +401,9 @@ def _interruptible(report: Callable[[str], None]) -> Iterator[list[int]]:
         if asked:
             raise KeyboardInterrupt
         asked.append(number)
-        report("stopping after the iteration under way; asked again, at once, with no checkpoint")
+        # Whoever reads the lines may have been stopped too, and a line may be under way.
+        with suppress(OSError, RuntimeError):
+            report("stopping within two iterations; asked again, at once, with no checkpoint")
 
     before = {}
     for number in (signal.SIGINT, signal.SIGTERM):

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import imageio.v3 as imageio
+import jax
 import pytest
 
 from pixelbrax_jax.agents import command
@@ -64,6 +65,13 @@ def test_errors_name_the_setting_and_the_cure(capsys):
     assert "Did you mean 'ant'?" in capsys.readouterr().err
     assert main(["record", "/nowhere"]) == 1
     assert "no checkpoint" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("given", "told"), [("0", "at least 1"), ("2", "comes too late")])
+def test_devices_cannot_be_emulated_late(given, told, capsys):
+    jax.devices()
+    assert main(["train", "ppo", *TINY, "--cpu-devices", given]) == 1
+    assert told in capsys.readouterr().err
 
 
 def test_stopped_at_once_it_says_so(monkeypatch, capsys):

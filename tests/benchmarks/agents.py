@@ -43,9 +43,14 @@ def curve_of(folder: Path) -> dict:
     }
 
 
-def drawn_actions(task: str, action_repeat: int, episodes: int = 100) -> dict:
-    """Returns of whole episodes under actions drawn uniformly from [-1, 1]."""
-    env, params = make(task, obs_mode="state", action_repeat=action_repeat)
+_TASK = ("task", "backend", "reward_preset", "action_repeat", "episode_length")
+"""Settings that decide what a return means."""
+
+
+def drawn_actions(curve: dict, episodes: int = 100) -> dict:
+    """Returns of whole episodes of a run's task under actions drawn uniformly from [-1, 1]."""
+    settings = {name: curve["config"][name] for name in _TASK}
+    env, params = make(settings["task"], obs_mode="state", **dict(list(settings.items())[1:]))
     envs = VectorPixelEnv(env, episodes, "disabled")
 
     @jax.jit
@@ -58,12 +63,13 @@ def drawn_actions(task: str, action_repeat: int, episodes: int = 100) -> dict:
 
         first, rest = jax.random.split(key)
         state, _ = envs.reset(jax.random.split(first, episodes), params)
-        steps = -(-env.episode_length // action_repeat)
+        steps = -(-env.episode_length // env.action_repeat)
         _, (returns, over) = jax.lax.scan(step, state, jax.random.split(rest, steps))
         return returns[over.argmax(0), np.arange(episodes)]
 
     returns = np.asarray(play(jax.random.key(0), params))
     return {
+        "settings": settings,
         "episodes": episodes,
         "mean": float(returns.mean()),
         "standard_error": float(returns.std(ddof=1) / np.sqrt(episodes)),
@@ -121,8 +127,10 @@ def main() -> None:
     parser.add_argument("--output", type=Path, required=True, help="without .json or .png")
     options = parser.parse_args()
     curves = [curve for path in options.runs for curve in runs_of(path)]
-    tasks = {(c["config"]["task"], c["config"]["action_repeat"]) for c in curves}
-    drawn = {task: drawn_actions(task, repeat) for task, repeat in sorted(tasks)}
+    tasks = {tuple(curve["config"][name] for name in _TASK): curve for curve in curves}
+    drawn = {curve["config"]["task"]: drawn_actions(curve) for curve in tasks.values()}
+    if len(drawn) < len(tasks):
+        raise SystemExit(f"runs of one task differ in {', '.join(_TASK[1:])}; plot them apart")
     about = {"jax": version("jax"), "brax": version("brax"), "machine": platform.machine()}
     options.output.with_suffix(".json").write_text(
         json.dumps({"about": about, "drawn_actions": drawn, "runs": curves})

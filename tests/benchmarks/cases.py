@@ -50,6 +50,10 @@ PEERS: dict[str, tuple[str, ...]] = {
 """Peer -> what is installed for it, into an environment of its own."""
 
 
+ABSENT = 3
+"""Exit status of a worker that lacks what it is to measure."""
+
+
 @dataclass(frozen=True)
 class Case:
     """One measurement, made in a process of its own.

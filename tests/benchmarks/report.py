@@ -34,8 +34,8 @@ def page(machines: dict[str, Row], rows: list[Row], name: str, plotted: bool) ->
     parts = [
         f"# Measurements: {name}",
         "Written by `pixelbrax bench`. Medians of at least five repetitions of half a second or "
-        "more; compilation is apart, every call is waited for, actions are drawn, and episodes "
-        "begin anew. Each case has a process of its own.",
+        "more, unless a part says otherwise; compilation is apart, every call is waited for, "
+        "actions are drawn, and episodes begin anew. Each case has a process of its own.",
         *(_machine(machine) for machine in machines.values()),
     ]
     if plotted:
@@ -58,9 +58,11 @@ NOTES = {
     "startup": "16 environments behind Gymnasium; one sample each. `gymnasium` and PixelBrax are "
     "imported first, JAX and Brax when the environment is made.",
     "doors": "The ratio is that to the JAX loop with the same autoreset mode, which waits for each "
-    "step, with its bootstrap interval of 95 %; all take turns in one process.",
-    "distractors": "With a bank of 60 clips of 70 frames; all take turns in one process. Ratios "
-    "are to the speed without: medians over the rounds, with bootstrap intervals of 95 %.",
+    "step: medians over rounds, in which all take a turn of 8 to 100 steps in one process, with "
+    "bootstrap intervals of 95 %.",
+    "distractors": "With a bank of 60 clips of 70 frames. Ratios are to the speed without: medians "
+    "over rounds, in which all take a turn of 1 to 100 steps in one process, with bootstrap "
+    "intervals of 95 %.",
     "clips": "Pictures of 854 x 480, as many as the training split of DAVIS-2017 has at most, just "
     "written and so still in memory; one sample each.",
     "original": "A compiled loop of ours in the settings in which the speed of the original is "
@@ -309,7 +311,8 @@ def _devices(rows: list[Row]) -> str:
                 ]
             )
     heads = ("devices", "cores", "environments", "steps/s", "of ideal", "compilation, s")
-    return f"{stepping}\n\nTraining, PPO's preset `ci`:\n\n{_table(heads, lines)}"
+    training = f"\n\nTraining, PPO's preset `ci`:\n\n{_table(heads, lines)}" if lines else ""
+    return stepping + training
 
 
 def _peers(rows: list[Row]) -> str:

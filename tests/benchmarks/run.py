@@ -28,7 +28,7 @@ from typing import Any
 from tqdm import tqdm
 
 from tests.benchmarks import report
-from tests.benchmarks.cases import GROUPS, TASKS, Case
+from tests.benchmarks.cases import ABSENT, GROUPS, TASKS, Case
 from tests.benchmarks.machine import cores
 from tests.benchmarks.peers.install import AbsentError, peer_python
 
@@ -41,8 +41,6 @@ OUT_OF_MEMORY = (
     "bad_alloc",
     "cannot allocate memory",
 )
-ABSENT = 3
-"""Exit status of a worker that lacks what it is to measure."""
 
 
 class KilledError(Exception):

@@ -14,6 +14,7 @@ from pixelbrax_jax.agents.ppo import make_ppo
 from pixelbrax_jax.agents.presets import preset
 from pixelbrax_jax.agents.sharding import everywhere, state_shardings
 from pixelbrax_jax.envs.sharded import ShardedVectorEnv, make_env_mesh
+from tests.benchmarks.cases import ABSENT
 from tests.benchmarks.throughput import compiled, rate
 
 
@@ -26,13 +27,12 @@ def training(task: str, num_devices: int, cores: int, num_envs: int) -> dict[str
         cores: of this machine, on which the process may run.
         num_envs: environments on all devices together.
     """
-    if hasattr(os, "sched_setaffinity"):
-        allowed = sorted(os.sched_getaffinity(0))
-        if len(allowed) < cores:
-            sys.stderr.write(f"there are {len(allowed)} cores, not {cores}\n")
-            sys.exit(3)
-        # Before JAX makes its threads.
-        os.sched_setaffinity(0, allowed[:cores])
+    allowed = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_setaffinity") else []
+    if len(allowed) < cores:
+        sys.stderr.write(f"there are {len(allowed)} cores to choose from, not {cores}\n")
+        sys.exit(ABSENT)
+    # Before JAX makes its threads.
+    os.sched_setaffinity(0, allowed[:cores])
     config = replace(preset("ppo", "ci"), task=task, num_envs=num_envs)  # type: ignore[arg-type]
     env, params = make_env(config)
     mesh = make_env_mesh(num_devices)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import pixelbrax_jax as pb
-from tests.benchmarks.cases import TASKS
+from tests.benchmarks.cases import ABSENT, TASKS
 
 REPETITIONS = 5
 SECONDS = 0.5
@@ -187,7 +187,7 @@ def sharded(task: str, num_devices: int, num_envs: int) -> dict[str, Any]:
 
     if jax.device_count() < num_devices:
         sys.stderr.write(f"there are {jax.device_count()} devices, not {num_devices}\n")
-        sys.exit(3)
+        sys.exit(ABSENT)
     env, params = pb.make(task)
     venv = ShardedVectorEnv(env, num_envs, make_env_mesh(num_devices))
     step = jax.jit(venv.step, donate_argnums=0, compiler_options=pb.compiler_options())

@@ -63,9 +63,9 @@ def test_an_overlay_covers_everything():
             np.testing.assert_allclose(plane, expected, atol=1e-6)
 
 
-@pytest.mark.parametrize("ground_alpha", [1.0, 0.3, 0.0])
-def test_a_background_leaves_the_agent_alone(ground_alpha):
-    video = run(distractors.Video(ground_alpha=ground_alpha))
+@pytest.mark.parametrize(("ground_alpha", "alpha"), [(1.0, 1.0), (0.3, 0.4), (0.0, 0.0)])
+def test_a_background_leaves_the_agent_alone(ground_alpha, alpha):
+    video = run(distractors.Video(ground_alpha=ground_alpha, alpha=alpha))
     clean = run(None)
     clips = make_clips()
     ground = Ball.geoms.kind.index(GeomKind.PLANE)
@@ -81,7 +81,10 @@ def test_a_background_leaves_the_agent_alone(ground_alpha):
         newest, clean_pixels = timestep.obs[..., -3:], bare.obs[..., -3:]
         np.testing.assert_array_equal(newest[agent], clean_pixels[agent])
         np.testing.assert_array_equal(frame.r[agent], plain.r[agent])
-        np.testing.assert_allclose(frame.r[sky], red[sky], atol=1e-6)
+        expected = (1 - alpha) * plain.r + alpha * red
+        np.testing.assert_allclose(frame.r[sky], expected[sky], atol=1e-6)
+        if alpha == 0.0:
+            np.testing.assert_array_equal(frame.r[sky], plain.r[sky])
         expected = ground_alpha * plain.r + (1 - ground_alpha) * red
         np.testing.assert_allclose(frame.r[floor], expected[floor], atol=1e-6)
 
