@@ -81,15 +81,16 @@ def main() -> None:
     parser.add_argument("--output", type=Path, required=True)
     parser.add_argument("--num-envs", type=int, default=64)
     parser.add_argument("--num-steps", type=int, default=16)
+    parser.add_argument("--encoders", nargs="+", choices=ENCODERS, default=list(ENCODERS))
     options = parser.parse_args()
     about = {name: version(name) for name in ("jax", "brax", "pixelbrax")}
     about |= {"machine": platform.machine(), "device": jax.devices()[0].device_kind}
     rows = []
-    for encoder in ENCODERS:
+    for encoder in options.encoders:
         rows.append(measure(encoder, options.num_envs, options.num_steps))
         print(json.dumps(rows[-1]), flush=True)
-    report = {"about": about, "encoders": rows}
-    options.output.write_text(json.dumps(report, indent=2) + "\n", "utf-8")
+        report = {"about": about, "encoders": rows}
+        options.output.write_text(json.dumps(report, indent=2) + "\n", "utf-8")
 
 
 if __name__ == "__main__":
