@@ -405,12 +405,19 @@ def plot(rows: list[Row], path: Path) -> bool:
         Whether there was anything to plot.
     """
     rows = [row for row in _ok(rows) if row["group"] in ("environments", "peers")]
-    if not any(row["group"] == "environments" for row in rows):
+    measured = {r["arguments"]["task"] for r in rows if r["group"] == "environments"}
+    if not measured:
         return False
+    tasks = {task: title for task, title in TASKS.items() if task in measured}
     figure, panels = plt.subplots(
-        1, len(TASKS), figsize=(13, 3.6), sharey=True, layout="constrained"
+        1,
+        len(tasks),
+        figsize=(1 + 3 * len(tasks), 3.6),
+        sharey=True,
+        layout="constrained",
+        squeeze=False,
     )
-    for panel, (task, title) in zip(panels, TASKS.items(), strict=True):
+    for panel, (task, title) in zip(panels[0], tasks.items(), strict=True):
         of_task = [row for row in rows if row["arguments"].get("task") == task]
         for obs_mode, label in (("state", "state only"), ("pixels", "84 x 84 pixels")):
             points = [
@@ -430,7 +437,7 @@ def plot(rows: list[Row], path: Path) -> bool:
         panel.set(title=title, xlabel="environments")
         panel.grid(alpha=0.3, which="both")
         panel.legend(fontsize=7)
-    panels[0].set_ylabel("steps / s")
+    panels[0, 0].set_ylabel("steps / s")
     figure.savefig(path, dpi=130)
     plt.close(figure)
     return True
