@@ -102,9 +102,14 @@ def _train(arguments: list[str]) -> int:
     try:
         from pixelbrax_jax.agents.command import train
     except ImportError as error:
-        sys.stderr.write(f"pixelbrax train: {error}; try: {install_extra('train')}\n")
-        return 1
+        return _lacks_train("train", error)
     return train(arguments)
+
+
+def _lacks_train(command: str, error: ImportError) -> int:
+    """Says how to get the extra that agents need, and returns the exit status."""
+    sys.stderr.write(f"pixelbrax {command}: {error}; try: {install_extra('train')}\n")
+    return 1
 
 
 def _add_trained(command: argparse.ArgumentParser) -> None:
@@ -143,8 +148,7 @@ def _evaluate(options: argparse.Namespace) -> int:
     try:
         from pixelbrax_jax.agents.evaluate_command import evaluate
     except ImportError as error:
-        sys.stderr.write(f"pixelbrax evaluate: {error}; try: {install_extra('train')}\n")
-        return 1
+        return _lacks_train("evaluate", error)
     return evaluate(options)
 
 
@@ -170,8 +174,7 @@ def _record(options: argparse.Namespace) -> int:
     try:
         from pixelbrax_jax.agents.record import record
     except ImportError as error:
-        sys.stderr.write(f"pixelbrax record: {error}; try: {install_extra('train')}\n")
-        return 1
+        return _lacks_train("record", error)
     return record(options)
 
 
