@@ -24,6 +24,7 @@ from pixelbrax_gym.single_env import check_render_size
 from pixelbrax_gym.stateful import SEEDS, StatefulEnv, spread_seeds
 from pixelbrax_gym.torchrl_specs import action_spec, done_spec, observation_spec
 
+_OBSERVATIONS = ("pixels", "observation")
 _OWN_OPTIONS = ("num_envs", "device", "render_height", "render_width")
 
 
@@ -141,6 +142,24 @@ class PixelBraxTorchRLEnv(EnvBase):
         # Handed out once, and so never shared by two who might write to it.
         obs, self._first_obs = self._first_obs, None
         return self._tensordict(self._observations(to_torch(obs)) | self._flags())
+
+    def _reset_proc_data(
+        self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        """TorchRL's, apart from observations.
+
+        `_reset` returns those of all environments, also of the ones that go on. TorchRL would
+        choose between old and new ones row by row, and copy every picture for it. That is only
+        needed while some ended episode keeps its last observation.
+        """
+        if tensordict is None or np.any(self._began):
+            return super()._reset_proc_data(tensordict, tensordict_reset)
+        rest = super()._reset_proc_data(
+            tensordict.exclude(*_OBSERVATIONS), tensordict_reset.exclude(*_OBSERVATIONS)
+        )
+        tensordict.pop("_reset", None)
+        observations = tensordict_reset.select(*_OBSERVATIONS, strict=False)
+        return tensordict.update(rest).update(observations)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         where = tensordict.get("_step", None)

@@ -44,6 +44,7 @@ ANSWERS = {
     "throughput.gymnasium": STEPS,
     "throughput.sharded": STEPS,
     "scaling.training": STEPS,
+    "turns.batches": [{"num_envs": 10, **TURN}],
     "turns.doors": [{"door": "JAX loop", "autoreset_mode": "next_step", **TURN}],
     "turns.distractors": [{"distractors": "camera", **TURN}],
     "bank.load": {"frames": 4200, "file_bytes": 2e8, "bank_bytes": 1e8, "seconds": {"read": 9.0}},
@@ -249,6 +250,7 @@ def test_a_real_case_runs_in_a_process_of_its_own():
     [
         ("throughput.gymnasium", WALKERS),
         ("throughput.scan", WALKERS),
+        ("turns.batches", {"task": "walker2d", "batches": (2,), "seconds": 1.0}),
         ("turns.doors", {**WALKERS, "seconds": 1.0}),
         ("turns.distractors", {**WALKERS, "seconds": 1.0}),
         ("bank.load", {"size": 16, "frames": 2}),

@@ -22,7 +22,7 @@ _RESET_STREAM = 0
 """Name of the random stream of physics resets, folded into an episode's key."""
 
 _BANDS = 2
-"""Parts in which a picture is drawn, one above the other; a loop of one turn would be none."""
+"""Parts in which an accelerator draws a picture, one above the other: a loop of one is none."""
 
 
 class PixelEnv:
@@ -281,28 +281,40 @@ class PixelEnv:
     def draw_at(self, state: EnvState, params: EnvParams, height: int, width: int) -> jax.Array:
         """The packed frame of a state at any size, (height, width) uint32."""
         scene = self._scene(state, params)
-        # A loop over bands of rows is a wall that XLA does not fuse across: without it the
-        # renderer is fused into whoever reads the words, and runs again for every reader.
-        rows = -(-height // _BANDS)
 
-        def draw_band(first_row: jax.Array) -> jax.Array:
-            frame = render(scene, height, width, self.renderer, first_row=first_row, num_rows=rows)
+        # Both forms are walls that XLA does not fuse across: without one the renderer is fused
+        # into whoever reads the words, and runs again for every reader.
+        def draw_rows(first_row: jax.Array, num_rows: int) -> jax.Array:
+            frame = render(
+                scene, height, width, self.renderer, first_row=first_row, num_rows=num_rows
+            )
             # The last band may reach beyond the picture.
-            within = jnp.minimum(first_row + jnp.arange(rows), height - 1)
-            backdrops = self.distractors.backdrops(state.distraction, params, within, height, width)
+            rows = jnp.minimum(first_row + jnp.arange(num_rows), height - 1)
+            backdrops = self.distractors.backdrops(state.distraction, params, rows, height, width)
             return observe.pack(self.distractors.change_frame(state.distraction, frame, backdrops))
 
-        def draw_band_apart(first_row: jax.Array) -> jax.Array:
-            # On a CPU, XLA runs in one thread whatever is fused into the write to a loop's
-            # result. It fuses nothing across a conditional either.
-            blank = jnp.zeros((rows, width), jnp.uint32)
-            return jax.lax.cond(first_row >= 0, draw_band, lambda _: blank, first_row)
+        def draw_in_bands(zero: jax.Array) -> jax.Array:
+            num_rows = -(-height // _BANDS)
+            first_rows = zero + jnp.arange(_BANDS) * num_rows
+            words = jax.lax.map(lambda first_row: draw_rows(first_row, num_rows), first_rows)
+            return words.reshape(-1, width)[:height]
 
-        def band(first_row: jax.Array) -> jax.Array:
-            return jax.lax.platform_dependent(first_row, cpu=draw_band_apart, default=draw_band)
+        def draw_at_once(zero: jax.Array) -> jax.Array:
+            # On a CPU, XLA clears the result of a loop beforehand, and runs in one thread whatever
+            # is fused into the writes to it. A conditional costs nothing, as long as the compiler
+            # cannot know that it is always taken.
+            blank = jnp.zeros((height, width), jnp.uint32)
+            return jax.lax.cond(
+                jax.lax.optimization_barrier(zero) == 0,
+                lambda first_row: draw_rows(first_row, height),
+                lambda _: blank,
+                zero,
+            )
 
-        words = jax.lax.map(band, jnp.arange(_BANDS) * rows)
-        return words.reshape(-1, width)[:height]
+        words: jax.Array = jax.lax.platform_dependent(
+            jnp.int32(0), cpu=draw_at_once, default=draw_in_bands
+        )
+        return words
 
     def show(self, state: EnvState, params: EnvParams, first: jax.Array) -> EnvState:
         """``state`` with its present frame on the stack."""

@@ -19,6 +19,9 @@ AUTORESET_MODES = ("next_step", "same_step", "disabled")
 _BLOCK = 32
 """Environments that begin an episode together; their number is rounded up to a multiple."""
 
+_CHUNK = 128
+"""Most environments whose physics a CPU steps together, so that all of it fits its caches."""
+
 
 class VectorPixelEnv:
     """``num_envs`` independent copies of a pixel environment that step together.
@@ -142,7 +145,7 @@ class VectorPixelEnv:
         if action.shape != expected:
             raise ValueError(f"action must have shape {expected}, got {tuple(action.shape)}.")
         begins = state.done
-        state, reward = jax.vmap(self.env.advance, in_axes=(0, 0, None))(state, action, params)
+        state, reward = self._advance(state, action, params)
         if self.autoreset_mode == "next_step":
             state = self._restart(state, begins, state.episode + 1, params)
             state = self._show(state, params, begins)
@@ -176,6 +179,29 @@ class VectorPixelEnv:
         check_key(key, (self.num_envs,))
         return key
 
+    def _advance(
+        self, state: EnvState, action: jax.Array, params: EnvParams
+    ) -> tuple[EnvState, jax.Array]:
+        """The states after the actions, with nothing drawn yet, and the rewards."""
+        advance = jax.vmap(self.env.advance, in_axes=(0, 0, None))
+        size = _chunk_size(self.num_envs)
+
+        def advance_in_chunks(state: EnvState, action: jax.Array, params: EnvParams) -> Any:
+            def chunks(x: jax.Array) -> jax.Array:
+                return x.reshape(-1, size, *x.shape[1:])
+
+            inputs = jax.tree.map(chunks, (state, action))
+            outputs = jax.lax.map(lambda chunk: advance(*chunk, params), inputs)
+            return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), outputs)
+
+        if size == self.num_envs:
+            return advance(state, action, params)
+        # Physics does not read the frames, which would be copied at the door of the loop.
+        moved, reward = jax.lax.platform_dependent(
+            state.replace(frames=None), action, params, cpu=advance_in_chunks, default=advance
+        )
+        return moved.replace(frames=state.frames), reward
+
     def _timestep(self, state: EnvState, reward: jax.Array) -> Timestep:
         return jax.vmap(self.env.timestep)(state, reward)
 
@@ -208,6 +234,12 @@ class VectorPixelEnv:
         first = jax.vmap(observe.push)(state.frames, newest, jnp.ones_like(mask))
         # Environments that go on keep their stack as it is: nothing new was drawn for them.
         return state.replace(frames=jnp.where(mask[:, None, None, None], first, state.frames))
+
+
+def _chunk_size(num_envs: int) -> int:
+    """The largest chunk into which so many environments divide evenly, if it is worth a loop."""
+    sizes = range(min(_CHUNK, num_envs), _CHUNK // 2 - 1, -1)
+    return next((size for size in sizes if num_envs % size == 0), num_envs)
 
 
 def _replace_rows(

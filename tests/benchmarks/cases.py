@@ -99,6 +99,12 @@ def environments() -> Iterator[Case]:
             yield Case("environments", "throughput.scan", {**where, "obs_mode": "pixels"})
 
 
+def batches() -> Iterator[Case]:
+    """Pixels over the number of environments, all taking turns."""
+    for task in TASKS:
+        yield Case("batches", "turns.batches", {"task": task})
+
+
 def sizes() -> Iterator[Case]:
     """Pixels of 64 x 64."""
     for task in TASKS:
@@ -172,6 +178,7 @@ GROUPS = {
     "original": original,
     "peers": peers,
     "devices": devices,
+    "batches": batches,
     "sizes": sizes,
     "environments": environments,
 }

@@ -8,7 +8,7 @@ rounds, and its interval tells how far the machine can be trusted.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -58,6 +58,29 @@ def speed_ratio(seconds: list[float], standard: list[float]) -> dict[str, Any]:
     drawn = np.random.default_rng(0).choice(ratios, (2000, len(ratios)))
     low, high = np.quantile(np.median(drawn, axis=1), [0.025, 0.975])
     return {"ratio": float(np.median(ratios)), "interval": [float(low), float(high)]}
+
+
+def batches(
+    task: str, batches: Sequence[int] = (100, 10, 1000), seconds: float = SECONDS
+) -> list[dict[str, Any]]:
+    """Steps per second over the number of environments; ``ratio`` is to the first."""
+    action_size = pb.make(task)[0].action_size
+    steps = 4 * max(batches)
+    runners = {}
+    for num_envs in batches:
+        shape = (steps // num_envs, num_envs, action_size)
+        actions = np.random.default_rng(0).uniform(-1, 1, shape).astype(np.float32)
+        runners[num_envs] = _jax_scan(task, num_envs, "next_step", actions)
+    times = take_turns(runners, seconds)
+    return [
+        {
+            "num_envs": num_envs,
+            "steps_per_second": steps / float(np.median(turns)),
+            **speed_ratio(turns, times[batches[0]]),
+            "turns": len(turns),
+        }
+        for num_envs, turns in times.items()
+    ]
 
 
 def doors(task: str, num_envs: int, seconds: float = SECONDS) -> list[dict[str, Any]]:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from pixelbrax_jax import PixelEnv, VectorPixelEnv
+from pixelbrax_jax.envs import vector
 from tests.envs.toy import PARAMS, Ball
 
 N = 5
@@ -195,3 +196,34 @@ def test_bad_options_and_arguments():
         venv.reset_where(state, jnp.ones(4, bool), PARAMS)
     with pytest.raises(TypeError, match=r"key must have shape \(5,\)"):
         venv.reset(jax.random.split(jax.random.key(0), 4), PARAMS)
+
+
+@pytest.mark.parametrize(
+    ("num_envs", "size"),
+    [(1, 1), (100, 100), (128, 128), (130, 65), (256, 128), (257, 257), (1000, 125), (8192, 128)],
+)
+def test_chunks_divide_the_environments(num_envs, size):
+    assert vector._chunk_size(num_envs) == size
+
+
+@pytest.mark.parametrize("mode", ["next_step", "same_step"])
+def test_chunks_of_physics_change_nothing(mode, monkeypatch):
+    """Also where a chunk ends episodes and the other does not, and with the physics repeated."""
+    num_envs = 24
+    actions = jnp.linspace(-0.2, 1.0, num_envs)[:, None]
+    whole = make(mode, num_envs, action_repeat=2)
+    monkeypatch.setattr(vector, "_CHUNK", 12)
+    chunked = make(mode, num_envs, action_repeat=2)
+    text = jax.jit(chunked._advance).lower(*run(chunked, 0, actions)[:1], actions, PARAMS).as_text()
+    assert "2x12x1xf32" in text
+    chunked_state, chunked_steps = run(chunked, 9, actions)
+    monkeypatch.undo()
+    whole_state, whole_steps = run(whole, 9, actions)
+    assert (whole_state.episode[:12] == 0).all()
+    assert (whole_state.episode[12:] > 0).any()
+    for a, b in zip(
+        jax.tree.leaves((chunked_state.replace(key=None), chunked_steps)),
+        jax.tree.leaves((whole_state.replace(key=None), whole_steps)),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(a, b)

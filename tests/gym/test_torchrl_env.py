@@ -245,6 +245,27 @@ def test_tensors_are_the_buffers_that_jax_computed(make_torchrl):
     assert td["reward"].data_ptr() == seen[1]["reward"].unsafe_buffer_pointer()
 
 
+def test_episodes_that_begin_copy_no_pictures(make_torchrl):
+    """TorchRL's own reset would choose each row of the batch between two tensors."""
+    env = make_torchrl(obs_mode="both")
+    td, seen = env.reset(), []
+    step = env._stateful.step
+    env._stateful.step = lambda *args: seen.append(step(*args)) or seen[-1]
+    goes_right = torch.tensor([[0.0], [1.0], [0.0]])
+    done = torch.zeros(3, 1, dtype=torch.bool)
+    while not done.any():
+        stepped, td = env.step_and_maybe_reset(act(td, goes_right))
+        done = stepped["next", "done"]
+    assert done.flatten().tolist() == [False, True, False]
+    assert td.get("_reset", None) is None
+    assert not td["done"].any()
+    obs = seen[-1]["obs"]
+    assert td["pixels"].data_ptr() == obs["pixels"].unsafe_buffer_pointer()
+    assert td["observation"][:, 1].tolist() == np.asarray(obs["state"])[:, 1].tolist()
+    assert torch.equal(td["pixels"][0], stepped["next", "pixels"][0])
+    assert not torch.equal(td["pixels"][1], stepped["next", "pixels"][1])
+
+
 def test_writing_to_tensors_changes_nothing_later(make_torchrl):
     clean, dirty = make_torchrl(obs_mode="both"), make_torchrl(obs_mode="both")
     td, expected = dirty.reset(), clean.reset()

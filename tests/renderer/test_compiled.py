@@ -38,7 +38,8 @@ def program(ants):
 def test_no_plane_of_pixels_is_kept_for_a_geom(program):
     memory = program.memory_analysis()
     assert memory.output_size_in_bytes >= 4 * PIXELS
-    assert memory.temp_size_in_bytes <= 1.25 * memory.output_size_in_bytes
+    # Beside the words only poses and the like.
+    assert memory.temp_size_in_bytes <= 0.25 * memory.output_size_in_bytes
 
 
 def test_a_pixel_costs_what_it_should(ants):
@@ -48,9 +49,8 @@ def test_a_pixel_costs_what_it_should(ants):
 
 
 def test_bytes_are_few(program):
-    # Words are written by the ray-caster, joined and turned: a few times four bytes a pixel. XLA
-    # counts one of the loop's two turns.
-    assert program.cost_analysis()["bytes accessed"] / PIXELS < 40
+    # Words are written once, four bytes a pixel; XLA also counts the branch that is never taken.
+    assert program.cost_analysis()["bytes accessed"] / PIXELS < 10
 
 
 def test_pixels_are_computed_in_one_fusion(program):
@@ -61,7 +61,7 @@ def test_pixels_are_computed_in_one_fusion(program):
 
 @pytest.mark.skipif(cores() < 2, reason="needs two cores")
 def test_pixels_are_spread_over_the_cores(program):
-    shape = rf"u32\[{NUM_ENVS},{SIZE // 2},{SIZE}\]"
+    shape = rf"u32\[{NUM_ENVS},{SIZE},{SIZE}\]"
     lines = [
         line for line in program.as_text().splitlines() if re.search(rf"= {shape}.* fusion", line)
     ]
