@@ -24,7 +24,6 @@ from pixelbrax_gym.single_env import check_render_size
 from pixelbrax_gym.stateful import SEEDS, StatefulEnv, spread_seeds
 from pixelbrax_gym.torchrl_specs import action_spec, done_spec, observation_spec
 
-_OBSERVATIONS = ("pixels", "observation")
 _OWN_OPTIONS = ("num_envs", "device", "render_height", "render_width")
 
 
@@ -150,16 +149,18 @@ class PixelBraxTorchRLEnv(EnvBase):
 
         `_reset` returns those of all environments, also of the ones that go on. TorchRL would
         choose between old and new ones row by row, and copy every picture for it. That is only
-        needed while some ended episode keeps its last observation.
+        needed while some ended episode keeps its last observation. Rows that go on therefore show
+        what the environment shows, also if the caller had changed them. A ``TransformedEnv``
+        chooses, and copies, by itself.
         """
         if tensordict is None or np.any(self._began):
             return super()._reset_proc_data(tensordict, tensordict_reset)
+        names = list(self.observation_spec.keys())
         rest = super()._reset_proc_data(
-            tensordict.exclude(*_OBSERVATIONS), tensordict_reset.exclude(*_OBSERVATIONS)
+            tensordict.exclude(*names), tensordict_reset.exclude(*names)
         )
         tensordict.pop("_reset", None)
-        observations = tensordict_reset.select(*_OBSERVATIONS, strict=False)
-        return tensordict.update(rest).update(observations)
+        return tensordict.update(rest).update(tensordict_reset.select(*names))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         where = tensordict.get("_step", None)

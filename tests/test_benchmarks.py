@@ -153,6 +153,7 @@ def test_the_page_has_every_table_and_right_ratios(workers, tmp_path, monkeypatc
     assert "| DM Control quadruped, alone | 2 |  | 4.00 | 125 | a software one |" in page
     assert "| HalfCheetah | 4 | 500 | 12.6 | 39.7 |" in page
     assert "| 84 | 256 | 800 | 100 | 8.00 |" in page
+    assert "| Ant | 10 | 97.0 | 0.97 | 0.96 to 0.98 | 5 |" in page
     assert "| Ant | 256 | next_step | JAX loop | 97.0 | 0.97 | 0.96 to 0.98 | 5 |" in page
     assert (tmp_path / "cpu.png").stat().st_size > 10_000
 
@@ -250,7 +251,7 @@ def test_a_real_case_runs_in_a_process_of_its_own():
     [
         ("throughput.gymnasium", WALKERS),
         ("throughput.scan", WALKERS),
-        ("turns.batches", {"task": "walker2d", "batches": (2,), "seconds": 1.0}),
+        ("turns.batches", {"task": "walker2d", "sizes": (2, 1), "seconds": 1.0}),
         ("turns.doors", {**WALKERS, "seconds": 1.0}),
         ("turns.distractors", {**WALKERS, "seconds": 1.0}),
         ("bank.load", {"size": 16, "frames": 2}),

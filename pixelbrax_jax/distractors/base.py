@@ -76,7 +76,7 @@ class Distractor:
 
         Args:
             state: at this frame.
-            frame: a band of some rows; observations are drawn band by band.
+            frame: some rows of the picture, or all.
             backdrop: the same rows of the backdrop, if there is one. What differs from pixel to
                 pixel, such as noise, belongs there.
         """

@@ -293,27 +293,21 @@ class PixelEnv:
             backdrops = self.distractors.backdrops(state.distraction, params, rows, height, width)
             return observe.pack(self.distractors.change_frame(state.distraction, frame, backdrops))
 
-        def draw_in_bands(zero: jax.Array) -> jax.Array:
+        def draw_in_bands() -> jax.Array:
             num_rows = -(-height // _BANDS)
-            first_rows = zero + jnp.arange(_BANDS) * num_rows
+            first_rows = jnp.arange(_BANDS) * num_rows
             words = jax.lax.map(lambda first_row: draw_rows(first_row, num_rows), first_rows)
             return words.reshape(-1, width)[:height]
 
-        def draw_at_once(zero: jax.Array) -> jax.Array:
+        def draw_at_once() -> jax.Array:
             # On a CPU, XLA clears the result of a loop beforehand, and runs in one thread whatever
-            # is fused into the writes to it. A conditional costs nothing, as long as the compiler
-            # cannot know that it is always taken.
+            # is fused into the writes to it. A conditional costs nothing; were it known to be
+            # always taken, the compiler would remove it, and the wall with it.
+            zero = jax.lax.optimization_barrier(jnp.int32(0))
             blank = jnp.zeros((height, width), jnp.uint32)
-            return jax.lax.cond(
-                jax.lax.optimization_barrier(zero) == 0,
-                lambda first_row: draw_rows(first_row, height),
-                lambda _: blank,
-                zero,
-            )
+            return jax.lax.cond(zero == 0, lambda: draw_rows(zero, height), lambda: blank)
 
-        words: jax.Array = jax.lax.platform_dependent(
-            jnp.int32(0), cpu=draw_at_once, default=draw_in_bands
-        )
+        words: jax.Array = jax.lax.platform_dependent(cpu=draw_at_once, default=draw_in_bands)
         return words
 
     def show(self, state: EnvState, params: EnvParams, first: jax.Array) -> EnvState:

@@ -20,7 +20,7 @@ _BLOCK = 32
 """Environments that begin an episode together; their number is rounded up to a multiple."""
 
 _CHUNK = 128
-"""Most environments whose physics a CPU steps together, so that all of it fits its caches."""
+"""Largest chunk of environments whose physics a CPU steps together; see `_chunk_size`."""
 
 
 class VectorPixelEnv:
@@ -28,6 +28,10 @@ class VectorPixelEnv:
 
     States, observations, rewards and flags have a leading axis N. Environment i draws from
     ``fold_in(key, i)``, so that it is the same whatever N is.
+
+    Of more than 128 environments a CPU steps the physics in equal chunks of 64 to 128, whose
+    intermediate results stay in its caches, if N divides into such: prefer multiples of 128. To
+    spread environments over several devices, take ``ShardedVectorEnv``.
 
     An ended episode is followed by a fresh one as ``autoreset_mode`` says, with Gymnasium's
     meanings:
@@ -183,19 +187,21 @@ class VectorPixelEnv:
         self, state: EnvState, action: jax.Array, params: EnvParams
     ) -> tuple[EnvState, jax.Array]:
         """The states after the actions, with nothing drawn yet, and the rewards."""
-        advance = jax.vmap(self.env.advance, in_axes=(0, 0, None))
-        size = _chunk_size(self.num_envs)
+        # Under jit both forms below share one trace of the physics, which takes seconds.
+        advance = jax.vmap(jax.jit(self.env.advance), in_axes=(0, 0, None))
+        num_envs, size = self.num_envs, _chunk_size(self.num_envs)
+        if size == num_envs:
+            return advance(state, action, params)
 
         def advance_in_chunks(state: EnvState, action: jax.Array, params: EnvParams) -> Any:
+            # Some engines carry empty arrays, of which no dimension can be left to be found.
             def chunks(x: jax.Array) -> jax.Array:
-                return x.reshape(-1, size, *x.shape[1:])
+                return x.reshape(num_envs // size, size, *x.shape[1:])
 
             inputs = jax.tree.map(chunks, (state, action))
             outputs = jax.lax.map(lambda chunk: advance(*chunk, params), inputs)
-            return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), outputs)
+            return jax.tree.map(lambda x: x.reshape(num_envs, *x.shape[2:]), outputs)
 
-        if size == self.num_envs:
-            return advance(state, action, params)
         # Physics does not read the frames, which would be copied at the door of the loop.
         moved, reward = jax.lax.platform_dependent(
             state.replace(frames=None), action, params, cpu=advance_in_chunks, default=advance
@@ -237,7 +243,7 @@ class VectorPixelEnv:
 
 
 def _chunk_size(num_envs: int) -> int:
-    """The largest chunk into which so many environments divide evenly, if it is worth a loop."""
+    """Environments in a chunk: the largest divisor from half of ``_CHUNK`` to it, or else all."""
     sizes = range(min(_CHUNK, num_envs), _CHUNK // 2 - 1, -1)
     return next((size for size in sizes if num_envs % size == 0), num_envs)
 

@@ -102,7 +102,7 @@ def environments() -> Iterator[Case]:
 def batches() -> Iterator[Case]:
     """Pixels over the number of environments, all taking turns."""
     for task in TASKS:
-        yield Case("batches", "turns.batches", {"task": task})
+        yield Case("batches", "turns.batches", {"task": task, "sizes": (100, 10, 1000)})
 
 
 def sizes() -> Iterator[Case]:

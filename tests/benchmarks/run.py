@@ -103,7 +103,8 @@ def main(arguments: list[str] | None = None) -> int:
 
 def fits(case: Case, options: argparse.Namespace) -> bool:
     """Whether the case is among those that the options ask for."""
-    few = options.max_envs is None or case.arguments.get("num_envs", 0) <= options.max_envs
+    largest = max(case.arguments.get("sizes", [case.arguments.get("num_envs", 0)]))
+    few = options.max_envs is None or largest <= options.max_envs
     return few and (not options.task or case.arguments.get("task") in options.task)
 
 

@@ -7,6 +7,7 @@ rounds, and its interval tells how far the machine can be trusted.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any
@@ -61,13 +62,13 @@ def speed_ratio(seconds: list[float], standard: list[float]) -> dict[str, Any]:
 
 
 def batches(
-    task: str, batches: Sequence[int] = (100, 10, 1000), seconds: float = SECONDS
+    task: str, sizes: Sequence[int] = (100, 10, 1000), seconds: float = SECONDS
 ) -> list[dict[str, Any]]:
     """Steps per second over the number of environments; ``ratio`` is to the first."""
     action_size = pb.make(task)[0].action_size
-    steps = 4 * max(batches)
+    steps = 4 * math.lcm(*sizes)
     runners = {}
-    for num_envs in batches:
+    for num_envs in sizes:
         shape = (steps // num_envs, num_envs, action_size)
         actions = np.random.default_rng(0).uniform(-1, 1, shape).astype(np.float32)
         runners[num_envs] = _jax_scan(task, num_envs, "next_step", actions)
@@ -76,7 +77,7 @@ def batches(
         {
             "num_envs": num_envs,
             "steps_per_second": steps / float(np.median(turns)),
-            **speed_ratio(turns, times[batches[0]]),
+            **speed_ratio(turns, times[sizes[0]]),
             "turns": len(turns),
         }
         for num_envs, turns in times.items()

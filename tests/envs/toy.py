@@ -41,7 +41,7 @@ class Ball:
         return self._state(x, jnp.float32(0.0), jnp.float32(0.0), jnp.bool_(False))
 
     def step(self, state: PhysicsState, action: jax.Array) -> PhysicsState:
-        x, count = state.engine
+        x, count, _ = state.engine
         moved = x + self.dt * action[0]
         bad = ~jnp.isfinite(moved)
         moved = jnp.where(bad, x, moved)
@@ -50,7 +50,8 @@ class Ball:
     @staticmethod
     def _state(x, count, reward, bad) -> PhysicsState:
         return PhysicsState(
-            engine=(x, count),
+            # Engines may carry empty arrays, as MJX does.
+            engine=(x, count, jnp.zeros((0, 3))),
             xpos=jnp.stack([x, 0.0 * x, 0.0 * x])[None],
             xquat=jnp.array([[1.0, 0.0, 0.0, 0.0]]),
             obs=jnp.stack([x, count]),
