@@ -42,6 +42,8 @@ def together(records: list[Mapping[str, Any]]) -> dict[str, float]:
 class MetricsWriter:
     """Writes records to ``metrics.jsonl`` and TensorBoard, and to Weights & Biases if asked.
 
+    The settings are written to ``config.json``, for people and scripts; nothing reads it back.
+
     Attributes:
         path: of the JSONL file: one object a line with ``steps``, ``seconds`` and the metrics.
     """
@@ -58,7 +60,7 @@ class MetricsWriter:
 
         Args:
             folder: where they are.
-            config: settings, for Weights & Biases.
+            config: settings by name, as JSON has them.
             first_step: control steps at which the run goes on; later records of an earlier
                 attempt are dropped, for they will be written again.
             wandb_project: project of Weights & Biases; None writes nothing there.
@@ -69,6 +71,7 @@ class MetricsWriter:
         from tensorboardX import SummaryWriter
 
         folder.mkdir(parents=True, exist_ok=True)
+        (folder / "config.json").write_text(json.dumps(config, indent=2) + "\n", "utf-8")
         self.path = folder / "metrics.jsonl"
         self._seconds = _keep_until(self.path, first_step)
         self._began = time.monotonic()

@@ -236,7 +236,12 @@ class _Run:
             try:
                 writer = MetricsWriter(
                     Path(options.output_dir),
-                    describe(self._config),
+                    {
+                        "algorithm": self._algorithm.name,
+                        **describe(self._config),
+                        "seed": options.seed,
+                        "seeds": options.seeds,
+                    },
                     first_step=steps,
                     wandb_project=options.wandb_project,
                 )

@@ -102,6 +102,15 @@ def test_without_evaluations_no_such_environment_is_made(whole, tmp_path, monkey
     assert not outcome.evaluations
 
 
+def test_settings_lie_beside_the_metrics(whole):
+    settings = json.loads((whole[1] / "config.json").read_text())
+    config = ppg(8).config
+    assert settings["algorithm"] == "ppg"
+    assert settings["seed"] == 0
+    assert settings["total_steps"] == config.total_steps
+    assert settings["learning_rate"] == config.learning_rate
+
+
 def test_without_metrics_nothing_is_logged(tmp_path):
     run(ppg(3), PARAMS, options(tmp_path, log_training_metrics=False))
     assert read_metrics(tmp_path / "metrics.jsonl") == []
