@@ -154,7 +154,7 @@ def run(
     check_memory(algorithm, template, report)
     checkpoints = Checkpoints(
         folder / "checkpoints",
-        describe(algorithm.config) | {"seed": options.seed, "seeds": options.seeds},
+        _settings(algorithm, options),
         algorithm.name,
         keep=options.keep_checkpoints,
     )
@@ -236,12 +236,7 @@ class _Run:
             try:
                 writer = MetricsWriter(
                     Path(options.output_dir),
-                    {
-                        "algorithm": self._algorithm.name,
-                        **describe(self._config),
-                        "seed": options.seed,
-                        "seeds": options.seeds,
-                    },
+                    {"algorithm": self._algorithm.name} | _settings(self._algorithm, options),
                     first_step=steps,
                     wandb_project=options.wandb_project,
                 )
@@ -389,6 +384,11 @@ class _Run:
         if self._options.num_evals:
             return self._results["clean"].mean if evaluated else None
         return self._record.get("episode/return")
+
+
+def _settings(algorithm: Algorithm, options: RunConfig) -> dict[str, Any]:
+    """What decides the result of a run."""
+    return describe(algorithm.config) | {"seed": options.seed, "seeds": options.seeds}
 
 
 def _steps(algorithm: Algorithm, state: TrainState) -> int:

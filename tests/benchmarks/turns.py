@@ -61,9 +61,7 @@ def speed_ratio(seconds: list[float], standard: list[float]) -> dict[str, Any]:
     return {"ratio": float(np.median(ratios)), "interval": [float(low), float(high)]}
 
 
-def batches(
-    task: str, sizes: Sequence[int] = (100, 10, 1000), seconds: float = SECONDS
-) -> list[dict[str, Any]]:
+def batches(task: str, sizes: Sequence[int], seconds: float = SECONDS) -> list[dict[str, Any]]:
     """Steps per second over the number of environments; ``ratio`` is to the first."""
     action_size = pb.make(task)[0].action_size
     steps = 4 * math.lcm(*sizes)
