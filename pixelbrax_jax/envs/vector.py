@@ -198,8 +198,15 @@ class VectorPixelEnv:
             def chunks(x: jax.Array) -> jax.Array:
                 return x.reshape(num_envs // size, size, *x.shape[1:])
 
-            inputs = jax.tree.map(chunks, (state, action))
-            outputs = jax.lax.map(lambda chunk: advance(*chunk, params), inputs)
+            def put(i: jax.Array, carry: tuple[EnvState, jax.Array]) -> tuple[EnvState, jax.Array]:
+                chunk = jax.tree.map(lambda x: x[i], (carry[0], actions))
+                moved = advance(*chunk, params)
+                return jax.tree.map(lambda x, new: x.at[i].set(new), carry, moved)
+
+            # In place: the results of `jax.lax.map` would be cleared first and copied afterwards.
+            states, actions = jax.tree.map(chunks, (state, action))
+            rewards = jnp.zeros((num_envs // size, size))
+            outputs = jax.lax.fori_loop(0, num_envs // size, put, (states, rewards))
             return jax.tree.map(lambda x: x.reshape(num_envs, *x.shape[2:]), outputs)
 
         # Physics does not read the frames, which would be copied at the door of the loop.
