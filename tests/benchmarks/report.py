@@ -74,7 +74,7 @@ NOTES = {
     "devices": "Emulated devices share the cores of the machine: the first table shows what is "
     "where, and no speed. Ideal is the speed of one device on one core times the number of cores.",
     "batches": "A compiled loop over steps. Ratios are to the first line of a task: medians over "
-    "rounds, in which all take a turn of 4,000 environment steps in one process, with bootstrap "
+    "rounds, in which all take a turn of 16,000 environment steps in one process, with bootstrap "
     "intervals of 95 %.",
     "sizes": "",
     "environments": "A compiled loop over steps; nothing leaves it.",
