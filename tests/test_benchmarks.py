@@ -51,7 +51,11 @@ ANSWERS = {
     "startup.first_frame": {"seconds": {"import": 1.0, "make": 2.0}},
     "scene.describe": {},
     "peers.dm_control_envs": {"steps_per_second": 4.0, "processes": 2, "opengl": "a software one"},
-    "peers.gymnasium_envs": {"steps_per_second": 5.0, "processes": 2},
+    "peers.gymnasium_envs": {
+        "steps_per_second": 5.0,
+        "processes": 2,
+        "versions": {"gymnasium": "3", "mujoco": "2"},
+    },
     "peers.envpool_envs": {"steps_per_second": 8.0, "num_envs": 2},
     "peers.mujoco_warp_renderer": {"frames_per_second": 100.0, "versions": {"mujoco": "1"}},
 }
@@ -153,6 +157,7 @@ def test_the_page_has_every_table_and_right_ratios(workers, tmp_path, monkeypatc
     assert "| DM Control quadruped, alone | 2 |  | 4.00 | 125 | a software one |" in page
     assert "| HalfCheetah | 4 | 500 | 12.6 | 39.7 |" in page
     assert "| 84 | 256 | 800 | 100 | 8.00 |" in page
+    assert "gymnasium 3, mujoco 1, mujoco 2." in page
     assert "| Ant | 10 | 97.0 | 0.97 | 0.96 to 0.98 | 5 |" in page
     assert "| Ant | 256 | next_step | JAX loop | 97.0 | 0.97 | 0.96 to 0.98 | 5 |" in page
     assert (tmp_path / "cpu.png").stat().st_size > 10_000

@@ -193,10 +193,14 @@ class VectorPixelEnv:
         if size == num_envs:
             return advance(state, action, params)
 
-        def advance_in_chunks(state: EnvState, action: jax.Array, params: EnvParams) -> Any:
+        def advance_in_chunks(
+            state: EnvState, action: jax.Array, params: EnvParams
+        ) -> tuple[EnvState, jax.Array]:
             # Some engines carry empty arrays, of which no dimension can be left to be found.
             def chunks(x: jax.Array) -> jax.Array:
                 return x.reshape(num_envs // size, size, *x.shape[1:])
+
+            states, actions = jax.tree.map(chunks, (state, action))
 
             def put(i: jax.Array, carry: tuple[EnvState, jax.Array]) -> tuple[EnvState, jax.Array]:
                 chunk = jax.tree.map(lambda x: x[i], (carry[0], actions))
@@ -204,10 +208,9 @@ class VectorPixelEnv:
                 return jax.tree.map(lambda x, new: x.at[i].set(new), carry, moved)
 
             # In place: the results of `jax.lax.map` would be cleared first and copied afterwards.
-            states, actions = jax.tree.map(chunks, (state, action))
-            rewards = jnp.zeros((num_envs // size, size))
-            outputs = jax.lax.fori_loop(0, num_envs // size, put, (states, rewards))
-            return jax.tree.map(lambda x: x.reshape(num_envs, *x.shape[2:]), outputs)
+            carry = (states, jnp.zeros_like(states.episode_return))
+            states, rewards = jax.lax.fori_loop(0, num_envs // size, put, carry)
+            return jax.tree.map(lambda x: x.reshape(num_envs, *x.shape[2:]), (states, rewards))
 
         # Physics does not read the frames, which would be copied at the door of the loop.
         moved, reward = jax.lax.platform_dependent(

@@ -385,8 +385,13 @@ def _who(row: Row, title: str) -> tuple[str, str]:
 
 
 def _peer_versions(rows: list[Row]) -> str:
-    versions = {k: v for row in _ok(rows) for k, v in row["values"].get("versions", {}).items()}
-    return f"Peers' versions: {', '.join(f'{k} {v}' for k, v in sorted(versions.items()))}."
+    # Each peer has an environment of its own: two may have different versions of a library.
+    versions = {
+        f"{name} {version}"
+        for row in _ok(rows)
+        for name, version in row["values"].get("versions", {}).items()
+    }
+    return f"Peers' versions: {', '.join(sorted(versions))}."
 
 
 TABLES: dict[str, Callable[[list[Row]], str]] = {

@@ -64,7 +64,7 @@ def speed_ratio(seconds: list[float], standard: list[float]) -> dict[str, Any]:
 def batches(task: str, sizes: Sequence[int], seconds: float = SECONDS) -> list[dict[str, Any]]:
     """Steps per second over the number of environments; ``ratio`` is to the first."""
     action_size = pb.make(task)[0].action_size
-    # A rollout. Fresh memory for each call takes its time too: of a call of four steps a tenth.
+    # 16 steps of the largest number: a call takes fresh memory, a tenth of the time of four steps.
     steps = 16 * math.lcm(*sizes)
     runners = {}
     for num_envs in sizes:
