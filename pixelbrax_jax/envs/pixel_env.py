@@ -304,8 +304,10 @@ class PixelEnv:
             # is fused into the writes to it. A conditional costs nothing; were it known to be
             # always taken, the compiler would remove it, and the wall with it.
             zero = jax.lax.optimization_barrier(jnp.int32(0))
-            blank = jnp.zeros((height, width), jnp.uint32)
-            return jax.lax.cond(zero == 0, lambda: draw_rows(zero, height), lambda: blank)
+            blank = jnp.zeros(height * width, jnp.uint32)
+            # In one axis, as the renderer computes it.
+            words = jax.lax.cond(zero == 0, lambda: draw_rows(zero, height).ravel(), lambda: blank)
+            return words.reshape(height, width)
 
         words: jax.Array = jax.lax.platform_dependent(cpu=draw_at_once, default=draw_in_bands)
         return words

@@ -18,6 +18,7 @@ import numpy as np
 
 from pixelbrax_jax import spatial
 from pixelbrax_jax.renderer import ground
+from pixelbrax_jax.renderer.bounds import at_least, at_most, between
 from pixelbrax_jax.renderer.intersect import Axes, Hit, Vector, dot, intersect
 from pixelbrax_jax.types import Frame, GeomKind, Geoms, Look, Scene
 
@@ -55,8 +56,9 @@ def render(
     )
     geoms, look = scene.geoms, scene.look
 
-    shape = (num_rows, width)
-    ray = _rays(pixel, height, shape, first_row)
+    # Row after row in one axis: rows would end in pixels that fill no vector and go one by one.
+    shape = (num_rows * width,)
+    ray = _rays(pixel, height, width, shape, first_row)
     # Geoms of one material get neighboring ranks, so that a material is a range of ranks.
     order = sorted(range(len(geoms.kind)), key=lambda g: geoms.material[g])
     kinds = [geoms.kind[g] for g in order]
@@ -96,14 +98,14 @@ def render(
                 first, second = look.ground_rgb[0, c], look.ground_rgb[1, c]
                 color[c] = jnp.where(seen[rank], first + share * (second - first), color[c])
 
-    gloss = jnp.maximum(2.0 * n_l * n_z - light[2], 0.0) ** look.shininess
+    gloss = at_least(2.0 * n_l * n_z - light[2], 0.0) ** look.shininess
     gloss = jnp.where(lit & (n_l > 0.0), gloss, 0.0)
-    diffuse = jnp.where(lit, jnp.maximum(n_l, 0.0), 0.0)
+    diffuse = jnp.where(lit, at_least(n_l, 0.0), 0.0)
     shade = look.ambient + look.diffuse * diffuse + look.specular * gloss
-    rise = jnp.clip(dot(ray, tuple(up)), 0.0, 1.0)
+    rise = between(0.0, dot(ray, tuple(up)), 1.0)
     planes = []
     for c in range(3):
-        surface = jnp.clip(color[c] * shade + look.highlight * gloss, 0.0, 1.0)
+        surface = between(0.0, color[c] * shade + look.highlight * gloss, 1.0)
         air = look.sky[0, c] + rise * (look.sky[1, c] - look.sky[0, c])
         planes.append(jnp.where(sky, air, surface))
 
@@ -113,7 +115,7 @@ def render(
     for rank, kind in enumerate(kinds):
         if kind == GeomKind.PLANE:
             on_plane |= seen[rank]
-    return Frame(
+    frame = Frame(
         r=planes[0],
         g=planes[1],
         b=planes[2],
@@ -121,21 +123,27 @@ def render(
         seg=geom_of_rank[winner],
         ground=on_plane,
     )
+    return jax.tree.map(lambda plane: plane.reshape(num_rows, width), frame)
 
 
 def _rays(
-    pixel: jax.Array, height: int, shape: tuple[int, int], first_row: jax.Array | int
+    pixel: jax.Array,
+    height: int,
+    width: int,
+    shape: tuple[int],
+    first_row: jax.Array | int,
 ) -> Vector:
     """Unit rays through the pixels' centers in the camera's frame, row 0 on top."""
-    row = jax.lax.broadcasted_iota(jnp.float32, shape, 0) + first_row
-    column = jax.lax.broadcasted_iota(jnp.float32, shape, 1)
-    x = (column - 0.5 * (shape[1] - 1)) * pixel
-    y = (0.5 * (height - 1) - row) * pixel
+    index = jax.lax.broadcasted_iota(jnp.int32, shape, 0)
+    row = jax.lax.div(index, np.int32(width)) + first_row
+    column = jax.lax.rem(index, np.int32(width))
+    x = (column.astype(jnp.float32) - 0.5 * (width - 1)) * pixel
+    y = (0.5 * (height - 1) - row.astype(jnp.float32)) * pixel
     inv_length = jax.lax.rsqrt(x * x + y * y + 1.0)
     return x * inv_length, y * inv_length, -inv_length
 
 
-def _nearest(hits: list[Hit], shape: tuple[int, int]) -> tuple[jax.Array, jax.Array]:
+def _nearest(hits: list[Hit], shape: tuple[int]) -> tuple[jax.Array, jax.Array]:
     """Distance and rank of the nearest hit; the rank of the sky is ``len(hits)``."""
     rank_bits = np.uint32((1 << len(hits).bit_length()) - 1)
     key = jnp.full(shape, (_INF_BITS & ~rank_bits) | np.uint32(len(hits)), jnp.uint32)
@@ -167,7 +175,7 @@ def _ground_share(
 ) -> jax.Array:
     """Share of the ground's second color in each pixel, for rays that hit a plane at ``t``."""
     normal = axes[2]
-    slope = 1.0 / jnp.minimum(dot(ray, normal), -1e-7)
+    slope = 1.0 / at_most(dot(ray, normal), -1e-7)
     inv_pitch = 1.0 / look.ground_pitch
     step = -t * ray[2] * pixel * inv_pitch
     coords, widths = [], []

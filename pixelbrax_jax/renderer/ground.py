@@ -13,6 +13,8 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
+from pixelbrax_jax.renderer.bounds import at_least, at_most
+
 LINE_WIDTH = 1.0 / 84.0
 """Width of a grid line in grid pitches: one texel of the original's texture at 84 pixels."""
 
@@ -21,7 +23,7 @@ def _average(
     integral: Callable[[jax.Array], jax.Array], center: jax.Array, width: jax.Array
 ) -> jax.Array:
     """Mean of a periodic function of period 1 over a window, given its integral."""
-    width = jnp.maximum(width, 1e-4)
+    width = at_least(width, 1e-4)
     return (integral(center + 0.5 * width) - integral(center - 0.5 * width)) / width
 
 
@@ -33,7 +35,7 @@ def _square_wave_integral(x: jax.Array) -> jax.Array:
 def _line_integral(x: jax.Array) -> jax.Array:
     """Integral of the function that is 1 on [0, LINE_WIDTH) and 0 on the rest of [0, 1)."""
     whole = jnp.floor(x)
-    return LINE_WIDTH * whole + jnp.minimum(x - whole, LINE_WIDTH)
+    return LINE_WIDTH * whole + at_most(x - whole, LINE_WIDTH)
 
 
 def second_color_share(

@@ -1,7 +1,7 @@
 """Closed forms for a ray from the origin against one convex geom.
 
-A vector is a tuple of its three components, and each component is either a scalar or an
-(H, W) plane of pixels: the same code serves rays that fan out from the camera (ray in planes,
+A vector is a tuple of its three components, and each component is either a scalar or a
+plane of pixels: the same code serves rays that fan out from the camera (ray in planes,
 geom in scalars) and shadow rays towards a distant light (ray in scalars, geom in planes).
 Rays have unit length. A ray enters a geom from outside; a geom around the origin is not seen.
 
@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from pixelbrax_jax.renderer.bounds import at_least, at_most, between
 from pixelbrax_jax.types import GeomKind
 
 Vector = Sequence[Any]
@@ -53,7 +54,7 @@ def _plane(ray: Vector, pos: Vector, axes: Axes, size: Vector) -> Hit:
     normal = axes[2]
     descent = dot(ray, normal)
     # Seen from above alone; from below, the quotient is negative by itself.
-    t = jnp.where(descent < -_TINY, dot(pos, normal) / jnp.minimum(descent, -_TINY), -1.0)
+    t = jnp.where(descent < -_TINY, dot(pos, normal) / at_most(descent, -_TINY), -1.0)
     return Hit(t, lambda v, ray_v: dot(normal, v))
 
 
@@ -70,11 +71,11 @@ def _capsule(ray: Vector, pos: Vector, axes: Axes, size: Vector) -> Hit:
     ray_axis, ray_pos = dot(ray, axis), dot(ray, pos)
     # The line enters the infinite cylinder at axial coordinate y. Clamped to the segment, y is
     # the center of the only sphere on it through which the line can enter the capsule.
-    a = jnp.maximum(1.0 - ray_axis * ray_axis, _TINY)
+    a = at_least(1.0 - ray_axis * ray_axis, _TINY)
     b = ray_pos - ray_axis * pos_axis
     c = pos_pos - pos_axis * pos_axis - radius * radius
     y = (b - jnp.sqrt(b * b - a * c)) / a * ray_axis - pos_axis
-    y = jnp.clip(y, -half, half)
+    y = between(-half, y, half)
     b = ray_pos + y * ray_axis
     c = (pos_pos - radius * radius) + y * (2.0 * pos_axis + y)
     t = b - jnp.sqrt(b * b - c)
@@ -101,7 +102,7 @@ def _cylinder(ray: Vector, pos: Vector, axes: Axes, size: Vector) -> Hit:
     radius, half = size[0], size[1]
     dx, dy, dz = (dot(ray, axis) for axis in axes)
     ox, oy, oz = (-dot(pos, axis) for axis in axes)
-    a = jnp.maximum(dx * dx + dy * dy, _TINY)
+    a = at_least(dx * dx + dy * dy, _TINY)
     b, c = ox * dx + oy * dy, ox * ox + oy * oy - radius * radius
     t_side = (-b - jnp.sqrt(b * b - a * c)) / a
     on_side = jnp.abs(oz + t_side * dz) <= half  # False for NaN
@@ -126,8 +127,8 @@ def _box(ray: Vector, pos: Vector, axes: Axes, size: Vector) -> Hit:
     facing = [jnp.where(d[k] > 0, -1.0, 1.0) for k in range(3)]
     near = [(facing[k] * size[k] - o[k]) / d[k] for k in range(3)]
     far = [(-facing[k] * size[k] - o[k]) / d[k] for k in range(3)]
-    entry = jnp.maximum(jnp.maximum(near[0], near[1]), near[2])
-    leave = jnp.minimum(jnp.minimum(far[0], far[1]), far[2])
+    entry = at_least(at_least(near[0], near[1]), near[2])
+    leave = at_most(at_most(far[0], far[1]), far[2])
     t = jnp.where(entry <= leave, entry, -1.0)
 
     def normal_dot(v: Vector, ray_v: jax.Array) -> jax.Array:
