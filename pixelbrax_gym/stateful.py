@@ -14,6 +14,7 @@ from gymnasium import error
 
 from pixelbrax_gym.actions import as_actions, name_rows
 from pixelbrax_gym.fork import check_not_forked, is_forked
+from pixelbrax_gym.threads import call_on_threads, num_cores
 from pixelbrax_jax import PixelEnv, VectorPixelEnv, registry
 from pixelbrax_jax.choices import check_options, check_whole
 from pixelbrax_jax.compilation import compiler_options
@@ -21,6 +22,9 @@ from pixelbrax_jax.types import EnvParams, EnvState, Timestep
 
 SEEDS = 2**32
 """Seeds lie below this."""
+
+_LEAST_PART = 64
+"""Environments of a part of the physics; fewer take hardly less time."""
 
 _made: set[Any] = set()
 """Options of the environments that exist, so that forks of this process can name them."""
@@ -264,8 +268,46 @@ class _Programs:
         options = compiler_options()
         self.reset = jax.jit(self._reset, compiler_options=options)
         self.reset_where = jax.jit(self._reset_where, donate_argnums=0, compiler_options=options)
-        self.step = jax.jit(self._step, donate_argnums=0, compiler_options=options)
         self.step_where = jax.jit(self._step_where, donate_argnums=0, compiler_options=options)
+        self.step_at_once = jax.jit(self._step, donate_argnums=0, compiler_options=options)
+        self.advance_part = jax.jit(self._advance_part, compiler_options=options)
+        self.finish_step = jax.jit(self._finish_step, donate_argnums=0, compiler_options=options)
+        self._num_parts = _num_parts(vector.num_envs) if jax.default_backend() == "cpu" else 1
+
+    def step(
+        self, state: EnvState, action: jax.Array, params: EnvParams
+    ) -> tuple[EnvState, dict[str, Any]]:
+        """A step; on a CPU every core has a part of a large batch's physics."""
+        stepped: tuple[EnvState, dict[str, Any]]
+        if self._num_parts == 1:
+            stepped = self.step_at_once(state, action, params)
+            return stepped
+        before = state.replace(frames=None)
+        starts = np.arange(0, self.vector.num_envs, self._part_size, dtype=np.int32)
+        parts = call_on_threads(
+            self.advance_part, [(before, action, params, start) for start in starts]
+        )
+        stepped = self.finish_step(state, parts, params)
+        return stepped
+
+    @property
+    def _part_size(self) -> int:
+        return self.vector.num_envs // self._num_parts
+
+    def _advance_part(
+        self, state: EnvState, action: jax.Array, params: EnvParams, start: jax.Array
+    ) -> tuple[EnvState, jax.Array]:
+        def rows(x: jax.Array) -> jax.Array:
+            return jax.lax.dynamic_slice_in_dim(x, start, self._part_size)
+
+        return self.vector.advance(*jax.tree.map(rows, (state, action)), params)
+
+    def _finish_step(
+        self, state: EnvState, parts: list[tuple[EnvState, jax.Array]], params: EnvParams
+    ) -> tuple[EnvState, dict[str, Any]]:
+        moved, reward = jax.tree.map(lambda *rows: jnp.concatenate(rows), *parts)
+        state, timestep = self.vector.finish(state, moved, reward, params)
+        return state, self._outputs(timestep, jnp.ones(self.vector.num_envs, bool))
 
     def _reset(self, seeds: jax.Array, params: EnvParams) -> tuple[EnvState, dict[str, Any]]:
         state, timestep = self.vector.reset(jax.vmap(jax.random.key)(seeds), params)
@@ -324,6 +366,12 @@ class _Programs:
             ended["final_info"] = _with_masks(ended["final_info"], done)
             info |= _with_masks(ended, done)
         return outputs | {"info": info}
+
+
+def _num_parts(num_envs: int) -> int:
+    """Parts of equal size whose physics run at the same time: at most one for each core."""
+    most = min(num_cores(), num_envs // _LEAST_PART)
+    return next((parts for parts in range(most, 1, -1) if num_envs % parts == 0), 1)
 
 
 def _with_masks(info: Mapping[str, Any], mask: jax.Array) -> dict[str, Any]:

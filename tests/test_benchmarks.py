@@ -16,6 +16,7 @@ MACHINE = {
     "platform": "cpu",
     "device": "a device",
     "processor": "a processor",
+    "vectors": "",
     "cores": 2,
     "system": "a system",
     "python": "3",
@@ -131,6 +132,21 @@ def test_another_machine_s_figures_are_not_taken_for_this_one_s(workers, tmp_pat
         "another processor",
     }
     assert len({case["machine"] for case in kept["cases"].values()}) == 2
+
+
+@pytest.mark.parametrize(
+    ("platform", "vectors", "name"),
+    [("cpu", "AVX-512", "cpu-avx512"), ("cpu", "", "cpu"), ("gpu", "AVX2", "gpu")],
+)
+def test_processors_of_one_name_but_other_vectors_have_files_of_their_own(
+    workers, tmp_path, monkeypatch, platform, vectors, name
+):
+    monkeypatch.setitem(MACHINE, "platform", platform)
+    monkeypatch.setitem(MACHINE, "vectors", vectors)
+    assert run.main(["--only", "clips", "--output-dir", str(tmp_path)]) == 0
+    assert (tmp_path / f"{name}.json").exists()
+    told = f"a processor with {vectors}," if vectors else "a processor,"
+    assert told in (tmp_path / f"{name}.md").read_text()
 
 
 def test_a_file_of_another_kind_is_not_touched(workers, tmp_path):

@@ -148,20 +148,8 @@ class VectorPixelEnv:
         expected = (self.num_envs, self.env.action_size)
         if action.shape != expected:
             raise ValueError(f"action must have shape {expected}, got {tuple(action.shape)}.")
-        begins = state.done
-        state, reward = self._advance(state, action, params)
-        if self.autoreset_mode == "next_step":
-            state = self._restart(state, begins, state.episode + 1, params)
-            state = self._show(state, params, begins)
-            return state, self._timestep(state, jnp.where(begins, 0.0, reward))
-        state = self._show(state, params, jnp.zeros(self.num_envs, bool))
-        timestep = self._timestep(state, reward)
-        if self.autoreset_mode == "disabled":
-            return state, timestep
-        state = self._begin_where(state, state.done, state.episode + 1, params)
-        first = self._timestep(state, reward)
-        info = {**first.info, "final_obs": timestep.obs, "final_info": timestep.info}
-        return state, timestep.replace(obs=first.obs, info=info)
+        moved, reward = self.advance(state.replace(frames=None), action, params)
+        return self.finish(state, moved, reward, params)
 
     def obs(self, state: EnvState) -> Any:
         """Observations of the states, with a leading axis N."""
@@ -177,20 +165,21 @@ class VectorPixelEnv:
         check_key(key)
         return jax.vmap(partial(jax.random.fold_in, key))(jnp.arange(num_envs))
 
-    def _env_keys(self, key: jax.Array) -> jax.Array:
-        if getattr(key, "shape", ()) == ():
-            return self.keys_of(key, self.num_envs)
-        check_key(key, (self.num_envs,))
-        return key
+    # The pieces of a step, for those who run the physics of some rows apart.
 
-    def _advance(
+    def advance(
         self, state: EnvState, action: jax.Array, params: EnvParams
     ) -> tuple[EnvState, jax.Array]:
-        """The states after the actions, with nothing drawn yet, and the rewards."""
+        """The states of some or all environments after their actions, and the rewards.
+
+        No episode has begun and nothing is drawn yet. ``frames`` must be None: physics does not
+        read them, and they would be copied at the door of a loop.
+        """
         # Under jit both forms below share one trace of the physics, which takes seconds.
         advance = jax.vmap(jax.jit(self.env.advance), in_axes=(0, 0, None))
-        num_envs, size = self.num_envs, _chunk_size(self.num_envs)
-        if size == num_envs:
+        num_rows = action.shape[0]
+        size = _chunk_size(num_rows)
+        if size == num_rows:
             return advance(state, action, params)
 
         def advance_in_chunks(
@@ -198,7 +187,7 @@ class VectorPixelEnv:
         ) -> tuple[EnvState, jax.Array]:
             # Some engines carry empty arrays, of which no dimension can be left to be found.
             def chunks(x: jax.Array) -> jax.Array:
-                return x.reshape(num_envs // size, size, *x.shape[1:])
+                return x.reshape(num_rows // size, size, *x.shape[1:])
 
             states, actions = jax.tree.map(chunks, (state, action))
 
@@ -209,14 +198,45 @@ class VectorPixelEnv:
 
             # In place: the results of `jax.lax.map` would be cleared first and copied afterwards.
             carry = (states, jnp.zeros_like(states.episode_return))
-            states, rewards = jax.lax.fori_loop(0, num_envs // size, put, carry)
-            return jax.tree.map(lambda x: x.reshape(num_envs, *x.shape[2:]), (states, rewards))
+            states, rewards = jax.lax.fori_loop(0, num_rows // size, put, carry)
+            return jax.tree.map(lambda x: x.reshape(num_rows, *x.shape[2:]), (states, rewards))
 
-        # Physics does not read the frames, which would be copied at the door of the loop.
-        moved, reward = jax.lax.platform_dependent(
-            state.replace(frames=None), action, params, cpu=advance_in_chunks, default=advance
+        result: tuple[EnvState, jax.Array] = jax.lax.platform_dependent(
+            state, action, params, cpu=advance_in_chunks, default=advance
         )
-        return moved.replace(frames=state.frames), reward
+        return result
+
+    def finish(
+        self, state: EnvState, moved: EnvState, reward: jax.Array, params: EnvParams
+    ) -> tuple[EnvState, Timestep]:
+        """What ``step`` does after ``advance``: new episodes, pictures, timesteps.
+
+        Args:
+            state: the states before the step.
+            moved: of ``advance``, all N.
+            reward: of ``advance``, (N,).
+            params: what may be randomised.
+        """
+        begins = state.done
+        state = moved.replace(frames=state.frames)
+        if self.autoreset_mode == "next_step":
+            state = self._restart(state, begins, state.episode + 1, params)
+            state = self._show(state, params, begins)
+            return state, self._timestep(state, jnp.where(begins, 0.0, reward))
+        state = self._show(state, params, jnp.zeros(self.num_envs, bool))
+        timestep = self._timestep(state, reward)
+        if self.autoreset_mode == "disabled":
+            return state, timestep
+        state = self._begin_where(state, state.done, state.episode + 1, params)
+        first = self._timestep(state, reward)
+        info = {**first.info, "final_obs": timestep.obs, "final_info": timestep.info}
+        return state, timestep.replace(obs=first.obs, info=info)
+
+    def _env_keys(self, key: jax.Array) -> jax.Array:
+        if getattr(key, "shape", ()) == ():
+            return self.keys_of(key, self.num_envs)
+        check_key(key, (self.num_envs,))
+        return key
 
     def _timestep(self, state: EnvState, reward: jax.Array) -> Timestep:
         return jax.vmap(self.env.timestep)(state, reward)

@@ -33,7 +33,7 @@ ORIGINAL = (
     ("walker2d", 4, 13.5),
 )
 """Task, environments and steps per second of the original (the code of arXiv 2502.00021)
-on two cores of the machine of docs/benchmarks/cpu.md; measured once, apart from this benchmark."""
+on two cores of an AMD EPYC machine whose vectors were not noted; measured once, apart."""
 
 PEERS: dict[str, tuple[str, ...]] = {
     "dm_control": (

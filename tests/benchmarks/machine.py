@@ -32,13 +32,20 @@ def describe() -> dict[str, Any]:
         "device": device.device_kind,
         "devices": jax.device_count(),
         "runtime": device.client.platform_version,
-        "processor": _processor(),
+        "processor": _from_cpuinfo("model name") or platform.processor() or platform.machine(),
+        "vectors": _vectors(),
         "cores": cores(),
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
         "versions": {name: _version(name) for name in PACKAGES},
         "xla_flags": os.environ.get("XLA_FLAGS", ""),
     }
+
+
+def file_stem(machine: dict[str, Any]) -> str:
+    """Name of the files of results: machines that are not alike write into different ones."""
+    vectors: str = machine["vectors"] if machine["platform"] == "cpu" else ""
+    return "-".join(filter(None, (machine["platform"], vectors.lower().replace("-", ""))))
 
 
 def cores() -> int:
@@ -55,11 +62,20 @@ def _version(name: str) -> str | None:
         return None
 
 
-def _processor() -> str:
-    """The processor's name where the system tells it."""
+def _vectors() -> str:
+    """The widest vectors that the processor computes with, where the system tells.
+
+    Virtual machines name processors of several generations alike, and pictures depend on it.
+    """
+    flags = _from_cpuinfo("flags").split()
+    known = {"avx512f": "AVX-512", "avx2": "AVX2"}
+    return next((name for flag, name in known.items() if flag in flags), "")
+
+
+def _from_cpuinfo(entry: str) -> str:
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
         for line in cpuinfo.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    return platform.processor() or platform.machine()
+            if line.partition(":")[0].strip() == entry:
+                return line.partition(":")[2].strip()
+    return ""

@@ -66,7 +66,7 @@ NOTES = {
     "clips": "Pictures of 854 x 480, as many as the training split of DAVIS-2017 has at most, just "
     "written and so still in memory; one sample each.",
     "original": "A compiled loop of ours in the settings in which the speed of the original is "
-    "known; that was measured apart, on two cores of the same kind.",
+    "known; that was measured apart, on two cores of an AMD EPYC whose vectors were not noted.",
     "peers": "All hand NumPy arrays to Python. Tasks are of the same class, not the same: bodies, "
     "control steps and simulators differ. OpenGL peers draw textures and shadows, which we do not, "
     "and would be faster with a GPU; this compares what a machine without one can do. MuJoCo Warp "
@@ -84,8 +84,9 @@ NOTES = {
 
 def _machine(machine: Row) -> str:
     versions = ", ".join(f"{name} {v}" for name, v in machine["versions"].items() if v)
+    vectors = f" with {machine['vectors']}" if machine["vectors"] else ""
     return (
-        f"{machine['device']} ({machine['processor']}, {machine['cores']} cores), "
+        f"{machine['device']} ({machine['processor']}{vectors}, {machine['cores']} cores), "
         f"{machine['system']}, Python {machine['python']}; {versions}. "
         f"XLA_FLAGS: `{machine['xla_flags'] or 'none'}`."
     )

@@ -29,7 +29,7 @@ from tqdm import tqdm
 
 from tests.benchmarks import report
 from tests.benchmarks.cases import ABSENT, GROUPS, TASKS, Case
-from tests.benchmarks.machine import cores
+from tests.benchmarks.machine import cores, file_stem
 from tests.benchmarks.peers.install import AbsentError, peer_python
 
 ROOT = Path(__file__).parents[2]
@@ -82,7 +82,7 @@ def main(arguments: list[str] | None = None) -> int:
     # A worker must not outlive this process and disturb the next one's measurements.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     machine = worker("machine.describe", {}, sys.executable, 300.0)["values"]
-    file = options.output_dir / f"{machine['platform']}.json"
+    file = options.output_dir / f"{file_stem(machine)}.json"
     results = Results(file, machine)
     todo = [case for case in cases if options.again or not results.has(case)]
     print(f"{len(todo)} of {len(cases)} cases are to be measured; results in {file}")

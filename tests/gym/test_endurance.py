@@ -33,7 +33,7 @@ def test_nothing_is_compiled_twice(make_vector, mode):
                 env.reset(options={"reset_mask": done})
             env.step(env.action_space.sample())
         counts.append(
-            [p._cache_size() for p in (programs.step, programs.reset, programs.reset_where)]
+            [p._cache_size() for p in (programs.step_at_once, programs.reset, programs.reset_where)]
         )
     assert counts[0] == counts[1]
     assert counts[0][0] == 1

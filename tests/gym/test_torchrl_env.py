@@ -517,7 +517,7 @@ def test_nothing_is_compiled_twice(make_torchrl):
         for _ in range(num_steps):
             _, td = env.step_and_maybe_reset(env.rand_action(td))
         programs = env._stateful._programs
-        counts.append([p._cache_size() for p in (programs.step, programs.reset_where)])
+        counts.append([p._cache_size() for p in (programs.step_at_once, programs.reset_where)])
     assert counts[0] == counts[1]
     assert counts[0][0] == 1
 
