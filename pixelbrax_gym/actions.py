@@ -44,7 +44,7 @@ def as_actions(action: Any, shape: tuple[int, ...], device: jax.Device) -> Any:
                 f"the action is on {names}, the environment on {device}; move the action with "
                 "jax.device_put."
             )
-        return action
+        return action if action.dtype == np.float32 else action.astype(np.float32)
     else:
         given = np.asarray(action)
         _check_shape(given.shape, shape)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from typing import Any
 
@@ -14,17 +14,15 @@ from gymnasium import error
 
 from pixelbrax_gym.actions import as_actions, name_rows
 from pixelbrax_gym.fork import check_not_forked, is_forked
-from pixelbrax_gym.threads import call_on_threads, num_cores
+from pixelbrax_gym.threads import call_on_threads
 from pixelbrax_jax import PixelEnv, VectorPixelEnv, registry
 from pixelbrax_jax.choices import check_options, check_whole
 from pixelbrax_jax.compilation import compiler_options
+from pixelbrax_jax.envs.vector import chunk_size
 from pixelbrax_jax.types import EnvParams, EnvState, Timestep
 
 SEEDS = 2**32
 """Seeds lie below this."""
-
-_LEAST_PART = 64
-"""Environments of a part of the physics; fewer take hardly less time."""
 
 _made: set[Any] = set()
 """Options of the environments that exist, so that forks of this process can name them."""
@@ -259,8 +257,8 @@ class StatefulEnv:
 class _Programs:
     """The compiled programs of one set of options; all environments with them share these.
 
-    States are donated: XLA overwrites them in place. Outputs are not, which is why they can be
-    given away.
+    States, or their frames, are donated: XLA overwrites them in place. Outputs are not, which is
+    why they can be given away.
     """
 
     def __init__(self, vector: VectorPixelEnv, single: bool) -> None:
@@ -270,43 +268,53 @@ class _Programs:
         self.reset_where = jax.jit(self._reset_where, donate_argnums=0, compiler_options=options)
         self.step_where = jax.jit(self._step_where, donate_argnums=0, compiler_options=options)
         self.step_at_once = jax.jit(self._step, donate_argnums=0, compiler_options=options)
-        self.advance_part = jax.jit(self._advance_part, compiler_options=options)
-        self.finish_step = jax.jit(self._finish_step, donate_argnums=0, compiler_options=options)
-        self._num_parts = _num_parts(vector.num_envs) if jax.default_backend() == "cpu" else 1
+        self.advance = jax.jit(self._advance, compiler_options=options)
+        self.finish = jax.jit(self._finish, donate_argnums=0, compiler_options=options)
+        self.compiled_advance: dict[Any, Callable[..., tuple[EnvState, jax.Array]]] = {}
+        on_cpu = jax.default_backend() == "cpu"
+        self._chunk_size = chunk_size(vector.num_envs) if on_cpu else vector.num_envs
 
     def step(
         self, state: EnvState, action: jax.Array, params: EnvParams
     ) -> tuple[EnvState, dict[str, Any]]:
-        """A step; on a CPU every core has a part of a large batch's physics."""
+        """A step; on a CPU chunks of physics run at the same time, each on a core.
+
+        They are the chunks of ``VectorPixelEnv``, whatever the number of cores, so that this
+        number does not decide how XLA rounds.
+        """
         stepped: tuple[EnvState, dict[str, Any]]
-        if self._num_parts == 1:
+        if self._chunk_size == self.vector.num_envs:
             stepped = self.step_at_once(state, action, params)
             return stepped
         before = state.replace(frames=None)
-        starts = np.arange(0, self.vector.num_envs, self._part_size, dtype=np.int32)
-        parts = call_on_threads(
-            self.advance_part, [(before, action, params, start) for start in starts]
-        )
-        stepped = self.finish_step(state, parts, params)
+        starts = np.arange(0, self.vector.num_envs, self._chunk_size, dtype=np.int32)
+        calls = [(before, action, params, start) for start in starts]
+        # Compiled here: threads do not know the contexts that the caller may be in.
+        arrays = tuple(jax.typeof(x) for x in jax.tree.leaves(params))
+        kind = (frozenset(state.done.devices()), arrays)
+        if kind not in self.compiled_advance:
+            self.compiled_advance[kind] = self.advance.lower(*calls[0]).compile()
+        chunks = call_on_threads(self.compiled_advance[kind], calls)
+        stepped = self.finish(state.frames, state.done, chunks, params)
         return stepped
 
-    @property
-    def _part_size(self) -> int:
-        return self.vector.num_envs // self._num_parts
-
-    def _advance_part(
+    def _advance(
         self, state: EnvState, action: jax.Array, params: EnvParams, start: jax.Array
     ) -> tuple[EnvState, jax.Array]:
         def rows(x: jax.Array) -> jax.Array:
-            return jax.lax.dynamic_slice_in_dim(x, start, self._part_size)
+            return jax.lax.dynamic_slice_in_dim(x, start, self._chunk_size)
 
         return self.vector.advance(*jax.tree.map(rows, (state, action)), params)
 
-    def _finish_step(
-        self, state: EnvState, parts: list[tuple[EnvState, jax.Array]], params: EnvParams
+    def _finish(
+        self,
+        frames: jax.Array,
+        begins: jax.Array,
+        chunks: list[tuple[EnvState, jax.Array]],
+        params: EnvParams,
     ) -> tuple[EnvState, dict[str, Any]]:
-        moved, reward = jax.tree.map(lambda *rows: jnp.concatenate(rows), *parts)
-        state, timestep = self.vector.finish(state, moved, reward, params)
+        moved, reward = jax.tree.map(lambda *rows: jnp.concatenate(rows), *chunks)
+        state, timestep = self.vector.finish(frames, begins, moved, reward, params)
         return state, self._outputs(timestep, jnp.ones(self.vector.num_envs, bool))
 
     def _reset(self, seeds: jax.Array, params: EnvParams) -> tuple[EnvState, dict[str, Any]]:
@@ -366,12 +374,6 @@ class _Programs:
             ended["final_info"] = _with_masks(ended["final_info"], done)
             info |= _with_masks(ended, done)
         return outputs | {"info": info}
-
-
-def _num_parts(num_envs: int) -> int:
-    """Parts of equal size whose physics run at the same time: at most one for each core."""
-    most = min(num_cores(), num_envs // _LEAST_PART)
-    return next((parts for parts in range(most, 1, -1) if num_envs % parts == 0), 1)
 
 
 def _with_masks(info: Mapping[str, Any], mask: jax.Array) -> dict[str, Any]:

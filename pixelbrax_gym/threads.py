@@ -1,4 +1,4 @@
-"""Calls of compiled programs that run at the same time.
+"""Calls of a compiled program that run at the same time.
 
 The runtime runs what one thread starts one after the other, on a CPU too, where XLA's programs of
 small operations, such as physics, keep little more than one core busy. What several threads start
@@ -9,44 +9,47 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from typing import Any
 
-import jax
-
 _workers: list[ThreadPoolExecutor] = []
-"""Of one thread each: calls that meet in a thread would run one after the other."""
+"""Of one thread each, so that the shares of a batch never meet in a thread."""
 
 
 def num_cores() -> int:
-    """CPU cores that this process may use."""
+    """CPU cores that this process may run on; quotas of containers are not seen."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def call_on_threads(program: Callable, calls: Sequence[tuple[Any, ...]]) -> list[Any]:
-    """``program`` of the arguments of each call, started in a thread of its own.
+    """``program`` of the arguments of each call, in as many threads as there are cores at most.
 
     Args:
-        program: a jitted function.
-        calls: arguments of each call, all of the same shapes.
+        program: a compiled function. One that is only jitted would be compiled in every thread
+            whose contexts, such as ``jax.default_matmul_precision``, are not the caller's.
+        calls: arguments of each call.
 
     Returns:
-        What the calls return, in their order; it may still be computed.
+        What the calls return, in their order; arrays may not be ready yet.
+
+    Raises:
+        Exception: that of the first call that failed, after all others have been started.
     """
-    # In the caller's own thread, where the program is compiled if it is new.
-    first = program(*calls[0])
-    while len(_workers) < len(calls) - 1:
+    num_threads = min(num_cores(), len(calls))
+    while len(_workers) < num_threads - 1:
         _workers.append(ThreadPoolExecutor(1, thread_name_prefix="pixelbrax"))
-    device = jax.config.jax_default_device  # which a context may have set for this thread alone
 
-    def call(arguments: tuple[Any, ...]) -> Any:
-        with jax.default_device(device):
-            return program(*arguments)
+    def call_share(first: int) -> list[Any]:
+        return [program(*arguments) for arguments in calls[first::num_threads]]
 
-    others = [
-        worker.submit(call, arguments)
-        for worker, arguments in zip(_workers, calls[1:], strict=False)
-    ]
-    return [first, *(other.result() for other in others)]
+    others = [_workers[i - 1].submit(call_share, i) for i in range(1, num_threads)]
+    results: list[Any] = [None] * len(calls)
+    try:
+        results[::num_threads] = call_share(0)
+    finally:
+        wait(others)
+    for first, other in enumerate(others, 1):
+        results[first::num_threads] = other.result()
+    return results

@@ -134,19 +134,40 @@ def test_another_machine_s_figures_are_not_taken_for_this_one_s(workers, tmp_pat
     assert len({case["machine"] for case in kept["cases"].values()}) == 2
 
 
-@pytest.mark.parametrize(
-    ("platform", "vectors", "name"),
-    [("cpu", "AVX-512", "cpu-avx512"), ("cpu", "", "cpu"), ("gpu", "AVX2", "gpu")],
-)
 def test_processors_of_one_name_but_other_vectors_have_files_of_their_own(
-    workers, tmp_path, monkeypatch, platform, vectors, name
+    workers, tmp_path, monkeypatch
 ):
-    monkeypatch.setitem(MACHINE, "platform", platform)
-    monkeypatch.setitem(MACHINE, "vectors", vectors)
+    command = ["--only", "clips", "--output-dir", str(tmp_path)]
+    for vectors in ("AVX-512", "AVX2", ""):
+        monkeypatch.setitem(MACHINE, "vectors", vectors)
+        assert run.main(command) == 0
+    assert len(workers[0]) == 3
+    assert {file.name for file in tmp_path.glob("*.json")} == {
+        "cpu-avx512.json",
+        "cpu-avx2.json",
+        "cpu.json",
+    }
+    assert "a processor with AVX-512," in (tmp_path / "cpu-avx512.md").read_text()
+    assert "a processor, 2 cores" in (tmp_path / "cpu.md").read_text()
+
+
+def test_vectors_of_a_gpu_s_host_do_not_matter(workers, tmp_path, monkeypatch):
+    monkeypatch.setitem(MACHINE, "platform", "gpu")
+    monkeypatch.setitem(MACHINE, "vectors", "AVX2")
     assert run.main(["--only", "clips", "--output-dir", str(tmp_path)]) == 0
-    assert (tmp_path / f"{name}.json").exists()
-    told = f"a processor with {vectors}," if vectors else "a processor,"
-    assert told in (tmp_path / f"{name}.md").read_text()
+    assert (tmp_path / "gpu.json").exists()
+
+
+def test_results_from_before_vectors_were_noted_are_shown(workers, tmp_path, monkeypatch):
+    command = ["--only", "clips", "--output-dir", str(tmp_path)]
+    assert run.main(command) == 0
+    kept = json.loads((tmp_path / "cpu.json").read_text())
+    for machine in kept["machines"].values():
+        del machine["vectors"]
+    (tmp_path / "cpu.json").write_text(json.dumps(kept))
+    monkeypatch.setitem(MACHINE, "processor", "another processor")
+    assert run.main([*command, "--only", "devices"]) == 0
+    assert "a processor, 2 cores" in (tmp_path / "cpu.md").read_text()
 
 
 def test_a_file_of_another_kind_is_not_touched(workers, tmp_path):

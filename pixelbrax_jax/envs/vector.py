@@ -20,7 +20,7 @@ _BLOCK = 32
 """Environments that begin an episode together; their number is rounded up to a multiple."""
 
 _CHUNK = 128
-"""Largest chunk of environments whose physics a CPU steps together; see `_chunk_size`."""
+"""Largest chunk of environments whose physics a CPU steps together; see `chunk_size`."""
 
 
 class VectorPixelEnv:
@@ -30,8 +30,10 @@ class VectorPixelEnv:
     ``fold_in(key, i)``, so that it is the same whatever N is.
 
     Of more than 128 environments a CPU steps the physics in equal chunks of 64 to 128, whose
-    intermediate results stay in its caches, if N divides into such: prefer multiples of 128. To
-    spread environments over several devices, take ``ShardedVectorEnv``.
+    intermediate results stay in its caches, if N divides into such: prefer multiples of 128. The
+    chunks of a step are taken one after the other; the Gymnasium, TorchRL and Stable-Baselines3
+    environments take them at the same time, on all cores. To spread environments over several
+    devices, take ``ShardedVectorEnv``.
 
     An ended episode is followed by a fresh one as ``autoreset_mode`` says, with Gymnasium's
     meanings:
@@ -149,7 +151,7 @@ class VectorPixelEnv:
         if action.shape != expected:
             raise ValueError(f"action must have shape {expected}, got {tuple(action.shape)}.")
         moved, reward = self.advance(state.replace(frames=None), action, params)
-        return self.finish(state, moved, reward, params)
+        return self.finish(state.frames, state.done, moved, reward, params)
 
     def obs(self, state: EnvState) -> Any:
         """Observations of the states, with a leading axis N."""
@@ -165,20 +167,26 @@ class VectorPixelEnv:
         check_key(key)
         return jax.vmap(partial(jax.random.fold_in, key))(jnp.arange(num_envs))
 
-    # The pieces of a step, for those who run the physics of some rows apart.
+    # The pieces of a step, for those who run the physics in parts.
 
     def advance(
         self, state: EnvState, action: jax.Array, params: EnvParams
     ) -> tuple[EnvState, jax.Array]:
-        """The states of some or all environments after their actions, and the rewards.
+        """The states after their actions, with no episode begun and nothing drawn, and the rewards.
 
-        No episode has begun and nothing is drawn yet. ``frames`` must be None: physics does not
-        read them, and they would be copied at the door of a loop.
+        Args:
+            state: of all environments, or of some rows of them. ``frames`` should be None: physics
+                does not read them, and they would be copied at the door of a loop.
+            action: (rows, A) float.
+            params: what may be randomised.
+
+        Returns:
+            The states and (rows,) float32 rewards.
         """
         # Under jit both forms below share one trace of the physics, which takes seconds.
         advance = jax.vmap(jax.jit(self.env.advance), in_axes=(0, 0, None))
         num_rows = action.shape[0]
-        size = _chunk_size(num_rows)
+        size = chunk_size(num_rows)
         if size == num_rows:
             return advance(state, action, params)
 
@@ -207,18 +215,26 @@ class VectorPixelEnv:
         return result
 
     def finish(
-        self, state: EnvState, moved: EnvState, reward: jax.Array, params: EnvParams
+        self,
+        frames: jax.Array,
+        begins: jax.Array,
+        moved: EnvState,
+        reward: jax.Array,
+        params: EnvParams,
     ) -> tuple[EnvState, Timestep]:
-        """What ``step`` does after ``advance``: new episodes, pictures, timesteps.
+        """New episodes, pictures and timesteps: what ``step`` does after ``advance``.
 
         Args:
-            state: the states before the step.
-            moved: of ``advance``, all N.
-            reward: of ``advance``, (N,).
+            frames: the frame stacks before the step.
+            begins: (N,) bool, ``done`` of the states before the step.
+            moved: the states of ``advance``, all N; their ``frames`` do not matter.
+            reward: (N,) float32, of ``advance``.
             params: what may be randomised.
+
+        Returns:
+            What ``step`` returns.
         """
-        begins = state.done
-        state = moved.replace(frames=state.frames)
+        state = moved.replace(frames=frames)
         if self.autoreset_mode == "next_step":
             state = self._restart(state, begins, state.episode + 1, params)
             state = self._show(state, params, begins)
@@ -272,8 +288,11 @@ class VectorPixelEnv:
         return state.replace(frames=jnp.where(mask[:, None, None, None], first, state.frames))
 
 
-def _chunk_size(num_envs: int) -> int:
-    """Environments in a chunk: the largest divisor from half of ``_CHUNK`` to it, or else all."""
+def chunk_size(num_envs: int) -> int:
+    """Environments whose physics a CPU steps together.
+
+    The largest divisor of ``num_envs`` from 64 to 128; if there is none, all.
+    """
     sizes = range(min(_CHUNK, num_envs), _CHUNK // 2 - 1, -1)
     return next((size for size in sizes if num_envs % size == 0), num_envs)
 

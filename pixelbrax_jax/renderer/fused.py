@@ -58,7 +58,7 @@ def render(
 
     # Row after row in one axis: rows would end in pixels that fill no vector and go one by one.
     shape = (num_rows * width,)
-    ray = _rays(pixel, height, width, shape, first_row)
+    ray = _rays(pixel, height, width, first_row, num_rows)
     # Geoms of one material get neighboring ranks, so that a material is a range of ranks.
     order = sorted(range(len(geoms.kind)), key=lambda g: geoms.material[g])
     kinds = [geoms.kind[g] for g in order]
@@ -130,11 +130,11 @@ def _rays(
     pixel: jax.Array,
     height: int,
     width: int,
-    shape: tuple[int],
     first_row: jax.Array | int,
+    num_rows: int,
 ) -> Vector:
-    """Unit rays through the pixels' centers in the camera's frame, row 0 on top."""
-    index = jax.lax.broadcasted_iota(jnp.int32, shape, 0)
+    """Unit rays through the pixels' centers in the camera's frame, row after row from the top."""
+    index = jnp.arange(num_rows * width, dtype=jnp.int32)
     row = jax.lax.div(index, np.int32(width)) + first_row
     column = jax.lax.rem(index, np.int32(width))
     x = (column.astype(jnp.float32) - 0.5 * (width - 1)) * pixel

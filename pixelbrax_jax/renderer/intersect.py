@@ -1,8 +1,8 @@
 """Closed forms for a ray from the origin against one convex geom.
 
-A vector is a tuple of its three components, and each component is either a scalar or a
-plane of pixels: the same code serves rays that fan out from the camera (ray in planes,
-geom in scalars) and shadow rays towards a distant light (ray in scalars, geom in planes).
+A vector is a tuple of its three components, and each component is either a scalar or an
+array over pixels: the same code serves rays that fan out from the camera (ray in arrays,
+geom in scalars) and shadow rays towards a distant light (ray in scalars, geom in arrays).
 Rays have unit length. A ray enters a geom from outside; a geom around the origin is not seen.
 
 A missed geom yields NaN or a negative distance, never +inf: `fused.py` relies on it. Formulas
@@ -75,6 +75,7 @@ def _capsule(ray: Vector, pos: Vector, axes: Axes, size: Vector) -> Hit:
     b = ray_pos - ray_axis * pos_axis
     c = pos_pos - pos_axis * pos_axis - radius * radius
     y = (b - jnp.sqrt(b * b - a * c)) / a * ray_axis - pos_axis
+    # Of a line that misses the cylinder NaN became an end: that sphere is missed all the more.
     y = between(-half, y, half)
     b = ray_pos + y * ray_axis
     c = (pos_pos - radius * radius) + y * (2.0 * pos_axis + y)

@@ -8,6 +8,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from pixelbrax_gym.threads import num_cores
+
 PACKAGES = (
     "pixelbrax",
     "jax",
@@ -34,7 +36,7 @@ def describe() -> dict[str, Any]:
         "runtime": device.client.platform_version,
         "processor": _from_cpuinfo("model name") or platform.processor() or platform.machine(),
         "vectors": _vectors(),
-        "cores": cores(),
+        "cores": num_cores(),
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
         "versions": {name: _version(name) for name in PACKAGES},
@@ -43,16 +45,9 @@ def describe() -> dict[str, Any]:
 
 
 def file_stem(machine: dict[str, Any]) -> str:
-    """Name of the files of results: machines that are not alike write into different ones."""
+    """Name of the files of results: CPUs with other vectors write into other files."""
     vectors: str = machine["vectors"] if machine["platform"] == "cpu" else ""
     return "-".join(filter(None, (machine["platform"], vectors.lower().replace("-", ""))))
-
-
-def cores() -> int:
-    """Cores that this process may use, where the system tells."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _version(name: str) -> str | None:

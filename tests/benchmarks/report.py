@@ -84,7 +84,8 @@ NOTES = {
 
 def _machine(machine: Row) -> str:
     versions = ", ".join(f"{name} {v}" for name, v in machine["versions"].items() if v)
-    vectors = f" with {machine['vectors']}" if machine["vectors"] else ""
+    # Results from before vectors were noted have none.
+    vectors = f" with {machine['vectors']}" if machine.get("vectors") else ""
     return (
         f"{machine['device']} ({machine['processor']}{vectors}, {machine['cores']} cores), "
         f"{machine['system']}, Python {machine['python']}; {versions}. "

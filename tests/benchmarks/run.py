@@ -27,9 +27,10 @@ from typing import Any
 
 from tqdm import tqdm
 
+from pixelbrax_gym.threads import num_cores
 from tests.benchmarks import report
 from tests.benchmarks.cases import ABSENT, GROUPS, TASKS, Case
-from tests.benchmarks.machine import cores, file_stem
+from tests.benchmarks.machine import file_stem
 from tests.benchmarks.peers.install import AbsentError, peer_python
 
 ROOT = Path(__file__).parents[2]
@@ -115,7 +116,7 @@ def measure(case: Case, timeout: float) -> dict[str, Any]:
         python = peer_python(case.peer) if case.peer else sys.executable
         arguments = dict(case.arguments)
         if case.peer:
-            arguments["cores"] = cores()
+            arguments["cores"] = num_cores()
         if case.peer == "mujoco_warp":
             scene = worker("scene.describe", {"task": arguments["task"]}, sys.executable, timeout)
             arguments["scene"] = scene["values"]

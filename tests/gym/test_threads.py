@@ -2,6 +2,7 @@
 
 import os
 import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import gymnasium
 import jax
@@ -9,8 +10,9 @@ import numpy as np
 import pytest
 
 import pixelbrax_jax as pb
-from pixelbrax_gym import stateful
+from pixelbrax_gym import stateful, threads
 from pixelbrax_gym.threads import call_on_threads
+from pixelbrax_jax.envs import vector
 from tests.gym.conftest import ID, SIZE, TASK
 
 NUM_ENVS = 24
@@ -19,15 +21,16 @@ pytestmark = pytest.mark.skipif(jax.default_backend() != "cpu", reason="only don
 
 
 @pytest.fixture
-def make_parts(monkeypatch):
-    """A function that makes 24 environments whose physics has so many parts."""
+def make_chunked(monkeypatch):
+    """A function that makes 24 environments whose physics has three chunks, on three cores."""
+    monkeypatch.setattr(vector, "_CHUNK", 8)
+    monkeypatch.setattr(threads, "num_cores", lambda: 3)
+    stateful._programs.cache_clear()
     made = []
 
-    def make(cores, **options):
-        monkeypatch.setattr(stateful, "_LEAST_PART", 4)
-        monkeypatch.setattr(stateful, "num_cores", lambda: cores)
-        stateful._programs.cache_clear()
-        made.append(gymnasium.make_vec(ID, num_envs=NUM_ENVS, output="jax", **(SIZE | options)))
+    def make(**options):
+        options = SIZE | {"episode_length": 1000} | options
+        made.append(gymnasium.make_vec(ID, num_envs=NUM_ENVS, output="jax", **options))
         return made[-1]
 
     yield make
@@ -36,49 +39,112 @@ def make_parts(monkeypatch):
     stateful._programs.cache_clear()
 
 
-@pytest.mark.parametrize(
-    ("num_envs", "cores", "parts"),
-    [(1, 8, 1), (127, 8, 1), (128, 8, 2), (128, 1, 1), (256, 2, 2), (1000, 2, 2), (1000, 16, 10)],
-)
-def test_parts_are_equal_and_not_too_small(monkeypatch, num_envs, cores, parts):
-    monkeypatch.setattr(stateful, "num_cores", lambda: cores)
-    assert stateful._num_parts(num_envs) == parts
+def actions(count, seed=0):
+    # The first chunk stays on its feet, others end episodes.
+    rows = np.linspace(-0.2, 1.0, NUM_ENVS, dtype=np.float32)[:, None]
+    jitter = np.random.default_rng(seed).uniform(-0.05, 0.05, (count, NUM_ENVS, 1))
+    return (rows + jitter).astype(np.float32)
+
+
+def assert_same(one, other):
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+        np.testing.assert_array_equal(a, b)
 
 
 @pytest.mark.parametrize("mode", ["next_step", "same_step"])
-def test_parts_change_nothing(make_parts, mode):
-    """Also where episodes end in one part and not in another."""
-    envs = make_parts(3, autoreset_mode=mode, episode_length=1000)
+def test_chunks_in_threads_change_nothing(make_chunked, mode):
+    """Also where episodes end in one chunk and not in another."""
+    envs = make_chunked(autoreset_mode=mode)
     env, params = pb.make(TASK, **(SIZE | {"episode_length": 1000}))
     venv = pb.VectorPixelEnv(env, NUM_ENVS, mode)
     step = jax.jit(venv.step, compiler_options=pb.compiler_options())
     envs.reset(seed=0)
     state, _ = venv.reset(jax.vmap(jax.random.key)(np.arange(NUM_ENVS)), params)
-    action = np.linspace(-0.2, 1.0, NUM_ENVS, dtype=np.float32)[:, None]
     ended = np.zeros(NUM_ENVS, bool)
-    for _ in range(24):
+    for action in actions(24):
         obs, reward, terminated, truncated, infos = envs.step(action)
         state, timestep = step(state, action, params)
-        ours = (obs, reward, terminated, truncated, infos["episode_length"])
-        theirs = (
-            timestep.obs,
-            timestep.reward,
-            timestep.terminated,
-            timestep.truncated,
-            timestep.info["episode_length"],
+        info = {name: value for name, value in infos.items() if name in timestep.info}
+        assert_same(
+            (obs, reward, terminated, truncated, info["episode_length"]),
+            (
+                timestep.obs,
+                timestep.reward,
+                timestep.terminated,
+                timestep.truncated,
+                timestep.info["episode_length"],
+            ),
         )
-        for a, b in zip(ours, theirs, strict=True):
-            np.testing.assert_array_equal(a, b)
         ended |= np.asarray(terminated)
     assert ended.any()
     assert not ended[:8].any()
     programs = envs.unwrapped._stateful._programs
-    assert programs.advance_part._cache_size() == programs.finish_step._cache_size() == 1
+    assert len(programs.compiled_advance) == programs.finish._cache_size() == 1
     assert programs.step_at_once._cache_size() == 0
 
 
-def test_autoreset_disabled(make_parts):
-    envs = make_parts(2, autoreset_mode="disabled", episode_length=2)
+def test_distractors_and_half_precision_actions(make_chunked):
+    import jax.numpy as jnp
+
+    envs = make_chunked(distractors=(pb.distractors.Camera(scale=0.2),))
+    envs.reset(seed=0)
+    for action in actions(3):
+        obs = envs.step(jnp.asarray(action, jnp.bfloat16))[0]
+    again = make_chunked(distractors=(pb.distractors.Camera(scale=0.2),))
+    again.reset(seed=0)
+    for action in actions(3):
+        rounded = np.asarray(jnp.asarray(action, jnp.bfloat16), np.float32)
+        other = again.step(rounded)[0]
+    assert_same(obs, other)
+
+
+def test_contexts_of_the_caller_compile_nothing_anew(make_chunked):
+    envs = make_chunked()
+    envs.reset(seed=0)
+    envs.step(actions(1)[0])
+    programs = envs.unwrapped._stateful._programs
+    with jax.default_device(jax.devices()[0]), jax.default_matmul_precision("highest"):
+        envs.step(actions(1)[0])
+    assert len(programs.compiled_advance) == 1
+
+
+def test_a_failed_step_leaves_everything_as_it_was(make_chunked):
+    envs, other = make_chunked(), make_chunked()
+    envs.reset(seed=0), other.reset(seed=0)
+    first, second = actions(2)
+    assert_same(envs.step(first), other.step(first))
+    compiled = envs.unwrapped._stateful._programs.compiled_advance
+    ((kind, program),) = compiled.items()
+
+    def fails(state, action, params, start):
+        if start == 8:
+            raise RuntimeError("out of memory")
+        return program(state, action, params, start)
+
+    compiled[kind] = fails
+    with pytest.raises(RuntimeError, match="out of memory"):
+        envs.step(second)
+    compiled[kind] = program
+    assert_same(envs.step(second), other.step(second))
+
+
+def test_two_environments_step_from_two_threads(make_chunked):
+    envs, other = make_chunked(), make_chunked()
+    plan = actions(20)
+
+    def run(env):
+        env.reset(seed=0)
+        return [env.step(action)[0] for action in plan]
+
+    alone = run(other)
+    with ThreadPoolExecutor(2) as pool:
+        one, two = pool.map(run, (envs, other))
+    assert_same(one, alone)
+    assert_same(two, alone)
+
+
+def test_autoreset_disabled(make_chunked):
+    envs = make_chunked(autoreset_mode="disabled", episode_length=2)
     envs.reset(seed=0)
     action = np.zeros((NUM_ENVS, 1), np.float32)
     for _ in range(2):
@@ -88,37 +154,32 @@ def test_autoreset_disabled(make_parts):
         envs.step(action)
 
 
-def test_every_call_has_a_thread_of_its_own():
-    names = []
+@pytest.mark.parametrize("cores", [1, 2, 3, 16])
+def test_calls_are_dealt_to_the_cores_and_keep_their_order(monkeypatch, cores):
+    monkeypatch.setattr(threads, "num_cores", lambda: cores)
+    seen = {}
 
     def program(number):
-        names.append(threading.get_ident())
+        seen[number] = threading.get_ident()
         return number
 
     for _ in range(3):
-        names.clear()
-        assert call_on_threads(program, [(i,) for i in range(4)]) == [0, 1, 2, 3]
-        assert len(set(names)) == 4
-        assert threading.get_ident() in names
+        assert call_on_threads(program, [(i,) for i in range(5)]) == [0, 1, 2, 3, 4]
+        assert len(set(seen.values())) == min(cores, 5)
+        assert seen[0] == threading.get_ident()
 
 
-def test_an_error_of_any_call_is_raised():
+@pytest.mark.parametrize("failing", [0, 2])
+def test_an_error_of_any_call_is_raised(monkeypatch, failing):
+    monkeypatch.setattr(threads, "num_cores", lambda: 3)
+
     def program(number):
-        if number == 2:
-            raise ValueError("the third call failed")
+        if number == failing:
+            raise ValueError(f"call {number} failed")
         return number
 
-    with pytest.raises(ValueError, match="the third call failed"):
+    with pytest.raises(ValueError, match=f"call {failing} failed"):
         call_on_threads(program, [(i,) for i in range(3)])
-
-
-def test_threads_know_the_default_device():
-    """A program compiled under another default device is not compiled again in each thread."""
-    program = jax.jit(lambda x: x + 1)
-    with jax.default_device(jax.devices()[0]):
-        results = call_on_threads(program, [(np.float32(i),) for i in range(3)])
-    assert [float(x) for x in results] == [1.0, 2.0, 3.0]
-    assert program._cache_size() == 1
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cannot choose cores here")
@@ -126,6 +187,6 @@ def test_cores_are_those_that_the_process_may_use():
     allowed = os.sched_getaffinity(0)
     try:
         os.sched_setaffinity(0, {min(allowed)})
-        assert stateful.num_cores() == 1
+        assert threads.num_cores() == 1
     finally:
         os.sched_setaffinity(0, allowed)

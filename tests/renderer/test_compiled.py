@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import pytest
 
 import pixelbrax_jax as pb
-from tests.benchmarks.machine import cores
+from pixelbrax_gym.threads import num_cores
 from tests.benchmarks.throughput import operations
 
 NUM_ENVS, SIZE = 64, 84
@@ -61,7 +61,7 @@ def test_pixels_are_computed_in_one_fusion(program):
     assert roots == 5 + 2 * 12
 
 
-@pytest.mark.skipif(cores() < 2, reason="needs two cores")
+@pytest.mark.skipif(num_cores() < 2, reason="needs two cores")
 def test_pixels_are_spread_over_the_cores(program):
     shape = rf"u32\[{NUM_ENVS},{SIZE * SIZE}\]"
     lines = [
