@@ -169,6 +169,7 @@ class StatefulEnv:
             self._check_not_done()
         shape = (self.env.action_size,)
         action = as_actions(action, shape if self.single else (self.num_envs, *shape), self.device)
+        assert self._state is not None
         if mask is None:
             self._state, outputs = self._programs.step(self._state, action, self.params)
         else:
@@ -304,7 +305,8 @@ class _Programs:
         def rows(x: jax.Array) -> jax.Array:
             return jax.lax.dynamic_slice_in_dim(x, start, self._chunk_size)
 
-        return self.vector.advance(*jax.tree.map(rows, (state, action)), params)
+        state, action = jax.tree.map(rows, (state, action))
+        return self.vector.advance(state, action, params)
 
     def _finish(
         self,
