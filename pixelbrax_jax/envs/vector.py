@@ -20,7 +20,7 @@ _BLOCK = 32
 """Environments that begin an episode together; their number is rounded up to a multiple."""
 
 _CHUNK = 128
-"""Largest chunk of environments whose physics a CPU steps together; see `chunk_size`."""
+"""Largest chunk of environments whose physics a CPU steps together; see `_chunk_size`."""
 
 
 class VectorPixelEnv:
@@ -167,6 +167,11 @@ class VectorPixelEnv:
         check_key(key)
         return jax.vmap(partial(jax.random.fold_in, key))(jnp.arange(num_envs))
 
+    @property
+    def chunk_size(self) -> int:
+        """Environments whose physics a CPU steps together."""
+        return _chunk_size(self.num_envs)
+
     # The pieces of a step, for those who run the physics in parts.
 
     def advance(
@@ -186,7 +191,7 @@ class VectorPixelEnv:
         # Under jit both forms below share one trace of the physics, which takes seconds.
         advance = jax.vmap(jax.jit(self.env.advance), in_axes=(0, 0, None))
         num_rows = action.shape[0]
-        size = chunk_size(num_rows)
+        size = _chunk_size(num_rows)
         if size == num_rows:
             return advance(state, action, params)
 
@@ -288,11 +293,8 @@ class VectorPixelEnv:
         return state.replace(frames=jnp.where(mask[:, None, None, None], first, state.frames))
 
 
-def chunk_size(num_envs: int) -> int:
-    """Environments whose physics a CPU steps together.
-
-    The largest divisor of ``num_envs`` from 64 to 128; if there is none, all.
-    """
+def _chunk_size(num_envs: int) -> int:
+    """The largest divisor of ``num_envs`` from half of ``_CHUNK`` to it; if there is none, all."""
     sizes = range(min(_CHUNK, num_envs), _CHUNK // 2 - 1, -1)
     return next((size for size in sizes if num_envs % size == 0), num_envs)
 

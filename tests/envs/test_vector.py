@@ -203,7 +203,7 @@ def test_bad_options_and_arguments():
     [(1, 1), (100, 100), (128, 128), (130, 65), (256, 128), (257, 257), (1000, 125), (8192, 128)],
 )
 def test_chunks_divide_the_environments(num_envs, size):
-    assert vector.chunk_size(num_envs) == size
+    assert vector._chunk_size(num_envs) == size
 
 
 @pytest.mark.parametrize("mode", ["next_step", "same_step"])
