@@ -51,8 +51,8 @@ class Programs:
         starts = np.arange(0, self.vector.num_envs, self._chunk_size, dtype=np.int32)
         calls = [(before, action, params, start) for start in starts]
         # Compiled here: threads do not know the contexts that the caller may be in.
-        arrays = tuple(jax.typeof(x) for x in jax.tree.leaves(params))
-        kind = (frozenset(state.done.devices()), arrays)
+        leaves, structure = jax.tree.flatten(params)
+        kind = (frozenset(state.done.devices()), structure, *map(jax.typeof, leaves))
         if kind not in self.compiled_advance:
             self.compiled_advance[kind] = self.advance.lower(*calls[0]).compile()
         chunks = call_on_threads(self.compiled_advance[kind], calls)

@@ -35,7 +35,8 @@ def call_on_threads(program: Callable, calls: Sequence[tuple[Any, ...]]) -> list
         What the calls return, in their order; arrays may not be ready yet.
 
     Raises:
-        Exception: that of the first call that failed, after all others have been started.
+        Exception: of a call that failed, the caller's thread first. No thread is still at it, and
+            calls that the failed one's thread had left are not made.
     """
     num_threads = min(num_cores(), len(calls))
     while len(_workers) < num_threads - 1:

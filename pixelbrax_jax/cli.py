@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -191,7 +192,10 @@ def _bench(arguments: list[str]) -> int:
         return 1
     path = os.pathsep.join(filter(None, (str(root), os.environ.get("PYTHONPATH"))))
     command = [sys.executable, "-m", "tests.benchmarks.run", *arguments]
-    return subprocess.run(command, env=os.environ | {"PYTHONPATH": path}, check=False).returncode
+    with subprocess.Popen(command, env=os.environ | {"PYTHONPATH": path}) as process:
+        # Left behind, it would go on and disturb, and overwrite, the next one's measurements.
+        signal.signal(signal.SIGTERM, lambda *_: process.terminate())
+        return process.wait()
 
 
 def _version() -> str:

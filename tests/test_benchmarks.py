@@ -1,11 +1,13 @@
 """The benchmark keeps what it has measured and says what it could not."""
 
 import json
+import os
 import subprocess
 import sys
 import time
 from pathlib import Path
 
+import psutil
 import pytest
 
 from tests.benchmarks import cases, run
@@ -168,6 +170,21 @@ def test_results_from_before_vectors_were_noted_are_shown(workers, tmp_path, mon
     monkeypatch.setitem(MACHINE, "processor", "another processor")
     assert run.main([*command, "--only", "devices"]) == 0
     assert "a processor, 2 cores" in (tmp_path / "cpu.md").read_text()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals are those of POSIX")
+def test_a_benchmark_that_is_stopped_leaves_no_process_behind(tmp_path):
+    command = [sys.executable, "-m", "pixelbrax_jax.cli", "bench", "--output-dir", str(tmp_path)]
+    stopped = subprocess.Popen(command, cwd=run.ROOT)
+    parent = psutil.Process(stopped.pid)
+    while not (left := parent.children(recursive=True)):
+        assert stopped.poll() is None
+        time.sleep(0.1)
+    time.sleep(3.0)  # until it knows what to do when it is told to stop
+    left = parent.children(recursive=True)
+    stopped.terminate()
+    assert stopped.wait(30.0) != 0
+    assert not psutil.wait_procs(left, timeout=30.0)[1]
 
 
 def test_a_file_of_another_kind_is_not_touched(workers, tmp_path):

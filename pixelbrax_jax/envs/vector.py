@@ -181,7 +181,7 @@ class VectorPixelEnv:
 
         Args:
             state: of all environments, or of some rows of them. ``frames`` should be None: physics
-                does not read them, and they would be copied at the door of a loop.
+                does not read them, and they would be copied when a loop begins.
             action: (rows, A) float.
             params: what may be randomised.
 

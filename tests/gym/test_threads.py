@@ -6,9 +6,11 @@ from concurrent.futures import ThreadPoolExecutor
 
 import gymnasium
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import pixelbrax_gym.programs
 import pixelbrax_jax as pb
 from pixelbrax_gym import stateful, threads
 from pixelbrax_gym.threads import call_on_threads
@@ -52,10 +54,11 @@ def assert_same(one, other):
 
 
 @pytest.mark.parametrize("mode", ["next_step", "same_step"])
-def test_chunks_in_threads_change_nothing(make_chunked, mode):
+@pytest.mark.parametrize("distractors", [(), (pb.distractors.Camera(scale=0.2),)])
+def test_chunks_in_threads_change_nothing(make_chunked, mode, distractors):
     """Also where episodes end in one chunk and not in another."""
-    envs = make_chunked(autoreset_mode=mode)
-    env, params = pb.make(TASK, **(SIZE | {"episode_length": 1000}))
+    envs = make_chunked(autoreset_mode=mode, distractors=distractors)
+    env, params = pb.make(TASK, **SIZE | {"episode_length": 1000, "distractors": distractors})
     venv = pb.VectorPixelEnv(env, NUM_ENVS, mode)
     step = jax.jit(venv.step, compiler_options=pb.compiler_options())
     envs.reset(seed=0)
@@ -64,16 +67,14 @@ def test_chunks_in_threads_change_nothing(make_chunked, mode):
     for action in actions(24):
         obs, reward, terminated, truncated, infos = envs.step(action)
         state, timestep = step(state, action, params)
-        info = {name: value for name, value in infos.items() if name in timestep.info}
+        for name, value in timestep.info.items():
+            theirs = infos[name]
+            if isinstance(value, dict):
+                theirs = {key: theirs[key] for key in value}
+            assert_same(theirs, value)
         assert_same(
-            (obs, reward, terminated, truncated, info["episode_length"]),
-            (
-                timestep.obs,
-                timestep.reward,
-                timestep.terminated,
-                timestep.truncated,
-                timestep.info["episode_length"],
-            ),
+            (obs, reward, terminated, truncated),
+            (timestep.obs, timestep.reward, timestep.terminated, timestep.truncated),
         )
         ended |= np.asarray(terminated)
     assert ended.any()
@@ -83,29 +84,38 @@ def test_chunks_in_threads_change_nothing(make_chunked, mode):
     assert programs.step_at_once._cache_size() == 0
 
 
-def test_distractors_and_half_precision_actions(make_chunked):
-    import jax.numpy as jnp
-
-    envs = make_chunked(distractors=(pb.distractors.Camera(scale=0.2),))
-    envs.reset(seed=0)
+def test_actions_of_half_precision(make_chunked):
+    envs, other = make_chunked(), make_chunked()
+    envs.reset(seed=0), other.reset(seed=0)
     for action in actions(3):
-        obs = envs.step(jnp.asarray(action, jnp.bfloat16))[0]
-    again = make_chunked(distractors=(pb.distractors.Camera(scale=0.2),))
-    again.reset(seed=0)
-    for action in actions(3):
-        rounded = np.asarray(jnp.asarray(action, jnp.bfloat16), np.float32)
-        other = again.step(rounded)[0]
-    assert_same(obs, other)
+        half = jnp.asarray(action, jnp.bfloat16)
+        assert_same(envs.step(half)[:4], other.step(np.asarray(half, np.float32))[:4])
 
 
-def test_contexts_of_the_caller_compile_nothing_anew(make_chunked):
+def test_environments_that_differ_in_what_is_static(make_chunked):
+    """They share programs but for what is compiled anew."""
+    for options in ({}, {"shadows": True}, {"look": "original"}):
+        envs = make_chunked(**options)
+        envs.reset(seed=0)
+        envs.step(actions(1)[0])
+
+
+def test_a_context_of_the_caller_compiles_nothing_in_the_threads(make_chunked, monkeypatch):
     envs = make_chunked()
     envs.reset(seed=0)
     envs.step(actions(1)[0])
     programs = envs.unwrapped._stateful._programs
+    (compiled,) = programs.compiled_advance.values()
+    called = []
+
+    def call(program, calls):
+        called.append(program)
+        return call_on_threads(program, calls)
+
+    monkeypatch.setattr(pixelbrax_gym.programs, "call_on_threads", call)
     with jax.default_device(jax.devices()[0]), jax.default_matmul_precision("highest"):
         envs.step(actions(1)[0])
-    assert len(programs.compiled_advance) == 1
+    assert called == [compiled]
 
 
 def test_a_failed_step_leaves_everything_as_it_was(make_chunked):
@@ -167,6 +177,20 @@ def test_calls_are_dealt_to_the_cores_and_keep_their_order(monkeypatch, cores):
         assert call_on_threads(program, [(i,) for i in range(5)]) == [0, 1, 2, 3, 4]
         assert len(set(seen.values())) == min(cores, 5)
         assert seen[0] == threading.get_ident()
+
+
+def test_of_several_errors_one_is_raised_and_no_thread_is_left(monkeypatch):
+    monkeypatch.setattr(threads, "num_cores", lambda: 2)
+    made = []
+
+    def program(number):
+        made.append(number)
+        if number in (1, 2):
+            raise ValueError(f"call {number} failed")
+
+    with pytest.raises(ValueError, match="call 2 failed"):
+        call_on_threads(program, [(i,) for i in range(4)])
+    assert sorted(made) == [0, 1, 2]
 
 
 @pytest.mark.parametrize("failing", [0, 2])
