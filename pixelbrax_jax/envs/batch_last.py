@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -17,10 +18,10 @@ from jax import lax
 from jax.extend import core
 
 _LANES = 16
-"""Rows are filled up to a multiple, of which vectors leave no rest to be computed one by one."""
+"""Rows are padded to a multiple, so that loops over vectors leave no scalar remainder."""
 
 _FEW = 4
-"""So many rows are not filled up: one by one they take less time."""
+"""So many rows are not padded: one by one they take less time."""
 
 _LONGEST_SUM = 16
 """Products of matrices over longer axes stay calls of a library."""
@@ -36,8 +37,10 @@ class _Operand(NamedTuple):
 def batch_last(fn: Callable[..., Any], in_axes: Sequence[int | None]) -> Callable[..., Any]:
     """``jax.vmap(fn, in_axes)``, computed with the batch as last axis.
 
-    Results differ from those of ``jax.vmap`` by rounding. What has no rule here is computed by
-    ``jax.vmap``.
+    Results differ from those of ``jax.vmap`` by rounding. What has no rule here, among it loops
+    that end by themselves and functions with derivatives of their own, is computed by
+    ``jax.vmap``, as is everything within ``jax.shard_map`` if that keeps track of what varies.
+    More than a few rows are padded by copies of the last one, whose side effects happen too.
 
     Args:
         fn: a function of trees of arrays, of one row.
@@ -45,28 +48,38 @@ def batch_last(fn: Callable[..., Any], in_axes: Sequence[int | None]) -> Callabl
             same for all rows. At least one is 0.
 
     Returns:
-        The function of all rows; its results have rows along their first axis.
+        The function of all rows; its results have rows along their first axis. It raises a
+        ValueError if arguments have different numbers of rows.
     """
 
     def rows_of(*args: Any) -> Any:
         args = jax.tree.map(jnp.asarray, args)
-        flags = [axis is not None for axis in in_axes]
-        by_argument = list(zip(args, flags, strict=True))
-        size = next(len(jax.tree.leaves(arg)[0]) for arg, batched in by_argument if batched)
+        by_argument = [(x, axis is not None) for x, axis in zip(args, in_axes, strict=True)]
+        leaves = [(x, batched) for arg, batched in by_argument for x in jax.tree.leaves(arg)]
+        sizes = {len(x) for x, batched in leaves if batched}
+        if len(sizes) != 1:
+            raise ValueError(f"arguments must have the same number of rows, got {sorted(sizes)}.")
+        if any(_varies(x) for x, _ in leaves):
+            return jax.vmap(fn, in_axes=tuple(in_axes))(*args)
+        (size,) = sizes
         padded = size if size <= _FEW else -(-size // _LANES) * _LANES
         row = [jax.tree.map(_row if batched else jax.typeof, arg) for arg, batched in by_argument]
         closed, shapes = jax.make_jaxpr(fn, return_shape=True)(*row)
         operands = [
-            _Operand(jnp.moveaxis(_fill_up(leaf, padded), 0, -1) if batched else leaf, batched)
-            for arg, batched in by_argument
-            for leaf in jax.tree.leaves(arg)
+            _Operand(jnp.moveaxis(_pad_rows(x, padded), 0, -1) if batched else x, batched)
+            for x, batched in leaves
         ]
         results = _evaluate(closed, operands, padded)
-        leaves, tree = jax.tree.flatten(shapes)
-        filled = [_fill(x, leaf.shape, padded) for x, leaf in zip(results, leaves, strict=True)]
-        return jax.tree.unflatten(tree, [jnp.moveaxis(x, -1, 0)[:size] for x in filled])
+        outputs, tree = jax.tree.flatten(shapes)
+        spread = [_spread(x, out.shape, padded) for x, out in zip(results, outputs, strict=True)]
+        return jax.tree.unflatten(tree, [jnp.moveaxis(x, -1, 0)[:size] for x in spread])
 
     return rows_of
+
+
+def _varies(x: jax.Array) -> bool:
+    """Whether ``jax.shard_map`` tracks that devices have different values of ``x``."""
+    return bool(getattr(getattr(jax.typeof(x), "manual_axis_type", None), "varying", ()))
 
 
 def _aval(atom: core.Var | core.Literal) -> Any:
@@ -78,7 +91,7 @@ def _row(x: jax.Array) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct(x.shape[1:], x.dtype, weak_type=jax.typeof(x).weak_type)
 
 
-def _fill_up(x: jax.Array, size: int) -> jax.Array:
+def _pad_rows(x: jax.Array, size: int) -> jax.Array:
     """Rows, and the last one again until there are ``size``."""
     return x if len(x) == size else x[jnp.minimum(jnp.arange(size), len(x) - 1)]
 
@@ -97,36 +110,39 @@ def _evaluate(closed: core.ClosedJaxpr, operands: Sequence[_Operand], size: int)
     known.update(zip(jaxpr.invars, operands, strict=True))
     for eqn in jaxpr.eqns:
         inputs = [read(atom) for atom in eqn.invars]
-        known.update(zip(eqn.outvars, _apply(eqn, inputs, size), strict=True))
+        with eqn.ctx.manager:
+            known.update(zip(eqn.outvars, _apply(eqn, inputs, size), strict=True))
     return [read(atom) for atom in jaxpr.outvars]
 
 
 def _apply(eqn: core.JaxprEqn, inputs: list[_Operand], size: int) -> list[_Operand]:
     name = eqn.primitive.name
-    if name in _CALLS:
-        return _evaluate(eqn.params[_CALLS[name]], inputs, size)
-    if name == "scan":
-        return _scan(eqn, inputs, size)
     values = [x.value for x in inputs]
     flags = [x.batched for x in inputs]
     if not any(flags):
         return [_Operand(x, False) for x in _bind(eqn, *values)]
+    if name in _CALLS:
+        return _evaluate(eqn.params[_CALLS[name]], inputs, size)
+    if name == "scan":
+        return _scan(eqn, inputs, size)
     if name in _ELEMENTWISE:
         shape = _aval(eqn.outvars[0]).shape
-        outputs = _bind(eqn, *(_fill(x, shape, size) for x in inputs))
+        outputs = _bind(eqn, *(_spread(x, shape, size) for x in inputs))
     elif name in _NAMED_AXES:
         outputs = _bind(eqn, *values)
     elif name in _FIRST_BATCHED and flags == [True] + [False] * (len(flags) - 1):
         outputs = [_FIRST_BATCHED[name](eqn, *values)]
-    elif name == "concatenate":
+    elif name in ("concatenate", "stack"):
         parts = [
-            _fill(x, _aval(atom).shape, size) for x, atom in zip(inputs, eqn.invars, strict=True)
+            _spread(x, _aval(atom).shape, size) for x, atom in zip(inputs, eqn.invars, strict=True)
         ]
         outputs = _bind(eqn, *parts)
     elif name == "dot_general" and _is_short(eqn):
         outputs = [_dot(eqn, *inputs)]
-    elif name == "scatter-add" and not flags[1]:
-        outputs = [_scatter_add(eqn, size, *inputs)]
+    elif name in _SCATTERS and not flags[1]:
+        outputs = [_scatter(eqn, size, *inputs)]
+    elif name == "cond":
+        outputs = _cond(eqn, size, inputs[0], inputs[1:])
     else:
         in_axes = [-1 if batched else None for batched in flags]
         outputs = jax.vmap(lambda *row: _bind(eqn, *row), in_axes=in_axes, out_axes=-1)(*values)
@@ -135,14 +151,14 @@ def _apply(eqn: core.JaxprEqn, inputs: list[_Operand], size: int) -> list[_Opera
 
 def _bind(eqn: core.JaxprEqn, *values: Any, **changed: Any) -> list[Any]:
     params = eqn.primitive.get_bind_params({**eqn.params, **changed})
-    # Earlier versions of JAX hand out functions apart.
+    # Other releases of JAX hand out functions apart.
     functions, params = params if isinstance(params, tuple) else ((), params)
     outputs = eqn.primitive.bind(*functions, *values, **params)
     return list(outputs) if eqn.primitive.multiple_results else [outputs]
 
 
-def _fill(operand: _Operand, shape: tuple[int, ...], size: int) -> jax.Array:
-    """An operand of ``shape``, or a scalar in place of it, with the batch as last axis."""
+def _spread(operand: _Operand, shape: tuple[int, ...], size: int) -> jax.Array:
+    """The operand as (*shape, size); its row has ``shape`` or is a scalar."""
     rank = jnp.ndim(operand.value) - operand.batched
     axes = tuple(range(rank)) + ((len(shape),) if operand.batched else ())
     if operand.batched and rank == len(shape):
@@ -151,7 +167,7 @@ def _fill(operand: _Operand, shape: tuple[int, ...], size: int) -> jax.Array:
 
 
 _CALLS = {"jit": "jaxpr", "closed_call": "call_jaxpr"}
-"""Primitives that are programs, and the parameter that holds it."""
+"""Primitives that are programs, which are written out in place, and the parameter that has it."""
 
 _ELEMENTWISE_NAMES = """
 abs acos add and asin atan atan2 cbrt ceil clamp convert_element_type copy copy_p cos cosh div eq
@@ -176,7 +192,9 @@ def _broadcast(eqn: core.JaxprEqn, x: jax.Array) -> jax.Array:
 
 
 def _reshape(eqn: core.JaxprEqn, x: jax.Array) -> jax.Array:
-    return lax.reshape(x, (*eqn.params["new_sizes"], x.shape[-1]))
+    order = eqn.params["dimensions"]
+    order = None if order is None else (*order, x.ndim - 1)
+    return lax.reshape(x, (*eqn.params["new_sizes"], x.shape[-1]), order)
 
 
 def _transpose(eqn: core.JaxprEqn, x: jax.Array) -> jax.Array:
@@ -194,8 +212,10 @@ def _slice(eqn: core.JaxprEqn, x: jax.Array) -> jax.Array:
 
 
 def _dynamic_slice(eqn: core.JaxprEqn, x: jax.Array, *start: jax.Array) -> jax.Array:
-    zero = jnp.zeros_like(start[0])
-    return lax.dynamic_slice(x, (*start, zero), (*eqn.params["slice_sizes"], x.shape[-1]))
+    # Bound as it is: `lax.dynamic_slice` would take negative indices from the end once more.
+    zero = jnp.zeros((), start[0].dtype if start else jnp.int32)
+    sizes = (*eqn.params["slice_sizes"], x.shape[-1])
+    return _bind(eqn, x, *start, zero, slice_sizes=sizes)[0]
 
 
 def _pad(eqn: core.JaxprEqn, x: jax.Array, padding: jax.Array) -> jax.Array:
@@ -222,14 +242,17 @@ _FIRST_BATCHED: dict[str, Callable[..., jax.Array]] = {
 """Rules for a batched first operand and further ones that are the same for all rows."""
 
 
-def _scatter_add(
+_SCATTERS = frozenset(["scatter", "scatter-add", "scatter-mul", "scatter-min", "scatter-max"])
+
+
+def _scatter(
     eqn: core.JaxprEqn, size: int, x: _Operand, indices: _Operand, updates: _Operand
 ) -> jax.Array:
     numbers = eqn.params["dimension_numbers"]
     last = _aval(eqn.invars[2]).ndim
     numbers = numbers._replace(update_window_dims=(*numbers.update_window_dims, last))
-    into = _fill(x, _aval(eqn.invars[0]).shape, size)
-    added = _fill(updates, _aval(eqn.invars[2]).shape, size)
+    into = _spread(x, _aval(eqn.invars[0]).shape, size)
+    added = _spread(updates, _aval(eqn.invars[2]).shape, size)
     return _bind(eqn, into, indices.value, added, dimension_numbers=numbers)[0]
 
 
@@ -238,7 +261,10 @@ def _is_short(eqn: core.JaxprEqn) -> bool:
     terms = 1
     for axis in contracted:
         terms *= _aval(eqn.invars[0]).shape[axis]
-    return 0 < terms <= _LONGEST_SUM
+    # Libraries add the products of short floats in longer ones.
+    dtype = _aval(eqn.outvars[0]).dtype
+    is_short_float = jnp.issubdtype(dtype, jnp.floating) and dtype.itemsize < 4
+    return 0 < terms <= _LONGEST_SUM and not is_short_float
 
 
 def _dot(eqn: core.JaxprEqn, left: _Operand, right: _Operand) -> jax.Array:
@@ -267,6 +293,26 @@ def _dot(eqn: core.JaxprEqn, left: _Operand, right: _Operand) -> jax.Array:
     return sum(terms[1:], start=terms[0])
 
 
+def _cond(
+    eqn: core.JaxprEqn, size: int, index: _Operand, operands: list[_Operand]
+) -> list[jax.Array]:
+    flags = [x.batched for x in operands]
+    shapes = [_aval(var).shape for var in eqn.outvars]
+
+    def branch(closed: core.ClosedJaxpr, *values: jax.Array) -> list[jax.Array]:
+        results = _evaluate(closed, list(map(_Operand, values, flags)), size)
+        return [_spread(x, shape, size) for x, shape in zip(results, shapes, strict=True)]
+
+    branches = [partial(branch, closed) for closed in eqn.params["branches"]]
+    values = [x.value for x in operands]
+    if not index.batched:
+        return list(lax.switch(index.value, branches, *values))
+    # Rows differ in their branch: all are computed, as under `jax.vmap`.
+    chosen = _Operand(lax.clamp(0, index.value, len(branches) - 1), True)
+    cases = zip(shapes, *(take(*values) for take in branches), strict=True)
+    return [lax.select_n(_spread(chosen, shape, size), *case) for shape, *case in cases]
+
+
 def _scan(eqn: core.JaxprEqn, inputs: list[_Operand], size: int) -> list[_Operand]:
     closed, params = eqn.params["jaxpr"], eqn.params
     num_consts, num_carry = params["num_consts"], params["num_carry"]
@@ -278,7 +324,7 @@ def _scan(eqn: core.JaxprEqn, inputs: list[_Operand], size: int) -> list[_Operan
     def carry(operands: Sequence[_Operand]) -> list[Any]:
         shapes = [_aval(var).shape for var in closed.jaxpr.outvars[:num_carry]]
         return [
-            _fill(x, shape, size) if flag else x.value
+            _spread(x, shape, size) if flag else x.value
             for x, shape, flag in zip(operands, shapes, flags, strict=True)
         ]
 

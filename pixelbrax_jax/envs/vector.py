@@ -192,15 +192,18 @@ class VectorPixelEnv:
         """
         # Under jit both forms below share one trace of the physics, which takes seconds.
         one = jax.jit(self.env.advance)
-        advance = batch_last(one, in_axes=(0, 0, None))
+        first = jax.vmap(one, in_axes=(0, 0, None))
         num_rows = action.shape[0]
+        if num_rows == 1:
+            return first(state, action, params)
+        last = batch_last(one, in_axes=(0, 0, None))
         size = _chunk_size(num_rows)
 
         def advance_in_chunks(
             state: EnvState, action: jax.Array, params: EnvParams
         ) -> tuple[EnvState, jax.Array]:
             if size == num_rows:
-                return advance(state, action, params)
+                return last(state, action, params)
 
             # Some engines carry empty arrays, of which no dimension can be left to be found.
             def chunks(x: jax.Array) -> jax.Array:
@@ -210,7 +213,7 @@ class VectorPixelEnv:
 
             def put(i: jax.Array, carry: tuple[EnvState, jax.Array]) -> tuple[EnvState, jax.Array]:
                 chunk = jax.tree.map(lambda x: x[i], (carry[0], actions))
-                moved = advance(*chunk, params)
+                moved = last(*chunk, params)
                 return jax.tree.map(lambda x, new: x.at[i].set(new), carry, moved)
 
             # In place: the results of `jax.lax.map` would be cleared first and copied afterwards.
@@ -223,7 +226,7 @@ class VectorPixelEnv:
             action,
             params,
             cpu=advance_in_chunks,
-            default=jax.vmap(one, in_axes=(0, 0, None)),
+            default=first,
         )
         return result
 

@@ -7,6 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.extend import core
+from jax.sharding import AxisType
+from jax.sharding import PartitionSpec as P
 
 import pixelbrax_jax as pb
 from pixelbrax_jax.envs.batch_last import batch_last
@@ -52,20 +54,29 @@ FUNCTIONS = {
     "casts": lambda x: (x * 10).astype(jnp.int32) % 3,
     "broadcast": lambda x: x[:, None] + x[None] + TABLE[0][:, None],
     "reshape": lambda x: jnp.outer(x, x).reshape(-1)[::2],
+    "reshape in another order": lambda x: jnp.outer(x, TABLE[1]).reshape(-1, order="F"),
     "transpose": lambda x: jnp.outer(x, TABLE[2]).T,
     "slices": lambda x: (x[1:], x[::-1], x[0:3:2], jnp.split(x, 3)),
     "pad": lambda x: jnp.pad(x, (1, 2), constant_values=4.0),
     "pad with a row's own": lambda x: jax.lax.pad(x, x[0], ((1, 0, 1),)),
     "concatenate": lambda x: jnp.concatenate([x, TABLE[0], jnp.zeros(1)]),
+    "stack": lambda x: (jnp.stack([x, TABLE[0]]), jnp.stack([TABLE[0], x], axis=-1)),
     "tile": lambda x: jnp.tile(jnp.outer(x, x), (2, 3)),
     "take the same": lambda x: jnp.outer(x, x)[jnp.array([2, 0, 0])],
     "take one's own": lambda x: TABLE[jnp.argmax(x)],
     "dynamic slice": lambda x: jax.lax.dynamic_slice(x, (jnp.int32(1),), (2,)),
+    "dynamic slice before the start": lambda x: jax.lax.dynamic_slice(x, (jnp.int32(-5),), (1,)),
+    "dynamic slices in a loop": lambda x: jax.lax.map(lambda i: x[i], jnp.arange(-5, 5)),
+    "dynamic slice of a scalar": lambda x: jax.lax.dynamic_slice(x[0], (), ()),
     "dynamic slice of one's own": lambda x: jax.lax.dynamic_slice(x, (jnp.argmax(x),), (2,)),
+    "take beyond the end": lambda x: (
+        jnp.take(x, jnp.array([1, 7]), mode="clip"),
+        x.at[jnp.array([1, 7])].get(mode="fill", fill_value=3),
+    ),
     "add at the same": lambda x: jax.ops.segment_sum(jnp.outer(x, x), jnp.array([1, 0, 1]), 4),
     "add at the same, to all the same": lambda x: TABLE.at[jnp.array([1, 3])].add(x),
     "add at one's own": lambda x: TABLE.at[jnp.argmax(x)].add(x),
-    "set": lambda x: x.at[1].set(5.0),
+    "set": lambda x: (x.at[1].set(5.0), TABLE.at[2].set(x), TABLE.at[jnp.array([1, 1])].max(x)),
     "reductions": lambda x: (x.sum(), x.max(), jnp.argmin(x), jnp.cumsum(x), jnp.all(x > 0)),
     "matrix and vector": lambda x: jnp.outer(x, x) @ x,
     "matrix and the same": lambda x: TABLE @ x,
@@ -73,6 +84,11 @@ FUNCTIONS = {
     "batches of matrices": lambda x: jax.vmap(jnp.dot)(jnp.outer(x, x), TABLE[:3]),
     "many axes": lambda x: jnp.einsum("ijk,kj->i", TABLE[:, :, None] * x, jnp.outer(x, x)),
     "integers": lambda x: x.astype(jnp.int32) @ jnp.arange(3),
+    "booleans": lambda x: jnp.dot(x > 0, TABLE[0] > 0),
+    "short integers": lambda x: jnp.dot(
+        x.astype(jnp.int8), jnp.full(3, 100, jnp.int8), preferred_element_type=jnp.int32
+    ),
+    "short floats": lambda x: x.astype(jnp.bfloat16) @ x.astype(jnp.bfloat16),
     "long sums": lambda x: jnp.tile(x, 20) @ jnp.ones((60, 2)),
     "sort": jnp.sort,
     "calls": lambda x: jax.jit(lambda y: jax.jit(jnp.tanh)(y) + 1)(x),
@@ -81,6 +97,10 @@ FUNCTIONS = {
     "loops within": nested,
     "a loop that ends by itself": until_nine,
     "branches": lambda x: jax.lax.cond(x[0] > 0, jnp.sin, jnp.cos, x),
+    "branches with loops": lambda x: jax.lax.cond(x[0] > 0, late, lambda y: (y[2], x[1], 1.0), x),
+    "three branches": lambda x: jax.lax.switch(
+        jnp.argmax(x) * 2 - 1, [jnp.sin, lambda y: TABLE[0], jnp.outer(x, x).__matmul__], x
+    ),
     "the same branch": lambda x: jax.lax.switch(jnp.int32(1), [jnp.sin, jnp.cos], x),
     "draws": lambda x: jax.random.normal(jax.random.fold_in(jax.random.key(0), x[0] > 0), 2),
     "no use of it": lambda x: (TABLE, jnp.float32(3)),
@@ -120,6 +140,29 @@ def test_arguments_may_be_trees_keys_and_the_same_for_all():
     np.testing.assert_array_equal(actual["sum"], expected["sum"])
 
 
+def test_numbers_of_rows_must_agree():
+    fn = batch_last(lambda x, y: x + y, (0, 0))
+    with pytest.raises(ValueError, match=r"same number of rows, got \[2, 3\]"):
+        fn(jnp.ones(3), jnp.ones(2))
+    assert batch_last(lambda _, y: y + 1, (0, 0))(None, jnp.ones(0)).shape == (0,)
+
+
+def test_a_shard_map_that_tracks_what_varies():
+    mesh = jax.make_mesh((1,), ("i",), axis_types=(AxisType.Auto,))
+    double = batch_last(lambda x: x * 2.0, (0,))
+    sharded = jax.shard_map(double, mesh=mesh, in_specs=P("i"), out_specs=P("i"))
+    np.testing.assert_array_equal(jax.jit(sharded)(jnp.ones(5)), jnp.full(5, 2.0))
+
+
+def test_equations_keep_their_contexts():
+    def draw(x):
+        with jax.threefry_partitionable(False):
+            return jax.random.normal(jax.random.key(0), (4,)) + x
+
+    actual = batch_last(draw, (0,))(jnp.zeros(2))
+    np.testing.assert_array_equal(actual, jax.vmap(draw)(jnp.zeros(2)))
+
+
 def test_derivatives_are_those_of_vmap():
     def loss(form, x):
         return jnp.sum(form(lambda y: doubled(y) @ jnp.outer(y, TABLE[1]))(x))
@@ -137,7 +180,7 @@ def equations(jaxpr):
             yield from equations(sub)
 
 
-@pytest.mark.parametrize("task", ["ant", "halfcheetah"])
+@pytest.mark.parametrize("task", ["ant", "walker2d", "inverted_pendulum", "swimmer"])
 def test_physics_keep_the_batch_last(task):
     # A number of environments that is no other length; 48 is a multiple of the lanes.
     num_envs = 48
