@@ -136,7 +136,9 @@ def _apply(eqn: core.JaxprEqn, inputs: list[_Operand], size: int) -> list[_Opera
         parts = [
             _spread(x, _aval(atom).shape, size) for x, atom in zip(inputs, eqn.invars, strict=True)
         ]
-        outputs = _bind(eqn, *parts)
+        # Held together: else XLA puts the parts in place of slices, and computes them anew in
+        # each kernel that reads some.
+        outputs = lax.optimization_barrier(_bind(eqn, *parts))
     elif name == "dot_general" and _is_short(eqn):
         outputs = [_dot(eqn, *inputs)]
     elif name in _SCATTERS and not flags[1]:
@@ -268,7 +270,7 @@ def _is_short(eqn: core.JaxprEqn) -> bool:
 
 
 def _dot(eqn: core.JaxprEqn, left: _Operand, right: _Operand) -> jax.Array:
-    """A product of matrices as a sum of products, which XLA fuses with what is around it."""
+    """A product of matrices as a sum of products, which XLA fuses with what comes before it."""
     contracted, batch = eqn.params["dimension_numbers"]
     out = _aval(eqn.outvars[0])
 
@@ -281,16 +283,22 @@ def _dot(eqn: core.JaxprEqn, left: _Operand, right: _Operand) -> jax.Array:
 
     (x, x_own), (y, _) = arrange(0, left), arrange(1, right)
     size = x.shape[-1] if left.batched else y.shape[-1]
-    shared = tuple(range(len(batch[0])))
-    first, last = len(shared), out.ndim
-    x_axes = (*shared, *range(first, first + x_own), *([last] if left.batched else []))
-    y_axes = (*shared, *range(first + x_own, last), *([last] if right.batched else []))
-    terms = [
-        lax.broadcast_in_dim(x[index], (*out.shape, size), x_axes)
-        * lax.broadcast_in_dim(y[index], (*out.shape, size), y_axes)
-        for index in itertools.product(*map(range, x.shape[: len(contracted[0])]))
-    ]
-    return sum(terms[1:], start=terms[0])
+    terms = x.shape[: len(contracted[0])]
+
+    def product(x: jax.Array, y: jax.Array, leading: tuple[int, ...]) -> jax.Array:
+        """(*leading, *out.shape, size); both have axes leading, batch, own, and rows if batched."""
+        shape = (*leading, *out.shape, size)
+        shared = tuple(range(len(leading) + len(batch[0])))
+        first, last = len(shared), len(shape) - 1
+        x_axes = (*shared, *range(first, first + x_own), *([last] if left.batched else []))
+        y_axes = (*shared, *range(first + x_own, last), *([last] if right.batched else []))
+        return lax.broadcast_in_dim(x, shape, x_axes) * lax.broadcast_in_dim(y, shape, y_axes)
+
+    if size <= _FEW:
+        return jnp.sum(product(x, y, terms), tuple(range(len(terms))), dtype=out.dtype)
+    # Sums of many rows would be added up one row after the other.
+    products = [product(x[i], y[i], ()) for i in itertools.product(*map(range, terms))]
+    return sum(products[1:], start=products[0])
 
 
 def _cond(

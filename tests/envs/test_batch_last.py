@@ -165,11 +165,29 @@ def test_equations_keep_their_contexts():
 
 def test_derivatives_are_those_of_vmap():
     def loss(form, x):
-        return jnp.sum(form(lambda y: doubled(y) @ jnp.outer(y, TABLE[1]))(x))
+        return jnp.sum(form(lambda y: doubled(y) @ jnp.stack([y, TABLE[1], y * y]))(x))
 
     x = jnp.linspace(-1, 1, 15).reshape(5, 3)
     actual = jax.grad(lambda x: loss(lambda fn: batch_last(fn, (0,)), x))(x)
     np.testing.assert_allclose(actual, jax.grad(lambda x: loss(jax.vmap, x))(x), rtol=1e-5)
+
+
+@pytest.mark.parametrize("join", [jnp.stack, jnp.concatenate])
+def test_xla_may_not_take_joined_arrays_apart(join):
+    jaxpr = jax.make_jaxpr(batch_last(lambda x: join([x, jnp.sin(x)]), (0,)))(jnp.ones((5, 3)))
+    held = {id(eqn.invars[0]) for eqn in equations(jaxpr.jaxpr) if "barrier" in eqn.primitive.name}
+    names = ("concatenate", "stack")
+    joined = [eqn for eqn in equations(jaxpr.jaxpr) if eqn.primitive.name in names]
+    assert joined
+    assert {id(eqn.outvars[0]) for eqn in joined} == held
+
+
+@pytest.mark.parametrize("size", [4, 5])
+def test_products_of_few_rows_are_sums_over_an_axis(size):
+    jaxpr = jax.make_jaxpr(batch_last(jnp.dot, (0, 0)))(jnp.ones((size, 3)), jnp.ones((size, 3)))
+    names = [eqn.primitive.name for eqn in equations(jaxpr.jaxpr)]
+    assert "dot_general" not in names
+    assert ("reduce_sum" in names) == (size == 4)
 
 
 def equations(jaxpr):
