@@ -317,20 +317,20 @@ def _replace_rows(
 
     The work is done in blocks and grows with the number of masked rows, not with N: most steps
     end no episode, and a select over the whole batch would pay for all of them.
+
+    The loop carries which rows are left. With a counter in their place XLA took what the blocks
+    have in common, such as physics at the first pose, out of the loop and into every step.
     """
     num_rows = mask.shape[0]
     block = min(_BLOCK, num_rows)
-    padded = -(-num_rows // block) * block
-    # Out-of-range entries at the end: read as the last row, never written.
-    chosen = jnp.nonzero(mask, size=padded, fill_value=num_rows)[0]
 
     def put(carry: tuple[jax.Array, Any]) -> tuple[jax.Array, Any]:
-        start, rows = carry
-        index = jax.lax.dynamic_slice(chosen, (start,), (block,))
+        left, rows = carry
+        # Past the last one of those left: read as the last row, never written.
+        index = jnp.nonzero(left, size=block, fill_value=num_rows)[0]
         inputs = jax.tree.map(lambda x: jnp.take(x, index, axis=0, mode="clip"), arguments)
         outputs = jax.vmap(fn)(*inputs)
         rows = jax.tree.map(lambda x, new: x.at[index].set(new, mode="drop"), rows, outputs)
-        return start + block, rows
+        return left.at[index].set(False, mode="drop"), rows
 
-    count = jnp.sum(mask)
-    return jax.lax.while_loop(lambda carry: carry[0] < count, put, (jnp.int32(0), rows))[1]
+    return jax.lax.while_loop(lambda carry: jnp.any(carry[0]), put, (mask, rows))[1]
