@@ -1,8 +1,8 @@
 """Calls of a compiled program that run at the same time.
 
 The runtime runs what one thread starts one after the other, on a CPU too, where XLA's programs of
-small operations, such as physics, keep little more than one core busy. What several threads start
-runs at the same time.
+small operations, such as physics, do not keep all cores busy. What several threads start runs at
+the same time.
 """
 
 from __future__ import annotations

@@ -21,7 +21,8 @@ _LANES = 16
 """Rows are padded to a multiple, so that loops over vectors leave no scalar remainder."""
 
 _FEW = 4
-"""So many rows are not padded: one by one they take less time."""
+"""So many rows are not padded, and their products of matrices not written out: loops over so few
+gain nothing."""
 
 _LONGEST_SUM = 16
 """Products of matrices over longer axes stay calls of a library."""
@@ -136,11 +137,11 @@ def _apply(eqn: core.JaxprEqn, inputs: list[_Operand], size: int) -> list[_Opera
         parts = [
             _spread(x, _aval(atom).shape, size) for x, atom in zip(inputs, eqn.invars, strict=True)
         ]
-        # Held together: else XLA puts the parts in place of slices, and computes them anew in
-        # each kernel that reads some.
+        # A barrier: else XLA reads the parts in place of slices of the whole, and computes them
+        # anew in each kernel that reads one.
         outputs = lax.optimization_barrier(_bind(eqn, *parts))
     elif name == "dot_general" and _is_short(eqn):
-        outputs = [_dot(eqn, *inputs)]
+        outputs = [_dot(eqn, size, *inputs)]
     elif name in _SCATTERS and not flags[1]:
         outputs = [_scatter(eqn, size, *inputs)]
     elif name == "cond":
@@ -269,8 +270,8 @@ def _is_short(eqn: core.JaxprEqn) -> bool:
     return 0 < terms <= _LONGEST_SUM and not is_short_float
 
 
-def _dot(eqn: core.JaxprEqn, left: _Operand, right: _Operand) -> jax.Array:
-    """A product of matrices as a sum of products, which XLA fuses with what comes before it."""
+def _dot(eqn: core.JaxprEqn, size: int, left: _Operand, right: _Operand) -> jax.Array:
+    """A product of matrices as sums of products of entries: no call of a library."""
     contracted, batch = eqn.params["dimension_numbers"]
     out = _aval(eqn.outvars[0])
 
@@ -282,23 +283,25 @@ def _dot(eqn: core.JaxprEqn, left: _Operand, right: _Operand) -> jax.Array:
         return lax.transpose(operand.value.astype(out.dtype), axes), len(own)
 
     (x, x_own), (y, _) = arrange(0, left), arrange(1, right)
-    size = x.shape[-1] if left.batched else y.shape[-1]
-    terms = x.shape[: len(contracted[0])]
+    lengths = x.shape[: len(contracted[0])]
 
-    def product(x: jax.Array, y: jax.Array, leading: tuple[int, ...]) -> jax.Array:
-        """(*leading, *out.shape, size); both have axes leading, batch, own, and rows if batched."""
+    def multiply(a: jax.Array, b: jax.Array, leading: tuple[int, ...]) -> jax.Array:
+        """Products of entries, (*leading, *out.shape, size).
+
+        Axes of ``a`` and ``b`` are leading, batch, own, and rows if batched.
+        """
         shape = (*leading, *out.shape, size)
         shared = tuple(range(len(leading) + len(batch[0])))
         first, last = len(shared), len(shape) - 1
-        x_axes = (*shared, *range(first, first + x_own), *([last] if left.batched else []))
-        y_axes = (*shared, *range(first + x_own, last), *([last] if right.batched else []))
-        return lax.broadcast_in_dim(x, shape, x_axes) * lax.broadcast_in_dim(y, shape, y_axes)
+        a_axes = (*shared, *range(first, first + x_own), *([last] if left.batched else []))
+        b_axes = (*shared, *range(first + x_own, last), *([last] if right.batched else []))
+        return lax.broadcast_in_dim(a, shape, a_axes) * lax.broadcast_in_dim(b, shape, b_axes)
 
     if size <= _FEW:
-        return jnp.sum(product(x, y, terms), tuple(range(len(terms))), dtype=out.dtype)
-    # Sums of many rows would be added up one row after the other.
-    products = [product(x[i], y[i], ()) for i in itertools.product(*map(range, terms))]
-    return sum(products[1:], start=products[0])
+        return jnp.sum(multiply(x, y, lengths), tuple(range(len(lengths))), dtype=out.dtype)
+    # Additions run over many rows at a time, which a sum over an axis was seen not to.
+    terms = [multiply(x[index], y[index], ()) for index in itertools.product(*map(range, lengths))]
+    return sum(terms[1:], start=terms[0])
 
 
 def _cond(
