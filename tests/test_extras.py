@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from pixelbrax_gym import doctor, window
-from pixelbrax_jax import load_clips
+from pixelbrax_jax import cli, load_clips
 from pixelbrax_jax.distractors import clips
 from pixelbrax_jax.extras import install_extra
 
@@ -20,9 +20,12 @@ SOURCES = [*(ROOT / "pixelbrax_jax").rglob("*.py"), *(ROOT / "pixelbrax_gym").rg
 
 
 def test_the_command():
-    assert install_extra("sb3") == 'pip install -e ".[sb3]" in your clone of PixelBrax'
+    assert install_extra("sb3") == (
+        'pip install -c constraints.txt -e ".[sb3]" in your clone of PixelBrax'
+    )
     assert install_extra("cuda12", "cuda13") == (
-        'pip install -e ".[cuda12]" or pip install -e ".[cuda13]" in your clone of PixelBrax'
+        'pip install -c constraints.txt -e ".[cuda12]" or '
+        'pip install -c constraints.txt -e ".[cuda13]" in your clone of PixelBrax'
     )
 
 
@@ -71,3 +74,10 @@ def test_a_window_without_pygame(monkeypatch):
     monkeypatch.setitem(sys.modules, "pygame", None)
     with pytest.raises(ImportError, match=r"needs pygame; try: .*\[human\]"):
         window.Window("Ant", 20)
+
+
+def test_a_film_needs_an_extra(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "imageio.v2", None)
+    monkeypatch.delitem(sys.modules, "pixelbrax_jax.agents.record", raising=False)
+    assert cli.main(["record", "nowhere"]) == 1
+    assert '".[train]"' in capsys.readouterr().err

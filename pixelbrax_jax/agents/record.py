@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import imageio.v2 as imageio
 import jax
 import numpy as np
 
@@ -80,8 +81,6 @@ def film(
         CheckpointError: there is no such checkpoint.
         ValueError: an option is out of range.
     """
-    import imageio.v2 as imageio
-
     check_whole("grid", grid)
     check_whole("size", size)
     check_whole("num_frames", num_frames)

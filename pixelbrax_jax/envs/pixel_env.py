@@ -372,6 +372,12 @@ def check_key(key: jax.Array, shape: tuple[int, ...] = ()) -> None:
         TypeError: it is not, with the cure.
     """
     if not (isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)):
-        raise TypeError(f"key must come from jax.random.key(seed), got {type(key).__name__}.")
+        # Not the type's name: under jit that is a tracer's, which the caller has not made.
+        is_array = isinstance(key, jax.Array)
+        got = f"{key.dtype}{list(key.shape)}" if is_array else type(key).__name__
+        raise TypeError(
+            f"key must come from jax.random.key(seed), got {got}; jax.random.wrap_key_data turns "
+            "one of jax.random.PRNGKey into such a key."
+        )
     if key.shape != shape:
         raise TypeError(f"key must have shape {shape}, got {key.shape}.")

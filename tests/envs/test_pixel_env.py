@@ -188,7 +188,7 @@ def test_bad_actions_and_keys():
         env.step(state, jnp.ones(2), PARAMS)
     with pytest.raises(TypeError, match="action must be floating point"):
         env.step(state, jnp.ones(1, int), PARAMS)
-    with pytest.raises(TypeError, match=r"jax.random.key\(seed\)"):
+    with pytest.raises(TypeError, match=r"jax.random.key\(seed\), got uint32\[2\]"):
         env.reset(jax.random.PRNGKey(0), PARAMS)
     with pytest.raises(TypeError, match=r"key must have shape \(\), got \(2,\)"):
         env.reset(jax.random.split(jax.random.key(0)), PARAMS)
