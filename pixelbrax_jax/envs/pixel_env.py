@@ -371,9 +371,9 @@ def check_key(key: jax.Array, shape: tuple[int, ...] = ()) -> None:
     Raises:
         TypeError: it is not, with the cure.
     """
-    if not (isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)):
-        # Not the type's name: under jit that is a tracer's, which the caller has not made.
-        is_array = isinstance(key, jax.Array)
+    is_array = isinstance(key, jax.Array)
+    if not (is_array and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)):
+        # An array's type is no help: under jit it is a tracer, which the caller has not made.
         got = f"{key.dtype}{list(key.shape)}" if is_array else type(key).__name__
         raise TypeError(
             f"key must come from jax.random.key(seed), got {got}; jax.random.wrap_key_data turns "
