@@ -3,6 +3,7 @@
 #   make PYTHON=python3.12 test     another Python for a new environment
 #   make VENV=/tmp/env test         another place for it
 #   make test ARGS="-k autoreset"   arguments for pytest, the demo or the benchmarks
+#   make test-newest SPEED=slow     the slow tests, with the newest releases
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -16,7 +17,7 @@ WORKERS := -n 2 --dist loadfile
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-slow lint format bench docs docs-serve clean
+.PHONY: help demo test test-slow test-newest test-oldest lint format bench docs docs-serve clean
 
 help: ## show this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1|/' | \
@@ -25,11 +26,25 @@ help: ## show this list
 demo: $(VENV)/.installed-demo ## train a PyTorch agent from pixels; results in runs/demo
 	$(RUN) examples/train_inverted_pendulum.py --output-dir runs/demo $(ARGS)
 
+# Tests of what needs no torch.
+TORCHLESS := tests/renderer tests/distractors tests/envs tests/physics tests/scene tests/agents \
+	tests/test_choices.py tests/test_compilation.py tests/test_architecture.py
+# One that runs, also if pyenv has it but another is chosen.
+NEWEST_PYTHON ?= $(firstword $(shell for python in python3.13 $(HOME)/.pyenv/versions/3.13*/bin/python; \
+	do $$python -c "" 2>/dev/null && echo $$python; done) python3.13)
+SPEED ?= not slow
+
 test: $(VENV)/.installed-dev ## run the tests that take minutes at most
 	$(RUN) -m pytest $(WORKERS) -m "not slow and not gpu" $(ARGS)
 
 test-slow: $(VENV)/.installed-dev ## run the tests that take longer
 	$(RUN) -m pytest $(WORKERS) -m "slow and not gpu" $(ARGS)
+
+test-newest: .venv-newest/.installed ## run those that need no torch with the newest releases
+	.venv-newest/bin/python -m pytest $(WORKERS) -m "$(SPEED) and not gpu" $(TORCHLESS) $(ARGS)
+
+test-oldest: .venv-oldest/.installed ## run those that need no torch with the oldest releases
+	.venv-oldest/bin/python -m pytest $(WORKERS) -m "$(SPEED) and not gpu" $(TORCHLESS) $(ARGS)
 
 lint: $(VENV)/.installed-dev ## check style, types and spelling
 	$(RUN) -m ruff check .
@@ -51,7 +66,7 @@ docs-serve: $(VENV)/.installed-docs ## read the documentation in a browser while
 	NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs serve
 
 clean: ## remove the environment, builds and caches; keeps runs/
-	rm -rf $(VENV) .venv-ci .venv-peers build dist site .jax_cache .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) .venv-ci .venv-newest .venv-oldest .venv-peers build dist site .jax_cache .mypy_cache .pytest_cache .ruff_cache
 	find pixelbrax_jax pixelbrax_gym tests examples -name __pycache__ -prune -exec rm -rf {} +
 
 # One environment for all; each set of extras is installed when it is first needed, and again
@@ -59,6 +74,22 @@ clean: ## remove the environment, builds and caches; keeps runs/
 $(VENV)/.installed-%: $(VENV)/.created pyproject.toml constraints.txt
 	@echo "Installing PixelBrax with its $* extras into $(VENV); the first time takes minutes ..."
 	@$(PIP) -e ".[$*]"
+	@touch $@
+
+# With no constraints pip takes the newest releases.
+.venv-newest/.installed: pyproject.toml
+	@echo "Installing PixelBrax with the newest releases into .venv-newest ..."
+	@$(NEWEST_PYTHON) -m venv --clear .venv-newest
+	@.venv-newest/bin/python -m pip install --quiet --disable-pip-version-check -e ".[test]"
+	@touch $@
+
+.venv-oldest/.installed: pyproject.toml tests/oldest_releases.py
+	@echo "Installing PixelBrax with the oldest releases into .venv-oldest ..."
+	@$(PYTHON) -m venv --clear .venv-oldest
+	@.venv-oldest/bin/python -m pip install --quiet --disable-pip-version-check packaging
+	@.venv-oldest/bin/python tests/oldest_releases.py > .venv-oldest/constraints.txt
+	@.venv-oldest/bin/python -m pip install --quiet --disable-pip-version-check \
+		-c .venv-oldest/constraints.txt -e ".[test]"
 	@touch $@
 
 $(VENV)/.created:

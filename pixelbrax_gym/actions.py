@@ -46,7 +46,12 @@ def as_actions(action: Any, shape: tuple[int, ...], device: jax.Device) -> Any:
             )
         return action if action.dtype == np.float32 else action.astype(np.float32)
     else:
-        given = np.asarray(action)
+        try:
+            given = np.asarray(action)
+        except ValueError as error:
+            raise ValueError(
+                f"action must be an array of shape {shape}, got rows of different lengths."
+            ) from error
         _check_shape(given.shape, shape)
         _check_floating(given.dtype.kind == "f", given.dtype)
         # A copy: JAX may read it after the caller has begun to fill in the next action.

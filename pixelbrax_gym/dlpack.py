@@ -34,27 +34,6 @@ def to_torch(tree: Any) -> Any:
     return jax.tree.map(torch.utils.dlpack.from_dlpack, tree)
 
 
-def to_host(tree: Any) -> Any:
-    """Every array of a tree as a NumPy array that may be written to.
-
-    Without a copy where the array is on a CPU: hand over only arrays that nobody reads again.
-
-    Args:
-        tree: a pytree of JAX arrays, each on one device.
-
-    Returns:
-        The same tree of NumPy arrays, of the same shapes and dtypes.
-    """
-
-    def host(array: jax.Array) -> np.ndarray:
-        (device,) = array.devices()
-        if device.platform == "cpu":
-            return torch.utils.dlpack.from_dlpack(array).numpy()
-        return np.array(array)
-
-    return jax.tree.map(host, tree)
-
-
 def actions_to_jax(tensor: torch.Tensor, device: jax.Device) -> np.ndarray | jax.Array:
     """A tensor of actions as something that a jitted function takes.
 
@@ -69,9 +48,11 @@ def actions_to_jax(tensor: torch.Tensor, device: jax.Device) -> np.ndarray | jax
         float32, same shape: a NumPy array for a CPU tensor, else an array on ``device``.
 
     Raises:
-        TypeError: the tensor is not floating point.
+        TypeError: the tensor is not floating point, or sparse.
         ValueError: the tensor is on another device; the message names both.
     """
+    if tensor.layout != torch.strided:
+        raise TypeError(f"action must be a dense tensor, got {tensor.layout}; try .to_dense().")
     if not tensor.is_floating_point():
         raise TypeError(f"action must be floating point in [-1, 1], got {tensor.dtype}.")
     expected = torch_device(device)
@@ -84,6 +65,25 @@ def actions_to_jax(tensor: torch.Tensor, device: jax.Device) -> np.ndarray | jax
         )
     copy = tensor.detach().to(torch.float32, copy=True).contiguous()
     return copy.numpy() if expected.type == "cpu" else jax.dlpack.from_dlpack(copy)
+
+
+def as_device(device: torch.device | str) -> torch.device:
+    """Return a torch device that is there.
+
+    Args:
+        device: a torch device or its name.
+
+    Raises:
+        ValueError: there is no such device; the message names the argument.
+    """
+    try:
+        place = torch.device(device)
+        torch.empty(0, device=place)
+    # Torch without CUDA raises an AssertionError.
+    except (RuntimeError, AssertionError, TypeError) as error:
+        reason = str(error).splitlines()[0]
+        raise ValueError(f"device={device!r} is not there: {reason}.") from error
+    return place
 
 
 def torch_device(device: jax.Device) -> torch.device:

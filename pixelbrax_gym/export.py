@@ -17,8 +17,9 @@ def exporter(output: str) -> Callable[[Any], Any]:
     """How to hand out a tree of JAX arrays.
 
     Args:
-        output: ``"numpy"`` for read-only views, ``"torch"`` for tensors on the environment's
-            device, both without a copy where the device is the CPU; ``"jax"`` for the arrays.
+        output: ``"numpy"`` for arrays that may be written to, ``"torch"`` for tensors on the
+            environment's device, both without a copy where the device is the CPU; ``"jax"`` for
+            the arrays. Hand over only arrays that nobody reads again.
 
     Returns:
         A function of a tree.
@@ -32,11 +33,42 @@ def exporter(output: str) -> Callable[[Any], Any]:
         from pixelbrax_gym.dlpack import to_torch
 
         return to_torch
-    return _to_numpy if output == "numpy" else _to_jax
+    return to_numpy if output == "numpy" else _to_jax
 
 
-def _to_numpy(tree: Any) -> Any:
-    return jax.tree.map(np.asarray, tree)
+def to_numpy(tree: Any) -> Any:
+    """Return every array of a tree as a NumPy array that may be written to.
+
+    Without a copy where the array is on a CPU: hand over only arrays that nobody reads again.
+
+    Args:
+        tree: a pytree of JAX arrays, each on one device.
+
+    Returns:
+        The same tree of NumPy arrays, of the same shapes and dtypes.
+    """
+    return jax.tree.map(_writable, tree)
+
+
+class _Memory:
+    """A JAX array's memory, as NumPy's array interface; NumPy itself would make it read-only."""
+
+    def __init__(self, array: jax.Array) -> None:
+        # NumPy keeps this object, and so the memory, as long as it has a view of it.
+        self._array = array.block_until_ready()
+        self.__array_interface__ = {
+            "version": 3,
+            "shape": array.shape,
+            "typestr": array.dtype.str,
+            "data": (array.unsafe_buffer_pointer(), False),
+        }
+
+
+def _writable(array: jax.Array) -> np.ndarray:
+    (device,) = array.devices()
+    if device.platform != "cpu" or not array.size:
+        return np.array(array)
+    return np.asarray(_Memory(array))
 
 
 def _to_jax(tree: Any) -> Any:

@@ -18,11 +18,14 @@ except ImportError as missing:
         f"Stable-Baselines3 is not installed; try: {install_extra('sb3')}"
     ) from missing
 
-from pixelbrax_gym.dlpack import to_host
+from pixelbrax_gym.export import to_numpy
+from pixelbrax_gym.member import Member, call_members
+from pixelbrax_gym.reset_options import check_reset_options
+from pixelbrax_gym.seeds import SEEDS, spread_seeds
 from pixelbrax_gym.single_env import check_render_size
 from pixelbrax_gym.spaces import action_space, channels_first_space, observation_space
-from pixelbrax_gym.stateful import SEEDS, StatefulEnv, spread_seeds
-from pixelbrax_jax.choices import check_choice
+from pixelbrax_gym.stateful import StatefulEnv
+from pixelbrax_jax.choices import check_bool, check_choice
 
 _OWN_OPTIONS = (
     "num_envs",
@@ -96,6 +99,8 @@ class PixelBraxSB3VecEnv(VecEnv):
         """
         if render_mode is not None:
             check_choice("render_mode", render_mode, ("rgb_array",))
+        self._channels_first = check_bool("channels_first", channels_first)
+        stagger = check_bool("stagger", stagger)
         self._stateful = StatefulEnv(
             task,
             options,
@@ -105,12 +110,14 @@ class PixelBraxSB3VecEnv(VecEnv):
             also_allowed=_OWN_OPTIONS,
         )
         env, num_envs = self._stateful.env, self._stateful.num_envs
-        self._channels_first = channels_first
-        self._render_size = check_render_size(render_height, render_width)
+        self._render_size = check_render_size(render_height, render_width, num_envs)
         space = observation_space(env.obs_spec)
         space = channels_first_space(space) if channels_first else space
-        self._members = [Member(self, i, render_mode) for i in range(num_envs)]
-        super().__init__(num_envs, space, action_space(env.action_size))
+        spaces = (space, action_space(env.action_size))
+        # Stable-Baselines3 asks them for their render mode while it makes the rest.
+        self.render_mode = render_mode
+        self._members = [Member(self, i, *spaces) for i in range(num_envs)]
+        super().__init__(num_envs, *spaces)
         # SB3's wrappers ask for a number here, beside its lists.
         self.metadata: dict[str, Any] = self.metadata | {"render_fps": self._stateful.fps}
         head_starts = np.arange(num_envs) * env.episode_length // num_envs
@@ -124,12 +131,14 @@ class PixelBraxSB3VecEnv(VecEnv):
             Observations.
 
         Raises:
-            ValueError: there are options, of which no environment has any.
+            ValueError: there are options, of which no environment has any; they are dropped.
             ClosedEnvironmentError: after ``close``.
             RuntimeError: this process is a fork that cannot run JAX.
         """
-        if any(self._options):
-            raise ValueError(f"environments take no options at a reset, got {self._options!r}.")
+        for options in self._options:
+            # What is refused must not be refused again at the next reset.
+            self._reset_options()
+            check_reset_options(options)
         outputs = self._stateful.reset(self._seeds)
         if self._head_starts is not None:
             self._stateful.shorten(self._head_starts)
@@ -208,7 +217,7 @@ class PixelBraxSB3VecEnv(VecEnv):
         """
         if self.render_mode is None:
             return [None] * self.num_envs
-        return list(np.asarray(self._stateful.render(*self._render_size)))
+        return list(to_numpy(self._stateful.render(*self._render_size)))
 
     def close(self) -> None:
         """Forgets the states."""
@@ -227,10 +236,8 @@ class PixelBraxSB3VecEnv(VecEnv):
         self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
     ) -> list[Any]:
         """What a method of the members returns."""
-        return [
-            getattr(member, method_name)(*method_args, **method_kwargs)
-            for member in self._selected(indices)
-        ]
+        members = self._selected(indices)
+        return call_members(members, method_name, *method_args, **method_kwargs)
 
     def env_is_wrapped(
         self, wrapper_class: type[gymnasium.Wrapper], indices: Any = None
@@ -243,50 +250,7 @@ class PixelBraxSB3VecEnv(VecEnv):
         return [self._members[i] for i in self._get_indices(indices)]
 
     def _observations(self, obs: Any) -> Any:
-        arrays = to_host(obs)
+        arrays = to_numpy(obs)
         if not self._channels_first:
             return arrays
         return jax.tree.map(lambda x: x.transpose(0, 3, 1, 2) if x.ndim == 4 else x, arrays)
-
-
-class Member:
-    """Stands for one environment of a ``PixelBraxSB3VecEnv``.
-
-    Attributes:
-        render_mode: None or ``"rgb_array"``.
-        index: which one it is.
-    """
-
-    spec = None
-
-    def __init__(self, vec_env: PixelBraxSB3VecEnv, index: int, render_mode: str | None) -> None:
-        """Makes the stand-in; see the class."""
-        self._vec_env, self.index, self.render_mode = vec_env, index, render_mode
-
-    @property
-    def unwrapped(self) -> Member:
-        """Itself."""
-        return self
-
-    @property
-    def metadata(self) -> dict[str, Any]:
-        """That of the whole."""
-        return self._vec_env.metadata
-
-    @property
-    def observation_space(self) -> gymnasium.Space:
-        """That of one environment."""
-        return self._vec_env.observation_space
-
-    @property
-    def action_space(self) -> gymnasium.Space:
-        """That of one environment."""
-        return self._vec_env.action_space
-
-    def get_wrapper_attr(self, name: str) -> Any:
-        """The attribute of that name, as Gymnasium's environments have it."""
-        return getattr(self, name)
-
-    def render(self) -> np.ndarray | None:
-        """The environment's picture; draws those of all."""
-        return self._vec_env.get_images()[self.index]

@@ -6,12 +6,16 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 
-from pixelbrax_gym.export import exporter
+from pixelbrax_gym.export import exporter, to_numpy
+from pixelbrax_gym.reset_options import check_reset_options
+from pixelbrax_gym.seeds import check_seed
 from pixelbrax_gym.spaces import action_space, observation_space
-from pixelbrax_gym.stateful import StatefulEnv
+from pixelbrax_gym.stateful import StatefulEnv, with_time_limit
 from pixelbrax_gym.window import Window
 from pixelbrax_jax.choices import check_choice, check_whole
+from pixelbrax_jax.envs.memory import check_fits
 
 RENDER_MODES = ("human", "rgb_array")
 
@@ -34,8 +38,9 @@ class PixelBraxEnv(gymnasium.Env):
     ``TimeLimit``, and whichever limit is reached first truncates. A longer episode than 1000
     control steps hence wants ``episode_length``.
 
-    Observations are never overwritten. As ``"numpy"`` they are read-only views of what JAX has
-    computed; copy them to write.
+    Observations are never overwritten, and may be written to: nothing reads them again.
+
+    After ``close`` a ``reset`` opens the environment again.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012  # as Gymnasium declares it
@@ -88,7 +93,8 @@ class PixelBraxEnv(gymnasium.Env):
         self.action_space = action_space(env.action_size)
         self.render_mode = render_mode
         self.metadata = {**type(self).metadata, "render_fps": self._stateful.fps}
-        self._render_size = check_render_size(render_height, render_width)
+        self._render_size = check_render_size(render_height, render_width, 1)
+        self._spec: EnvSpec | None = None
         self._window: Window | None = None
         if render_mode == "human":
             self._window = Window(f"PixelBrax {task}", self._stateful.fps)
@@ -101,16 +107,18 @@ class PixelBraxEnv(gymnasium.Env):
         Args:
             seed: s begins episode 0 of ``jax.random.key(s)``; None begins the next episode, or
                 draws a seed if there was none yet.
-            options: ignored.
+            options: None or an empty dict; there are none.
 
         Returns:
             The observation and the info of ``step``.
 
         Raises:
-            ClosedEnvironmentError: after ``close``.
+            TypeError: the seed is no integer, or ``options`` no dict.
+            ValueError: the seed is out of range, or there are options.
             RuntimeError: this process is a fork that cannot run JAX.
         """
-        del options
+        check_reset_options(options)
+        seed = None if seed is None else check_seed(seed)
         super().reset(seed=seed)
         outputs = self._stateful.reset(seed, self.np_random)
         self._show()
@@ -131,8 +139,7 @@ class PixelBraxEnv(gymnasium.Env):
             * ``non_finite``: bool, the physics diverged and ended the episode.
 
         Raises:
-            ResetNeeded: before the first reset, or when the episode has ended.
-            ClosedEnvironmentError: after ``close``.
+            ResetNeeded: before the first reset, after ``close``, or when the episode has ended.
             RuntimeError: this process is a fork that cannot run JAX.
             TypeError: the action is not floating point.
             ValueError: the action has another shape, is on another device, or contains a NaN
@@ -157,34 +164,47 @@ class PixelBraxEnv(gymnasium.Env):
             modes. A window is drawn by ``reset`` and ``step`` already.
 
         Raises:
-            ResetNeeded: before the first reset.
-            ClosedEnvironmentError: after ``close``.
+            ResetNeeded: before the first reset, or after ``close``.
         """
         if self.render_mode != "rgb_array":
             return None
         return self._picture()
 
     def close(self) -> None:
-        """Closes the window and forgets the state."""
+        """Close the window and forget the state; the next ``reset`` opens both again."""
         if self._window is not None:
             self._window.close()
-        self._stateful.close()
+        self._stateful.forget()
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """What Gymnasium knows of the environment, with its time limit in calls of ``step``."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = with_time_limit(spec, self._stateful.env)
 
     def _show(self) -> None:
         if self._window is not None:
             self._window.show(self._picture())
 
     def _picture(self) -> np.ndarray:
-        return np.asarray(self._stateful.render(*self._render_size))[0]
+        image: np.ndarray = to_numpy(self._stateful.render(*self._render_size))[0]
+        return image
 
 
-def check_render_size(height: Any, width: Any) -> tuple[int, int]:
-    """The size of ``render()``.
+def check_render_size(height: Any, width: Any, num_envs: int) -> tuple[int, int]:
+    """Return the size of ``render()``.
 
     Raises:
-        ValueError: it is not a pair of whole numbers of at least 1.
+        ValueError: it is not a pair of integers of at least 1.
+        MemoryError: images of all environments would not fit into this machine's memory.
     """
-    return check_whole("render_height", height), check_whole("render_width", width)
+    size = check_whole("render_height", height), check_whole("render_width", width)
+    what = f"num_envs={num_envs}, render_height={height}, render_width={width}"
+    check_fits(what, 3 * num_envs * size[0] * size[1])
+    return size
 
 
 def _plain(info: dict[str, Any]) -> dict[str, Any]:

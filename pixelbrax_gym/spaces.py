@@ -1,4 +1,4 @@
-"""Gymnasium spaces of a pixel environment, which cost no memory however many environments."""
+"""Gymnasium spaces of pixel environments, which take no more memory for many than for one."""
 
 from __future__ import annotations
 
@@ -7,16 +7,18 @@ from typing import Any
 import gymnasium
 import jax
 import numpy as np
+from gymnasium.vector.utils import batch_differing_spaces, iterate
 
 _BOUNDS = ("low", "high", "bounded_below", "bounded_above")
 
 
 class BroadcastBox(gymnasium.spaces.Box):
-    """A ``Box`` with one lower and one upper bound, kept once.
+    """A ``Box`` of a batch, with one lower and one upper bound, kept once.
 
     An ordinary ``Box`` stores four arrays of its full shape: for 4096 stacks of 84x84 frames more
     than a gigabyte, and seconds to fill it. Here they are views of a single number, also in
-    copies and after unpickling. It equals an ordinary ``Box`` of the same bounds.
+    copies and after unpickling, and cannot be written to. It equals an ordinary ``Box`` of the
+    same bounds.
     """
 
     def __init__(self, low: float, high: float, shape: tuple[int, ...], dtype: Any) -> None:
@@ -60,6 +62,11 @@ class BroadcastBox(gymnasium.spaces.Box):
     __hash__ = None  # type: ignore[assignment]  # as every Gymnasium space that can be compared
 
 
+# Gymnasium looks up the exact class in these, not its bases.
+batch_differing_spaces.register(BroadcastBox, batch_differing_spaces.dispatch(gymnasium.spaces.Box))
+iterate.register(BroadcastBox, iterate.dispatch(gymnasium.spaces.Box))
+
+
 def observation_space(spec: Any, num_envs: int | None = None) -> gymnasium.Space:
     """The space of an observation.
 
@@ -77,15 +84,15 @@ def observation_space(spec: Any, num_envs: int | None = None) -> gymnasium.Space
     return _box(spec, num_envs)
 
 
-def _box(spec: jax.ShapeDtypeStruct, num_envs: int | None) -> BroadcastBox:
+def _box(spec: jax.ShapeDtypeStruct, num_envs: int | None) -> gymnasium.spaces.Box:
     pixels = spec.dtype == np.uint8
     low, high = (0, 255) if pixels else (-np.inf, np.inf)
-    return BroadcastBox(low, high, _batched(spec.shape, num_envs), spec.dtype)
+    return _batched(low, high, spec.shape, spec.dtype, num_envs)
 
 
-def action_space(action_size: int, num_envs: int | None = None) -> BroadcastBox:
+def action_space(action_size: int, num_envs: int | None = None) -> gymnasium.spaces.Box:
     """The space of an action: float32 in [-1, 1], whatever the model's control range."""
-    return BroadcastBox(-1.0, 1.0, _batched((action_size,), num_envs), np.float32)
+    return _batched(-1.0, 1.0, (action_size,), np.float32, num_envs)
 
 
 def channels_first_space(space: gymnasium.Space) -> gymnasium.Space:
@@ -97,8 +104,12 @@ def channels_first_space(space: gymnasium.Space) -> gymnasium.Space:
     if space.dtype != np.uint8 or space.shape is None:
         return space
     height, width, channels = space.shape
-    return BroadcastBox(0, 255, (channels, height, width), np.uint8)
+    return gymnasium.spaces.Box(0, 255, (channels, height, width), np.uint8)
 
 
-def _batched(shape: tuple[int, ...], num_envs: int | None) -> tuple[int, ...]:
-    return tuple(shape) if num_envs is None else (num_envs, *shape)
+def _batched(
+    low: float, high: float, shape: tuple[int, ...], dtype: Any, num_envs: int | None
+) -> gymnasium.spaces.Box:
+    if num_envs is None:
+        return gymnasium.spaces.Box(low, high, shape, dtype)
+    return BroadcastBox(low, high, (num_envs, *shape), dtype)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import inspect
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -11,17 +12,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from gymnasium import error
+from gymnasium.envs.registration import EnvSpec
 
 from pixelbrax_gym.actions import as_actions, name_rows
 from pixelbrax_gym.fork import check_not_forked, is_forked
 from pixelbrax_gym.programs import Programs
+from pixelbrax_gym.seeds import SEEDS, seeds_of
 from pixelbrax_jax import PixelEnv, VectorPixelEnv, registry
 from pixelbrax_jax.choices import check_options, check_whole
 from pixelbrax_jax.compilation import compiler_options
 from pixelbrax_jax.types import EnvParams, EnvState
-
-SEEDS = 2**32
-"""Seeds lie below this."""
 
 _made: set[Any] = set()
 """Options of the environments that exist, so that forks of this process can name them."""
@@ -70,6 +70,7 @@ class StatefulEnv:
         Raises:
             TypeError: an option is unknown; the message lists those there are.
             ValueError: an option is out of range; the message lists what is allowed.
+            MemoryError: observations would not fit into this machine's memory.
             RuntimeError: this process is a fork that cannot run JAX.
         """
         self.env, self.params = _make(task, dict(options), max_episode_steps, also_allowed)
@@ -109,11 +110,11 @@ class StatefulEnv:
             ResetNeeded: the first reset leaves some environments out.
             ClosedEnvironmentError: after ``close``.
             RuntimeError: this process is a fork that cannot run JAX.
-            TypeError: a seed is not a whole number.
+            TypeError: a seed is no integer.
             ValueError: a seed is out of range, or there are not N.
         """
         self._check_usable()
-        seeds = self._seeds(seed)
+        seeds = seeds_of(seed, self.num_envs)
         where = np.ones(self.num_envs, bool) if mask is None else mask.copy()
         if self._state is None:
             if not where.all():
@@ -209,9 +210,13 @@ class StatefulEnv:
         self._check_ready("render")
         return _picture_program(self.env, height, width)(self._state, self.params)
 
-    def close(self) -> None:
-        """Lets go of the states; only another ``close`` may follow."""
+    def forget(self) -> None:
+        """Let go of the states; a ``reset`` comes next."""
         self._state = self._done = None
+
+    def close(self) -> None:
+        """Let go of the states; only another ``close`` may follow."""
+        self.forget()
         self._closed = True
 
     @property
@@ -243,16 +248,6 @@ class StatefulEnv:
             "step()."
         )
 
-    def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
-        if seed is None:
-            return [None] * self.num_envs
-        if not isinstance(seed, (list, tuple, np.ndarray)):
-            first = _check_seed(seed)
-            return [_check_seed(first + i) for i in range(self.num_envs)]
-        if len(seed) != self.num_envs:
-            raise ValueError(f"expected one seed for each of {self.num_envs}, got {len(seed)}.")
-        return [None if s is None else _check_seed(s) for s in seed]
-
 
 @cache
 def _programs(env: PixelEnv, num_envs: int, autoreset_mode: str, single: bool) -> Programs:
@@ -267,6 +262,29 @@ def _picture_program(env: PixelEnv, height: int, width: int) -> Any:
     return jax.jit(jax.vmap(picture, in_axes=(0, None)), compiler_options=compiler_options())
 
 
+def calls_of(episode_length: int, action_repeat: int) -> int:
+    """Return the calls of ``step`` until the time limit in control steps."""
+    return -(-episode_length // action_repeat)
+
+
+def with_time_limit(spec: EnvSpec | None, env: PixelEnv) -> EnvSpec | None:
+    """Return Gymnasium's description of an environment, which tells the time limit too.
+
+    Args:
+        spec: what Gymnasium knows of it.
+        env: what was made.
+    """
+    if spec is None or spec.max_episode_steps is not None:
+        return spec
+    spec = copy.copy(spec)
+    spec.max_episode_steps = calls_of(env.episode_length, env.action_repeat)
+    if "max_episode_steps" not in spec.kwargs:
+        # Calls are whole control steps only by the last one, and an environment made anew from
+        # the spec shall have the same limit.
+        spec.kwargs = {**spec.kwargs, "episode_length": env.episode_length}
+    return spec
+
+
 def _make(
     task: str,
     options: dict[str, Any],
@@ -276,14 +294,15 @@ def _make(
     allowed = list(inspect.signature(registry.make).parameters)[1:]
     check_options(options, [*allowed, *also_allowed])
     if max_episode_steps not in (None, -1):
-        if "episode_length" in options:
-            raise ValueError(
-                "give either max_episode_steps, which counts calls of step(), or "
-                "episode_length, which counts control steps."
-            )
         calls = check_whole("max_episode_steps", max_episode_steps)
         repeat = check_whole("action_repeat", options.get("action_repeat", 1))
-        options["episode_length"] = calls * repeat
+        limit = options.setdefault("episode_length", calls * repeat)
+        if calls_of(check_whole("episode_length", limit), repeat) != calls:
+            raise ValueError(
+                f"max_episode_steps={calls} counts calls of step() and episode_length={limit} "
+                f"control steps, of which each call makes action_repeat={repeat}: they differ; "
+                "give one of them."
+            )
     try:
         known = (task, frozenset(options.items()))
         is_made = known in _made
@@ -298,28 +317,3 @@ def _make(
     if known is not None and made[1].clips is None:
         _made.add(known)
     return made
-
-
-def spread_seeds(seed: int, num_envs: int) -> list[int]:
-    """Seed i is ``seed + i``, beginning anew at 0 beyond 2**32 - 1.
-
-    For frameworks that hand seeds of any size from one environment to the next.
-
-    Raises:
-        TypeError: it is not a whole number.
-    """
-    first = _whole_seed(seed)
-    return [(first + i) % SEEDS for i in range(num_envs)]
-
-
-def _check_seed(seed: Any) -> int:
-    seed = _whole_seed(seed)
-    if not 0 <= seed < SEEDS:
-        raise ValueError(f"seeds must lie in [0, 2**32), got {seed}.")
-    return seed
-
-
-def _whole_seed(seed: Any) -> int:
-    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)):
-        raise TypeError(f"a seed must be a whole number, got {seed!r}.")
-    return int(seed)

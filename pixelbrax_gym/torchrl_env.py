@@ -18,10 +18,11 @@ except ImportError as missing:
     raise ImportError(f"TorchRL is not installed; try: {install_extra('torchrl')}") from missing
 
 from pixelbrax_gym.actions import name_rows
-from pixelbrax_gym.dlpack import default_torch_device, to_torch
+from pixelbrax_gym.dlpack import as_device, default_torch_device, to_torch
 from pixelbrax_gym.fork import check_not_forked
+from pixelbrax_gym.seeds import SEEDS, spread_seeds
 from pixelbrax_gym.single_env import check_render_size
-from pixelbrax_gym.stateful import SEEDS, StatefulEnv, spread_seeds
+from pixelbrax_gym.stateful import StatefulEnv
 from pixelbrax_gym.torchrl_specs import action_spec, done_spec, observation_spec
 
 _OWN_OPTIONS = ("num_envs", "device", "render_height", "render_width")
@@ -94,12 +95,12 @@ class PixelBraxTorchRLEnv(EnvBase):
             also_allowed=_OWN_OPTIONS,
         )
         self._jax_device = default_torch_device()
-        device = self._jax_device if device is None else torch.device(device)
+        device = self._jax_device if device is None else as_device(device)
         super().__init__(device=device, batch_size=(stateful.num_envs,))
         self.is_closed = False
         self.infos: dict[str, torch.Tensor] = {}
-        self._stateful, self._num_envs = stateful, stateful.num_envs
-        self._render_size = check_render_size(render_height, render_width)
+        self._task, self._stateful, self._num_envs = task, stateful, stateful.num_envs
+        self._render_size = check_render_size(render_height, render_width, self._num_envs)
         # Of environments whose next reset shall begin episode 0 of a seed; else None.
         self._seeds: list[int | None] | None = None
         self._is_seeded = False
@@ -122,7 +123,7 @@ class PixelBraxTorchRLEnv(EnvBase):
         mask = np.ones(self._num_envs, bool)
         given = None if tensordict is None else tensordict.get("_reset", None)
         if given is not None:
-            mask = given.reshape(self._num_envs).cpu().numpy()
+            mask = self._mask("'_reset'", given)
         if not self._is_seeded:
             self._set_seed(None)
         seeds = None
@@ -164,7 +165,13 @@ class PixelBraxTorchRLEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         where = tensordict.get("_step", None)
-        mask = None if where is None else where.reshape(self._num_envs).cpu().numpy()
+        mask = None if where is None else self._mask("'_step'", where)
+        action = tensordict.get("action", None)
+        if action is None:
+            raise ValueError(
+                "step() needs an entry 'action' in its tensordict; a policy writes it, or "
+                "env.rand_action(tensordict)."
+            )
         began = np.asarray(self._began)
         ended = began if mask is None else began & mask
         if ended.any():
@@ -173,7 +180,7 @@ class PixelBraxTorchRLEnv(EnvBase):
                 "their '_reset' True before the next step(). Should a transform step several "
                 "times in a row, use action_repeat instead."
             )
-        outputs = self._stateful.step(tensordict.get("action").to(self._jax_device), mask)
+        outputs = self._stateful.step(action.to(self._jax_device), mask)
         infos = outputs["info"]
         self._first_obs = outputs["obs"]
         # Not `done` itself, which leaves and may be written to.
@@ -219,6 +226,16 @@ class PixelBraxTorchRLEnv(EnvBase):
         # TorchRL also closes an environment whose construction failed.
         if "_stateful" in self.__dict__:
             self._stateful.close()
+
+    def _mask(self, what: str, given: torch.Tensor) -> np.ndarray:
+        if given.dtype != torch.bool:
+            raise TypeError(f"{what} must be a tensor of bool, got {given.dtype}.")
+        return given.reshape(self._num_envs).cpu().numpy()
+
+    def __repr__(self) -> str:
+        """Name the task, the number of environments and the device."""
+        name = type(self).__name__
+        return f"{name}({self._task!r}, num_envs={self._num_envs}, device={self.device})"
 
     def _observations(self, obs: Any) -> dict[str, torch.Tensor]:
         if not isinstance(obs, dict):

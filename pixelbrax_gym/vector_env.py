@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from typing import Any
 
 import gymnasium
 import jax
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 
-from pixelbrax_gym.export import exporter
+from pixelbrax_gym.export import exporter, to_numpy
+from pixelbrax_gym.member import Member, call_members
+from pixelbrax_gym.reset_options import reset_mask
+from pixelbrax_gym.seeds import seeds_of
 from pixelbrax_gym.single_env import check_render_size
 from pixelbrax_gym.spaces import action_space, observation_space
-from pixelbrax_gym.stateful import StatefulEnv
+from pixelbrax_gym.stateful import StatefulEnv, with_time_limit
 from pixelbrax_jax import AUTORESET_MODES
 from pixelbrax_jax.choices import check_choice
 
@@ -49,15 +54,18 @@ class PixelBraxVectorEnv(gymnasium.vector.VectorEnv):
 
     ``output`` decides what all of these are:
 
-    * ``"numpy"``: observations are read-only views of what JAX has computed, the rest are
-      arrays of their own. ``final_obs`` is an object array with None where no episode ended,
+    * ``"numpy"``: arrays that may be written to; observations share memory with what JAX has
+      computed on a CPU. ``final_obs`` is an object array with None where no episode ended,
       absent when none did, as Gymnasium has it.
     * ``"torch"`` and ``"jax"``: arrays on the environment's device. ``final_obs`` and
       ``final_info`` are dense, present in every step, and mean something where the masks
       ``_final_obs`` and ``_final_info`` are True: the host never waits to find out.
 
-    Observations are never overwritten, and an in-place operation on a tensor reaches no later
-    result.
+    Observations are never overwritten, and an in-place operation on an array or tensor reaches no
+    later result.
+
+    ``call``, ``get_attr`` and ``set_attr`` are those of Gymnasium's own vector environments; what
+    they address is a ``Member`` that stands for one of the N.
 
     Attributes:
         autoreset_mode: an ``AutoresetMode``, also in ``metadata``.
@@ -130,7 +138,8 @@ class PixelBraxVectorEnv(gymnasium.vector.VectorEnv):
             "render_fps": self._stateful.fps,
             "autoreset_mode": self.autoreset_mode,
         }
-        self._render_size = check_render_size(render_height, render_width)
+        self._render_size = check_render_size(render_height, render_width, self.num_envs)
+        self._spec: EnvSpec | None = None
 
     def reset(
         self,
@@ -144,22 +153,26 @@ class PixelBraxVectorEnv(gymnasium.vector.VectorEnv):
             seed: s seeds environment i with s + i; a list has a seed for each. A seeded
                 environment begins its episode 0; None begins an environment's next episode,
                 or draws a seed if there was none yet.
-            options: ``{"reset_mask": mask}`` with an (N,) bool array, at least one True, resets
-                only those and repeats the observations of the others. Never changed.
+            options: ``{"reset_mask": mask}`` with an (N,) bool array or tensor, at least one
+                True, resets only those and repeats the observations of the others. Never changed.
 
         Returns:
             Observations and infos.
 
         Raises:
-            TypeError: the mask is not a NumPy array of bool, or a seed not a whole number.
-            ValueError: the mask has another shape or no True; or a seed is out of range.
+            TypeError: the mask is no array or tensor of bool, or a seed no integer.
+            ValueError: the mask has another shape or no True; a seed is out of range; or there
+                are other options.
             ResetNeeded: the first reset has a mask that leaves environments out.
             ClosedEnvironmentError: after ``close``.
             RuntimeError: this process is a fork that cannot run JAX.
         """
-        mask = _reset_mask(options, self.num_envs)
-        super().reset(seed=int(seed) if isinstance(seed, (int, np.integer)) else None)
-        outputs = self._stateful.reset(seed, self.np_random, mask)
+        mask = reset_mask(options, self.num_envs)
+        seeds = seeds_of(seed, self.num_envs)
+        # One seed for all also seeds the generator that Gymnasium's wrappers draw from.
+        is_one = seed is not None and not isinstance(seed, Sequence) and not np.ndim(seed)
+        super().reset(seed=seeds[0] if is_one else None)
+        outputs = self._stateful.reset(seeds, self.np_random, mask)
         return self._export(outputs["obs"]), self._infos(outputs)
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
@@ -201,7 +214,58 @@ class PixelBraxVectorEnv(gymnasium.vector.VectorEnv):
         """
         if self.render_mode is None:
             return None
-        return tuple(np.asarray(self._stateful.render(*self._render_size)))
+        return tuple(to_numpy(self._stateful.render(*self._render_size)))
+
+    def get_images(self) -> list[np.ndarray | None]:
+        """Draw the present states.
+
+        Returns:
+            N arrays (render_height, render_width, 3) of uint8; None without a render mode.
+
+        Raises:
+            ResetNeeded: before the first reset.
+            ClosedEnvironmentError: after ``close``.
+        """
+        return list(self.render() or [None] * self.num_envs)
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """Return what a method of each environment returns, or the attribute of that name.
+
+        Args:
+            name: of the method or attribute, such as ``"render"``.
+            *args: of the method.
+            **kwargs: of the method.
+        """
+        return tuple(call_members(self._members, name, *args, **kwargs))
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        """Return the attribute of each environment."""
+        return self.call(name)
+
+    def set_attr(self, name: str, values: Any) -> None:
+        """Set an attribute of the environments' members.
+
+        Args:
+            name: of the attribute.
+            values: a list or tuple has one for each environment; anything else is for all.
+
+        Raises:
+            ValueError: there are not N values.
+        """
+        each = values if isinstance(values, (list, tuple)) else [values] * self.num_envs
+        if len(each) != self.num_envs:
+            raise ValueError(f"expected one value for each of {self.num_envs}, got {len(each)}.")
+        for member, value in zip(self._members, each, strict=True):
+            member.set_wrapper_attr(name, value)
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """What Gymnasium knows of the environments, with their time limit in calls of ``step``."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = with_time_limit(spec, self._stateful.env)
 
     def close_extras(self, **kwargs: Any) -> None:
         """Forgets the states."""
@@ -209,6 +273,11 @@ class PixelBraxVectorEnv(gymnasium.vector.VectorEnv):
         # Gymnasium also calls this on an environment whose construction failed.
         if hasattr(self, "_stateful"):
             self._stateful.close()
+
+    @cached_property
+    def _members(self) -> list[Member]:
+        spaces = (self.single_observation_space, self.single_action_space)
+        return [Member(self, i, *spaces) for i in range(self.num_envs)]
 
     def _infos(self, outputs: Mapping[str, Any]) -> dict[str, Any]:
         if self._output != "numpy":
@@ -246,20 +315,6 @@ def as_autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:
     if isinstance(mode, AutoresetMode):
         return mode
     by_value = {member.value: member for member in AutoresetMode}
-    if mode in by_value:
+    if isinstance(mode, str) and mode in by_value:
         return by_value[mode]
     return AutoresetMode[check_choice("autoreset_mode", mode, AUTORESET_MODES).upper()]
-
-
-def _reset_mask(options: Mapping[str, Any] | None, num_envs: int) -> np.ndarray | None:
-    if options is None or "reset_mask" not in options:
-        return None
-    mask = options["reset_mask"]
-    if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_:
-        kind = f"{mask.dtype} array" if isinstance(mask, np.ndarray) else type(mask).__name__
-        raise TypeError(f"options['reset_mask'] must be a NumPy array of bool, got {kind}.")
-    if mask.shape != (num_envs,):
-        raise ValueError(f"options['reset_mask'] must have shape ({num_envs},), got {mask.shape}.")
-    if not mask.any():
-        raise ValueError("options['reset_mask'] must have at least one True.")
-    return mask

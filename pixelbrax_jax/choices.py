@@ -1,4 +1,4 @@
-"""One way each to reject unknown names and options, what is no count, and what is no share."""
+"""One way each to reject unknown names and options, and values of the wrong kind."""
 
 from __future__ import annotations
 
@@ -9,8 +9,25 @@ from collections.abc import Callable, Iterable
 from numbers import Integral, Real
 from typing import ParamSpec, TypeVar
 
+import numpy as np
+
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
+
+_SIMILAR = 0.75
+"""Likeness, of at most 1, from which a name is suggested in place of an unknown one."""
+
+_ELSEWHERE = {
+    "batch_size": "num_envs",
+    "frame_skip": "action_repeat",
+    "frameskip": "action_repeat",
+    "max_episode_length": "episode_length",
+    "n_envs": "num_envs",
+    "num_frames": "frame_stack",
+    "num_stack": "frame_stack",
+    "time_limit": "episode_length",
+}
+"""Options under the names that other libraries give them."""
 
 
 def check_choice(what: str, value: object, allowed: Iterable[str]) -> str:
@@ -30,7 +47,9 @@ def check_choice(what: str, value: object, allowed: Iterable[str]) -> str:
     names = sorted(allowed)
     if isinstance(value, str) and value in names:
         return value
-    raise ValueError(_unknown(what, value, names))
+    raise ValueError(
+        f"unknown {what}: {value!r}; allowed: {', '.join(names)}.{suggest(value, names)}"
+    )
 
 
 def check_options(given: Iterable[str], allowed: Iterable[str]) -> None:
@@ -41,12 +60,16 @@ def check_options(given: Iterable[str], allowed: Iterable[str]) -> None:
         allowed: every accepted name.
 
     Raises:
-        TypeError: one is not, naming it, all allowed names and the nearest one.
+        TypeError: one is not, naming it, all allowed names and the nearest one. It has the words
+            of Python's own message, by which some libraries find out which options there are.
     """
     names = sorted(allowed)
     for name in given:
         if name not in names:
-            raise TypeError(_unknown("option", name, names))
+            raise TypeError(
+                f"got an unexpected keyword argument {name!r}; allowed: {', '.join(names)}."
+                + suggest(_ELSEWHERE.get(name, name), names)
+            )
 
 
 def checks_options(function: Callable[_P, _T]) -> Callable[_P, _T]:
@@ -70,13 +93,41 @@ def checks_options(function: Callable[_P, _T]) -> Callable[_P, _T]:
     return checked
 
 
-def _unknown(what: str, value: object, names: list[str]) -> str:
-    message = f"unknown {what}: {value!r}; allowed: {', '.join(names)}."
-    nearest = difflib.get_close_matches(str(value).lower(), [n.lower() for n in names], n=1)
-    if nearest:
-        match = next(n for n in names if n.lower() == nearest[0])
-        message += f" Did you mean {match!r}?"
-    return message
+def suggest(value: object, names: Iterable[str]) -> str:
+    """Ask whether a similar name was meant.
+
+    Args:
+        value: what the user gave.
+        names: what there is.
+
+    Returns:
+        A question with a space before it; empty if no name is similar.
+    """
+    by_lower = {name.lower(): name for name in names}
+    given = str(value).lower()
+    nearest = difflib.get_close_matches(given, by_lower, n=1, cutoff=_SIMILAR)
+    if not nearest and len(given) > 3:
+        parts = [name for name in by_lower if given in name]
+        nearest = parts if len(parts) == 1 else []
+    return f" Did you mean {by_lower[nearest[0]]!r}?" if nearest else ""
+
+
+def check_bool(what: str, value: object) -> bool:
+    """Return ``value`` if it is a truth value.
+
+    Args:
+        what: what the value stands for, as the message should call it.
+        value: what the user gave; Python's or NumPy's.
+
+    Returns:
+        ``value`` as Python's own.
+
+    Raises:
+        TypeError: otherwise, naming the value.
+    """
+    if isinstance(value, (bool, np.bool_)):
+        return bool(value)
+    raise TypeError(f"{what} must be True or False, got {value!r}.")
 
 
 def check_whole(what: str, value: object) -> int:

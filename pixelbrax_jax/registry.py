@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass
 from functools import cache, lru_cache, partial
+from os import PathLike
 from pathlib import Path
 from weakref import WeakValueDictionary
 
@@ -134,6 +135,17 @@ def make(
         MemoryError: the clips would take too much memory.
     """
     check_choice("task", task, _REGISTRY)
+    _check_single(
+        backend=backend,
+        height=height,
+        width=width,
+        frame_stack=frame_stack,
+        obs_mode=obs_mode,
+        action_repeat=action_repeat,
+        episode_length=episode_length,
+        renderer=renderer,
+        split=split,
+    )
     check_choice("reward_preset", reward_preset, REWARD_PRESETS)
     links = resolve(distractors, task)
     env = _pixel_env(
@@ -163,6 +175,15 @@ def make(
     return env, EnvParams(geoms=env.physics.geoms, rig=rig, look=look, clips=bank)
 
 
+def _check_single(**options: object) -> None:
+    """Rejects lists and the like, which could not be looked up among the environments made."""
+    for name, value in options.items():
+        if not isinstance(value, Hashable):
+            raise TypeError(
+                f"{name} must be a single value, got a {type(value).__name__}: {value!r}."
+            )
+
+
 def _clips(
     clips: str | Path | ClipBank | None,
     split: str,
@@ -179,6 +200,10 @@ def _clips(
         if clips is None:
             warn_procedural()
             clips = "procedural"
+        if not isinstance(clips, (str, PathLike)):
+            raise TypeError(
+                f"clips must be a folder, 'procedural' or a bank of load_clips, got {clips!r}."
+            )
         bank = load_clips(clips, split, height=height, width=width, num_clips=num_clips)
     return _on_device(bank)
 

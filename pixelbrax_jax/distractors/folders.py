@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from pixelbrax_jax.choices import check_choice
+from pixelbrax_jax.choices import check_choice, suggest
 
 IMAGES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".webp"})
 VIDEOS = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".gif"})
@@ -76,6 +76,7 @@ def find(folder: Path, split: str) -> list[Source]:
         raise FileNotFoundError(
             f"there is no folder of clips at {folder}. {_DAVIS_LAYOUT}. Or give a folder with "
             "video files or folders of pictures; or clips='procedural', which needs no files."
+            + suggest(folder, ["procedural"])
         )
     for root in (folder, folder / "DAVIS"):
         if (root / "JPEGImages").is_dir():

@@ -94,6 +94,11 @@ def resolve(
     """
     if distractors is None:
         return ()
+    if not isinstance(distractors, (str, Distractor, Iterable)):
+        raise TypeError(
+            f"distractors must be a name, a Distractor or several of them, got {distractors!r}; "
+            f"names: {', '.join(PRESETS)}."
+        )
     given = (distractors,) if isinstance(distractors, (str, Distractor)) else tuple(distractors)
     resolved: list[Distractor] = []
     for item in given:

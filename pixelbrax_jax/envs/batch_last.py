@@ -8,7 +8,8 @@ of matrices is a call for every link. Over (links, 3, N) they are loops over env
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -43,6 +44,10 @@ def batch_last(fn: Callable[..., Any], in_axes: Sequence[int | None]) -> Callabl
     ``jax.vmap``, as is everything within ``jax.shard_map`` if that keeps track of what varies.
     More than a few rows are padded by copies of the last one, whose side effects happen too.
 
+    The parameters of JAX's primitives, which are read here, are not public. With a release whose
+    parameters are others, all of ``fn`` is computed by ``jax.vmap``, and a RuntimeWarning says so
+    once.
+
     Args:
         fn: a function of trees of arrays, of one row.
         in_axes: for each argument 0, a row in each entry of its arrays' first axis, or None, the
@@ -70,12 +75,33 @@ def batch_last(fn: Callable[..., Any], in_axes: Sequence[int | None]) -> Callabl
             _Operand(jnp.moveaxis(_pad_rows(x, padded), 0, -1) if batched else x, batched)
             for x, batched in leaves
         ]
-        results = _evaluate(closed, operands, padded)
+        try:
+            results = _evaluate(closed, operands, padded)
+        # Whatever this meets in an unknown release must not stop a user: `fn` itself, and so the
+        # user's mistakes, went through `make_jaxpr` above.
+        except Exception as error:
+            _warn_once(error)
+            return jax.vmap(fn, in_axes=tuple(in_axes))(*args)
         outputs, tree = jax.tree.flatten(shapes)
         spread = [_spread(x, out.shape, padded) for x, out in zip(results, outputs, strict=True)]
         return jax.tree.unflatten(tree, [jnp.moveaxis(x, -1, 0)[:size] for x in spread])
 
     return rows_of
+
+
+_warned: list[str] = []
+"""Warnings given in this process: one at most."""
+
+
+def _warn_once(error: Exception) -> None:
+    if _warned:
+        return
+    _warned.append(
+        f"jax {jax.__version__} has programs that PixelBrax cannot compute with the environments "
+        f"as last axis ({type(error).__name__}: {error}). They are computed by jax.vmap: the "
+        "results are as good, and on a CPU physics take up to three times as long."
+    )
+    warnings.warn(_warned[0], RuntimeWarning, stacklevel=3)
 
 
 def _varies(x: jax.Array) -> bool:
@@ -149,6 +175,9 @@ def _apply(eqn: core.JaxprEqn, inputs: list[_Operand], size: int) -> list[_Opera
     else:
         in_axes = [-1 if batched else None for batched in flags]
         outputs = jax.vmap(lambda *row: _bind(eqn, *row), in_axes=in_axes, out_axes=-1)(*values)
+    for x, var in zip(outputs, eqn.outvars, strict=True):
+        if x.shape != (*_aval(var).shape, size):
+            raise ValueError(f"{name} gave {x.shape} for {_aval(var).shape} of {size} rows.")
     return [_Operand(x, True) for x in outputs]
 
 
@@ -326,7 +355,7 @@ def _cond(
 
 def _scan(eqn: core.JaxprEqn, inputs: list[_Operand], size: int) -> list[_Operand]:
     closed, params = eqn.params["jaxpr"], eqn.params
-    num_consts, num_carry = params["num_consts"], params["num_carry"]
+    num_consts, num_carry = _scan_sizes(params)
     consts, first = inputs[:num_consts], inputs[num_consts : num_consts + num_carry]
     xs = inputs[num_consts + num_carry :]
     reached = _reach_scan(eqn, [x.batched for x in inputs])
@@ -350,10 +379,19 @@ def _scan(eqn: core.JaxprEqn, inputs: list[_Operand], size: int) -> list[_Operan
     return list(map(_Operand, [*last, *ys], reached))
 
 
+def _scan_sizes(params: Mapping[str, Any]) -> tuple[int, int]:
+    """How many of a scan's operands are constants, and how many are carried."""
+    if "num_carry" in params:
+        return params["num_consts"], params["num_carry"]
+    # From jax 0.12 on: operands in groups.
+    consts, carry, _ = params["ft_in"].unpack()
+    return len(consts), len(carry)
+
+
 def _reach_scan(eqn: core.JaxprEqn, flags: list[bool]) -> list[bool]:
     """Which carries and results of a scan are batched."""
-    start = eqn.params["num_consts"]
-    stop = start + eqn.params["num_carry"]
+    start, num_carry = _scan_sizes(eqn.params)
+    stop = start + num_carry
     # What reaches a carry in one turn reaches others in the next.
     carried, before = flags[start:stop], None
     while carried != before:

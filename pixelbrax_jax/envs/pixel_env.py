@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from pixelbrax_jax.choices import check_choice, check_whole
 from pixelbrax_jax.distractors.base import Chain, Distractor
 from pixelbrax_jax.envs import observe
+from pixelbrax_jax.envs.memory import check_fits
 from pixelbrax_jax.physics.base import Physics
 from pixelbrax_jax.renderer.base import RENDERERS, render
 from pixelbrax_jax.scene.place import place
@@ -77,6 +78,7 @@ class PixelEnv:
 
         Raises:
             ValueError: an option is out of range; the message says what is allowed.
+            MemoryError: frames would not fit into this machine's memory.
         """
         self.physics = physics
         self.height = check_whole("height", height)
@@ -87,6 +89,7 @@ class PixelEnv:
         self.episode_length = check_whole("episode_length", episode_length)
         self.renderer = check_choice("renderer", renderer, RENDERERS)
         self.distractors = Chain(distractors if obs_mode != "state" else ())
+        self.check_memory(1)
 
     @property
     def action_size(self) -> int:
@@ -105,6 +108,23 @@ class PixelEnv:
         state = jax.ShapeDtypeStruct((self.physics.state_size,), jnp.float32)
         both = {"pixels": pixels, "state": state}
         return both if self.obs_mode == "both" else both[self.obs_mode]
+
+    def check_memory(self, num_envs: int) -> None:
+        """Reject sizes that cannot fit into the memory of any device here.
+
+        Args:
+            num_envs: how many environments are stepped together.
+
+        Raises:
+            MemoryError: observations and states of two steps, which are there at the same time,
+                take more bytes than the machine has.
+        """
+        numbers = 2 * self.physics.state_size + 7 * len(self.physics.link_names)
+        what, num_bytes = f"num_envs={num_envs}", 8 * num_envs * numbers
+        if self.obs_mode != "state":
+            num_bytes += 2 * num_envs * self.height * self.width * 3 * self.frame_stack
+            what += f", height={self.height}, width={self.width}, frame_stack={self.frame_stack}"
+        check_fits(what, num_bytes)
 
     @partial(jax.jit, static_argnums=0)
     def reset(self, key: jax.Array, params: EnvParams) -> tuple[EnvState, Timestep]:

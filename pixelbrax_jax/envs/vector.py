@@ -65,10 +65,12 @@ class VectorPixelEnv:
 
         Raises:
             ValueError: an option is out of range; the message says what is allowed.
+            MemoryError: observations would not fit into this machine's memory.
         """
         self.env = env
         self.num_envs = check_whole("num_envs", num_envs)
         self.autoreset_mode = check_choice("autoreset_mode", autoreset_mode, AUTORESET_MODES)
+        env.check_memory(self.num_envs)
 
     @partial(jax.jit, static_argnums=0)
     def reset(self, key: jax.Array, params: EnvParams) -> tuple[EnvState, Timestep]:

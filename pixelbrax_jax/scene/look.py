@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from pixelbrax_jax.choices import check_choice
+from pixelbrax_jax.choices import check_bool, check_choice
 from pixelbrax_jax.types import Look
 
 
@@ -61,10 +61,12 @@ def make_look(look: str | Look = "default", *, shadows: bool | None = None) -> L
 
     Raises:
         ValueError: the name is unknown.
-        TypeError: ``look`` is neither a string nor a ``Look``.
+        TypeError: ``look`` is neither a string nor a ``Look``; ``shadows`` is no truth value.
     """
     if isinstance(look, str):
         look = LOOKS[check_choice("look", look, LOOKS)]
     elif not isinstance(look, Look):
         raise TypeError(f"look must be a name or a pixelbrax_jax.Look, got {type(look).__name__}.")
-    return look if shadows is None else dataclasses.replace(look, shadows=bool(shadows))
+    if shadows is None:
+        return look
+    return dataclasses.replace(look, shadows=check_bool("shadows", shadows))

@@ -11,6 +11,7 @@ from jax.sharding import AxisType
 from jax.sharding import PartitionSpec as P
 
 import pixelbrax_jax as pb
+from pixelbrax_jax.envs import batch_last as module
 from pixelbrax_jax.envs.batch_last import batch_last
 
 TABLE = jnp.arange(12.0).reshape(4, 3)
@@ -162,6 +163,32 @@ def test_equations_keep_their_contexts():
 
     actual = batch_last(draw, (0,))(jnp.zeros(2))
     np.testing.assert_array_equal(actual, jax.vmap(draw)(jnp.zeros(2)))
+
+
+@pytest.mark.parametrize("function", ["_scan_sizes", "_bind", "_reshape_wrongly"])
+def test_what_is_not_known_is_computed_by_vmap(monkeypatch, function):
+    """As if a release of JAX had other parameters, or shapes that no rule foresaw."""
+    if function == "_reshape_wrongly":
+        monkeypatch.setitem(module._FIRST_BATCHED, "reshape", lambda eqn, x: x)
+    else:
+        monkeypatch.setattr(module, function, lambda *_: {}["num_carry"])
+    monkeypatch.setattr(module, "_warned", [])
+
+    def fn(x):
+        return nested(x)[1].reshape(-1), jax.jit(jnp.sin)(x)
+
+    x = jax.random.normal(jax.random.key(0), (5, 3))
+    with pytest.warns(RuntimeWarning, match=r"jax .* has programs .* computed by jax\.vmap"):
+        actual = jax.jit(batch_last(fn, (0,)))(x)
+    for a, b in zip(actual, jax.jit(jax.vmap(fn))(x), strict=True):
+        np.testing.assert_array_equal(a, b)
+    # One warning is enough; warnings are errors here.
+    batch_last(fn, (0,))(x)
+
+
+def test_mistakes_of_the_function_itself_are_not_hidden():
+    with pytest.raises(ZeroDivisionError):
+        batch_last(lambda x: x * (1 // 0), (0,))(jnp.ones(5))
 
 
 @pytest.mark.parametrize("size", [4, 5])

@@ -216,10 +216,14 @@ class TestMake:
             pixelbrax_jax.make(**({"task": "ant"} | options))
 
     def test_a_misspelt_option_is_named(self):
-        message = r"unknown option: 'heigth'; allowed: .*, width\. Did you mean 'height'\?"
+        message = (
+            r"unexpected keyword argument 'heigth'; allowed: .*, width\. Did you mean 'height'\?"
+        )
         with pytest.raises(TypeError, match=message):
             pixelbrax_jax.make("ant", heigth=84)
-        with pytest.raises(TypeError, match=r"unknown option: 'zzz'; allowed: .*, width\.$"):
+        with pytest.raises(
+            TypeError, match=r"unexpected keyword argument 'zzz'; allowed: .*, width\.$"
+        ):
             pixelbrax_jax.make("ant", zzz=84)
 
     def test_the_signature_is_there_for_editors(self):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gymnasium
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import torch
@@ -40,8 +41,18 @@ def test_options(kind, options, message):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"heigth": 3}, r"unknown option: 'heigth'; allowed: .*width.* Did you mean 'height'\?"),
+        (
+            {"heigth": 3},
+            r"unexpected keyword argument 'heigth'; allowed: .*width.* Did you mean 'height'\?",
+        ),
         ({"rendermode": 3}, r"Did you mean 'render_mode'\?"),
+        ({"frame_skip": 3}, r"Did you mean 'action_repeat'\?"),
+        ({"backend": ["spring"]}, r"backend must be a single value, got a list: \['spring'\]"),
+        ({"height": [84]}, "height must be a single value"),
+        ({"split": {"train"}}, "split must be a single value"),
+        ({"shadows": "yes"}, "shadows must be True or False, got 'yes'"),
+        ({"distractors": 5}, "distractors must be a name, a Distractor or several of them, got 5"),
+        ({"distractors": "video", "clips": ["a"]}, r"clips must be .*, got \['a'\]"),
     ],
 )
 def test_names_of_options(kind, options, message):
@@ -54,13 +65,33 @@ def test_task():
         PixelBraxEnv("Ant")
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"num_envs": 2**31}, r"num_envs=2147483648, height=84.*at least 27\d,\d\d\d\.\d GB"),
+        ({"num_envs": 2**40, "obs_mode": "state"}, "num_envs=1099511627776 would take"),
+        ({"height": 10**6, "width": 10**6}, "num_envs=1, height=1000000, width=1000000"),
+        ({"frame_stack": 10**10}, "frame_stack=10000000000 would take at least"),
+        ({"render_height": 10**6, "render_width": 10**6}, "render_height=1000000.*lower one"),
+    ],
+)
+def test_sizes_that_cannot_fit(options, message):
+    with pytest.raises(MemoryError, match=message):
+        PixelBraxVectorEnv(TASK, **options)
+
+
+def test_mistyped_clips():
+    with pytest.raises(FileNotFoundError, match=r"Did you mean 'procedural'\?"):
+        PixelBraxVectorEnv(TASK, distractors="video", clips="procedual")
+
+
 @pytest.mark.parametrize("num_envs", [0, -1, 1.5, True])
 def test_num_envs(num_envs):
     with pytest.raises(ValueError, match="num_envs must be a whole number of at least 1"):
         PixelBraxVectorEnv(TASK, num_envs)
 
 
-@pytest.mark.parametrize("mode", ["nextstep", None, "NEXT"])
+@pytest.mark.parametrize("mode", ["nextstep", None, "NEXT", ["next_step"]])
 def test_autoreset_mode(mode):
     with pytest.raises(ValueError, match=r"unknown autoreset_mode.*allowed: disabled, next_step"):
         PixelBraxVectorEnv(TASK, 2, autoreset_mode=mode)
@@ -83,6 +114,8 @@ def test_human_rendering_of_many():
         (torch.zeros(3, 1, dtype=torch.int32), TypeError, "got torch.int32"),
         (np.array([["a"], ["b"], ["c"]]), TypeError, "must be floating point"),
         (None, ValueError, r"shape \(3, 1\), got \(\)"),
+        ([[1.0], [1.0, 2.0], [3.0]], ValueError, "got rows of different lengths"),
+        (torch.zeros(3, 1).to_sparse(), TypeError, r"must be a dense tensor.*to_dense"),
         (np.array([[0.0], [np.nan], [np.nan]]), ValueError, "environment 1, 2 contains NaN"),
         (torch.tensor([[0.0], [0.0], [torch.nan]]), ValueError, "environment 2 contains NaN"),
     ],
@@ -122,9 +155,9 @@ def test_infinite_actions_are_clipped(make_single):
 @pytest.mark.parametrize(
     ("mask", "error", "message"),
     [
-        ([True, False, True], TypeError, "NumPy array of bool, got list"),
-        (torch.ones(3, dtype=torch.bool), TypeError, "NumPy array of bool, got Tensor"),
-        (np.ones(3, int), TypeError, "NumPy array of bool, got int64 array"),
+        ([True, False, True], TypeError, "array or tensor of bool, got list"),
+        (torch.ones(3), TypeError, "array or tensor of bool, got float32 array"),
+        (np.ones(3, int), TypeError, "array or tensor of bool, got int64 array"),
         (np.ones(2, bool), ValueError, r"shape \(3,\), got \(2,\)"),
         (np.zeros(3, bool), ValueError, "at least one True"),
     ],
@@ -139,6 +172,40 @@ def test_reset_mask(make_vector, mask, error, message):
     np.testing.assert_array_equal(before, repeat)
 
 
+@pytest.mark.parametrize("convert", [torch.from_numpy, jnp.asarray])
+def test_reset_mask_of_any_kind(make_vector, convert):
+    mask = np.array([True, False, True])
+    env, other = make_vector(obs_mode="state"), make_vector(obs_mode="state")
+    for each, given in ((env, convert(mask)), (other, mask)):
+        each.reset(seed=0)
+        each.step(ACTIONS)
+        obs, _ = each.reset(options={"reset_mask": given})
+        assert (obs[:, 1] == [0, 1, 0]).all()
+    np.testing.assert_array_equal(env.step(ACTIONS)[0], other.step(ACTIONS)[0])
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"reset_masks": np.ones(3, bool)}, ValueError, r"'reset_masks'.* mean 'reset_mask'\?"),
+        ({"mask": np.ones(3, bool)}, ValueError, r"'mask'; allowed: reset_mask. .*'reset_mask'\?"),
+        ("abc", TypeError, r"options of reset\(\) must be a dict or None, got 'abc'"),
+        ([1], TypeError, r"must be a dict or None, got \[1\]"),
+        (5, TypeError, "must be a dict or None, got 5"),
+    ],
+)
+def test_options_of_reset(make_vector, make_single, options, error, message):
+    env, single = make_vector(obs_mode="state"), make_single(obs_mode="state")
+    before = env.reset(seed=0, options={})[0]
+    env.step(ACTIONS)
+    with pytest.raises(error, match=message):
+        env.reset(options=options)
+    np.testing.assert_array_equal(env.reset(seed=0)[0], before)
+    single.reset(seed=0, options={})
+    with pytest.raises(error, match=message if error is TypeError else "takes no options, got"):
+        single.reset(options=options)
+
+
 def test_first_reset_must_be_whole(make_vector):
     env = make_vector(obs_mode="state")
     with pytest.raises(ResetNeeded, match="first reset must be of all"):
@@ -149,22 +216,32 @@ def test_first_reset_must_be_whole(make_vector):
 @pytest.mark.parametrize(
     ("seed", "error", "message"),
     [
-        (-1, ValueError, "Seed must be greater"),
+        (-1, ValueError, r"\[0, 2\*\*32\), got -1"),
         (2**32, ValueError, r"\[0, 2\*\*32\), got 4294967296"),
-        (2**32 - 1, ValueError, r"\[0, 2\*\*32\), got 4294967296"),
+        (2**32 - 1, ValueError, "seed=4294967295 would give 3 .* give at most 4294967293"),
         ([1, 2], ValueError, "one seed for each of 3, got 2"),
         ([1, 2, -3], ValueError, r"\[0, 2\*\*32\), got -3"),
-        ([1, 2, 0.5], TypeError, "whole number, got 0.5"),
-        (0.5, TypeError, "whole number, got 0.5"),
-        (True, TypeError, "whole number, got True"),
-        ("7", TypeError, "whole number, got '7'"),
+        ([1, 2, 0.5], TypeError, "an integer, got 0.5"),
+        (0.5, TypeError, "an integer, got 0.5"),
+        (True, TypeError, "an integer, got True"),
+        ("7", TypeError, "an integer, got '7'"),
     ],
 )
 def test_seeds(make_vector, seed, error, message):
     env = make_vector(obs_mode="state")
-    with pytest.raises((error, gymnasium.error.Error), match=message):
+    with pytest.raises(error, match=message):
         env.reset(seed=seed)
     env.reset(seed=2**32 - 3)
+
+
+@pytest.mark.parametrize("convert", [np.array, np.int64, jnp.asarray, torch.as_tensor])
+def test_seeds_of_any_kind(make_vector, make_single, convert):
+    env, single = make_vector(obs_mode="state"), make_single(obs_mode="state")
+    expected = env.reset(seed=3)[0]
+    np.testing.assert_array_equal(env.reset(seed=convert(3))[0], expected)
+    np.testing.assert_array_equal(single.reset(seed=convert(3))[0], expected[0])
+    if convert is not np.int64:
+        np.testing.assert_array_equal(env.reset(seed=convert([3, 4, 5]))[0], expected)
 
 
 def test_order_of_calls(make_vector, make_single):
@@ -179,8 +256,13 @@ def test_order_of_calls(make_vector, make_single):
         env.reset(seed=0)
         env.close()
         env.close()
-        for call in (env.reset, lambda env=env: env.step(ACTIONS), env.render):
-            with pytest.raises(ClosedEnvironmentError, match="is closed; make a new one"):
+        calls = [lambda env=env: env.step(ACTIONS), env.render]
+        if isinstance(env.unwrapped, PixelBraxVectorEnv):
+            kind, message, calls = ClosedEnvironmentError, "make a new one", [env.reset, *calls]
+        else:
+            kind, message = ResetNeeded, r"call reset\(\) before"
+        for call in calls:
+            with pytest.raises(kind, match=message):
                 call()
 
 
@@ -203,7 +285,11 @@ def test_stepping_on_after_the_end(make_vector, make_single):
 
 
 def test_gymnasium_passes_messages_on():
-    with pytest.raises(TypeError, match=r"unknown option: 'widht'.*Did you mean 'width'\?"):
+    with pytest.raises(
+        TypeError, match=r"unexpected keyword argument 'widht'.*Did you mean 'width'\?"
+    ):
         gymnasium.make(ID, widht=3)
-    with pytest.raises(TypeError, match=r"unknown option: 'widht'.*Did you mean 'width'\?"):
+    with pytest.raises(
+        TypeError, match=r"unexpected keyword argument 'widht'.*Did you mean 'width'\?"
+    ):
         gymnasium.make_vec(ID, num_envs=2, widht=3)

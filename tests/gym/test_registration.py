@@ -121,9 +121,39 @@ def test_minus_one_keeps_the_time_limit_of_the_environment():
     assert steps_until_truncated(gymnasium.make_vec(ID, num_envs=2, **options)) == 6
 
 
-def test_two_time_limits_are_an_error():
-    with pytest.raises(ValueError, match="give either max_episode_steps"):
+def test_two_time_limits_must_agree():
+    with pytest.raises(ValueError, match="they differ; give one of them"):
         pixelbrax_gym.PixelBraxEnv(TASK, max_episode_steps=3, episode_length=6)
+    options = {"obs_mode": "state", "episode_length": 5, "action_repeat": 2}
+    assert steps_until_truncated(gymnasium.make_vec(ID, 2, max_episode_steps=3, **options)) == 3
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [({}, 1000), ({"action_repeat": 3}, 334), ({"episode_length": 7, "action_repeat": 2}, 4)],
+)
+def test_specs_tell_the_time_limit(options, expected):
+    options = {"obs_mode": "state"} | options
+    for env, remake in (
+        (gymnasium.make(ID, **options), gymnasium.make),
+        (gymnasium.make_vec(ID, num_envs=2, **options), gymnasium.make_vec),
+    ):
+        assert env.spec.max_episode_steps == expected
+        again = remake(env.spec)
+        assert again.spec.max_episode_steps == expected
+        limit = again.unwrapped._stateful.env.episode_length
+        assert limit == env.unwrapped._stateful.env.episode_length
+
+
+def test_time_aware_observations_count_to_the_time_limit():
+    env = gymnasium.wrappers.TimeAwareObservation(
+        gymnasium.make(ID, obs_mode="state", episode_length=6), normalize_time=False
+    )
+    env.reset(seed=0)
+    steps = [env.step(np.zeros(1, np.float32)) for _ in range(6)]
+    assert [float(step[0][-1]) for step in steps] == [1, 2, 3, 4, 5, 6]
+    assert env.observation_space.high[-1] == 6
+    assert [step[3] for step in steps] == [False] * 5 + [True]
 
 
 def test_sync_and_vector_doors_agree():

@@ -7,6 +7,7 @@ import jax
 import numpy as np
 import pytest
 import torch
+from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
 from tests.gym.conftest import ID, SIZE
@@ -64,14 +65,25 @@ def test_results_are_plain(make_single):
     assert info["episode_return"] == reward
 
 
-def test_observations_are_read_only_and_distinct(make_single):
-    steps = run(make_single())
-    observations = [step[0] for step in steps]
-    for obs in observations:
-        with pytest.raises(ValueError, match="read-only"):
-            obs[:] = 0
-    for i, obs in enumerate(observations):
-        assert not any(np.shares_memory(obs, other) for other in observations[:i])
+def test_observations_are_distinct_and_may_be_written_to(make_single):
+    expected = [step[0] for step in run(make_single())]
+    observations = []
+    for (obs, *_), wanted in zip(run(make_single()), expected, strict=True):
+        np.testing.assert_array_equal(obs, wanted)
+        obs[:] = 0
+        assert not any(np.shares_memory(obs, other) for other in observations)
+        observations.append(obs)
+
+
+def test_a_reset_opens_a_closed_environment_again(make_single):
+    env = make_single()
+    before = env.reset(seed=3)[0].copy()
+    env.step(ACTION)
+    env.close()
+    with pytest.raises(ResetNeeded, match=r"call reset\(\) before step"):
+        env.step(ACTION)
+    np.testing.assert_array_equal(env.reset(seed=3)[0], before)
+    env.step(ACTION)
 
 
 @pytest.mark.parametrize(("output", "kind"), [("torch", torch.Tensor), ("jax", jax.Array)])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import jax
 import numpy as np
 import pytest
 import torch
@@ -26,9 +27,10 @@ from torchrl.record import CSVLogger, PixelRenderTransform, VideoRecorder
 import pixelbrax_gym
 import pixelbrax_jax
 from pixelbrax_gym import torchrl_specs
+from pixelbrax_gym.dlpack import torch_device
 from pixelbrax_gym.torchrl_specs import PixelSpec
 from pixelbrax_jax.physics.tasks import TASKS
-from tests.gym.conftest import TASK
+from tests.gym.conftest import ID, TASK
 
 RIGHT = np.array([[-0.2], [0.9], [1.0]], np.float32)
 """Ball 0 stays until the time limit; 1 and 2 leave the line, one before the other."""
@@ -318,7 +320,7 @@ def test_seeds(make_torchrl):
     td["_reset"] = torch.tensor([[True], [False], [True]])
     rest = env.reset(td)
     assert [rest["observation"][i, 0].item() for i in (0, 2)] == [seven[0], seven[2]]
-    with pytest.raises(TypeError, match="whole number"):
+    with pytest.raises(TypeError, match="must be an integer"):
         env.set_seed(1.5)
     with pytest.raises(TypeError, match="takes no seed; seeds are given by set_seed"):
         env.reset(seed=3)
@@ -479,8 +481,56 @@ def test_use_out_of_order(make_torchrl):
         env.reset()
 
 
+def test_missing_action(make_torchrl):
+    env = make_torchrl(obs_mode="state")
+    td = env.reset()
+    with pytest.raises(ValueError, match=r"step\(\) needs an entry 'action'.*rand_action"):
+        env.step(td)
+    env.step(env.rand_action(td))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.int64])
+@pytest.mark.parametrize("name", ["_reset", "_step"])
+def test_masks_are_bool(make_torchrl, name, dtype):
+    env = make_torchrl(obs_mode="state")
+    td = env.rand_action(env.reset()).set(name, torch.ones(3, 1, dtype=dtype))
+    with pytest.raises(TypeError, match=f"'{name}' must be a tensor of bool, got {dtype}"):
+        env._reset(td) if name == "_reset" else env._step(td)
+
+
+@pytest.mark.parametrize("device", ["gpu", "cuda:77", "cuda"])
+@pytest.mark.skipif(torch.cuda.is_available(), reason="the last one is there")
+def test_device_that_is_not_there(device):
+    with pytest.raises(ValueError, match=f"device='{device}' is not there"):
+        pixelbrax_gym.PixelBraxTorchRLEnv(TASK, 2, device=device)
+
+
+def test_repr_names_task_number_and_device(make_torchrl):
+    expected = f"PixelBraxTorchRLEnv({TASK!r}, num_envs=3, device={{}})"
+    assert repr(make_torchrl()) == expected.format(torch_device(jax.devices()[0]))
+    assert repr(make_torchrl(device="cpu")) == expected.format("cpu")
+
+
+def test_torchrls_own_gym_environment_takes_ours():
+    from torchrl.envs import GymEnv
+
+    env = GymEnv(ID, frame_skip=2, obs_mode="state", episode_length=20)
+    plain = pixelbrax_gym.PixelBraxEnv(TASK, obs_mode="state", episode_length=20)
+    # Seeding is a reset of its own there.
+    env.set_seed(3), plain.reset(seed=3)
+    td, (obs, _) = env.reset(), plain.reset()
+    np.testing.assert_array_equal(td["observation"], obs)
+    action = np.array([0.5], np.float32)
+    td = env.step(td.set("action", torch.from_numpy(action)))["next"]
+    steps = [plain.step(action) for _ in range(2)]
+    np.testing.assert_array_equal(td["observation"], steps[-1][0])
+    assert td["reward"].item() == pytest.approx(sum(step[1] for step in steps))
+
+
 def test_options_are_checked():
-    with pytest.raises(TypeError, match=r"unknown option: 'heigth'.*Did you mean 'height'"):
+    with pytest.raises(
+        TypeError, match=r"unexpected keyword argument 'heigth'.*Did you mean 'height'"
+    ):
         pixelbrax_gym.PixelBraxTorchRLEnv(TASK, 2, heigth=12)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+
 import gymnasium
 import jax
 import numpy as np
@@ -9,7 +11,7 @@ import pytest
 import torch
 from gymnasium.vector import AutoresetMode
 
-from pixelbrax_gym import PixelBraxEnv, check_vector_env
+from pixelbrax_gym import PixelBraxEnv, PixelBraxVectorEnv, check_vector_env
 from tests.gym.conftest import SIZE, TASK
 from tests.gym.test_registration import TASKS
 
@@ -173,13 +175,54 @@ def test_dense_final_entries_of_torch(make_vector):
     )
 
 
-def test_results_other_than_observations_may_be_written_to(make_vector):
-    env = make_vector()
+@pytest.mark.parametrize("mode", MODES)
+def test_results_may_be_written_to(make_vector, mode):
+    """What a caller does to them shows in no later result."""
+    env, other = (make_vector(obs_mode="both", autoreset_mode=mode) for _ in range(2))
+    obs, infos = env.reset(seed=0)
+    other.reset(seed=0)
+    steps = []
+    for _ in range(5):
+        for array in (*obs.values(), *infos.values()):
+            array[:] = 1
+        obs, *rest, infos = env.step(ACTIONS)
+        expected, *expected_rest, _ = other.step(ACTIONS)
+        for name in obs:
+            np.testing.assert_array_equal(obs[name], expected[name])
+        for array, wanted in zip(rest, expected_rest, strict=True):
+            np.testing.assert_array_equal(array, wanted)
+            array[:] = 1
+        steps.append(obs["pixels"])
+    assert not any(map(np.shares_memory, steps, steps[1:]))
+
+
+def test_observations_outlive_their_environment():
+    env = PixelBraxVectorEnv(TASK, 3, **SIZE)
+    obs, _ = env.reset(seed=0)
+    kept, before = obs[1], obs[1].copy()
+    env.close()
+    del env, obs
+    gc.collect()
+    jax.block_until_ready([jax.numpy.full((3, 12, 12, 6), 7, np.uint8) for _ in range(50)])
+    np.testing.assert_array_equal(kept, before)
+
+
+def test_members_are_addressed_as_in_gymnasium(make_vector):
+    env = make_vector(render_mode="rgb_array", render_height=8, render_width=8)
     env.reset(seed=0)
-    obs, reward, terminated, truncated, infos = env.step(ACTIONS)
-    assert not obs.flags.writeable
-    for array in (reward, terminated, truncated, *infos.values()):
-        array[:] = 1
+    images = env.call("render")
+    assert len(images) == 3
+    np.testing.assert_array_equal(images, env.render())
+    assert env.get_attr("render_mode") == ("rgb_array",) * 3
+    assert env.get_attr("spec")[2] == env.spec
+    env.set_attr("level", [1, 2, 3])
+    env.set_attr("name", "all")
+    assert env.call("level") == (1, 2, 3)
+    assert env.get_attr("name") == ("all",) * 3
+    with pytest.raises(ValueError, match="one value for each of 3, got 2"):
+        env.set_attr("level", [1, 2])
+    with pytest.raises(AttributeError, match="nothing"):
+        env.call("nothing")
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -188,10 +231,10 @@ def test_reset_mask_touches_one_row(make_vector, mode):
     for each in (env, other):
         each.reset(seed=0)
         before = each.step(ACTIONS)[0]
-    options = {"reset_mask": np.array([False, True, False]), "mine": 1}
+    options = {"reset_mask": np.array([False, True, False])}
     obs, infos = env.reset(options=options)
     np.testing.assert_array_equal(options["reset_mask"], [False, True, False])
-    assert set(options) == {"reset_mask", "mine"}
+    assert set(options) == {"reset_mask"}
     np.testing.assert_array_equal(infos["_episode_length"], [False, True, False])
     np.testing.assert_array_equal(infos["episode_length"], [1, 0, 1])
     np.testing.assert_array_equal(obs[[0, 2]], before[[0, 2]])

@@ -1,0 +1,102 @@
+"""One of many environments, for frameworks that ask each for its attributes and methods."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+
+class Member:
+    """Stands for one environment of a ``PixelBraxVectorEnv`` or ``PixelBraxSB3VecEnv``.
+
+    There is one object for all environments, and no object for each. What is set on a member is
+    kept there; the environments themselves know nothing of it.
+
+    Attributes:
+        owner: the environment of all.
+        index: which one it is.
+        render_mode: None or ``"rgb_array"``.
+        observation_space: of one environment.
+        action_space: of one environment.
+    """
+
+    def __init__(
+        self,
+        owner: Any,
+        index: int,
+        observation_space: gymnasium.Space,
+        action_space: gymnasium.Space,
+    ) -> None:
+        """Make the stand-in.
+
+        Args:
+            owner: the environment of all, whose ``get_images`` returns N images.
+            index: which one this is.
+            observation_space: of one environment.
+            action_space: of one environment.
+        """
+        self.owner, self.index, self.render_mode = owner, index, owner.render_mode
+        self.observation_space, self.action_space = observation_space, action_space
+
+    @property
+    def unwrapped(self) -> Member:
+        """Itself."""
+        return self
+
+    @property
+    def metadata(self) -> dict[str, Any]:
+        """That of the whole."""
+        return self.owner.metadata
+
+    @property
+    def spec(self) -> Any:
+        """That of the whole; None unless Gymnasium made it."""
+        return getattr(self.owner, "spec", None)
+
+    def has_wrapper_attr(self, name: str) -> bool:
+        """Tell whether there is such an attribute, as Gymnasium's environments do."""
+        return hasattr(self, name)
+
+    def get_wrapper_attr(self, name: str) -> Any:
+        """Return the attribute of that name, as Gymnasium's environments do."""
+        return getattr(self, name)
+
+    def set_wrapper_attr(self, name: str, value: Any, *, force: bool = True) -> bool:
+        """Set the attribute of that name, as Gymnasium's environments do.
+
+        Args:
+            name: of the attribute.
+            value: of the attribute.
+            force: whether one that is not there yet is made.
+
+        Returns:
+            Whether it was set.
+        """
+        if not force and not hasattr(self, name):
+            return False
+        setattr(self, name, value)
+        return True
+
+    def render(self) -> np.ndarray | None:
+        """Return the environment's image; draws those of all."""
+        return self.owner.get_images()[self.index]
+
+
+def call_members(members: Sequence[Member], name: str, *args: Any, **kwargs: Any) -> list[Any]:
+    """Return an attribute of each member, or what it returns if it can be called.
+
+    Args:
+        members: of one environment.
+        name: of the attribute or method.
+        *args: of the method.
+        **kwargs: of the method.
+    """
+    if name == "render" and members:
+        # Drawn once for all, not once for each.
+        images = members[0].owner.get_images()
+        return [images[member.index] for member in members]
+    values = [getattr(member, name) for member in members]
+    return [value(*args, **kwargs) if callable(value) else value for value in values]

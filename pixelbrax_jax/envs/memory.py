@@ -1,0 +1,35 @@
+"""Sizes that no memory of this machine could hold, refused before anything is allocated."""
+
+from __future__ import annotations
+
+import math
+import os
+
+
+def check_fits(what: str, num_bytes: float) -> None:
+    """Reject what takes more bytes than the machine has.
+
+    This finds mistyped numbers early. What the machine could hold but a device or other programs
+    leave no room for is found when it is allocated.
+
+    Args:
+        what: the options and their values, as the message should name them.
+        num_bytes: that they take at least.
+
+    Raises:
+        MemoryError: it is more than this machine's main memory, naming both.
+    """
+    limit = _main_memory()
+    if num_bytes > limit:
+        raise MemoryError(
+            f"{what} would take at least {num_bytes / 1e9:,.1f} GB, and this machine has "
+            f"{limit / 1e9:,.1f} GB of memory; lower one of them."
+        )
+
+
+def _main_memory() -> float:
+    """Bytes of main memory; infinite where the system does not tell."""
+    try:
+        return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    except (AttributeError, OSError, ValueError):
+        return math.inf
