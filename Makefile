@@ -17,7 +17,7 @@ WORKERS := -n 2 --dist loadfile
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-slow test-newest test-oldest lint format bench docs docs-serve clean
+.PHONY: help demo test test-slow test-newest test-oldest test-clients lint format bench docs docs-serve clean
 
 help: ## show this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1|/' | \
@@ -46,6 +46,9 @@ test-newest: .venv-newest/.installed ## run those that need no torch with the ne
 test-oldest: .venv-oldest/.installed ## run those that need no torch with the oldest releases
 	.venv-oldest/bin/python -m pytest $(WORKERS) -m "$(SPEED) and not gpu" $(TORCHLESS) $(ARGS)
 
+test-clients: .venv-clients/.installed ## run third-party agents and wrappers on the environments
+	.venv-clients/bin/python -m pytest $(WORKERS) tests/clients $(ARGS)
+
 lint: $(VENV)/.installed-dev ## check style, types and spelling
 	$(RUN) -m ruff check .
 	$(RUN) -m ruff format --check .
@@ -66,7 +69,7 @@ docs-serve: $(VENV)/.installed-docs ## read the documentation in a browser while
 	NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs serve
 
 clean: ## remove the environment, builds and caches; keeps runs/
-	rm -rf $(VENV) .venv-ci .venv-newest .venv-oldest .venv-peers build dist site .jax_cache .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) .venv-ci .venv-clients .venv-newest .venv-oldest .venv-peers build dist site .jax_cache .mypy_cache .pytest_cache .ruff_cache
 	find pixelbrax_jax pixelbrax_gym tests examples -name __pycache__ -prune -exec rm -rf {} +
 
 # One environment for all; each set of extras is installed when it is first needed, and again
@@ -90,6 +93,15 @@ $(VENV)/.installed-%: $(VENV)/.created pyproject.toml constraints.txt
 	@.venv-oldest/bin/python tests/oldest_releases.py > .venv-oldest/constraints.txt
 	@.venv-oldest/bin/python -m pip install --quiet --disable-pip-version-check \
 		-c .venv-oldest/constraints.txt -e ".[test]"
+	@touch $@
+
+.venv-clients/.installed: pyproject.toml constraints.txt tests/clients/requirements.txt
+	@echo "Installing PixelBrax and its clients into .venv-clients; the first time takes minutes ..."
+	@$(PYTHON) -m venv --clear .venv-clients
+	@.venv-clients/bin/python -m pip install --quiet --disable-pip-version-check \
+		-c constraints.txt -e ".[dev]"
+	@.venv-clients/bin/python -m pip install --quiet --disable-pip-version-check \
+		--no-deps -r tests/clients/requirements.txt
 	@touch $@
 
 $(VENV)/.created:

@@ -15,7 +15,7 @@ from pixelbrax_gym.spaces import action_space, observation_space
 from pixelbrax_gym.stateful import StatefulEnv, with_time_limit
 from pixelbrax_gym.window import Window
 from pixelbrax_jax.choices import check_choice, check_whole
-from pixelbrax_jax.envs.memory import check_fits
+from pixelbrax_jax.memory import check_fits
 
 RENDER_MODES = ("human", "rgb_array")
 

@@ -104,6 +104,9 @@ def _train(arguments: list[str]) -> int:
         from pixelbrax_jax.agents.command import train
     except ImportError as error:
         return _lacks_train("train", error)
+    except KeyboardInterrupt:
+        # While packages are imported, before a run has anything to lose.
+        return 128 + signal.SIGINT
     return train(arguments)
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import gymnasium
 import pytest
 
-import pixelbrax_gym  # noqa: F401  # registers PixelBrax/*
+import pixelbrax_gym  # registers PixelBrax/*
 import pixelbrax_jax
 from pixelbrax_jax import registry
 from pixelbrax_jax.physics.tasks import TASKS
@@ -164,6 +164,25 @@ def test_the_table_of_options_is_true():
     for names, values, _ in table_of("options"):
         for option, value in zip(names.split(", "), values.split(", "), strict=True):
             assert repr(options[option].default).replace("'", '"') == value, option
+
+
+def test_the_table_of_adapters_options_is_true():
+    adapters = [
+        pixelbrax_gym.PixelBraxEnv,
+        pixelbrax_gym.PixelBraxVectorEnv,
+        pixelbrax_gym.PixelBraxTorchRLEnv,
+        pixelbrax_gym.PixelBraxSB3VecEnv,
+    ]
+    taken = [
+        set(inspect.signature(adapter.__init__).parameters) - {"self", "task", "options"}
+        for adapter in adapters
+    ]
+    listed: list[set[str]] = [set() for _ in adapters]
+    for names, *cells, _ in table_of("adapter-options"):
+        for option in names.split(", "):
+            for options, cell in zip(listed, cells, strict=True):
+                options |= {option} if cell == "yes" else set()
+    assert listed == taken
 
 
 def test_blocks_are_found():

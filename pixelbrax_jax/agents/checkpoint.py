@@ -37,6 +37,10 @@ class CheckpointError(RuntimeError):
     """A checkpoint cannot be written or read; the message says why and what to do."""
 
 
+class DiskFullError(CheckpointError):
+    """There is no room for a checkpoint; raised in all processes alike, before any writes."""
+
+
 class Checkpoints:
     """The checkpoints of one run.
 
@@ -81,6 +85,8 @@ class Checkpoints:
             cleanup_tmp_directories=True,
         )
         self._manager = ocp.CheckpointManager(self.folder, options=options)
+        self._writing = False
+        logging.getLogger("absl").addFilter(_not_a_traceback)
 
     def steps(self) -> list[int]:
         """Control steps of all checkpoints, ascending."""
@@ -99,15 +105,21 @@ class Checkpoints:
             score: the higher, the better; None if it is not known.
 
         Raises:
-            CheckpointError: the disk is full, or cannot be written to.
+            DiskFullError: there is no room for it.
+            CheckpointError: it cannot be written, or the one before, which was being written,
+                could not be.
         """
+        self.wait()
         leaves = _plain(state)
         size = sum(leaf.nbytes for leaf in leaves.values())
-        free = shutil.disk_usage(self.folder).free
+        try:
+            free = shutil.disk_usage(self.folder).free
+        except OSError as error:
+            raise self._failed(error) from error
         if anywhere(free < _ROOM * size):
-            raise CheckpointError(
-                f"a checkpoint takes {size / 1e9:.2f} GB, but {self.folder} has only "
-                f"{free / 1e9:.2f} GB free. Make room, or give another --output-dir."
+            raise DiskFullError(
+                f"a checkpoint takes {_bytes(size)}, but {self.folder} has only {_bytes(free)} "
+                "free."
             )
         about = self._about | {"steps": steps, "score": score}
         arguments = ocp.args.Composite(
@@ -117,8 +129,19 @@ class Checkpoints:
         try:
             with _without_warnings():  # That there is no score is no mistake.
                 self._manager.save(steps, args=arguments, metrics=metrics, force=True)
-        except OSError as error:
-            raise CheckpointError(f"cannot write a checkpoint to {self.folder}: {error}") from error
+        except (OSError, ValueError) as error:
+            raise self._failed(error) from error
+        self._writing = True
+
+    def is_written(self) -> bool:
+        """Return whether nothing is being written any more.
+
+        Raises:
+            CheckpointError: the checkpoint that was being written could not be.
+        """
+        if self._writing and not self._manager.is_saving_in_progress():
+            self.wait()
+        return not self._writing
 
     def wait(self) -> None:
         """Returns when everything is written.
@@ -126,10 +149,24 @@ class Checkpoints:
         Raises:
             CheckpointError: it could not be.
         """
+        self._writing = False
         try:
             self._manager.wait_until_finished()
-        except OSError as error:
-            raise CheckpointError(f"cannot write a checkpoint to {self.folder}: {error}") from error
+        except (OSError, ValueError) as error:  # TensorStore has a ValueError for a full disk.
+            raise self._failed(error) from error
+
+    def _failed(self, error: Exception) -> CheckpointError:
+        """Return what to raise for a checkpoint that cannot be written; removes what there is."""
+        if jax.process_index() == 0:
+            for path in self.folder.glob("*.orbax-checkpoint-tmp*"):
+                shutil.rmtree(path, ignore_errors=True)
+        # The manager has left out those that the new one would have replaced.
+        with contextlib.suppress(OSError):
+            self._manager.reload()
+        # What TensorStore says ends with the system's own words.
+        told = str(error).splitlines()[0].rsplit(": ", 1)[-1]
+        told = getattr(error, "strerror", None) or told
+        return CheckpointError(f"cannot write a checkpoint to {self.folder}: {told}.")
 
     def restore(self, template: Tree, steps: int | None = None) -> Tree:
         """The state of a checkpoint.
@@ -172,8 +209,13 @@ class Checkpoints:
 
     def close(self) -> None:
         """Waits for what is being written, and lets go of the folder."""
-        self.wait()
-        self._manager.close()
+        try:
+            self.wait()
+        finally:
+            # What it says of a full disk, `wait` has said.
+            with contextlib.suppress(OSError, ValueError):
+                self._manager.close()
+            logging.getLogger("absl").removeFilter(_not_a_traceback)
 
     def _which(self, steps: int | None) -> int:
         known = self.steps()
@@ -220,6 +262,11 @@ def best_steps(folder: str | Path) -> int | None:
     scores = {steps: read_about(folder, steps)["score"] for steps in _all_steps(Path(folder))}
     scores = {steps: score for steps, score in scores.items() if score is not None}
     return max(scores, key=lambda steps: (scores[steps], steps)) if scores else None
+
+
+def latest_steps(folder: str | Path) -> int | None:
+    """Return the control steps of the latest checkpoint in a folder; None if there is none."""
+    return max(_all_steps(Path(folder)), default=None)
 
 
 def read_about(folder: str | Path, steps: int | None = None) -> dict[str, Any]:
@@ -335,6 +382,11 @@ def _all_steps(folder: Path) -> list[int]:
     return sorted(int(path.name) for path in found if (path / "about" / "metadata").exists())
 
 
+def _not_a_traceback(record: logging.LogRecord) -> bool:
+    """Return whether a record is no traceback of Orbax, whose errors are told by `Checkpoints`."""
+    return not (record.exc_info and "orbax" in record.pathname)
+
+
 @contextlib.contextmanager
 def _without_warnings() -> Iterator[None]:
     """Orbax's warnings are not shown."""
@@ -361,6 +413,11 @@ def _sharding(leaf: Any) -> Any:
     if getattr(leaf, "sharding", None) is not None:
         return leaf.sharding
     return jax.sharding.SingleDeviceSharding(jax.devices()[0])
+
+
+def _bytes(number: float) -> str:
+    """Return a number of bytes with a unit in which it shows."""
+    return f"{number / 1e9:.2f} GB" if number >= 1e8 else f"{number / 1e6:.2f} MB"
 
 
 def nbytes(tree: Any) -> int:

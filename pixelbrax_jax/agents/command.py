@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import os
 import sys
 from dataclasses import make_dataclass
 from pathlib import Path
@@ -12,10 +14,11 @@ import jax
 import tyro
 from tqdm import tqdm
 
-from pixelbrax_jax.agents.checkpoint import CheckpointError
+from pixelbrax_jax.agents.checkpoint import CheckpointError, latest_steps
 from pixelbrax_jax.agents.config import TrainConfig, make_env
 from pixelbrax_jax.agents.presets import CONFIGS, MAKERS, PRESETS, preset
-from pixelbrax_jax.agents.train import RunConfig, TrainingDivergedError, run
+from pixelbrax_jax.agents.run_config import RunConfig
+from pixelbrax_jax.agents.train import TrainingDivergedError, run
 from pixelbrax_jax.choices import check_whole
 from pixelbrax_jax.envs.sharded import ShardedVectorEnv, make_env_mesh
 from pixelbrax_jax.envs.vector import VectorPixelEnv
@@ -31,8 +34,18 @@ def train(arguments: list[str]) -> int:
         arguments: those behind ``pixelbrax train``.
 
     Returns:
-        The exit status: 0 when all is well, 1 for an error that is told, 130 when stopped.
+        The exit status: 0 when all is well, 1 for an error that is told, and for a run that was
+        stopped 128 plus the signal's number, as shells have it: 130 for Ctrl-C, 143 for SIGTERM,
+        129 for SIGHUP.
     """
+    try:
+        return _train(arguments)
+    finally:
+        for stream in filter(None, (sys.stdout, sys.stderr)):
+            _flush(stream)
+
+
+def _train(arguments: list[str]) -> int:
     first = argparse.ArgumentParser(prog="pixelbrax train", add_help=False)
     first.add_argument("algorithm", choices=sorted(CONFIGS))
     first.add_argument("--preset", choices=sorted(PRESETS), default="default")
@@ -53,6 +66,7 @@ def train(arguments: list[str]) -> int:
     spread = (chosen.coordinator, chosen.num_processes, chosen.process_id)
     if None in spread and any(given is not None for given in spread):
         first.error("--coordinator, --num-processes and --process-id belong together")
+    options = None
     try:
         if chosen.cpu_devices is not None:
             _emulate(chosen.cpu_devices)
@@ -69,13 +83,31 @@ def train(arguments: list[str]) -> int:
         ImportError,
         jax.errors.JaxRuntimeError,
     ) as error:
-        sys.stderr.write(f"pixelbrax train: {error}\n")
+        _tell(f"pixelbrax train: {error}")
         return 1
     except KeyboardInterrupt:
-        sys.stderr.write(
-            "pixelbrax train: stopped at once; what came after the last checkpoint is lost\n"
-        )
+        folder = Path(options.output_dir) / "checkpoints" if options else None
+        latest = None if folder is None else latest_steps(folder)
+        kept = "there is no checkpoint"
+        if latest is not None:
+            kept = f"go on from the checkpoint of {latest} steps with --resume latest"
+        _tell(f"pixelbrax train: stopped at once; {kept}")
         return INTERRUPTED
+
+
+def _tell(line: str) -> None:
+    """Writes a line above the bar, if anybody is left to read it."""
+    with contextlib.suppress(OSError):
+        tqdm.write(line, file=sys.stderr)
+
+
+def _flush(stream: Any) -> None:
+    """Empties a stream, or gives up its text: Python would exit with 120 on account of it."""
+    try:
+        stream.flush()
+    except OSError:
+        with Path(os.devnull).open("wb") as nowhere, contextlib.suppress(OSError):
+            os.dup2(nowhere.fileno(), stream.fileno())
 
 
 def _emulate(cpu_devices: int) -> None:
@@ -128,7 +160,7 @@ def parse(algorithm: str, name: str, arguments: list[str]) -> tuple[TrainConfig,
 def _run(algorithm: str, config: TrainConfig, options: RunConfig) -> int:
     def report(line: str) -> None:
         if jax.process_index() == 0:
-            tqdm.write(line, file=sys.stderr)  # above the bar
+            tqdm.write(line, file=sys.stderr)
 
     env, env_params = make_env(config)
     devices = jax.device_count()
@@ -136,10 +168,12 @@ def _run(algorithm: str, config: TrainConfig, options: RunConfig) -> int:
         envs: Any = ShardedVectorEnv(env, config.num_envs, make_env_mesh())
     else:
         envs = VectorPixelEnv(env, config.num_envs)
-    report(
-        f"{algorithm} on {config.task}, {config.num_envs} environments, {devices} "
-        f"{jax.default_backend()} device{'s' * (devices > 1)}, {config.num_iterations} iterations "
-        f"of {config.steps_per_iteration} control steps; into {Path(options.output_dir).resolve()}"
-    )
+    with contextlib.suppress(OSError):
+        report(
+            f"{algorithm} on {config.task}, {config.num_envs} environments, {devices} "
+            f"{jax.default_backend()} device{'s' * (devices > 1)}, {config.num_iterations} "
+            f"iterations of {config.steps_per_iteration} control steps; "
+            f"into {Path(options.output_dir).resolve()}"
+        )
     outcome = run(MAKERS[algorithm](config, envs), env_params, options, report=report)
-    return INTERRUPTED if outcome.interrupted else 0
+    return 128 + outcome.signal if outcome.interrupted else 0

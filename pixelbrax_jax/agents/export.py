@@ -38,6 +38,10 @@ def save_policy(algorithm: Algorithm, networks: Networks, path: str | Path) -> P
     path.parent.mkdir(parents=True, exist_ok=True)
     # Written aside and renamed: a file of this name is always whole.
     part = path.with_name(path.name + ".part")
-    part.write_bytes(exported.serialize())
-    part.replace(path)
+    try:
+        part.write_bytes(exported.serialize())
+        part.replace(path)
+    except OSError:
+        part.unlink(missing_ok=True)
+        raise
     return path

@@ -51,6 +51,12 @@ def everywhere(mesh: Mesh, tree: Any) -> Any:
 
 def anywhere(here: bool) -> bool:
     """Whether something is so in any process, when all must go the same way."""
+    return bool(highest(int(here))[0])
+
+
+def highest(*here: int) -> tuple[int, ...]:
+    """Return the highest of each number over all processes, when all must go the same way."""
     if jax.process_count() == 1:
         return here
-    return bool(multihost_utils.process_allgather(np.array(here)).any())
+    everyone = multihost_utils.process_allgather(np.array(here, np.int32))
+    return tuple(int(number) for number in everyone.max(axis=0))

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import signal
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,69 +16,26 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from pixelbrax_jax.agents.algorithm import Algorithm, TrainState
 from pixelbrax_jax.agents.checkpoint import CheckpointError, Checkpoints
-from pixelbrax_jax.agents.config import check_count, describe
+from pixelbrax_jax.agents.config import describe
 from pixelbrax_jax.agents.evaluate import Evaluator, Result, interquartile_mean, make_splits
 from pixelbrax_jax.agents.export import save_policy
+from pixelbrax_jax.agents.interruption import StopRequest, stop_requests
 from pixelbrax_jax.agents.memory import check_memory
 from pixelbrax_jax.agents.metrics import MetricsWriter, NoWriter, together
 from pixelbrax_jax.agents.optimizer import Networks
+from pixelbrax_jax.agents.progress import Bar, Messages, reason
+from pixelbrax_jax.agents.run_config import RunConfig
+from pixelbrax_jax.agents.saving import Saver
 from pixelbrax_jax.agents.seeds import keys_of, of_seed, over_seeds
-from pixelbrax_jax.agents.sharding import anywhere, everywhere, state_shardings
-from pixelbrax_jax.choices import check_choice, check_whole
+from pixelbrax_jax.agents.sharding import anywhere, everywhere, highest, state_shardings
 from pixelbrax_jax.compilation import compiler_options
 from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.types import EnvParams
 
-RESUME = ("never", "latest")
+__all__ = ["Outcome", "RunConfig", "TrainingDivergedError", "run"]
 
 Splits = dict[str, tuple[PixelEnv, EnvParams]]
 """Environments to evaluate in, and their parameters, by name."""
-
-
-@dataclass(frozen=True)
-class RunConfig:
-    """What is done around the training; nothing but the seeds changes a bit of it."""
-
-    output_dir: str = "runs/train"
-    """Folder of logs, checkpoints and the policy."""
-    seed: int = 0
-    """Seed of the run."""
-    seeds: int = 1
-    """Runs in one program, of the seeds ``seed``, ``seed`` + 1, ..."""
-    resume: str = "never"
-    """``latest`` goes on from the latest checkpoint in the folder, if there is one."""
-    log_training_metrics: bool = True
-    """Whether metrics of the training itself are logged."""
-    log_every: int = 1
-    """Iterations that one record sums up."""
-    num_evals: int = 0
-    """Evaluations, evenly over the run, the last at its end; 0 never makes such environments."""
-    eval_episodes: int = 32
-    """Episodes of an evaluation, for each split."""
-    checkpoint_every: int = 0
-    """Control steps between checkpoints; 0 writes them at evaluations and at the end only."""
-    keep_checkpoints: int = 3
-    """Latest checkpoints that are kept, besides the best."""
-    wandb_project: str | None = None
-    """Project of Weights & Biases; none writes nothing there."""
-    progress: bool = True
-    """Whether a progress bar is shown."""
-
-    def __post_init__(self) -> None:
-        """Checks the settings.
-
-        Raises:
-            ValueError: a setting is out of range; the message says what is allowed.
-        """
-        check_choice("resume", self.resume, RESUME)
-        for name in ("seeds", "log_every", "eval_episodes", "keep_checkpoints"):
-            check_whole(name, getattr(self, name))
-        for name in ("seed", "num_evals", "checkpoint_every"):
-            check_count(name, getattr(self, name))
-        if self.seed + self.seeds > 2**32:
-            raise ValueError(
-                f"seeds must be below 2**32, got seed={self.seed} and seeds={self.seeds}."
-            )
 
 
 class TrainingDivergedError(RuntimeError):
@@ -95,12 +51,16 @@ class Outcome:
         metrics: the last record of the training; empty if none was logged.
         evaluations: the last results, by split.
         interrupted: whether it was stopped before its end.
+        signal: number of the signal that stopped it; 0 if none did.
+        incomplete: what of the messages and records could not be written, and why, in lines.
     """
 
     state: TrainState
     metrics: dict[str, float]
     evaluations: dict[str, Result]
     interrupted: bool
+    signal: int = 0
+    incomplete: tuple[str, ...] = ()
 
 
 def _silent(line: str) -> None:
@@ -117,23 +77,38 @@ def run(
 ) -> Outcome:
     """Trains to the end, or until it is interrupted.
 
-    Ctrl-C, or SIGTERM, lets the iteration finish, and one that waits behind it, writes a
-    checkpoint and returns.
+    Ctrl-C, SIGTERM, or SIGHUP, lets the iteration finish, and one that waits behind it, writes a
+    checkpoint and returns. What reports, draws or logs may fail without an effect on the training.
 
     Args:
         algorithm: with its settings.
         env_params: of its environments.
         options: what is done around it.
-        report: gets lines about what is going on.
+        report: gets lines about what is going on; it may raise.
         splits: environments to evaluate in, with their parameters, by name; one is ``"clean"``,
             which chooses the best checkpoint. None makes those that the settings name, which
             environments of your own are not.
 
     Raises:
-        CheckpointError: the folder cannot be written to, or holds another run.
+        CheckpointError: the folder cannot be written to, or holds another run, or the last
+            checkpoint cannot be written.
+        OSError: files of records cannot be opened, or the policy cannot be written.
         MemoryError: what must be stored would not fit.
         TrainingDivergedError: a loss is not finite; the last good checkpoint stays.
     """
+    messages = Messages(report)
+    with stop_requests(report) as stop:
+        return _run(algorithm, env_params, options, messages, splits, stop)
+
+
+def _run(
+    algorithm: Algorithm,
+    env_params: EnvParams,
+    options: RunConfig,
+    report: Messages,
+    splits: Splits | None,
+    stop: StopRequest,
+) -> Outcome:
     folder = Path(options.output_dir)
     key = jax.random.key(options.seed)
     if options.seeds > 1:
@@ -183,7 +158,7 @@ def run(
         placed = None if mesh is None else (shardings, same)
         if options.num_evals and splits is None:
             splits = make_splits(algorithm.config)
-        loop = _Run(algorithm, env_params, options, checkpoints, report, placed, splits or {})
+        loop = _Run(algorithm, env_params, options, checkpoints, report, placed, splits or {}, stop)
         return loop.until_end(state)
     finally:
         checkpoints.close()
@@ -198,9 +173,10 @@ class _Run:
         env_params: EnvParams,
         options: RunConfig,
         checkpoints: Checkpoints,
-        report: Callable[[str], None],
+        report: Messages,
         placed: Any,
         splits: Splits,
+        stop: StopRequest,
     ) -> None:
         self._algorithm = algorithm
         self._config = algorithm.config
@@ -208,6 +184,9 @@ class _Run:
         self._options = options
         self._checkpoints = checkpoints
         self._report = report
+        self._stop = stop
+        self._folder = Path(options.output_dir)
+        self._first = jax.process_index() == 0
         # The state before an iteration is not needed after it: its memory is used again.
         compiled = partial(
             jax.jit, donate_argnums=0, out_shardings=placed, compiler_options=compiler_options()
@@ -226,72 +205,124 @@ class _Run:
         self._results: dict[str, Result] = {}
 
     def until_end(self, state: TrainState) -> Outcome:
-        steps, total = _steps(self._algorithm, state), self._config.num_iterations
-        per_iteration, options = self._config.steps_per_iteration, self._options
-        last_saved = steps
-        first = jax.process_index() == 0
-        writer: Any = NoWriter()
+        began = steps = _steps(self._algorithm, state)
+        total = self._config.num_iterations
+        writer = self._open_writer(steps)
+        try:
+            bar = Bar(self._options.progress and self._first, total, self._report)
+            with closing(bar):
+                state, steps, stopped_by = self._iterations(state, steps, writer, bar)
+            if not stopped_by or steps > began:
+                self._export(state, steps)
+        finally:
+            writer.close()
+            for line in (missing := writer.missing()):
+                self._report(line)
+        if not stopped_by:
+            self._report(f"done after {steps} steps; checkpoints and policy in {self._folder}")
+        failed = {"the progress bar": bar.failure, "messages": self._report.failure}
+        incomplete = [f"{name} could not be shown: {why}" for name, why in failed.items() if why]
+        return Outcome(
+            state,
+            self._record,
+            self._results,
+            bool(stopped_by),
+            stopped_by,
+            (*missing, *incomplete),
+        )
+
+    def _open_writer(self, steps: int) -> MetricsWriter | NoWriter:
+        writer: MetricsWriter | NoWriter = NoWriter()
         failure: Exception | None = None
-        if first:
+        if self._first:
             try:
                 writer = MetricsWriter(
-                    Path(options.output_dir),
-                    {"algorithm": self._algorithm.name} | _settings(self._algorithm, options),
+                    self._folder,
+                    {"algorithm": self._algorithm.name} | _settings(self._algorithm, self._options),
                     first_step=steps,
-                    wandb_project=options.wandb_project,
+                    wandb_project=self._options.wandb_project,
+                    report=self._report,
                 )
             except (ImportError, OSError) as error:
                 failure = error
         if anywhere(failure is not None):
             raise failure or RuntimeError("process 0 cannot write metrics; it says why.")
-        stopped = False
-        try:
-            if steps // per_iteration >= total:
-                self._report(f"the run has had its {steps} steps")
+        return writer
+
+    def _iterations(
+        self, state: TrainState, steps: int, writer: MetricsWriter | NoWriter, bar: Bar
+    ) -> tuple[TrainState, int, int]:
+        """Trains to the end, or until a signal; the state, its steps, the signal's number or 0."""
+        per_iteration, total = self._config.steps_per_iteration, self._config.num_iterations
+        options, done = self._options, steps // self._config.steps_per_iteration
+        bar.update(done)
+        if done >= total:
+            self._report(f"the run has had its {steps} steps")
+            return state, steps, 0
+        if stopped_by := highest(self._stop.signal)[0]:
+            left = f"go on from {steps} steps with --resume latest" if steps else "nothing is lost"
+            self._report(f"stopped before the first iteration; {left}")
+            return state, steps, stopped_by
+        self._report("compiling")
+        saver = Saver(
+            self._checkpoints,
+            steps,
+            self._report,
+            every=options.checkpoint_every,
+            minutes=options.checkpoint_minutes,
+        )
+        began, began_steps = time.perf_counter(), steps
+        for number in range(done + 1, total + 1):
+            state, steps = self._one(state, number), number * per_iteration
+            bar.update(1)
+            end = number == total
+            # The clock is that of the first process.
+            by_clock = self._first and saver.is_due_by_clock()
+            stopped_by, due = highest(self._stop.signal, int(by_clock))
+            stopped_by = 0 if end else stopped_by
+            last = end or bool(stopped_by)
+            evaluates = self._evaluates_after(number)
+            saves = last or evaluates or bool(due) or saver.is_due_after(steps)
+            logs = number % options.log_every == 0 or evaluates or saves
+            if logs:
+                self._settle(steps, saver)
+                seconds = time.perf_counter() - began
+                if options.log_training_metrics:
+                    self._record["speed/steps_per_second"] = (steps - began_steps) / seconds
+                    writer.write(steps, self._record)
+                bar.update(0, self._record)
+            if evaluates and not stopped_by:
+                writer.write(steps, self._evaluate(state))
+            if saves:
+                score = self._score(evaluates and not stopped_by)
+                saver.save(state, steps, score, last=last)
             else:
-                self._report("compiling")
-            with (
-                _interruptible(self._report) as interrupted,
-                _bar(options.progress and first, total) as bar,
-            ):
-                bar.update(steps // per_iteration)
+                saver.look_after()
+            if logs:
                 began, began_steps = time.perf_counter(), steps
-                for number in range(steps // per_iteration + 1, total + 1):
-                    state, steps = self._one(state, number), number * per_iteration
-                    bar.update(1)
-                    end = number == total
-                    stopped = anywhere(bool(interrupted)) and not end
-                    evaluates = self._evaluates_after(number)
-                    saves = end or stopped or evaluates or self._saves_after(steps, last_saved)
-                    if number % options.log_every == 0 or evaluates or saves:
-                        self._settle(steps)
-                        seconds = time.perf_counter() - began
-                        if options.log_training_metrics:
-                            self._record["speed/steps_per_second"] = (steps - began_steps) / seconds
-                            writer.write(steps, self._record)
-                        bar.show(self._record)
-                    if evaluates and not stopped:
-                        writer.write(steps, self._evaluate(state))
-                    if saves:
-                        self._checkpoints.save(state, steps, self._score(evaluates and not stopped))
-                        last_saved = steps
-                    if number % options.log_every == 0 or evaluates or saves:
-                        began, began_steps = time.perf_counter(), steps
-                    if stopped:
-                        # Whoever is asked to stop may soon be killed: first what is not to be lost.
-                        self._checkpoints.wait()
-                        self._report(f"stopped after {steps} steps; go on with --resume latest")
-                        if evaluates:
-                            writer.write(steps, self._evaluate(state))
-                        break
-                for networks, name in self._policies(state) if first else ():
-                    save_policy(self._algorithm, networks, Path(options.output_dir) / name)
-                if not stopped:
-                    folder = Path(options.output_dir)
-                    self._report(f"done after {steps} steps; checkpoints and policy in {folder}")
-                return Outcome(state, self._record, self._results, stopped)
-        finally:
-            writer.close()
+            if stopped_by:
+                # Whoever is asked to stop may soon be killed: first what is not to be lost.
+                self._report(f"stopped after {steps} steps; go on with --resume latest")
+                if evaluates:
+                    writer.write(steps, self._evaluate(state))
+                break
+        return state, steps, stopped_by
+
+    def _export(self, state: TrainState, steps: int) -> None:
+        """Writes the policies.
+
+        Raises:
+            OSError: one cannot be written.
+        """
+        for networks, name in self._policies(state) if self._first else ():
+            try:
+                save_policy(self._algorithm, networks, self._folder / name)
+            except OSError as error:
+                raise OSError(
+                    f"cannot write {self._folder / name}: {reason(error)}. The checkpoint of "
+                    f"{steps} steps is whole: make room, and the same command with --resume latest "
+                    "writes the policy at its end."
+                ) from error
 
     def _one(self, state: TrainState, number: int) -> TrainState:
         """Iteration ``number``, from 1, and the auxiliary phase if it is due."""
@@ -306,7 +337,7 @@ class _Run:
         jax.block_until_ready(self._pending[-2:-1])
         return state
 
-    def _settle(self, steps: int) -> None:
+    def _settle(self, steps: int, saver: Saver) -> None:
         """Puts the metrics of the latest iterations together, and looks at them.
 
         Raises:
@@ -325,8 +356,9 @@ class _Run:
                     those = np.flatnonzero(np.any(list(bad.values()), axis=0))
                     names = (str(self._options.seed + int(i)) for i in those)
                     runs = f" of seed {', '.join(names)}"
-                saved = self._checkpoints.steps()
-                kept = f"that of {saved[-1]} steps is good" if saved else "there is none"
+                saver.look_after(wait=True)
+                latest = saver.latest()
+                kept = "there is none" if latest is None else f"that of {latest} steps is good"
                 raise TrainingDivergedError(
                     f"not finite within the iterations before step {steps}{runs}: "
                     f"{', '.join(bad)}. Of the checkpoints {kept}. Begin anew in another "
@@ -337,10 +369,6 @@ class _Run:
     def _evaluates_after(self, number: int) -> bool:
         evals, total = self._options.num_evals, self._config.num_iterations
         return bool(evals) and number * evals // total > (number - 1) * evals // total
-
-    def _saves_after(self, steps: int, last_saved: int) -> bool:
-        every = self._options.checkpoint_every
-        return bool(every) and steps // every > last_saved // every
 
     def _policies(self, state: TrainState) -> Iterator[tuple[Networks, str]]:
         """Networks of each seed, and the name of its policy's file."""
@@ -394,56 +422,3 @@ def _settings(algorithm: Algorithm, options: RunConfig) -> dict[str, Any]:
 def _steps(algorithm: Algorithm, state: TrainState) -> int:
     """Control steps so far; all seeds are equally far."""
     return int(np.ravel(state.iteration)[0]) * algorithm.config.steps_per_iteration
-
-
-@contextmanager
-def _interruptible(report: Callable[[str], None]) -> Iterator[list[int]]:
-    """A list that is filled when somebody asks the process to stop; asked twice, it stops."""
-    asked: list[int] = []
-
-    def ask(number: int, frame: Any) -> None:
-        del frame
-        if asked:
-            raise KeyboardInterrupt
-        asked.append(number)
-        # Whoever reads the lines may have been stopped too, and a line may be under way.
-        with suppress(OSError, RuntimeError):
-            report("stopping within two iterations; asked again, at once, with no checkpoint")
-
-    before = {}
-    for number in (signal.SIGINT, signal.SIGTERM):
-        try:
-            before[number] = signal.signal(number, ask)
-        except ValueError:  # Only the main thread may.
-            continue
-    try:
-        yield asked
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-class _Bar:
-    """tqdm's progress bar, or nothing."""
-
-    def __init__(self, bar: Any) -> None:
-        self._bar = bar
-
-    def update(self, number: int) -> None:
-        if self._bar is not None:
-            self._bar.update(number)
-
-    def show(self, record: dict[str, float]) -> None:
-        if self._bar is not None and "episode/return" in record:
-            self._bar.set_postfix(episode_return=f"{record['episode/return']:.1f}")
-
-
-@contextmanager
-def _bar(shown: bool, total: int) -> Iterator[_Bar]:
-    if not shown:
-        yield _Bar(None)
-        return
-    from tqdm import tqdm
-
-    with tqdm(total=total, unit="iteration") as bar:
-        yield _Bar(bar)

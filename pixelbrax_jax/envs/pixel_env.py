@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from pixelbrax_jax.choices import check_choice, check_whole
 from pixelbrax_jax.distractors.base import Chain, Distractor
 from pixelbrax_jax.envs import observe
-from pixelbrax_jax.envs.memory import check_fits
+from pixelbrax_jax.memory import check_fits
 from pixelbrax_jax.physics.base import Physics
 from pixelbrax_jax.renderer.base import RENDERERS, render
 from pixelbrax_jax.scene.place import place

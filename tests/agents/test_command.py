@@ -74,13 +74,18 @@ def test_devices_cannot_be_emulated_late(given, told, capsys):
     assert told in capsys.readouterr().err
 
 
-def test_stopped_at_once_it_says_so(monkeypatch, capsys):
+def test_stopped_at_once_it_says_what_is_left(monkeypatch, capsys, tmp_path):
     def stopped(*_, **__):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(command, "run", stopped)
-    assert main(["train", "ppo", *TINY]) == 130
-    assert "what came after the last checkpoint is lost" in capsys.readouterr().err
+    line = ["train", "ppo", *TINY, "--output-dir", str(tmp_path)]
+    assert main(line) == 130
+    assert "stopped at once; there is no checkpoint" in capsys.readouterr().err
+    (tmp_path / "checkpoints" / "64" / "about").mkdir(parents=True)
+    (tmp_path / "checkpoints" / "64" / "about" / "metadata").touch()
+    assert main(line) == 130
+    assert "the checkpoint of 64 steps with --resume latest" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("given", ["--coordinator h:1 --num-processes 2", "--process-id 1"])

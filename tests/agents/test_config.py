@@ -242,6 +242,7 @@ def test_environments_come_with_their_parameters():
     [
         ({"num_evals": 1.5}, "num_evals must be a whole number of at least 0, got 1.5"),
         ({"checkpoint_every": -1}, "checkpoint_every must be a whole number of at least 0, got -1"),
+        ({"checkpoint_minutes": -1}, "checkpoint_minutes must be a number of at least 0, got -1"),
         ({"seed": 2**32 - 1, "seeds": 2}, "seeds must be below 2**32"),
         ({"resume": "last"}, "Did you mean 'latest'"),
     ],

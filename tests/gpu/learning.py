@@ -20,7 +20,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from pixelbrax_jax.agents.command import INTERRUPTED
+SIGNALLED = 128
+"""A run that was stopped exits with this and the signal's number."""
 
 STEPS = {
     "halfcheetah": 25_000_000,
@@ -76,7 +77,7 @@ def main() -> None:
             sys.stdout.write(f"pixelbrax {shlex.join(line)}\n")
             continue
         status = subprocess.Popen([sys.executable, "-m", "pixelbrax_jax.cli", *line]).wait()
-        if status == INTERRUPTED:
+        if status > SIGNALLED:
             sys.exit(status)
         if status:
             sys.stderr.write(f"{name} failed with status {status}\n")
