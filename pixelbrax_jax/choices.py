@@ -14,8 +14,11 @@ import numpy as np
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
 
-_SIMILAR = 0.75
+_SIMILAR = 0.65
 """Likeness, of at most 1, from which a name is suggested in place of an unknown one."""
+
+_SIMILAR_OPTION = 0.75
+"""The same of options, whose names share words such as ``render`` and ``mode``."""
 
 _ELSEWHERE = {
     "batch_size": "num_envs",
@@ -68,7 +71,7 @@ def check_options(given: Iterable[str], allowed: Iterable[str]) -> None:
         if name not in names:
             raise TypeError(
                 f"got an unexpected keyword argument {name!r}; allowed: {', '.join(names)}."
-                + suggest(_ELSEWHERE.get(name, name), names)
+                + suggest(_ELSEWHERE.get(name, name), names, _SIMILAR_OPTION)
             )
 
 
@@ -93,19 +96,20 @@ def checks_options(function: Callable[_P, _T]) -> Callable[_P, _T]:
     return checked
 
 
-def suggest(value: object, names: Iterable[str]) -> str:
+def suggest(value: object, names: Iterable[str], likeness: float = _SIMILAR) -> str:
     """Ask whether a similar name was meant.
 
     Args:
         value: what the user gave.
         names: what there is.
+        likeness: of at most 1, from which a name is similar.
 
     Returns:
         A question with a space before it; empty if no name is similar.
     """
     by_lower = {name.lower(): name for name in names}
     given = str(value).lower()
-    nearest = difflib.get_close_matches(given, by_lower, n=1, cutoff=_SIMILAR)
+    nearest = difflib.get_close_matches(given, by_lower, n=1, cutoff=likeness)
     if not nearest and len(given) > 3:
         parts = [name for name in by_lower if given in name]
         nearest = parts if len(parts) == 1 else []

@@ -21,22 +21,30 @@ OPTIONS = ("action_repeat", "frame_stack", "height", "num_envs", "obs_mode", "re
         ("double", TASKS, "inverted_double_pendulum"),
         ("pendulum", TASKS, None),
         ("2d", TASKS, None),
-        ("heigth", OPTIONS, "height"),
-        ("render_mode", OPTIONS, None),
-        ("autoreset_mode", OPTIONS, None),
-        ("seed", OPTIONS, None),
-        (3, OPTIONS, None),
+        ("mjs", ("generalized", "mjx"), "mjx"),
+        (3, TASKS, None),
     ],
 )
 def test_suggestions(given, names, nearest):
     assert suggest(given, names) == (f" Did you mean {nearest!r}?" if nearest else "")
 
 
+@pytest.mark.parametrize("given", ["render_mode", "autoreset_mode", "seed"])
+def test_far_options_are_not_suggested(given):
+    with pytest.raises(TypeError, match=r"allowed: .*, width\.$"):
+        check_options([given], OPTIONS)
+
+
 @pytest.mark.parametrize(
     ("given", "nearest"),
-    [("frame_skip", "action_repeat"), ("frameskip", "action_repeat"), ("n_envs", "num_envs")],
+    [
+        ("heigth", "height"),
+        ("frame_skip", "action_repeat"),
+        ("frameskip", "action_repeat"),
+        ("n_envs", "num_envs"),
+    ],
 )
-def test_options_under_the_names_of_other_libraries(given, nearest):
+def test_options_that_were_meant(given, nearest):
     # The first words are Python's own, which TorchRL looks for.
     message = rf"^got an unexpected keyword argument '{given}'; allowed: .* mean '{nearest}'\?$"
     with pytest.raises(TypeError, match=message):
