@@ -29,9 +29,11 @@ demo: $(VENV)/.installed-demo ## train a PyTorch agent from pixels; results in r
 # Tests of what needs no torch.
 TORCHLESS := tests/renderer tests/distractors tests/envs tests/physics tests/scene tests/agents \
 	tests/test_choices.py tests/test_compilation.py tests/test_architecture.py
-# One that runs, also if pyenv has it but another is chosen.
-NEWEST_PYTHON ?= $(firstword $(shell for python in python3.13 $(HOME)/.pyenv/versions/3.13*/bin/python; \
-	do $$python -c "" 2>/dev/null && echo $$python; done) python3.13)
+# The first that runs; pyenv may have one that is not chosen.
+find_python = $(firstword $(shell for python in python$(1) $(HOME)/.pyenv/versions/$(1).*/bin/python; \
+	do $$python -c "" 2>/dev/null && echo $$python; done) python$(1))
+NEWEST_PYTHON ?= $(call find_python,3.13)
+OLDEST_PYTHON ?= $(call find_python,3.11)
 SPEED ?= not slow
 
 test: $(VENV)/.installed-dev ## run the tests that take minutes at most
@@ -88,7 +90,7 @@ $(VENV)/.installed-%: $(VENV)/.created pyproject.toml constraints.txt
 
 .venv-oldest/.installed: pyproject.toml tests/oldest_releases.py
 	@echo "Installing PixelBrax with the oldest releases into .venv-oldest ..."
-	@$(PYTHON) -m venv --clear .venv-oldest
+	@$(OLDEST_PYTHON) -m venv --clear .venv-oldest
 	@.venv-oldest/bin/python -m pip install --quiet --disable-pip-version-check packaging
 	@.venv-oldest/bin/python tests/oldest_releases.py > .venv-oldest/constraints.txt
 	@.venv-oldest/bin/python -m pip install --quiet --disable-pip-version-check \

@@ -81,7 +81,7 @@ def as_device(device: torch.device | str) -> torch.device:
         torch.empty(0, device=place)
     # Torch without CUDA raises an AssertionError.
     except (RuntimeError, AssertionError, TypeError) as error:
-        reason = str(error).splitlines()[0]
+        reason = str(error).partition("\n")[0]
         raise ValueError(f"device={device!r} is not there: {reason}.") from error
     return place
 

@@ -51,16 +51,14 @@ def to_numpy(tree: Any) -> Any:
 
 
 class _Memory:
-    """A JAX array's memory, as NumPy's array interface; NumPy itself would make it read-only."""
+    """The memory of a read-only array, offered to NumPy as one that may be written to."""
 
-    def __init__(self, array: jax.Array) -> None:
+    def __init__(self, array: np.ndarray) -> None:
         # NumPy keeps this object, and so the memory, as long as it has a view of it.
-        self._array = array.block_until_ready()
+        self._array = array
         self.__array_interface__ = {
-            "version": 3,
-            "shape": array.shape,
-            "typestr": array.dtype.str,
-            "data": (array.unsafe_buffer_pointer(), False),
+            **array.__array_interface__,
+            "data": (array.ctypes.data, False),
         }
 
 
@@ -68,7 +66,8 @@ def _writable(array: jax.Array) -> np.ndarray:
     (device,) = array.devices()
     if device.platform != "cpu" or not array.size:
         return np.array(array)
-    return np.asarray(_Memory(array))
+    # The interface has no name for types such as bfloat16.
+    return np.asarray(_Memory(np.asarray(array))).view(array.dtype)
 
 
 def _to_jax(tree: Any) -> Any:

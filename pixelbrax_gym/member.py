@@ -21,6 +21,8 @@ class Member:
         render_mode: None or ``"rgb_array"``.
         observation_space: of one environment.
         action_space: of one environment.
+        metadata: of all environments.
+        spec: of all environments; None unless Gymnasium made them.
     """
 
     def __init__(
@@ -41,23 +43,19 @@ class Member:
         self.owner, self.index, self.render_mode = owner, index, owner.render_mode
         self.observation_space, self.action_space = observation_space, action_space
 
+    def __getattr__(self, name: str) -> Any:
+        """Return what all environments share, as long as a member has none of its own."""
+        if name in ("metadata", "spec"):
+            return getattr(self.owner, name, None)
+        raise AttributeError(f"environments have no attribute {name!r}; set_attr makes one.")
+
     @property
     def unwrapped(self) -> Member:
-        """Itself."""
+        """Return the member itself: there is nothing around it."""
         return self
 
-    @property
-    def metadata(self) -> dict[str, Any]:
-        """That of the whole."""
-        return self.owner.metadata
-
-    @property
-    def spec(self) -> Any:
-        """That of the whole; None unless Gymnasium made it."""
-        return getattr(self.owner, "spec", None)
-
     def has_wrapper_attr(self, name: str) -> bool:
-        """Tell whether there is such an attribute, as Gymnasium's environments do."""
+        """Return whether there is such an attribute, as Gymnasium's environments do."""
         return hasattr(self, name)
 
     def get_wrapper_attr(self, name: str) -> Any:

@@ -51,7 +51,10 @@ def reset_mask(options: Mapping[str, Any] | None, num_envs: int) -> np.ndarray |
     check_reset_options(options, ("reset_mask",))
     if not options:
         return None
-    return as_mask("options['reset_mask']", options["reset_mask"], (num_envs,))
+    mask = as_mask("options['reset_mask']", options["reset_mask"], (num_envs,))
+    if not mask.any():
+        raise ValueError("options['reset_mask'] must have at least one True.")
+    return mask
 
 
 def as_mask(what: str, given: Any, shape: tuple[int, ...]) -> np.ndarray:
@@ -64,7 +67,7 @@ def as_mask(what: str, given: Any, shape: tuple[int, ...]) -> np.ndarray:
 
     Raises:
         TypeError: it is no array or tensor of bool.
-        ValueError: it has another shape, or no True.
+        ValueError: it has another shape.
     """
     dtype = str(getattr(given, "dtype", "")).removeprefix("torch.")
     if dtype != "bool":
@@ -73,6 +76,4 @@ def as_mask(what: str, given: Any, shape: tuple[int, ...]) -> np.ndarray:
     mask = np.asarray(given.cpu() if hasattr(given, "cpu") else given)
     if mask.shape != shape:
         raise ValueError(f"{what} must have shape {shape}, got {mask.shape}.")
-    if not mask.any():
-        raise ValueError(f"{what} must have at least one True.")
     return mask

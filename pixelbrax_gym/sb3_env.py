@@ -110,7 +110,7 @@ class PixelBraxSB3VecEnv(VecEnv):
             also_allowed=_OWN_OPTIONS,
         )
         env, num_envs = self._stateful.env, self._stateful.num_envs
-        self._render_size = check_render_size(render_height, render_width, num_envs)
+        self._render_size = check_render_size(render_height, render_width)
         space = observation_space(env.obs_spec)
         space = channels_first_space(space) if channels_first else space
         spaces = (space, action_space(env.action_size))

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 SEEDS = 2**32
-"""Seeds lie below this."""
+"""Number of seeds there are: 0 to one less than this."""
 
 
 def as_seed(seed: Any) -> int:
@@ -56,8 +55,7 @@ def seeds_of(seed: Any, num_envs: int) -> list[int | None]:
     """
     if seed is None:
         return [None] * num_envs
-    is_array = getattr(seed, "ndim", 0) > 0
-    if is_array or (isinstance(seed, Sequence) and not isinstance(seed, str)):
+    if np.ndim(seed):
         if len(seed) != num_envs:
             raise ValueError(f"expected one seed for each of {num_envs}, got {len(seed)}.")
         return [None if s is None else check_seed(s) for s in seed]

@@ -34,9 +34,9 @@ class PixelBraxEnv(gymnasium.Env):
     Time limits: the environment truncates after ``episode_length`` control steps, 1000 unless
     told otherwise, hence after ``episode_length / action_repeat`` calls of ``step``.
     ``max_episode_steps`` counts calls of ``step``, as everywhere in Gymnasium. Given to this
-    class it replaces ``episode_length``; given to ``gymnasium.make`` it becomes Gymnasium's own
-    ``TimeLimit``, and whichever limit is reached first truncates. A longer episode than 1000
-    control steps hence wants ``episode_length``.
+    class it takes the place of the 1000 control steps; given to ``gymnasium.make`` it becomes
+    Gymnasium's own ``TimeLimit``. Whichever limit is reached first truncates. A longer episode
+    than 1000 control steps hence wants ``episode_length``.
 
     Observations are never overwritten, and may be written to: nothing reads them again.
 
@@ -93,7 +93,7 @@ class PixelBraxEnv(gymnasium.Env):
         self.action_space = action_space(env.action_size)
         self.render_mode = render_mode
         self.metadata = {**type(self).metadata, "render_fps": self._stateful.fps}
-        self._render_size = check_render_size(render_height, render_width, 1)
+        self._render_size = check_render_size(render_height, render_width)
         self._spec: EnvSpec | None = None
         self._window: Window | None = None
         if render_mode == "human":
@@ -194,16 +194,15 @@ class PixelBraxEnv(gymnasium.Env):
         return image
 
 
-def check_render_size(height: Any, width: Any, num_envs: int) -> tuple[int, int]:
-    """Return the size of ``render()``.
+def check_render_size(height: Any, width: Any) -> tuple[int, int]:
+    """Return the size of an image that ``render()`` draws.
 
     Raises:
         ValueError: it is not a pair of integers of at least 1.
-        MemoryError: images of all environments would not fit into this machine's memory.
+        MemoryError: an image would not fit into this machine's memory.
     """
     size = check_whole("render_height", height), check_whole("render_width", width)
-    what = f"num_envs={num_envs}, render_height={height}, render_width={width}"
-    check_fits(what, 3 * num_envs * size[0] * size[1])
+    check_fits(f"render_height={height}, render_width={width}", 3 * size[0] * size[1])
     return size
 
 

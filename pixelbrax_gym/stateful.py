@@ -21,6 +21,7 @@ from pixelbrax_gym.seeds import SEEDS, seeds_of
 from pixelbrax_jax import PixelEnv, VectorPixelEnv, registry
 from pixelbrax_jax.choices import check_options, check_whole
 from pixelbrax_jax.compilation import compiler_options
+from pixelbrax_jax.memory import check_fits
 from pixelbrax_jax.types import EnvParams, EnvState
 
 _made: set[Any] = set()
@@ -64,7 +65,8 @@ class StatefulEnv:
             autoreset_mode: as in ``VectorPixelEnv``.
             single: whether outputs lack the leading axis.
             max_episode_steps: time limit in calls of ``step``; None or -1 keeps
-                ``options["episode_length"]``, which counts control steps.
+                ``options["episode_length"]``, which counts control steps. Of two limits the one
+                that is reached first holds.
             also_allowed: option names of the caller, for the message about an unknown one.
 
         Raises:
@@ -205,9 +207,12 @@ class StatefulEnv:
         Raises:
             ResetNeeded: before the first reset.
             ClosedEnvironmentError: after ``close``.
+            MemoryError: the images would not fit into this machine's memory.
             RuntimeError: this process is a fork that cannot run JAX.
         """
         self._check_ready("render")
+        what = f"images of num_envs={self.num_envs}, height={height}, width={width}"
+        check_fits(what, 3 * self.num_envs * height * width)
         return _picture_program(self.env, height, width)(self._state, self.params)
 
     def forget(self) -> None:
@@ -262,26 +267,20 @@ def _picture_program(env: PixelEnv, height: int, width: int) -> Any:
     return jax.jit(jax.vmap(picture, in_axes=(0, None)), compiler_options=compiler_options())
 
 
-def calls_of(episode_length: int, action_repeat: int) -> int:
-    """Return the calls of ``step`` until the time limit in control steps."""
-    return -(-episode_length // action_repeat)
-
-
 def with_time_limit(spec: EnvSpec | None, env: PixelEnv) -> EnvSpec | None:
-    """Return Gymnasium's description of an environment, which tells the time limit too.
+    """Return Gymnasium's description of an environment, with the time limit in it.
 
     Args:
-        spec: what Gymnasium knows of it.
+        spec: what Gymnasium knows of the environment.
         env: what was made.
     """
-    if spec is None or spec.max_episode_steps is not None:
-        return spec
+    if spec is None:
+        return None
     spec = copy.copy(spec)
-    spec.max_episode_steps = calls_of(env.episode_length, env.action_repeat)
-    if "max_episode_steps" not in spec.kwargs:
-        # Calls are whole control steps only by the last one, and an environment made anew from
-        # the spec shall have the same limit.
-        spec.kwargs = {**spec.kwargs, "episode_length": env.episode_length}
+    # Calls of step(), of which the last one may make fewer control steps than the others.
+    spec.max_episode_steps = -(-env.episode_length // env.action_repeat)
+    spec.kwargs = {**spec.kwargs, "episode_length": env.episode_length}
+    spec.kwargs.pop("max_episode_steps", None)
     return spec
 
 
@@ -296,13 +295,9 @@ def _make(
     if max_episode_steps not in (None, -1):
         calls = check_whole("max_episode_steps", max_episode_steps)
         repeat = check_whole("action_repeat", options.get("action_repeat", 1))
-        limit = options.setdefault("episode_length", calls * repeat)
-        if calls_of(check_whole("episode_length", limit), repeat) != calls:
-            raise ValueError(
-                f"max_episode_steps={calls} counts calls of step() and episode_length={limit} "
-                f"control steps, of which each call makes action_repeat={repeat}: they differ; "
-                "give one of them."
-            )
+        limit = check_whole("episode_length", options.get("episode_length", calls * repeat))
+        # Whichever is reached first, as with Gymnasium's own TimeLimit around an environment.
+        options["episode_length"] = min(limit, calls * repeat)
     try:
         known = (task, frozenset(options.items()))
         is_made = known in _made

@@ -20,6 +20,7 @@ except ImportError as missing:
 from pixelbrax_gym.actions import name_rows
 from pixelbrax_gym.dlpack import as_device, default_torch_device, to_torch
 from pixelbrax_gym.fork import check_not_forked
+from pixelbrax_gym.reset_options import as_mask
 from pixelbrax_gym.seeds import SEEDS, spread_seeds
 from pixelbrax_gym.single_env import check_render_size
 from pixelbrax_gym.stateful import StatefulEnv
@@ -100,7 +101,7 @@ class PixelBraxTorchRLEnv(EnvBase):
         self.is_closed = False
         self.infos: dict[str, torch.Tensor] = {}
         self._task, self._stateful, self._num_envs = task, stateful, stateful.num_envs
-        self._render_size = check_render_size(render_height, render_width, self._num_envs)
+        self._render_size = check_render_size(render_height, render_width)
         # Of environments whose next reset shall begin episode 0 of a seed; else None.
         self._seeds: list[int | None] | None = None
         self._is_seeded = False
@@ -228,9 +229,7 @@ class PixelBraxTorchRLEnv(EnvBase):
             self._stateful.close()
 
     def _mask(self, what: str, given: torch.Tensor) -> np.ndarray:
-        if given.dtype != torch.bool:
-            raise TypeError(f"{what} must be a tensor of bool, got {given.dtype}.")
-        return given.reshape(self._num_envs).cpu().numpy()
+        return as_mask(what, given.reshape(self._num_envs), (self._num_envs,))
 
     def __repr__(self) -> str:
         """Name the task, the number of environments and the device."""

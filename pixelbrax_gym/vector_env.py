@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
 
@@ -15,7 +15,7 @@ from gymnasium.vector import AutoresetMode
 from pixelbrax_gym.export import exporter, to_numpy
 from pixelbrax_gym.member import Member, call_members
 from pixelbrax_gym.reset_options import reset_mask
-from pixelbrax_gym.seeds import seeds_of
+from pixelbrax_gym.seeds import check_seed
 from pixelbrax_gym.single_env import check_render_size
 from pixelbrax_gym.spaces import action_space, observation_space
 from pixelbrax_gym.stateful import StatefulEnv, with_time_limit
@@ -138,13 +138,13 @@ class PixelBraxVectorEnv(gymnasium.vector.VectorEnv):
             "render_fps": self._stateful.fps,
             "autoreset_mode": self.autoreset_mode,
         }
-        self._render_size = check_render_size(render_height, render_width, self.num_envs)
+        self._render_size = check_render_size(render_height, render_width)
         self._spec: EnvSpec | None = None
 
     def reset(
         self,
         *,
-        seed: int | Sequence[int | None] | None = None,
+        seed: Any = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Any, dict[str, Any]]:
         """Begins episodes.
@@ -168,11 +168,9 @@ class PixelBraxVectorEnv(gymnasium.vector.VectorEnv):
             RuntimeError: this process is a fork that cannot run JAX.
         """
         mask = reset_mask(options, self.num_envs)
-        seeds = seeds_of(seed, self.num_envs)
         # One seed for all also seeds the generator that Gymnasium's wrappers draw from.
-        is_one = seed is not None and not isinstance(seed, Sequence) and not np.ndim(seed)
-        super().reset(seed=seeds[0] if is_one else None)
-        outputs = self._stateful.reset(seeds, self.np_random, mask)
+        super().reset(seed=None if seed is None or np.ndim(seed) else check_seed(seed))
+        outputs = self._stateful.reset(seed, self.np_random, mask)
         return self._export(outputs["obs"]), self._infos(outputs)
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache, lru_cache, partial
 from os import PathLike
@@ -178,10 +178,12 @@ def make(
 def _check_single(**options: object) -> None:
     """Rejects lists and the like, which could not be looked up among the environments made."""
     for name, value in options.items():
-        if not isinstance(value, Hashable):
+        try:
+            hash(value)
+        except TypeError as error:
             raise TypeError(
                 f"{name} must be a single value, got a {type(value).__name__}: {value!r}."
-            )
+            ) from error
 
 
 def _clips(

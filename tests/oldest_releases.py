@@ -13,7 +13,7 @@ WITHOUT_TORCH = ("train", "clips", "human", "video", "test")
 
 
 def oldest_releases(pyproject: Path) -> list[str]:
-    """A pin for each requirement of the package and of those extras."""
+    """Return a pin for each requirement of the package and of those extras."""
     project = tomllib.loads(pyproject.read_text("utf-8"))["project"]
     extras = project["optional-dependencies"]
     lines = [*project["dependencies"], *(line for name in WITHOUT_TORCH for line in extras[name])]

@@ -163,10 +163,10 @@ class Checkpoints:
         # The manager has left out those that the new one would have replaced.
         with contextlib.suppress(OSError):
             self._manager.reload()
-        # What TensorStore says ends with the system's own words.
-        told = str(error).splitlines()[0].rsplit(": ", 1)[-1]
-        told = getattr(error, "strerror", None) or told
-        return CheckpointError(f"cannot write a checkpoint to {self.folder}: {told}.")
+        # TensorStore's messages end with the system's own words.
+        reason = str(error).partition("\n")[0].rsplit(": ", 1)[-1]
+        reason = getattr(error, "strerror", None) or reason or type(error).__name__
+        return CheckpointError(f"cannot write a checkpoint to {self.folder}: {reason}.")
 
     def restore(self, template: Tree, steps: int | None = None) -> Tree:
         """The state of a checkpoint.
@@ -212,7 +212,7 @@ class Checkpoints:
         try:
             self.wait()
         finally:
-            # What it says of a full disk, `wait` has said.
+            # `wait` has raised what it may raise of a full disk.
             with contextlib.suppress(OSError, ValueError):
                 self._manager.close()
             logging.getLogger("absl").removeFilter(_not_a_traceback)
@@ -383,7 +383,7 @@ def _all_steps(folder: Path) -> list[int]:
 
 
 def _not_a_traceback(record: logging.LogRecord) -> bool:
-    """Return whether a record is no traceback of Orbax, whose errors are told by `Checkpoints`."""
+    """Return whether a record is no traceback of Orbax, whose errors `Checkpoints` raises."""
     return not (record.exc_info and "orbax" in record.pathname)
 
 

@@ -34,9 +34,9 @@ def train(arguments: list[str]) -> int:
         arguments: those behind ``pixelbrax train``.
 
     Returns:
-        The exit status: 0 when all is well, 1 for an error that is told, and for a run that was
-        stopped 128 plus the signal's number, as shells have it: 130 for Ctrl-C, 143 for SIGTERM,
-        129 for SIGHUP.
+        The exit status: 0 when all is well, 1 for an error, which stderr names, and for a run
+        that was stopped 128 plus the signal's number, as shells have it: 130 for Ctrl-C, 143 for
+        SIGTERM, 129 for SIGHUP.
     """
     try:
         return _train(arguments)
@@ -83,7 +83,7 @@ def _train(arguments: list[str]) -> int:
         ImportError,
         jax.errors.JaxRuntimeError,
     ) as error:
-        _tell(f"pixelbrax train: {error}")
+        _write(f"pixelbrax train: {error}")
         return 1
     except KeyboardInterrupt:
         folder = Path(options.output_dir) / "checkpoints" if options else None
@@ -91,13 +91,13 @@ def _train(arguments: list[str]) -> int:
         kept = "there is no checkpoint"
         if latest is not None:
             kept = f"go on from the checkpoint of {latest} steps with --resume latest"
-        _tell(f"pixelbrax train: stopped at once; {kept}")
+        _write(f"pixelbrax train: stopped at once; {kept}")
         return INTERRUPTED
 
 
-def _tell(line: str) -> None:
+def _write(line: str) -> None:
     """Writes a line above the bar, if anybody is left to read it."""
-    with contextlib.suppress(OSError):
+    with contextlib.suppress(OSError, ValueError):
         tqdm.write(line, file=sys.stderr)
 
 
@@ -105,6 +105,8 @@ def _flush(stream: Any) -> None:
     """Empties a stream, or gives up its text: Python would exit with 120 on account of it."""
     try:
         stream.flush()
+    except ValueError:  # It is closed.
+        return
     except OSError:
         with Path(os.devnull).open("wb") as nowhere, contextlib.suppress(OSError):
             os.dup2(nowhere.fileno(), stream.fileno())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import socket
 import struct
 import time
@@ -114,7 +115,7 @@ class _TensorBoard:
         from tensorboardX.proto.event_pb2 import Event, SessionLog
 
         folder.mkdir(parents=True, exist_ok=True)
-        name = f"events.out.tfevents.{int(time.time())}.{socket.gethostname()}"
+        name = f"events.out.tfevents.{int(time.time())}.{socket.gethostname()}.{os.getpid()}"
         self._file = AppendedFile(folder / name)
         self.close = self._file.close
         # TensorBoard forgets what an earlier attempt wrote beyond this step.
@@ -164,7 +165,7 @@ class _Output:
     """A place that records are written to.
 
     Attributes:
-        name: as people are told.
+        name: as messages have it.
         writer: has ``write`` and ``close``, which may raise.
         retries: whether ``write`` keeps what it could not write, and tries again the next time.
         failure: why records are missing; empty while none is.
@@ -181,7 +182,7 @@ class _Output:
 class MetricsWriter:
     """Writes records to ``metrics.jsonl`` and TensorBoard, and to Weights & Biases if asked.
 
-    Once it is open none of them can raise: what fails is told, once, and the others go on.
+    Once it is open none of them can raise: what fails is reported, once, and the others go on.
 
     The settings are written to ``config.json``, for people and scripts; nothing reads it back.
 
@@ -206,7 +207,7 @@ class MetricsWriter:
             first_step: control steps at which the run goes on; later records of an earlier
                 attempt are dropped, for they will be written again.
             wandb_project: project of Weights & Biases; None writes nothing there.
-            report: is told what cannot be written.
+            report: gets a line about what cannot be written.
 
         Raises:
             ImportError: a project is given, but wandb is not installed.

@@ -45,7 +45,7 @@ class Bar:
         Args:
             shown: whether there is one.
             total: number of iterations.
-            report: is told once if the bar fails.
+            report: gets a line if the bar fails.
         """
         self._bar: Any = None
         self._report = report

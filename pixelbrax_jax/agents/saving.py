@@ -17,7 +17,7 @@ _RETRY_MINUTES = 1.0
 class Saver:
     """Writes the checkpoints of a run.
 
-    One that cannot be written is told and tried again, and training goes on; but for the last
+    One that cannot be written is reported and tried again, and training goes on; but for the last
     one, which is an error.
     """
 
@@ -35,7 +35,7 @@ class Saver:
         Args:
             checkpoints: of the run.
             steps: control steps at which it goes on.
-            report: is told of checkpoints that cannot be written.
+            report: gets a line about checkpoints that cannot be written.
             every: control steps between checkpoints; 0 does not count them.
             minutes: between checkpoints; 0 goes by no clock.
         """
@@ -79,7 +79,7 @@ class Saver:
                 kept = "there is no other" if latest is None else f"that of {latest} steps stays"
                 raise CheckpointError(
                     f"the checkpoint of {steps} steps, the last one, is lost; {kept}. {error} "
-                    "See to it, and go on with --resume latest."
+                    "Make room or mend the folder, and go on with --resume latest."
                 ) from error
             self._fail(error)
 

@@ -45,8 +45,8 @@ def batch_last(fn: Callable[..., Any], in_axes: Sequence[int | None]) -> Callabl
     More than a few rows are padded by copies of the last one, whose side effects happen too.
 
     The parameters of JAX's primitives, which are read here, are not public. With a release whose
-    parameters are others, all of ``fn`` is computed by ``jax.vmap``, and a RuntimeWarning says so
-    once.
+    parameters are others, all of ``fn`` is computed by ``jax.vmap``, with a RuntimeWarning once in
+    a process. Side effects, such as those of ``jax.debug.print``, may happen twice then.
 
     Args:
         fn: a function of trees of arrays, of one row.
@@ -380,7 +380,7 @@ def _scan(eqn: core.JaxprEqn, inputs: list[_Operand], size: int) -> list[_Operan
 
 
 def _scan_sizes(params: Mapping[str, Any]) -> tuple[int, int]:
-    """How many of a scan's operands are constants, and how many are carried."""
+    """Return how many of a scan's operands are constants, and how many are carried."""
     if "num_carry" in params:
         return params["num_consts"], params["num_carry"]
     # From jax 0.12 on: operands in groups.

@@ -110,7 +110,7 @@ class PixelEnv:
         return both if self.obs_mode == "both" else both[self.obs_mode]
 
     def check_memory(self, num_envs: int) -> None:
-        """Reject sizes that cannot fit into the memory of any device here.
+        """Reject sizes that cannot fit into this machine's main memory.
 
         Args:
             num_envs: how many environments are stepped together.

@@ -47,6 +47,7 @@ def test_options(kind, options, message):
         ),
         ({"rendermode": 3}, r"Did you mean 'render_mode'\?"),
         ({"frame_skip": 3}, r"Did you mean 'action_repeat'\?"),
+        ({"backend": ("a", ["b"])}, r"backend must be a single value, got a tuple"),
         ({"backend": ["spring"]}, r"backend must be a single value, got a list: \['spring'\]"),
         ({"height": [84]}, "height must be a single value"),
         ({"split": {"train"}}, "split must be a single value"),
@@ -72,12 +73,22 @@ def test_task():
         ({"num_envs": 2**40, "obs_mode": "state"}, "num_envs=1099511627776 would take"),
         ({"height": 10**6, "width": 10**6}, "num_envs=1, height=1000000, width=1000000"),
         ({"frame_stack": 10**10}, "frame_stack=10000000000 would take at least"),
-        ({"render_height": 10**6, "render_width": 10**6}, "render_height=1000000.*lower one"),
+        ({"render_height": 10**6, "render_width": 10**6}, r"render_height=1000000.*lower one"),
     ],
 )
 def test_sizes_that_cannot_fit(options, message):
     with pytest.raises(MemoryError, match=message):
         PixelBraxVectorEnv(TASK, **options)
+
+
+def test_images_that_cannot_fit(make_vector):
+    # Many environments are fine as long as nobody draws all of them.
+    PixelBraxVectorEnv(TASK, 100_000, obs_mode="state", render_mode="rgb_array")
+    size = {"render_height": 60_000, "render_width": 60_000}
+    env = make_vector(obs_mode="state", render_mode="rgb_array", **size)
+    env.reset(seed=0)
+    with pytest.raises(MemoryError, match=r"images of num_envs=3, height=60000, width=60000"):
+        env.render()
 
 
 def test_mistyped_clips():
@@ -221,6 +232,7 @@ def test_first_reset_must_be_whole(make_vector):
         (2**32 - 1, ValueError, "seed=4294967295 would give 3 .* give at most 4294967293"),
         ([1, 2], ValueError, "one seed for each of 3, got 2"),
         ([1, 2, -3], ValueError, r"\[0, 2\*\*32\), got -3"),
+        (b"abc", TypeError, "an integer, got b'abc'"),
         ([1, 2, 0.5], TypeError, "an integer, got 0.5"),
         (0.5, TypeError, "an integer, got 0.5"),
         (True, TypeError, "an integer, got True"),

@@ -121,11 +121,32 @@ def test_minus_one_keeps_the_time_limit_of_the_environment():
     assert steps_until_truncated(gymnasium.make_vec(ID, num_envs=2, **options)) == 6
 
 
-def test_two_time_limits_must_agree():
-    with pytest.raises(ValueError, match="they differ; give one of them"):
-        pixelbrax_gym.PixelBraxEnv(TASK, max_episode_steps=3, episode_length=6)
-    options = {"obs_mode": "state", "episode_length": 5, "action_repeat": 2}
-    assert steps_until_truncated(gymnasium.make_vec(ID, 2, max_episode_steps=3, **options)) == 3
+@pytest.mark.parametrize(("calls", "length", "expected"), [(3, 9, 3), (7, 9, 5), (5, 9, 5)])
+def test_of_two_time_limits_the_first_one_holds(calls, length, expected):
+    options = {"obs_mode": "state", "action_repeat": 2}
+    options |= {"max_episode_steps": calls, "episode_length": length}
+    assert steps_until_truncated(gymnasium.make(ID, **options)) == expected
+    assert steps_until_truncated(gymnasium.make_vec(ID, num_envs=2, **options)) == expected
+
+
+@pytest.mark.parametrize(
+    ("first", "changes", "expected"),
+    [
+        ({"max_episode_steps": 3}, {}, 3),
+        ({}, {"max_episode_steps": 5}, 5),
+        ({}, {"episode_length": 5}, 5),
+        ({"episode_length": 8}, {"action_repeat": 3}, 3),
+        ({"max_episode_steps": 8, "action_repeat": 3}, {"max_episode_steps": 2}, 2),
+    ],
+)
+@pytest.mark.parametrize("make", [gymnasium.make, gymnasium.make_vec])
+def test_time_limits_of_environments_made_from_a_spec(make, first, changes, expected):
+    spec = make(ID, obs_mode="state", **first).spec
+    remade = gymnasium.make_vec(spec, num_envs=2, **changes)
+    assert steps_until_truncated(remade) == expected
+    assert remade.spec.max_episode_steps == expected
+    if make is gymnasium.make:
+        assert steps_until_truncated(gymnasium.make(spec, **changes)) == expected
 
 
 @pytest.mark.parametrize(
@@ -140,7 +161,7 @@ def test_specs_tell_the_time_limit(options, expected):
     ):
         assert env.spec.max_episode_steps == expected
         again = remake(env.spec)
-        assert again.spec.max_episode_steps == expected
+        assert again.spec == env.spec
         limit = again.unwrapped._stateful.env.episode_length
         assert limit == env.unwrapped._stateful.env.episode_length
 

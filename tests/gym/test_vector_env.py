@@ -12,6 +12,7 @@ import torch
 from gymnasium.vector import AutoresetMode
 
 from pixelbrax_gym import PixelBraxEnv, PixelBraxVectorEnv, check_vector_env
+from pixelbrax_gym.export import to_numpy
 from tests.gym.conftest import SIZE, TASK
 from tests.gym.test_registration import TASKS
 
@@ -221,8 +222,21 @@ def test_members_are_addressed_as_in_gymnasium(make_vector):
     assert env.get_attr("name") == ("all",) * 3
     with pytest.raises(ValueError, match="one value for each of 3, got 2"):
         env.set_attr("level", [1, 2])
-    with pytest.raises(AttributeError, match="nothing"):
+    env.set_attr("metadata", {"mine": 1})
+    assert env.get_attr("metadata") == ({"mine": 1},) * 3
+    with pytest.raises(AttributeError, match="no attribute 'nothing'; set_attr makes one"):
         env.call("nothing")
+
+
+@pytest.mark.parametrize("dtype", ["float32", "bfloat16", "bool", "uint8", "int32"])
+def test_arrays_are_handed_out_as_they_are(dtype):
+    given = jax.numpy.arange(6).reshape(2, 3).astype(dtype)
+    expected = np.array(given)
+    (array,) = to_numpy([given])
+    assert array.dtype == given.dtype
+    np.testing.assert_array_equal(array, expected)
+    array[0, 0] = 1
+    assert to_numpy(given[:0]).shape == (0, 3)
 
 
 @pytest.mark.parametrize("mode", MODES)
