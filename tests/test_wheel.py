@@ -93,7 +93,7 @@ def test_the_metadata_says_what_a_user_needs(wheel):
     assert metadata["Requires-Python"] == ">=3.11"
     extras = {"torch", "torchrl", "sb3", "clips", "human", "video", "demo", "train"}
     extras |= {"cuda12", "cuda13"}
-    extras |= {"all", "dev", "docs"}
+    extras |= {"all", "test", "dev", "docs"}
     assert set(metadata.get_all("Provides-Extra")) == extras
     # What is heavy or needs a display is never installed unasked.
     core = [line for line in metadata.get_all("Requires-Dist") if "extra ==" not in line]

@@ -255,23 +255,24 @@ def test_a_checkpoint_that_fails_while_it_is_written_leaves_the_others(tmp_path,
 
 
 def test_only_a_second_ctrl_c_stops_at_once(monkeypatch):
-    now, told = [100.0], []
+    now, lines = [100.0], []
+    before = signal.getsignal(signal.SIGINT)
     monkeypatch.setattr(interruption, "time", SimpleNamespace(monotonic=lambda: now[0]))
-    with interruption.stop_requests(told.append) as request:
+    with interruption.stop_requests(lines.append) as request:
         assert not request.signal
         for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGTERM, signal.SIGINT):
             signal.raise_signal(number)
             now[0] += 5
         assert request.signal == signal.SIGTERM, "the first one"
-        assert len(told) == 1
+        assert len(lines) == 1
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
-    with interruption.stop_requests(told.append):
+    with interruption.stop_requests(lines.append):
         # One key press that a wrapper passes on again.
         for _ in range(2):
             signal.raise_signal(signal.SIGINT)
             now[0] += 0.1
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_messages_go_to_who_can_read_them():
