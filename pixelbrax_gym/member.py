@@ -8,6 +8,8 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from pixelbrax_jax.choices import suggest
+
 
 class Member:
     """Stands for one environment of a ``PixelBraxVectorEnv`` or ``PixelBraxSB3VecEnv``.
@@ -47,7 +49,8 @@ class Member:
         """Return what all environments share, as long as a member has none of its own."""
         if name in ("metadata", "spec"):
             return getattr(self.owner, name, None)
-        raise AttributeError(f"environments have no attribute {name!r}; set_attr makes one.")
+        names = [known for known in dir(type(self)) if not known.startswith("_")]
+        raise AttributeError(f"environments have no attribute {name!r}.{suggest(name, names)}")
 
     @property
     def unwrapped(self) -> Member:

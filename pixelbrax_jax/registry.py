@@ -165,6 +165,11 @@ def make(
     bank = _clips(clips, split, env.height, env.width, videos[0].num_clips) if videos else None
     if clips is not None and not videos and env.obs_mode != "state":
         raise ValueError("clips are given, but no video is: add 'video' to the distractors.")
+    if split != "train" and not links:
+        raise ValueError(
+            f"split={split!r} is given, but no distractor is: add one that has splits, such as "
+            "'video', to the distractors."
+        )
     rig = make_rig(task, camera, _fallback_rig(task))
     if not rig.link < len(env.physics.link_names):
         raise ValueError(

@@ -27,6 +27,7 @@ ACTIONS = np.array([[-0.2], [0.9], [1.0]], np.float32)
         ({"obs_mode": "pixel"}, r"Did you mean 'pixels'\?"),
         ({"camera": "nowhere"}, "camera"),
         ({"look": "nice"}, "unknown look"),
+        ({"split": "test"}, "split='test' is given, but no distractor is: add"),
         ({"backend": "mjx"}, "registered with its own physics"),
         ({"max_episode_steps": 0}, "max_episode_steps must be a whole number of at least 1"),
         ({"max_episode_steps": -2}, "max_episode_steps must be a whole number of at least 1"),
