@@ -135,9 +135,10 @@ class PixelBraxSB3VecEnv(VecEnv):
             ClosedEnvironmentError: after ``close``.
             RuntimeError: this process is a fork that cannot run JAX.
         """
-        for options in self._options:
-            # What is refused must not be refused again at the next reset.
-            self._reset_options()
+        given = self._options
+        # What is refused must not be refused again at the next reset.
+        self._reset_options()
+        for options in given:
             check_reset_options(options)
         outputs = self._stateful.reset(self._seeds)
         if self._head_starts is not None:
