@@ -78,7 +78,7 @@ def play(task: str, links: tuple, states: Any) -> np.ndarray:
 
         def step(distraction, state):
             later = chain.advance(distraction, key, state.step_count + 1, params)
-            return later, env.picture(state.replace(distraction=distraction), params)
+            return later, env.image(state.replace(distraction=distraction), params)
 
         return jax.lax.scan(step, chain.begin(key, params), states)[1]
 

@@ -39,7 +39,7 @@ def strip(task: str, num_steps: int) -> np.ndarray:
         ("original", False, SIZE),
     ):
         dressed = params.replace(look=pixelbrax_jax.make_look(look, shadows=shadows))
-        pixels = np.asarray(env.picture(state, dressed, size, size))
+        pixels = np.asarray(env.image(state, dressed, size, size))
         pictures.append(pixels.repeat(SIZE // size, axis=0).repeat(SIZE // size, axis=1))
     gap = np.full((SIZE, GAP, 3), 255, np.uint8)
     return np.concatenate([pictures[0], gap, pictures[1], gap, pictures[2]], axis=1)

@@ -1,4 +1,4 @@
-"""Whether JAX and PyTorch work together on this machine, in plain words and with cures."""
+"""Whether JAX and PyTorch work together on this machine, in plain words and with fixes."""
 
 from __future__ import annotations
 
@@ -63,18 +63,18 @@ class Finding:
     """One line of the report.
 
     Attributes:
-        level: ``"ok"``, ``"note"`` (works, but could be better) or ``"trouble"``.
+        level: ``"ok"``, ``"note"`` (works, but could be better) or ``"problem"``.
         text: what was found.
-        cure: what to do, where there is something to do.
+        fix: what to do, where there is something to do.
     """
 
     level: str
     text: str
-    cure: str = ""
+    fix: str = ""
 
 
 def inspect() -> Machine:
-    """Looks at this machine. Starts JAX; takes a second or two."""
+    """Look at this machine. Starts JAX; takes a second or two."""
     versions = {name: _version(name) for name in (*_PACKAGES, *_OPTIONAL)}
     device = jax_platform = jax_error = None
     try:
@@ -107,7 +107,7 @@ def inspect() -> Machine:
 
 
 def diagnose(machine: Machine) -> list[Finding]:
-    """What the facts mean.
+    """Return what the facts mean.
 
     Args:
         machine: the facts.
@@ -125,16 +125,16 @@ def diagnose(machine: Machine) -> list[Finding]:
 
 
 def report(findings: list[Finding]) -> str:
-    """The findings as text for a terminal."""
+    """Return the findings as text for a terminal."""
     lines = []
     for finding in findings:
         lines.append(f"{finding.level:>8}  {finding.text}")
-        if finding.cure:
-            lines.append(f"{'':>8}  -> {finding.cure}")
-    troubles = sum(finding.level == "trouble" for finding in findings)
+        if finding.fix:
+            lines.append(f"{'':>8}  -> {finding.fix}")
+    problems = sum(finding.level == "problem" for finding in findings)
     lines.append("")
     lines.append(
-        f"{troubles} trouble{'s' if troubles > 1 else ''} found." if troubles else "All is well."
+        f"{problems} problem{'s' if problems > 1 else ''} found." if problems else "All is well."
     )
     return "\n".join(lines)
 
@@ -144,14 +144,14 @@ def _about_packages(machine: Machine) -> Iterator[Finding]:
     yield Finding("ok", f"Python {platform.python_version()}, {here}")
     for name, extra in _OPTIONAL.items():
         if machine.versions[name] is None:
-            cure = f"{install_extra(extra)}, should you want it"
-            yield Finding("note", f"{name} is not installed", cure)
+            fix = f"{install_extra(extra)}, should you want it"
+            yield Finding("note", f"{name} is not installed", fix)
 
 
 def _about_devices(machine: Machine) -> Iterator[Finding]:
     if machine.jax_error is not None:
         yield Finding(
-            "trouble",
+            "problem",
             f"JAX finds no device to compute on: {machine.jax_error}",
             "unset JAX_PLATFORMS, or install the jax release that goes with your driver: "
             + _JAX_ON_CUDA,
@@ -161,7 +161,7 @@ def _about_devices(machine: Machine) -> Iterator[Finding]:
     on_cpu = machine.jax_platform == "cpu"
     if on_cpu and machine.has_nvidia:
         yield Finding(
-            "trouble",
+            "problem",
             "there is an NVIDIA GPU, but JAX does not use it",
             f"{_JAX_ON_CUDA}, as nvidia-smi tells the CUDA version; unset JAX_PLATFORMS; and "
             "import jax before torch, whose CUDA libraries may hide JAX's",
@@ -171,7 +171,7 @@ def _about_devices(machine: Machine) -> Iterator[Finding]:
     on_gpu = machine.jax_platform in _GPUS
     if isinstance(machine.torch_cuda, str):
         yield Finding(
-            "trouble",
+            "problem",
             f"torch is installed and cannot be imported: {machine.torch_cuda}",
             "install it again, see https://pytorch.org/get-started/locally",
         )
@@ -183,13 +183,13 @@ def _about_devices(machine: Machine) -> Iterator[Finding]:
         )
     elif on_cpu and machine.torch_cuda:
         yield Finding(
-            "trouble",
+            "problem",
             "torch uses CUDA and JAX the CPU: frames are drawn slowly and must be copied",
             _JAX_ON_CUDA,
         )
     elif on_gpu and not machine.torch_cuda:
         yield Finding(
-            "trouble",
+            "problem",
             "JAX uses the GPU and torch cannot: output='torch' will not work",
             "install a torch built for CUDA, see https://pytorch.org/get-started/locally",
         )
@@ -203,13 +203,13 @@ def _about_sharing(machine: Machine) -> Iterator[Finding]:
             yield Finding("ok", f"arrays cross from {way} without a copy")
         elif result is False:
             yield Finding(
-                "trouble",
+                "problem",
                 f"arrays are copied on their way from {way}",
                 "use a current torch and jax; the releases in constraints.txt do not copy",
             )
         elif result is not None:
             yield Finding(
-                "trouble",
+                "problem",
                 f"arrays do not cross from {way}: {result}",
                 "mend the devices first; else use output='numpy'",
             )
@@ -219,7 +219,7 @@ def _about_memory(machine: Machine) -> Iterator[Finding]:
     environ = machine.environ
     if _FRACTION in environ and _OLD_FRACTION in environ:
         yield Finding(
-            "trouble",
+            "problem",
             f"{_FRACTION} and {_OLD_FRACTION} are both set, which JAX refuses",
             f"unset {_OLD_FRACTION}",
         )
@@ -245,12 +245,12 @@ def _about_memory(machine: Machine) -> Iterator[Finding]:
 
 def _about_gl(machine: Machine) -> Iterator[Finding]:
     if machine.gl_libraries is None:
-        yield Finding("ok", "pictures need no OpenGL and no display")
+        yield Finding("ok", "images need no OpenGL and no display")
     elif machine.gl_libraries:
         names = ", ".join(machine.gl_libraries)
-        yield Finding("note", f"pictures need no OpenGL, though something else has loaded {names}")
+        yield Finding("note", f"images need no OpenGL, though something else has loaded {names}")
     else:
-        yield Finding("ok", "pictures need no OpenGL and no display, and none is loaded")
+        yield Finding("ok", "images need no OpenGL and no display, and none is loaded")
 
 
 def _version(package: str) -> str | None:
@@ -277,7 +277,7 @@ def _shares_to_torch() -> bool:
     import jax
     import jax.numpy as jnp
 
-    from pixelbrax_gym.dlpack import to_torch
+    from pixelbrax_gym.interop.dlpack import to_torch
 
     frames = jax.block_until_ready(jnp.zeros((2, 8, 8, 3), jnp.uint8))
     return bool(to_torch(frames).data_ptr() == frames.unsafe_buffer_pointer())
@@ -287,7 +287,7 @@ def _shares_to_jax() -> bool:
     import jax
     import torch
 
-    from pixelbrax_gym.dlpack import default_torch_device
+    from pixelbrax_gym.interop.dlpack import default_torch_device
 
     # Larger than any alignment asks for, as an allocator aligns what is large.
     tensor = torch.zeros(1 << 16, device=default_torch_device())
@@ -296,7 +296,7 @@ def _shares_to_jax() -> bool:
 
 
 def _gl_libraries() -> tuple[str, ...] | None:
-    """OpenGL libraries in this process, after all that draws a frame has been imported."""
+    """Return the OpenGL libraries in this process, after all that draws a frame was imported."""
     try:
         import pixelbrax_jax  # noqa: F401
     except Exception:  # told of elsewhere

@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from pixelbrax_jax.choices import suggest
+from pixelbrax_jax.validation import suggest
 
 
 class Member:

@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING
 
 import jax
 
-from pixelbrax_gym.dlpack import to_torch  # Where torch is missing, it tells the cure.
+from pixelbrax_gym.interop.dlpack import (
+    to_torch,
+)  # Where torch is missing, its message has the fix.
 from pixelbrax_jax.policy import load_policy
 
 if TYPE_CHECKING:
@@ -25,7 +27,7 @@ class TorchPolicy:
     """
 
     def __init__(self, path: str | Path) -> None:
-        """Loads the file.
+        """Load the file.
 
         Args:
             path: of the file that ``pixelbrax train`` wrote.
@@ -33,12 +35,12 @@ class TorchPolicy:
         Raises:
             FileNotFoundError: there is no such file.
             ValueError: it is no policy.
-            ImportError: what reads it is not installed, with the cure.
+            ImportError: what reads it is not installed, with the fix.
         """
         self._act = load_policy(path)
 
     def __call__(self, pixels: torch.Tensor) -> torch.Tensor:
-        """The mean actions of observations.
+        """Return the mean actions of observations.
 
         Args:
             pixels: (B, H, W, 3 K) uint8, oldest frame first, as environments give them.

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from pixelbrax_jax.choices import check_choice
+from pixelbrax_jax.validation import check_choice
 
 
 def check_reset_options(options: Any, allowed: tuple[str, ...] = ()) -> None:

@@ -1,11 +1,10 @@
-"""An environment that keeps its state: what every door to PyTorch is built on."""
+"""An environment that keeps its state: what every adapter is built on."""
 
 from __future__ import annotations
 
 import copy
-import inspect
+from collections import deque
 from collections.abc import Mapping, Sequence
-from functools import cache
 from typing import Any
 
 import jax
@@ -14,18 +13,18 @@ import numpy as np
 from gymnasium import error
 from gymnasium.envs.registration import EnvSpec
 
-from pixelbrax_gym.actions import as_actions, name_rows
-from pixelbrax_gym.fork import check_not_forked, is_forked
-from pixelbrax_gym.programs import Programs
+from pixelbrax_gym.interop.actions import as_actions, name_rows
+from pixelbrax_gym.interop.fork import check_not_forked, is_forked
+from pixelbrax_gym.programs import Programs, draw_images
 from pixelbrax_gym.seeds import SEEDS, seeds_of
-from pixelbrax_jax import PixelEnv, VectorPixelEnv, registry
-from pixelbrax_jax.choices import check_options, check_whole
-from pixelbrax_jax.compilation import compiler_options
+from pixelbrax_jax import EnvConfig, PixelEnv, VectorPixelEnv, make
+from pixelbrax_jax.config import env_config
 from pixelbrax_jax.memory import check_fits
 from pixelbrax_jax.types import EnvParams, EnvState
+from pixelbrax_jax.validation import check_positive_int
 
-_made: set[Any] = set()
-"""Options of the environments that exist, so that forks of this process can name them."""
+_made: deque[EnvConfig] = deque(maxlen=64)
+"""Options of the latest environments, so that forks of this process can name them."""
 
 
 class StatefulEnv:
@@ -43,6 +42,7 @@ class StatefulEnv:
         params: its parameters.
         num_envs: N.
         single: whether outputs lack the leading axis; N is then 1.
+        episode_length: time limit in control steps.
     """
 
     def __init__(
@@ -56,11 +56,11 @@ class StatefulEnv:
         max_episode_steps: int | None = None,
         also_allowed: Sequence[str] = (),
     ) -> None:
-        """Builds the environment; nothing is compiled yet.
+        """Build the environment; nothing is compiled yet.
 
         Args:
             task: one of ``pixelbrax_jax.list_envs()``.
-            options: of ``pixelbrax_jax.make``.
+            options: fields of ``pixelbrax_jax.EnvConfig``.
             num_envs: N.
             autoreset_mode: as in ``VectorPixelEnv``.
             single: whether outputs lack the leading axis.
@@ -75,10 +75,14 @@ class StatefulEnv:
             MemoryError: observations would not fit into this machine's memory.
             RuntimeError: this process is a fork that cannot run JAX.
         """
-        self.env, self.params = _make(task, dict(options), max_episode_steps, also_allowed)
-        # Before the cache is asked, to which True is as good as 1.
-        self.num_envs, self.single = check_whole("num_envs", num_envs), single
-        self._programs = _programs(self.env, self.num_envs, autoreset_mode, single)
+        config = env_config(task, options, also_allowed)
+        if max_episode_steps not in (None, -1):
+            config = _limited(config, max_episode_steps, "episode_length" in options)
+        self.env, self.params = _make(config)
+        vector = VectorPixelEnv(self.env, num_envs, autoreset_mode)
+        self.num_envs, self.single = vector.num_envs, single
+        self.episode_length = config.episode_length
+        self._programs = Programs(vector, single)
         self._must_reset = autoreset_mode == "disabled"
         self._state: EnvState | None = None
         self._done: jax.Array | None = None
@@ -96,14 +100,14 @@ class StatefulEnv:
         rng: np.random.Generator | None = None,
         mask: np.ndarray | None = None,
     ) -> dict[str, Any]:
-        """Begins episodes.
+        """Reset environments.
 
         Args:
             seed: s seeds environment i with s + i; a sequence has one seed for each. A seeded
-                environment begins its episode 0. None begins the next episode of an
+                environment is reset to its episode 0. None goes on to the next episode of an
                 environment, or draws a seed if there was none yet.
             rng: where seeds are drawn from; by default from the operating system.
-            mask: (N,) bool, where to begin; None means everywhere.
+            mask: (N,) bool, which ones to reset; None means all.
 
         Returns:
             Outputs with reward 0; unmasked environments repeat their observation and flags.
@@ -132,6 +136,7 @@ class StatefulEnv:
         if given.all():
             self._state, outputs = self._programs.reset(numbers, self.params)
         else:
+            assert self._state is not None
             # One call unless some environments are seeded and others are not.
             if (where & ~given).any() or not given.any():
                 self._state, outputs = self._programs.reset_where(
@@ -146,7 +151,7 @@ class StatefulEnv:
         return outputs
 
     def step(self, action: Any, mask: np.ndarray | None = None) -> dict[str, Any]:
-        """Steps all environments, or some.
+        """Step all environments, or some.
 
         Args:
             action: (N, A) or, of a single environment, (A,); see ``as_actions``.
@@ -158,8 +163,7 @@ class StatefulEnv:
             False; the rest of theirs means nothing.
 
         Raises:
-            ResetNeeded: before the first reset; or an episode has ended and does not begin anew
-                by itself.
+            ResetNeeded: before the first reset; or an episode has ended and autoreset is disabled.
             ClosedEnvironmentError: after ``close``.
             RuntimeError: this process is a fork that cannot run JAX.
             TypeError: the action is not floating point.
@@ -179,8 +183,8 @@ class StatefulEnv:
         self._done = outputs["done"]
         return outputs
 
-    def shorten(self, control_steps: np.ndarray) -> None:
-        """Brings the time limit of the present episodes nearer.
+    def offset_time_limits(self, control_steps: np.ndarray) -> None:
+        """Let the time limits of the present episodes come early.
 
         Args:
             control_steps: (N,) int, by how much, at least 0 and less than the limit.
@@ -190,12 +194,13 @@ class StatefulEnv:
             ClosedEnvironmentError: after ``close``.
             RuntimeError: this process is a fork that cannot run JAX.
         """
-        self._check_ready("shorten")
+        self._check_ready("offset_time_limits")
         assert self._state is not None
-        self._state = self._state.replace(head_start=jnp.asarray(control_steps, jnp.int32))
+        offset = jnp.asarray(control_steps, jnp.int32)
+        self._state = self._state.replace(sim=self._state.sim.replace(time_limit_offset=offset))
 
     def render(self, height: int, width: int) -> jax.Array:
-        """Pictures of the present states, at any size.
+        """Draw the present states, at any size.
 
         Args:
             height: pixels.
@@ -213,7 +218,8 @@ class StatefulEnv:
         self._check_ready("render")
         what = f"images of num_envs={self.num_envs}, height={height}, width={width}"
         check_fits(what, 3 * self.num_envs * height * width)
-        return _picture_program(self.env, height, width)(self._state, self.params)
+        assert self._state is not None
+        return draw_images(self.env, self._state, self.params, height, width)
 
     def forget(self) -> None:
         """Let go of the states; a ``reset`` comes next."""
@@ -254,61 +260,45 @@ class StatefulEnv:
         )
 
 
-@cache
-def _programs(env: PixelEnv, num_envs: int, autoreset_mode: str, single: bool) -> Programs:
-    return Programs(VectorPixelEnv(env, num_envs, autoreset_mode), single)
-
-
-@cache
-def _picture_program(env: PixelEnv, height: int, width: int) -> Any:
-    def picture(state: EnvState, params: EnvParams) -> jax.Array:
-        return env.picture(state, params, height, width)
-
-    return jax.jit(jax.vmap(picture, in_axes=(0, None)), compiler_options=compiler_options())
-
-
-def with_time_limit(spec: EnvSpec | None, env: PixelEnv) -> EnvSpec | None:
+def with_time_limit(spec: EnvSpec | None, stateful: StatefulEnv) -> EnvSpec | None:
     """Return Gymnasium's description of an environment, with the time limit in it.
 
     Args:
         spec: what Gymnasium knows of the environment.
-        env: what was made.
+        stateful: what was made.
     """
     if spec is None:
         return None
-    spec = copy.copy(spec)
+    spec, limit = copy.copy(spec), stateful.episode_length
     # Calls of step(), of which the last one may make fewer control steps than the others.
-    spec.max_episode_steps = -(-env.episode_length // env.action_repeat)
-    spec.kwargs = {**spec.kwargs, "episode_length": env.episode_length}
+    spec.max_episode_steps = -(-limit // stateful.env.action_repeat)
+    spec.kwargs = {**spec.kwargs, "episode_length": limit}
     spec.kwargs.pop("max_episode_steps", None)
     return spec
 
 
-def _make(
-    task: str,
-    options: dict[str, Any],
-    max_episode_steps: int | None,
-    also_allowed: Sequence[str],
-) -> tuple[PixelEnv, EnvParams]:
-    allowed = list(inspect.signature(registry.make).parameters)[1:]
-    check_options(options, [*allowed, *also_allowed])
-    if max_episode_steps not in (None, -1):
-        calls = check_whole("max_episode_steps", max_episode_steps)
-        repeat = check_whole("action_repeat", options.get("action_repeat", 1))
-        limit = check_whole("episode_length", options.get("episode_length", calls * repeat))
-        # Whichever is reached first, as with Gymnasium's own TimeLimit around an environment.
-        options["episode_length"] = min(limit, calls * repeat)
-    try:
-        known = (task, frozenset(options.items()))
-        is_made = known in _made
-    except TypeError:  # an option that is an array
-        known, is_made = None, False
-    if is_forked() and not is_made:
+def _limited(config: EnvConfig, max_episode_steps: Any, is_limited: bool) -> EnvConfig:
+    """Return options whose time limit is no longer than so many calls of ``step``."""
+    limit = check_positive_int("max_episode_steps", max_episode_steps) * config.action_repeat
+    # Whichever is reached first, as with Gymnasium's own TimeLimit around an environment.
+    limit = min(limit, config.episode_length) if is_limited else limit
+    return env_config(config, {"episode_length": limit})
+
+
+def _make(config: EnvConfig) -> tuple[PixelEnv, EnvParams]:
+    if is_forked() and not _is_made(config):
         check_not_forked()
     # What exists can be named in a fork without starting JAX. The worker then fails in reset(),
     # where Gymnasium's AsyncVectorEnv passes errors on; from here it would only see a lost pipe.
-    made = registry.make(task, **options)
+    env, params = make(config)
     # Clips would be put on the device, which starts JAX.
-    if known is not None and made[1].clips is None:
-        _made.add(known)
-    return made
+    if params.clips is None and not _is_made(config):
+        _made.append(config)
+    return env, params
+
+
+def _is_made(config: EnvConfig) -> bool:
+    try:
+        return config in _made
+    except ValueError:  # Arrays of a camera or look, which have no truth value.
+        return False

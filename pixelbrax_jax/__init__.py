@@ -1,34 +1,98 @@
 """PixelBrax: Brax physics seen through a pure-JAX ray-caster."""
 
-from pixelbrax_jax import distractors as distractors
-from pixelbrax_jax.compilation import compiler_options as compiler_options
-from pixelbrax_jax.distractors import load_clips as load_clips
-from pixelbrax_jax.envs.brax_env import BraxPixelEnv as BraxPixelEnv
-from pixelbrax_jax.envs.brax_env import wrap_fresh_episodes as wrap_fresh_episodes
-from pixelbrax_jax.envs.check import check_env as check_env
-from pixelbrax_jax.envs.pixel_env import PixelEnv as PixelEnv
-from pixelbrax_jax.envs.vector import AUTORESET_MODES as AUTORESET_MODES
-from pixelbrax_jax.envs.vector import VectorPixelEnv as VectorPixelEnv
-from pixelbrax_jax.physics.base import Physics as Physics
-from pixelbrax_jax.physics.brax_physics import BraxPhysics as BraxPhysics
-from pixelbrax_jax.physics.mjcf_task import mjcf_physics as mjcf_physics
-from pixelbrax_jax.registry import list_envs as list_envs
-from pixelbrax_jax.registry import make as make
-from pixelbrax_jax.registry import register as register
-from pixelbrax_jax.renderer.base import render as render
-from pixelbrax_jax.scene.cameras import named_rigs as named_rigs
-from pixelbrax_jax.scene.cameras import rig as rig
-from pixelbrax_jax.scene.look import make_look as make_look
-from pixelbrax_jax.scene.place import place as place
-from pixelbrax_jax.types import Camera as Camera
-from pixelbrax_jax.types import CameraRig as CameraRig
-from pixelbrax_jax.types import Clips as Clips
-from pixelbrax_jax.types import EnvParams as EnvParams
-from pixelbrax_jax.types import EnvState as EnvState
-from pixelbrax_jax.types import Frame as Frame
-from pixelbrax_jax.types import GeomKind as GeomKind
-from pixelbrax_jax.types import Geoms as Geoms
-from pixelbrax_jax.types import Look as Look
-from pixelbrax_jax.types import PhysicsState as PhysicsState
-from pixelbrax_jax.types import Scene as Scene
-from pixelbrax_jax.types import Timestep as Timestep
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from pixelbrax_jax import distractors as distractors
+    from pixelbrax_jax.compilation import compiler_options as compiler_options
+    from pixelbrax_jax.config import EnvConfig as EnvConfig
+    from pixelbrax_jax.distractors import load_clips as load_clips
+    from pixelbrax_jax.envs.autoreset import AUTORESET_MODES as AUTORESET_MODES
+    from pixelbrax_jax.envs.brax_env import BraxPixelEnv as BraxPixelEnv
+    from pixelbrax_jax.envs.brax_env import wrap_fresh_episodes as wrap_fresh_episodes
+    from pixelbrax_jax.envs.check import check_env as check_env
+    from pixelbrax_jax.envs.pixel_env import PixelEnv as PixelEnv
+    from pixelbrax_jax.envs.sharded import ShardedVectorEnv as ShardedVectorEnv
+    from pixelbrax_jax.envs.vector import VectorPixelEnv as VectorPixelEnv
+    from pixelbrax_jax.physics.base import Physics as Physics
+    from pixelbrax_jax.physics.brax.engine import BraxPhysics as BraxPhysics
+    from pixelbrax_jax.physics.brax.mjcf import mjcf_physics as mjcf_physics
+    from pixelbrax_jax.policy import load_policy as load_policy
+    from pixelbrax_jax.registry import list_envs as list_envs
+    from pixelbrax_jax.registry import make as make
+    from pixelbrax_jax.registry import register as register
+    from pixelbrax_jax.renderer.base import render as render
+    from pixelbrax_jax.scene.cameras import named_rigs as named_rigs
+    from pixelbrax_jax.scene.cameras import rig as rig
+    from pixelbrax_jax.scene.look import make_look as make_look
+    from pixelbrax_jax.scene.place import place as place
+    from pixelbrax_jax.types import Camera as Camera
+    from pixelbrax_jax.types import CameraRig as CameraRig
+    from pixelbrax_jax.types import Clips as Clips
+    from pixelbrax_jax.types import EnvParams as EnvParams
+    from pixelbrax_jax.types import EnvState as EnvState
+    from pixelbrax_jax.types import Frame as Frame
+    from pixelbrax_jax.types import GeomKind as GeomKind
+    from pixelbrax_jax.types import Geoms as Geoms
+    from pixelbrax_jax.types import Look as Look
+    from pixelbrax_jax.types import PhysicsState as PhysicsState
+    from pixelbrax_jax.types import Scene as Scene
+    from pixelbrax_jax.types import SimState as SimState
+    from pixelbrax_jax.types import Timestep as Timestep
+
+# Loaded when they are first asked for: who wants the list of tasks need not wait for JAX.
+_LAZY = {
+    "AUTORESET_MODES": "pixelbrax_jax.envs.autoreset",
+    "BraxPhysics": "pixelbrax_jax.physics.brax.engine",
+    "BraxPixelEnv": "pixelbrax_jax.envs.brax_env",
+    "Camera": "pixelbrax_jax.types",
+    "CameraRig": "pixelbrax_jax.types",
+    "Clips": "pixelbrax_jax.types",
+    "EnvConfig": "pixelbrax_jax.config",
+    "EnvParams": "pixelbrax_jax.types",
+    "EnvState": "pixelbrax_jax.types",
+    "Frame": "pixelbrax_jax.types",
+    "GeomKind": "pixelbrax_jax.types",
+    "Geoms": "pixelbrax_jax.types",
+    "Look": "pixelbrax_jax.types",
+    "Physics": "pixelbrax_jax.physics.base",
+    "PhysicsState": "pixelbrax_jax.types",
+    "PixelEnv": "pixelbrax_jax.envs.pixel_env",
+    "Scene": "pixelbrax_jax.types",
+    "ShardedVectorEnv": "pixelbrax_jax.envs.sharded",
+    "SimState": "pixelbrax_jax.types",
+    "Timestep": "pixelbrax_jax.types",
+    "VectorPixelEnv": "pixelbrax_jax.envs.vector",
+    "check_env": "pixelbrax_jax.envs.check",
+    "compiler_options": "pixelbrax_jax.compilation",
+    "list_envs": "pixelbrax_jax.registry",
+    "load_clips": "pixelbrax_jax.distractors",
+    "load_policy": "pixelbrax_jax.policy",
+    "make": "pixelbrax_jax.registry",
+    "make_look": "pixelbrax_jax.scene.look",
+    "mjcf_physics": "pixelbrax_jax.physics.brax.mjcf",
+    "named_rigs": "pixelbrax_jax.scene.cameras",
+    "place": "pixelbrax_jax.scene.place",
+    "register": "pixelbrax_jax.registry",
+    "render": "pixelbrax_jax.renderer.base",
+    "rig": "pixelbrax_jax.scene.cameras",
+    "wrap_fresh_episodes": "pixelbrax_jax.envs.brax_env",
+}
+
+__all__ = [*_LAZY, "distractors"]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "distractors":
+        return import_module("pixelbrax_jax.distractors")
+    if name not in _LAZY:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = globals()[name] = getattr(import_module(_LAZY[name]), name)
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

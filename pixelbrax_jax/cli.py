@@ -17,7 +17,7 @@ from pixelbrax_jax.extras import install_extra
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command.
+    """Run the command.
 
     Args:
         arguments: of the command line; None means those of this process.
@@ -32,9 +32,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     commands = parser.add_subparsers(title="commands", required=True)
     command = commands.add_parser(
         "doctor",
-        help="tell whether JAX and PyTorch work together here, and cure what does not",
+        help="tell whether JAX and PyTorch work together here, and fix what does not",
         description="Tells whether JAX and PyTorch see the same device, whether frames cross "
-        "between them without a copy, and how to cure what is amiss. Exits with 1 if something "
+        "between them without a copy, and how to fix what is amiss. Exits with 1 if something "
         "is.",
     )
     command.set_defaults(run=_doctor)
@@ -59,20 +59,20 @@ def _add_clips(commands: Any) -> None:
         "clips",
         help="prepare the videos of a distractor, and show them",
         description="Reads and caches the clips of a folder (DAVIS-2017, video files or folders "
-        "of pictures), or makes procedural ones, and tells what there is.",
+        "of images), or makes procedural ones, and tells what there is.",
     )
     command.add_argument("source", help="a folder, or 'procedural'")
     command.add_argument("--split", default="train", help="train, test, ... (default: train)")
     command.add_argument("--size", type=int, default=84, help="pixels, square (default: 84)")
     command.add_argument("--num-clips", type=int, help="only the first ones")
     command.add_argument("--cache-dir", help="default: $PIXELBRAX_CACHE or ~/.cache/pixelbrax")
-    command.add_argument("--sheet", help="write a contact sheet to this picture file")
+    command.add_argument("--sheet", help="write a contact sheet to this image file")
     command.set_defaults(run=_clips)
 
 
 def _clips(options: argparse.Namespace) -> int:
     from pixelbrax_jax.distractors.clips import load_clips
-    from pixelbrax_jax.distractors.sheet import contact_sheet
+    from pixelbrax_jax.distractors.contact_sheet import contact_sheet
 
     try:
         bank = load_clips(
@@ -101,7 +101,7 @@ def _clips(options: argparse.Namespace) -> int:
 
 def _train(arguments: list[str]) -> int:
     try:
-        from pixelbrax_jax.agents.command import train
+        from pixelbrax_jax.agents.runner.train_command import train
     except ImportError as error:
         return _lacks_train("train", error)
     except KeyboardInterrupt:
@@ -111,13 +111,13 @@ def _train(arguments: list[str]) -> int:
 
 
 def _lacks_train(command: str, error: ImportError) -> int:
-    """Says how to get the extra that agents need, and returns the exit status."""
+    """Say how to get the extra that agents need, and returns the exit status."""
     sys.stderr.write(f"pixelbrax {command}: {error}; try: {install_extra('train')}\n")
     return 1
 
 
 def _add_trained(command: argparse.ArgumentParser) -> None:
-    """Options that choose a trained agent."""
+    """Add the options that choose a trained agent."""
     command.add_argument("folder", help="output folder of a training run")
     command.add_argument("--steps", type=int, help="of which checkpoint (default: the latest)")
     command.add_argument("--best", action="store_true", help="take the best checkpoint")
@@ -150,7 +150,7 @@ def _add_evaluate(commands: Any) -> None:
 
 def _evaluate(options: argparse.Namespace) -> int:
     try:
-        from pixelbrax_jax.agents.evaluate_command import evaluate
+        from pixelbrax_jax.agents.runner.evaluate_command import evaluate
     except ImportError as error:
         return _lacks_train("evaluate", error)
     return evaluate(options)
@@ -176,7 +176,7 @@ def _add_record(commands: Any) -> None:
 
 def _record(options: argparse.Namespace) -> int:
     try:
-        from pixelbrax_jax.agents.record import record
+        from pixelbrax_jax.agents.runner.record import record
     except ImportError as error:
         return _lacks_train("record", error)
     return record(options)
@@ -214,7 +214,7 @@ def _doctor(options: argparse.Namespace) -> int:
 
     findings = doctor.diagnose(doctor.inspect())
     sys.stdout.write(doctor.report(findings) + "\n")
-    return int(any(finding.level == "trouble" for finding in findings))
+    return int(any(finding.level == "problem" for finding in findings))
 
 
 if __name__ == "__main__":

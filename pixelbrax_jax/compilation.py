@@ -1,17 +1,22 @@
-"""How XLA is asked to compile programs that draw pictures."""
+"""How XLA is asked to compile programs that draw images."""
 
 from __future__ import annotations
 
 import os
-from functools import cache
+from collections.abc import Callable
+from functools import cache, wraps
+from typing import Any, ParamSpec, TypeVar
 
 import jax
+
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
 
 _WIDTH = "xla_cpu_prefer_vector_width"
 
 
 def compiler_options() -> dict[str, int]:
-    """Options of ``jax.jit`` that make pictures fast on the default device.
+    """Return options of ``jax.jit`` that make images fast on the default device.
 
     XLA holds back on CPUs with AVX-512 and computes with vectors of 256 bits; with 512 the
     ray-caster is up to twice as fast there. Other CPUs have no such vectors and are not affected;
@@ -31,6 +36,29 @@ def compiler_options() -> dict[str, int]:
     if jax.default_backend() != "cpu" or _WIDTH in os.environ.get("XLA_FLAGS", ""):
         return {}
     return {_WIDTH: 512} if _is_known(_WIDTH) else {}
+
+
+def jit(**options: Any) -> Callable[[Callable[_P, _T]], Callable[_P, _T]]:
+    """Decorate as ``jax.jit`` does, with ``compiler_options``.
+
+    They are asked for at the first call: importing a package must not start a device.
+
+    Args:
+        **options: of ``jax.jit``.
+    """
+
+    def decorate(function: Callable[_P, _T]) -> Callable[_P, _T]:
+        @cache
+        def program() -> Any:
+            return jax.jit(function, compiler_options=compiler_options(), **options)
+
+        @wraps(function)
+        def call(*args: _P.args, **kwargs: _P.kwargs) -> _T:
+            return program()(*args, **kwargs)
+
+        return call
+
+    return decorate
 
 
 @cache

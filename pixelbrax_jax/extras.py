@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 def install_extra(*names: str) -> str:
-    """What to do to get an extra, as the end of a message.
+    """Return what to do to get an extra, as the end of a message.
 
     PixelBrax is installed from a clone, and ``-e`` leaves one that is being edited in use. With the
     constraints pip takes the releases that the tests run with.

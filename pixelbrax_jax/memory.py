@@ -28,7 +28,7 @@ def check_fits(what: str, num_bytes: float) -> None:
 
 
 def _main_memory() -> float:
-    """Bytes of main memory; infinite where the system has no number for it."""
+    """Return the bytes of main memory; infinite where the system has no number for it."""
     try:
         return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     except (AttributeError, OSError, ValueError):

@@ -12,7 +12,7 @@ from pixelbrax_jax.extras import install_extra
 
 
 def load_policy(path: str | Path) -> Callable[[jax.Array], jax.Array]:
-    """The policy of a file: (B, H, W, 3 K) uint8 pixels -> (B, A) float32 actions.
+    """Return the policy of a file: (B, H, W, 3 K) uint8 pixels -> (B, A) float32 actions.
 
     Raises:
         FileNotFoundError: there is no such file.

@@ -2,46 +2,53 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
-from functools import cache, lru_cache, partial
-from os import PathLike
-from pathlib import Path
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Any
 from weakref import WeakValueDictionary
 
 import jax
 import numpy as np
 
 from pixelbrax_jax import spatial
-from pixelbrax_jax.choices import check_choice, checks_options
-from pixelbrax_jax.distractors.base import Distractor
+from pixelbrax_jax.config import PROGRAM_OPTIONS, EnvConfig, env_config
 from pixelbrax_jax.distractors.clips import ClipBank, load_clips, warn_procedural
-from pixelbrax_jax.distractors.presets import resolve
+from pixelbrax_jax.distractors.presets import as_tuple, resolve
 from pixelbrax_jax.distractors.video import Video
 from pixelbrax_jax.envs.pixel_env import PixelEnv
+from pixelbrax_jax.physics import make_physics
 from pixelbrax_jax.physics.base import Physics
-from pixelbrax_jax.physics.tasks import REWARD_PRESETS, TASKS, make_physics
 from pixelbrax_jax.scene.cameras import make_rig, rig_around
 from pixelbrax_jax.scene.look import make_look
-from pixelbrax_jax.types import Camera, CameraRig, Clips, EnvParams, GeomKind, Look
+from pixelbrax_jax.tasks import TASKS
+from pixelbrax_jax.types import Camera, CameraRig, Clips, EnvParams, GeomKind
+from pixelbrax_jax.validation import check_choice
 
 
-@dataclass(frozen=True)
-class _Entry:
-    """How to build a task's physics; ``make_physics(backend=..., reward_preset=...)``."""
+@dataclass
+class _OwnTask:
+    """A task of the user's."""
 
-    make_physics: Callable[..., Physics]
+    make_physics: Callable[[], Physics]
     camera: CameraRig | None
 
+    @cached_property
+    def physics(self) -> Physics:
+        return self.make_physics()
 
-_REGISTRY: dict[str, _Entry] = {
-    name: _Entry(partial(make_physics, name), camera=None) for name in TASKS
-}
+    @cached_property
+    def default_rig(self) -> CameraRig:
+        return self.camera or _corner_rig(self.physics)
+
+
+_OWN_TASKS: dict[str, _OwnTask] = {}
 
 
 def list_envs() -> tuple[str, ...]:
-    """Names that ``make`` accepts, sorted."""
-    return tuple(sorted(_REGISTRY))
+    """Return the names that ``make`` accepts, sorted."""
+    return tuple(sorted([*TASKS, *_OWN_TASKS]))
 
 
 def register(
@@ -50,12 +57,13 @@ def register(
     *,
     camera: CameraRig | Camera | None = None,
 ) -> None:
-    """Adds a task of your own, from a Brax environment, an MJCF file or your own ``Physics``.
+    """Add a task of your own, from a Brax environment, an MJCF file or your own ``Physics``.
 
     Args:
         name: what ``make`` shall call it; must be new.
         make_physics: builds the physics, e.g. ``lambda: BraxPhysics(MyEnv())`` or
-            ``lambda: mjcf_physics("arm.xml", reward=my_reward)``. Called on the first ``make``.
+            ``lambda: mjcf_physics("arm.xml", reward=my_reward)``. Called once, by the first
+            ``make``.
         camera: default viewpoint; None looks from a corner at everything but the ground.
 
     Raises:
@@ -64,66 +72,22 @@ def register(
     """
     if not isinstance(name, str) or not name:
         raise ValueError(f"a task needs a name, got {name!r}.")
-    if name in _REGISTRY:
+    if name in list_envs():
         raise ValueError(f"task {name!r} is registered already; choose another name.")
     if not callable(make_physics):
         raise TypeError("make_physics must be a function that returns a Physics.")
-
-    def build(backend: str | None, reward_preset: str) -> Physics:
-        if backend is not None or reward_preset != "brax":
-            raise ValueError(
-                f"task {name!r} was registered with its own physics: choose its backend and "
-                "reward there, not in make()."
-            )
-        return make_physics()
-
-    _REGISTRY[name] = _Entry(build, None if camera is None else make_rig(name, camera))
+    _OWN_TASKS[name] = _OwnTask(make_physics, None if camera is None else make_rig(name, camera))
 
 
-@checks_options
-def make(
-    task: str,
-    *,
-    backend: str | None = None,
-    reward_preset: str = "brax",
-    camera: str | CameraRig | Camera = "default",
-    look: str | Look = "default",
-    shadows: bool | None = None,
-    height: int = 84,
-    width: int = 84,
-    frame_stack: int = 3,
-    obs_mode: str = "pixels",
-    action_repeat: int = 1,
-    episode_length: int = 1000,
-    renderer: str = "fused",
-    distractors: str | Distractor | Iterable[str | Distractor] | None = (),
-    clips: str | Path | ClipBank | None = None,
-    split: str = "train",
-) -> tuple[PixelEnv, EnvParams]:
-    """A pixel environment and its parameters.
+def make(task: str | EnvConfig, **options: Any) -> tuple[PixelEnv, EnvParams]:
+    """Make a pixel environment and its parameters.
 
-    Calls with equal options share one environment, and so its compiled programs.
+    Environments made of equal options are equal, and share compiled programs. Those that differ
+    in nothing but camera, look, time limit or clips are equal too: these are parameters.
 
     Args:
-        task: one of ``list_envs()``.
-        backend: physics backend, ``"spring"``, ``"positional"``, ``"generalized"`` or ``"mjx"``,
-            as far as the task supports it; None takes the task's own.
-        reward_preset: ``"brax"``, or ``"paper"`` for the rewards of arXiv 2502.00021.
-        camera: a named rig, a ``CameraRig`` or a ``Camera``.
-        look: ``"default"``, ``"original"`` or a ``Look``.
-        shadows: whether geoms cast shadows; None keeps the look's own choice.
-        height: pixels of a frame.
-        width: pixels of a frame.
-        frame_stack: frames in one observation.
-        obs_mode: ``"pixels"``, ``"state"`` or ``"both"``.
-        action_repeat: control steps per step.
-        episode_length: time limit in control steps.
-        renderer: ``"fused"`` or ``"reference"``.
-        distractors: what changes the picture: a ``Distractor``, a name of
-            ``distractors.presets.PRESETS``, or several of them.
-        clips: what a video distractor plays: the folder of DAVIS-2017 or one with videos, a bank
-            of ``load_clips``, or ``"procedural"``; None means ``"procedural"`` with a warning.
-        split: which of the clips, ``"train"`` or ``"test"``; see ``load_clips``.
+        task: one of ``list_envs()``; or an ``EnvConfig``, of which ``options`` are changed.
+        **options: the fields of ``EnvConfig``, which says what they are.
 
     Returns:
         The environment and its parameters.
@@ -134,84 +98,79 @@ def make(
         FileNotFoundError: clips are missing.
         MemoryError: the clips would take too much memory.
     """
-    check_choice("task", task, _REGISTRY)
-    _check_single(
-        backend=backend,
-        height=height,
-        width=width,
-        frame_stack=frame_stack,
-        obs_mode=obs_mode,
-        action_repeat=action_repeat,
-        episode_length=episode_length,
-        renderer=renderer,
-        split=split,
+    config = env_config(task, options)
+    physics = _physics(config)
+    program = {name: getattr(config, name) for name in PROGRAM_OPTIONS}
+    program["distractors"] = resolve(as_tuple(config.distractors), config.task)
+    env = PixelEnv(physics, **program)
+    fallback = None if config.task in TASKS else _OWN_TASKS[config.task].default_rig
+    rig = make_rig(config.task, config.camera, fallback)
+    if not rig.link < len(physics.link_names):
+        raise ValueError(
+            f"the camera follows link {rig.link}, but task {config.task!r} has only "
+            f"{len(physics.link_names)} links: {', '.join(physics.link_names)}."
+        )
+    return env, EnvParams(
+        geoms=physics.geoms,
+        rig=rig,
+        look=make_look(config.look, shadows=config.shadows),
+        clips=_clips(config, env),
+        episode_length=np.int32(config.episode_length),
     )
-    check_choice("reward_preset", reward_preset, REWARD_PRESETS)
-    links = resolve(distractors, task)
-    env = _pixel_env(
-        task,
-        backend,
-        reward_preset,
-        height,
-        width,
-        frame_stack,
-        obs_mode,
-        action_repeat,
-        episode_length,
-        renderer,
-        links,
+
+
+_parameters = [
+    inspect.Parameter(
+        field.name,
+        inspect.Parameter.POSITIONAL_OR_KEYWORD
+        if field.name == "task"
+        else inspect.Parameter.KEYWORD_ONLY,
+        default=inspect.Parameter.empty if field.name == "task" else field.default,
+        annotation=field.type,
     )
-    videos = [link for link in env.distractors.links if isinstance(link, Video)]
-    bank = _clips(clips, split, env.height, env.width, videos[0].num_clips) if videos else None
+    for field in fields(EnvConfig)
+]
+# What help() and editors show.
+make.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
+    sorted(_parameters, key=lambda parameter: parameter.kind)
+)
+
+
+def _physics(config: EnvConfig) -> Physics:
+    check_choice("task", config.task, list_envs())
+    if config.task in TASKS:
+        return make_physics(config.task, backend=config.backend, reward_preset=config.reward_preset)
+    if config.backend is not None or config.reward_preset != "brax":
+        raise ValueError(
+            f"task {config.task!r} was registered with its own physics: choose its backend and "
+            "reward there, not in make()."
+        )
+    return _OWN_TASKS[config.task].physics
+
+
+def _clips(config: EnvConfig, env: PixelEnv) -> Clips | None:
+    """Return the clips on the device, None where nothing plays any."""
+    clips, split = config.clips, config.split
+    videos = [link for link in env.chain.links if isinstance(link, Video)]
     if clips is not None and not videos and env.obs_mode != "state":
         raise ValueError("clips are given, but no video is: add 'video' to the distractors.")
-    if split != "train" and not links:
+    if split != "train" and not config.distractors:
         raise ValueError(
             f"split={split!r} is given, but no distractor is: add one that has splits, such as "
             "'video', to the distractors."
         )
-    rig = make_rig(task, camera, _fallback_rig(task))
-    if not rig.link < len(env.physics.link_names):
-        raise ValueError(
-            f"the camera follows link {rig.link}, but task {task!r} has only "
-            f"{len(env.physics.link_names)} links: {', '.join(env.physics.link_names)}."
-        )
-    look = make_look(look, shadows=shadows)
-    return env, EnvParams(geoms=env.physics.geoms, rig=rig, look=look, clips=bank)
-
-
-def _check_single(**options: object) -> None:
-    """Rejects lists and the like, which could not be looked up among the environments made."""
-    for name, value in options.items():
-        try:
-            hash(value)
-        except TypeError as error:
-            raise TypeError(
-                f"{name} must be a single value, got a {type(value).__name__}: {value!r}."
-            ) from error
-
-
-def _clips(
-    clips: str | Path | ClipBank | None,
-    split: str,
-    height: int,
-    width: int,
-    num_clips: int | None,
-) -> Clips:
-    """Clips on the device; equal ones are there once."""
+    if not videos:
+        return None
     if isinstance(clips, ClipBank):
-        bank = clips
-        if split not in ("train", bank.split):
-            raise ValueError(f"split={split!r}, but the clips are of split {bank.split!r}.")
-    else:
-        if clips is None:
-            warn_procedural()
-            clips = "procedural"
-        if not isinstance(clips, (str, PathLike)):
-            raise TypeError(
-                f"clips must be a folder, 'procedural' or a bank of load_clips, got {clips!r}."
-            )
-        bank = load_clips(clips, split, height=height, width=width, num_clips=num_clips)
+        if split not in ("train", clips.split):
+            raise ValueError(f"split={split!r}, but the clips are of split {clips.split!r}.")
+        return _on_device(clips)
+    if clips is None:
+        warn_procedural()
+        clips = "procedural"
+    bank = load_clips(
+        clips, split, height=env.height, width=env.width, num_clips=videos[0].num_clips
+    )
     return _on_device(bank)
 
 
@@ -220,55 +179,14 @@ _resident: WeakValueDictionary[str, Clips] = WeakValueDictionary()
 
 
 def _on_device(bank: ClipBank) -> Clips:
+    """Return the clips on the device, where equal ones are once."""
     clips = _resident.get(bank.digest)
     if clips is None:
         clips = _resident[bank.digest] = bank.to_device()
     return clips
 
 
-@cache
-def _physics(task: str, backend: str | None, reward_preset: str) -> Physics:
-    return _REGISTRY[task].make_physics(backend=backend, reward_preset=reward_preset)
-
-
-# Typed, because True equals 1 and must not slip past the checks.
-@lru_cache(maxsize=None, typed=True)
-def _pixel_env(
-    task: str,
-    backend: str | None,
-    reward_preset: str,
-    height: int,
-    width: int,
-    frame_stack: int,
-    obs_mode: str,
-    action_repeat: int,
-    episode_length: int,
-    renderer: str,
-    distractors: tuple[Distractor, ...],
-) -> PixelEnv:
-    return PixelEnv(
-        _physics(task, backend, reward_preset),
-        height=height,
-        width=width,
-        frame_stack=frame_stack,
-        obs_mode=obs_mode,
-        action_repeat=action_repeat,
-        episode_length=episode_length,
-        renderer=renderer,
-        distractors=distractors,
-    )
-
-
-def _fallback_rig(task: str) -> CameraRig | None:
-    """The default viewpoint of a task that the user registered; None for the built-in ones."""
-    if task in TASKS:
-        return None
-    return _REGISTRY[task].camera or _corner_rig(task)
-
-
-@cache
-def _corner_rig(task: str) -> CameraRig:
-    physics = _physics(task, None, "brax")
+def _corner_rig(physics: Physics) -> CameraRig:
     state = physics.reset(jax.random.key(0))
     geoms, xpos, xquat = physics.geoms, np.asarray(state.xpos), np.asarray(state.xquat)
     points = [

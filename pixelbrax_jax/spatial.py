@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 
 def quat_multiply(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Hamilton product: the rotation that applies ``b`` first, then ``a``.
+    """Return the Hamilton product: the rotation that applies ``b`` first, then ``a``.
 
     Args:
         a: (..., 4) float32.
@@ -30,7 +30,7 @@ def quat_multiply(a: jax.Array, b: jax.Array) -> jax.Array:
 
 
 def quat_normalize(quat: jax.Array) -> jax.Array:
-    """The unit quaternion of the same rotation; the zero quaternion becomes the identity.
+    """Return the unit quaternion of the same rotation; the zero quaternion becomes the identity.
 
     Args:
         quat: (..., 4) float32.
@@ -46,7 +46,7 @@ def quat_normalize(quat: jax.Array) -> jax.Array:
 
 
 def quat_to_mat(quat: jax.Array) -> jax.Array:
-    """Rotation matrix of a unit quaternion; its columns are the rotated axes.
+    """Return the rotation matrix of a unit quaternion; its columns are the rotated axes.
 
     Args:
         quat: (..., 4) float32, unit.
@@ -64,7 +64,7 @@ def quat_to_mat(quat: jax.Array) -> jax.Array:
 
 
 def rotate(quat: jax.Array, vector: jax.Array) -> jax.Array:
-    """``vector`` turned by the unit quaternion ``quat``.
+    """Return ``vector`` turned by the unit quaternion ``quat``.
 
     Args:
         quat: (..., 4) float32, unit.
@@ -79,7 +79,7 @@ def rotate(quat: jax.Array, vector: jax.Array) -> jax.Array:
 
 
 def unit(vector: jax.Array) -> jax.Array:
-    """``vector`` scaled to length 1; the zero vector stays zero, with a zero gradient.
+    """Return ``vector`` scaled to length 1; the zero vector stays zero, with a zero gradient.
 
     Args:
         vector: (..., 3) float32.
@@ -92,7 +92,7 @@ def unit(vector: jax.Array) -> jax.Array:
 
 
 def look_at(eye: jax.Array, target: jax.Array, up: jax.Array) -> jax.Array:
-    """Orientation of a camera at ``eye`` that looks at ``target``.
+    """Return the orientation of a camera at ``eye`` that looks at ``target``.
 
     Args:
         eye: (3,) float32, metres.

@@ -1,9 +1,9 @@
-"""Every value that crosses from one room of the package to the next.
+"""Every value that crosses from one module of the package to the next.
 
 Shapes are those of ONE environment; a batch has the same fields with a leading axis.
 Letters: G geoms, M materials, L links, S state features, A actions, H and W pixels,
 K stacked frames. Lengths are metres, angles degrees, quaternions ``(w, x, y, z)``, colors
-linear in [0, 1]. The world is right-handed with z up. Row 0 of a picture is its top.
+linear in [0, 1]. The world is right-handed with z up. Row 0 of an image is its top.
 
 Fields marked *static* are Python values: they decide which program is compiled, hence they
 are hashable and cannot be traced. All other fields are arrays and may be differentiated,
@@ -12,10 +12,12 @@ batched or randomised.
 
 from __future__ import annotations
 
+import warnings
 from enum import IntEnum
 from typing import Any
 
 import jax
+import numpy as np
 from flax import struct
 
 
@@ -56,7 +58,7 @@ class Geoms(struct.PyTreeNode):
 
 
 class PhysicsState(struct.PyTreeNode):
-    """What a physics engine tells the rest of the package after a step.
+    """What physics hands to the rest of the package after a step.
 
     Attributes:
         engine: the engine's own state, opaque to everyone else.
@@ -99,10 +101,10 @@ class CameraRig(struct.PyTreeNode):
 
     Attributes:
         link: static, index of the followed link, -1 to follow nothing.
-        track: (3,) float32, how much of the link's position is followed, per world axis.
+        track: (3,) float32, fraction of the link's position that is followed, per world axis.
         eye: (3,) float32, metres.
         target: (3,) float32, metres, the point looked at.
-        up: (3,) float32, the world direction that is up in the picture.
+        up: (3,) float32, the world direction that is up in the image.
         fovy: () float32, vertical field of view, degrees.
     """
 
@@ -151,7 +153,7 @@ class Look(struct.PyTreeNode):
 
 
 class Scene(struct.PyTreeNode):
-    """Everything a renderer needs for one picture, in the world frame.
+    """Everything a renderer needs for one image, in the world frame.
 
     Attributes:
         geoms: shapes, sizes and colors.
@@ -169,7 +171,7 @@ class Scene(struct.PyTreeNode):
 
 
 class Frame(struct.PyTreeNode):
-    """One picture. Color channels stay apart: stacking them early costs a CPU dearly.
+    """One image. Color channels stay apart: stacking them early costs a CPU dearly.
 
     Attributes:
         r, g, b: (H, W) float32 in [0, 1].
@@ -191,12 +193,12 @@ class Clips(struct.PyTreeNode):
     """Video clips on the device, one after the other. C clips, T frames in all.
 
     Attributes:
-        words: (T, H, W) uint32, packed pixels: red in the low byte, then green, then blue.
+        packed: (T, H, W) uint32, packed pixels: red in the low byte, then green, then blue.
         first: (C,) int32, index of a clip's first frame.
         length: (C,) int32, frames of a clip, at least 1.
     """
 
-    words: jax.Array
+    packed: jax.Array
     first: jax.Array
     length: jax.Array
 
@@ -209,39 +211,68 @@ class EnvParams(struct.PyTreeNode):
         rig: the camera rig.
         look: light, sky and ground.
         clips: videos for the background; None where no distractor shows any.
+        episode_length: () int32, time limit in control steps.
     """
 
     geoms: Geoms
     rig: CameraRig
     look: Look
     clips: Clips | None = None
+    episode_length: Any = np.int32(1000)
+
+
+class SimState(struct.PyTreeNode):
+    """What is simulated of one pixel environment.
+
+    Attributes:
+        physics: the state of the physics.
+        episode: () uint32, index of the current episode, 0 first.
+        step_count: () int32, control steps taken in this episode.
+        time_limit_offset: () int32, control steps by which the time limit comes early in this
+            episode; 0 unless somebody has set it.
+        episode_return: () float32, sum of rewards of this episode.
+        done: () bool, the episode has ended and the next call must reset.
+        distractor_state: states of the distractors, a tuple.
+    """
+
+    physics: PhysicsState
+    episode: jax.Array
+    step_count: jax.Array
+    time_limit_offset: jax.Array
+    episode_return: jax.Array
+    done: jax.Array
+    distractor_state: Any = ()
 
 
 class EnvState(struct.PyTreeNode):
     """State of one pixel environment.
 
     Attributes:
-        physics: the physics engine's state.
+        sim: what is simulated.
         frames: (H, W, 3K) uint8, the frame stack, oldest first; (0, 0, 0) without pixels.
         key: typed PRNG key of the environment; never changes.
-        episode: () uint32, index of the current episode, 0 first.
-        step_count: () int32, control steps taken in this episode.
-        head_start: () int32, control steps by which the time limit comes early in this episode;
-            0 unless somebody has set it.
-        episode_return: () float32, sum of rewards of this episode.
-        done: () bool, the episode has ended and the next call must begin a new one.
-        distraction: states of the distractors, a tuple.
     """
 
-    physics: PhysicsState
+    sim: SimState
     frames: jax.Array
     key: jax.Array
-    episode: jax.Array
-    step_count: jax.Array
-    head_start: jax.Array
-    episode_return: jax.Array
-    done: jax.Array
-    distraction: Any = ()
+
+    @property
+    def done(self) -> jax.Array:
+        """() bool, the episode has ended and the next call must reset."""
+        return self.sim.done
+
+    def __getattr__(self, name: str) -> Any:
+        """Look up a field of ``sim`` under the place and name that it had."""
+        new = {"head_start": "time_limit_offset", "distraction": "distractor_state"}.get(name, name)
+        if new not in SimState.__dataclass_fields__:
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        warnings.warn(
+            f"EnvState.{name} is EnvState.sim.{new}; the short form goes with the next release.",
+            DeprecationWarning,
+            stacklevel=2,
+        )
+        return getattr(self.sim, new)
 
 
 class Timestep(struct.PyTreeNode):

@@ -21,7 +21,7 @@ DRAWING_ROOMS = {"physics", "scene", "renderer", "distractors"}
 
 ALLOWED: dict[str, set[str]] = {
     "pixelbrax_jax.types": set(),
-    "pixelbrax_jax.choices": set(),
+    "pixelbrax_jax.validation": set(),
     "pixelbrax_jax.extras": set(),
     "pixelbrax_jax.compilation": set(),
     "pixelbrax_jax.memory": set(),
@@ -48,7 +48,7 @@ ALLOWED: dict[str, set[str]] = {
         "pixelbrax_jax.policy",
         "pixelbrax_jax.registry",
         "pixelbrax_jax.types",
-        "pixelbrax_jax.choices",
+        "pixelbrax_jax.validation",
         "pixelbrax_jax.compilation",
         "pixelbrax_jax.extras",
         "pixelbrax_jax.memory",
@@ -57,18 +57,18 @@ ALLOWED: dict[str, set[str]] = {
 """Room -> the rooms that it may import besides itself."""
 
 HOMES: dict[str, set[str]] = {
-    "brax": {"pixelbrax_jax/physics/brax_physics.py", "pixelbrax_jax/envs/brax_env.py"},
+    "brax": {"pixelbrax_jax/physics/brax/engine.py", "pixelbrax_jax/envs/brax_env.py"},
     "torch": {
-        "pixelbrax_gym/dlpack.py",
+        "pixelbrax_gym/interop/dlpack.py",
         "pixelbrax_gym/doctor.py",
         "pixelbrax_gym/policy.py",
-        "pixelbrax_gym/torchrl_env.py",
-        "pixelbrax_gym/torchrl_specs.py",
+        "pixelbrax_gym/torchrl/env.py",
+        "pixelbrax_gym/torchrl/specs.py",
     },
-    "torchrl": {"pixelbrax_gym/torchrl_env.py", "pixelbrax_gym/torchrl_specs.py"},
-    "tensordict": {"pixelbrax_gym/torchrl_env.py"},
-    "stable_baselines3": {"pixelbrax_gym/sb3_env.py"},
-    "pygame": {"pixelbrax_gym/window.py"},
+    "torchrl": {"pixelbrax_gym/torchrl/env.py", "pixelbrax_gym/torchrl/specs.py"},
+    "tensordict": {"pixelbrax_gym/torchrl/env.py"},
+    "stable_baselines3": {"pixelbrax_gym/sb3/vec_env.py"},
+    "pygame": {"pixelbrax_gym/gymnasium/window.py"},
 }
 """Third party -> the only files that may import it."""
 
@@ -206,13 +206,13 @@ def test_importing_pixelbrax_gym_loads_no_physics():
 SOUND = {
     "pixelbrax_jax/__init__.py": "from pixelbrax_jax.envs.pixel_env import step\n",
     "pixelbrax_jax/types.py": "import jax\n",
-    "pixelbrax_jax/physics/brax_physics.py": "import brax.envs\nfrom pixelbrax_jax import types\n",
+    "pixelbrax_jax/physics/brax/engine.py": "import brax.envs\nfrom pixelbrax_jax import types\n",
     "pixelbrax_jax/scene/place.py": "from pixelbrax_jax.types import Scene\n",
     "pixelbrax_jax/renderer/base.py": "from pixelbrax_jax import spatial, types\n",
     "pixelbrax_jax/spatial.py": "import jax\n",
     "pixelbrax_jax/envs/pixel_env.py": "from pixelbrax_jax.scene.place import place\n",
-    "pixelbrax_gym/dlpack.py": "import jax\nimport torch\n",
-    "pixelbrax_gym/vector_env.py": "import pixelbrax_jax\nfrom pixelbrax_jax.types import Scene\n",
+    "pixelbrax_gym/interop/dlpack.py": "import jax\nimport torch\n",
+    "pixelbrax_gym/gymnasium/vector_env.py": "import pixelbrax_jax\nfrom pixelbrax_jax.types import Scene\n",
 }
 
 
@@ -231,17 +231,25 @@ def test_the_checker_passes_a_sound_tree(tmp_path):
 @pytest.mark.parametrize(
     ("name", "code", "complaint"),
     [
-        ("pixelbrax_jax/scene/place.py", "import pixelbrax_jax.physics.brax_physics", "physics"),
+        ("pixelbrax_jax/scene/place.py", "import pixelbrax_jax.physics.brax.engine", "physics"),
         ("pixelbrax_jax/scene/place.py", "from pixelbrax_jax.envs import pixel_env", "envs"),
         ("pixelbrax_jax/renderer/base.py", "from pixelbrax_jax.scene import place", "scene"),
         ("pixelbrax_jax/renderer/base.py", "def f():\n    import pixelbrax_jax", "pixelbrax_jax"),
         ("pixelbrax_jax/types.py", "from pixelbrax_jax import spatial", "spatial"),
         ("pixelbrax_jax/envs/pixel_env.py", "import brax", "import brax"),
         ("pixelbrax_jax/envs/pixel_env.py", "from pixelbrax_gym import dlpack", "pixelbrax_gym"),
-        ("pixelbrax_gym/vector_env.py", "from torch import nn", "import torch"),
-        ("pixelbrax_gym/vector_env.py", "importlib.import_module('torch')", "import torch"),
-        ("pixelbrax_gym/vector_env.py", "from pixelbrax_jax.physics import tasks", "physics"),
-        ("pixelbrax_gym/vector_env.py", "from .dlpack import f", "relative"),
+        ("pixelbrax_gym/gymnasium/vector_env.py", "from torch import nn", "import torch"),
+        (
+            "pixelbrax_gym/gymnasium/vector_env.py",
+            "importlib.import_module('torch')",
+            "import torch",
+        ),
+        (
+            "pixelbrax_gym/gymnasium/vector_env.py",
+            "from pixelbrax_jax.physics import tasks",
+            "physics",
+        ),
+        ("pixelbrax_gym/gymnasium/vector_env.py", "from .dlpack import f", "relative"),
         ("pixelbrax_jax/scene/utils.py", "x = 1", "name"),
         ("pixelbrax_jax/scene/place.py", '""""""\nx = 1', "docstring"),
         ("pixelbrax_jax/scene/place.py", "x = 1\n" * (MAX_LINES + 1), "lines"),

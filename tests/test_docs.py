@@ -17,7 +17,7 @@ import pytest
 import pixelbrax_gym  # registers PixelBrax/*
 import pixelbrax_jax
 from pixelbrax_jax import registry
-from pixelbrax_jax.physics.tasks import TASKS
+from pixelbrax_jax.tasks import TASKS
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from pixelbrax_gym import doctor, window
+from pixelbrax_gym import doctor
+from pixelbrax_gym.gymnasium import window
 from pixelbrax_jax import cli, load_clips
 from pixelbrax_jax.distractors import clips
 from pixelbrax_jax.extras import install_extra
@@ -47,9 +48,9 @@ def test_extras_that_are_named_exist():
 @pytest.mark.parametrize(
     ("absent", "door", "extra"),
     [
-        ("torch", "pixelbrax_gym.dlpack", "torch"),
-        ("torchrl.envs", "pixelbrax_gym.torchrl_env", "torchrl"),
-        ("stable_baselines3.common.vec_env", "pixelbrax_gym.sb3_env", "sb3"),
+        ("torch", "pixelbrax_gym.interop.dlpack", "torch"),
+        ("torchrl.envs", "pixelbrax_gym.torchrl.env", "torchrl"),
+        ("stable_baselines3.common.vec_env", "pixelbrax_gym.sb3.vec_env", "sb3"),
     ],
 )
 def test_a_framework_that_is_missing(monkeypatch, absent, door, extra):
@@ -78,6 +79,6 @@ def test_a_window_without_pygame(monkeypatch):
 
 def test_a_film_needs_an_extra(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "imageio.v2", None)
-    monkeypatch.delitem(sys.modules, "pixelbrax_jax.agents.record", raising=False)
+    monkeypatch.delitem(sys.modules, "pixelbrax_jax.agents.runner.record", raising=False)
     assert cli.main(["record", "nowhere"]) == 1
     assert '".[train]"' in capsys.readouterr().err

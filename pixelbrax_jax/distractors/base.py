@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Iterable
 from typing import Any, ClassVar
 
 import jax
@@ -10,13 +12,13 @@ from pixelbrax_jax.types import EnvParams, Frame
 
 
 class Distractor:
-    """Changes what an environment looks like and nothing else.
+    """A change of what an environment looks like and of nothing else.
 
     Written for ONE environment. A distractor is a frozen dataclass of plain numbers and strings,
     for it decides which program is compiled. Whatever varies is in its *state*, a pytree that
-    ``begin`` draws when an episode begins and ``advance`` carries from frame to frame.
+    ``reset`` samples at an episode's reset and ``advance`` carries from frame to frame.
 
-    ``change_params`` acts before the picture is drawn, ``change_frame`` after. Each is a no-op
+    ``change_params`` acts before the image is drawn, ``change_frame`` after. Each is a no-op
     unless it is overridden.
 
     Attributes:
@@ -27,17 +29,24 @@ class Distractor:
     kind: ClassVar[str]
     stream: ClassVar[int]
 
-    def begin(self, key: jax.Array, params: EnvParams) -> Any:
-        """The state at the first frame of an episode.
+    def reset(self, key: jax.Array, params: EnvParams) -> Any:
+        """Sample the state at the first frame of an episode.
 
         Args:
             key: a key of this episode and this distractor alone.
             params: of the environment.
         """
+        if begin := getattr(self, "begin", None):
+            warnings.warn(
+                f"{type(self).__name__}.begin is called reset now; rename it.",
+                DeprecationWarning,
+                stacklevel=2,
+            )
+            return begin(key, params)
         raise NotImplementedError
 
     def advance(self, state: Any, key: jax.Array, frame: jax.Array, params: EnvParams) -> Any:
-        """The state at the next frame.
+        """Return the state at the next frame.
 
         Args:
             state: at the frame before.
@@ -49,34 +58,34 @@ class Distractor:
         return state
 
     def change_params(self, state: Any, params: EnvParams) -> EnvParams:
-        """Parameters to draw the frame with: other colors, another camera."""
+        """Return the parameters to draw the frame with: other colors, another camera."""
         del state
         return params
 
     def backdrop(
         self, state: Any, params: EnvParams, rows: jax.Array, height: int, width: int
     ) -> jax.Array | None:
-        """Rows of a picture that ``change_frame`` mixes in.
+        """Return rows of an image that ``change_frame`` mixes in.
 
         Args:
             state: at this frame.
             params: of the environment.
             rows: (R,) int32, which rows, in [0, height).
-            height: pixels of the whole picture.
+            height: pixels of the whole image.
             width: pixels.
 
         Returns:
-            (R, width) packed uint32, or None.
+            (R, width) uint32 packed pixels, or None.
         """
         del state, params, rows, height, width
         return None
 
     def change_frame(self, state: Any, frame: Frame, backdrop: jax.Array | None) -> Frame:
-        """The picture with other colors, all in [0, 1].
+        """Return the image with other colors, all in [0, 1].
 
         Args:
             state: at this frame.
-            frame: some rows of the picture, or all.
+            frame: some rows of the image, or all.
             backdrop: the same rows of the backdrop, if there is one. What differs from pixel to
                 pixel, such as noise, belongs there.
         """
@@ -84,7 +93,7 @@ class Distractor:
         return frame
 
     def info(self, state: Any) -> dict[str, jax.Array]:
-        """What ``Timestep.info`` tells of the state."""
+        """Return what the state adds to ``Timestep.info``."""
         del state
         return {}
 
@@ -92,14 +101,14 @@ class Distractor:
 class Chain:
     """Distractors one after the other; of each kind at most one.
 
-    Its state is the tuple of theirs. A picture passes them in the order camera, video, color,
+    Its state is the tuple of theirs. An image passes them in the order camera, video, color,
     others, whatever the order in which they were given.
     """
 
     _ORDER = ("camera", "video", "color")
 
-    def __init__(self, distractors: tuple[Distractor, ...] = ()) -> None:
-        """Sorts and checks.
+    def __init__(self, distractors: Iterable[object] = ()) -> None:
+        """Sort and check.
 
         Args:
             distractors: any of them.
@@ -108,32 +117,31 @@ class Chain:
             ValueError: two are of one kind or draw from one stream.
             TypeError: one is no distractor, or cannot be hashed.
         """
-        for distractor in distractors:
-            _check(distractor)
-        kinds = [distractor.kind for distractor in distractors]
+        links = [_checked(distractor) for distractor in distractors]
+        kinds = [distractor.kind for distractor in links]
         for kind in kinds:
             if kinds.count(kind) > 1:
                 raise ValueError(f"there are two distractors of kind {kind!r}; give one of them.")
-        if len({distractor.stream for distractor in distractors}) < len(kinds):
+        if len({distractor.stream for distractor in links}) < len(kinds):
             raise ValueError(f"the distractors {', '.join(kinds)} must differ in their streams.")
         known = {kind: place for place, kind in enumerate(self._ORDER)}
-        self.links = tuple(sorted(distractors, key=lambda d: known.get(d.kind, len(known))))
+        self.links = tuple(sorted(links, key=lambda d: known.get(d.kind, len(known))))
 
-    def begin(self, key: jax.Array, params: EnvParams) -> tuple[Any, ...]:
-        """States at the first frame of the episode that ``key`` stands for."""
-        return tuple(link.begin(self._key(key, link, 0), params) for link in self.links)
+    def reset(self, key: jax.Array, params: EnvParams) -> tuple[Any, ...]:
+        """Sample states at the first frame of the episode that ``key`` stands for."""
+        return tuple(link.reset(self._key(key, link, 0), params) for link in self.links)
 
     def advance(
         self, states: tuple[Any, ...], key: jax.Array, frame: jax.Array, params: EnvParams
     ) -> tuple[Any, ...]:
-        """States at frame ``frame``, at least 1, of the episode that ``key`` stands for."""
+        """Return states at frame ``frame``, at least 1, of the episode that ``key`` stands for."""
         return tuple(
             link.advance(state, self._key(key, link, frame), frame, params)
             for link, state in zip(self.links, states, strict=True)
         )
 
     def change_params(self, states: tuple[Any, ...], params: EnvParams) -> EnvParams:
-        """Parameters to draw with."""
+        """Return the parameters to draw with."""
         for link, state in zip(self.links, states, strict=True):
             params = link.change_params(state, params)
         return params
@@ -146,7 +154,7 @@ class Chain:
         height: int,
         width: int,
     ) -> tuple[jax.Array | None, ...]:
-        """The pictures to mix in, (R, width) each."""
+        """Return the images to mix in, (R, width) each."""
         return tuple(
             link.backdrop(state, params, rows, height, width)
             for link, state in zip(self.links, states, strict=True)
@@ -155,25 +163,25 @@ class Chain:
     def change_frame(
         self, states: tuple[Any, ...], frame: Frame, backdrops: tuple[jax.Array | None, ...]
     ) -> Frame:
-        """The changed picture."""
+        """Return the changed image."""
         for link, state, backdrop in zip(self.links, states, backdrops, strict=True):
             frame = link.change_frame(state, frame, backdrop)
         return frame
 
     def info(self, states: tuple[Any, ...]) -> dict[str, jax.Array]:
-        """What all of them tell."""
-        told: dict[str, jax.Array] = {}
+        """Return what all of them add to ``Timestep.info``."""
+        info: dict[str, jax.Array] = {}
         for link, state in zip(self.links, states, strict=True):
-            told |= link.info(state)
-        return told
+            info |= link.info(state)
+        return info
 
     @staticmethod
     def _key(key: jax.Array, link: Distractor, frame: jax.Array | int) -> jax.Array:
         return jax.random.fold_in(jax.random.fold_in(key, link.stream), frame)
 
 
-def _check(distractor: object) -> None:
-    """Rejects what a program cannot be compiled for.
+def _checked(distractor: object) -> Distractor:
+    """Return a distractor, and reject what a program cannot be compiled for.
 
     Raises:
         TypeError: it is no distractor, or cannot be hashed.
@@ -189,8 +197,9 @@ def _check(distractor: object) -> None:
         raise TypeError(f"{name} needs a kind, a name of its own.")
     stream = getattr(distractor, "stream", None)
     if not isinstance(stream, int) or stream < 1:
-        raise ValueError(f"{name} needs a stream, a whole number of at least 1, got {stream!r}.")
+        raise ValueError(f"{name} needs a stream, a positive integer, got {stream!r}.")
     try:
         hash(distractor)
     except TypeError as error:
         raise TypeError(f"{name} cannot be hashed; make it a frozen dataclass.") from error
+    return distractor

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 from flax import struct
 
 from pixelbrax_jax import spatial
-from pixelbrax_jax.choices import check_share
 from pixelbrax_jax.distractors.base import Distractor
 from pixelbrax_jax.types import CameraRig, EnvParams
+from pixelbrax_jax.validation import check_fraction
 
 _RADIUS = 4.0
 """Distance of a camera at which speeds are what they are called; they grow in proportion."""
@@ -50,7 +50,7 @@ class Camera(Distractor):
     distance of the undisturbed camera: azimuth and polar angle within +- (pi/2) b of its own,
     the polar angle also within [0, pi/2] unless the camera looks up from below, so that it
     never sinks into the ground; roll within +- (pi/2) b; distance from (1 - b/2) r0 to
-    (1 + 3b/2) r0. An episode begins at a uniform draw from the box.
+    (1 + 3b/2) r0. An episode starts at a uniform sample from the box.
 
     With ``dynamic=True`` the velocity v is on a random walk: ``v += N(0, (0.1 b s)^2)`` in each
     world axis, its length at most ``0.4 b s``, where ``s = r0 / 4``; the roll's velocity does
@@ -75,15 +75,15 @@ class Camera(Distractor):
     stream: ClassVar[int] = 3
 
     def __post_init__(self) -> None:
-        """Checks the options.
+        """Check the options.
 
         Raises:
             ValueError: the scale is out of range.
         """
-        check_share("scale of Camera", self.scale)
+        check_fraction("scale of Camera", self.scale)
 
-    def begin(self, key: jax.Array, params: EnvParams) -> CameraState:
-        """A place drawn from the box, and a velocity."""
+    def reset(self, key: jax.Array, params: EnvParams) -> CameraState:
+        """Return a place drawn from the box, and a velocity."""
         low, high = self._box(params.rig)
         place_key, direction_key, speed_key, roll_key = jax.random.split(key, 4)
         place = jax.random.uniform(place_key, (4,), minval=low, maxval=high)
@@ -104,7 +104,7 @@ class Camera(Distractor):
     def advance(
         self, state: CameraState, key: jax.Array, frame: jax.Array, params: EnvParams
     ) -> CameraState:
-        """One step of the walk."""
+        """Take one step of the walk."""
         del frame
         if not self.dynamic:
             return state
@@ -136,7 +136,7 @@ class Camera(Distractor):
         )
 
     def change_params(self, state: CameraState, params: EnvParams) -> EnvParams:
-        """The rig with its camera elsewhere."""
+        """Return the rig with its camera elsewhere."""
         rig = params.rig
         radius, azimuth, polar = _spherical(rig.eye - rig.target)
         away = _cartesian(state.radius * radius, state.azimuth + azimuth, state.polar + polar)
@@ -144,11 +144,11 @@ class Camera(Distractor):
         return params.replace(rig=rig.replace(eye=rig.target + away, up=up))
 
     def info(self, state: CameraState) -> dict[str, jax.Array]:
-        """``camera``: (4,), distance relative to the undisturbed one, then azimuth, polar, roll."""
+        """Return ``camera``, (4,): distance over the undisturbed one, azimuth, polar angle, roll."""
         return {"camera": jnp.stack([state.radius, state.azimuth, state.polar, state.roll])}
 
     def _box(self, rig: CameraRig) -> tuple[jax.Array, jax.Array]:
-        """Bounds of relative distance, azimuth, polar angle and roll."""
+        """Return bounds of relative distance, azimuth, polar angle and roll."""
         _, _, polar = _spherical(rig.eye - rig.target)
         b, angle = self.scale, 0.5 * jnp.pi * self.scale
         # Not below the ground, unless the undisturbed camera is.
@@ -159,13 +159,13 @@ class Camera(Distractor):
         return low, high
 
     def _speeds(self, rig: CameraRig) -> tuple[jax.Array, float]:
-        """The greatest velocities: metres a frame, and radians of roll a frame."""
+        """Return the greatest velocities: metres a frame, and radians of roll a frame."""
         radius = jnp.linalg.norm(rig.eye - rig.target)
         return 0.4 * self.scale * radius / _RADIUS, float(jnp.pi) * self.scale / 50.0
 
 
 def _spherical(away: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Distance, azimuth and polar angle of a vector."""
+    """Return distance, azimuth and polar angle of a vector."""
     x, y, z = jnp.asarray(away)
     # Straight above, where neither the azimuth nor the square root has a derivative.
     pole = (x == 0.0) & (y == 0.0)
@@ -182,6 +182,6 @@ def _cartesian(radius: jax.Array, azimuth: jax.Array, polar: jax.Array) -> jax.A
 
 
 def _turn(vector: jax.Array, axis: jax.Array, angle: jax.Array) -> jax.Array:
-    """A vector turned about a unit axis, by Rodrigues' formula."""
+    """Return a vector turned about a unit axis, by Rodrigues' formula."""
     along = jnp.dot(axis, vector) * axis
     return along + jnp.cos(angle) * (vector - along) + jnp.sin(angle) * jnp.cross(axis, vector)

@@ -20,13 +20,13 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from pixelbrax_jax.choices import check_choice, check_whole
 from pixelbrax_jax.distractors import folders, procedural
 from pixelbrax_jax.extras import install_extra
 from pixelbrax_jax.types import Clips
+from pixelbrax_jax.validation import check_choice, check_positive_int
 
 MAX_BYTES = 2 * 1024**3
-"""Device memory that a bank may take unless told otherwise."""
+"""Device memory that a bank may take by default."""
 
 _CACHE_VERSION = 1
 """Raised when the same files would give other pixels."""
@@ -58,7 +58,7 @@ class ClipBank:
     split: str
 
     def __post_init__(self) -> None:
-        """Checks that the parts agree.
+        """Check that the parts agree.
 
         Raises:
             ValueError: they do not; the message says how.
@@ -90,18 +90,18 @@ class ClipBank:
         return int(self.frames.shape[0] * self.frames.shape[1] * self.frames.shape[2] * 4)
 
     def to_device(self) -> Clips:
-        """The clips as ``EnvParams.clips`` wants them, on JAX's default device."""
+        """Return the clips as ``EnvParams.clips`` wants them, on JAX's default device."""
         pixels = np.zeros((*self.frames.shape[:3], 4), np.uint8)
         pixels[..., :3] = self.frames
         return Clips(
-            words=jnp.asarray(pixels.view("<u4")[..., 0]),
+            packed=jnp.asarray(pixels.view("<u4")[..., 0]),
             first=jnp.asarray(self.first),
             length=jnp.asarray(self.length, jnp.int32),
         )
 
 
 def load_clips(
-    source: str | Path = "procedural",
+    source: str | os.PathLike[str] = "procedural",
     split: str = "train",
     *,
     height: int = 84,
@@ -111,13 +111,13 @@ def load_clips(
     cache_dir: str | Path | None = None,
     progress: bool = True,
 ) -> ClipBank:
-    """A bank of clips.
+    """Return a bank of clips.
 
-    Pictures are cut to the middle of the wanted proportions and scaled with an antialiasing
+    Images are cut to the middle of the wanted proportions and scaled with an antialiasing
     filter. What was read once is cached on disk, under a name made from all that decides it.
 
     Args:
-        source: a folder: DAVIS-2017, or videos, or folders of pictures; see
+        source: a folder: DAVIS-2017, or videos, or folders of images; see
             ``folders.find``. ``"procedural"`` makes clips without any file; results with them
             are not results with DAVIS.
         split: of a DAVIS folder ``"train"``, ``"test"``, ``"paper-train"``, ``"paper-test"``; of
@@ -138,11 +138,11 @@ def load_clips(
         FileNotFoundError: something is missing; the message names it and what was expected.
         ValueError: an unknown split, a file that cannot be read, or a clip without frames.
         MemoryError: the bank would be too large; the message says how to make it smaller.
-        ImportError: Pillow or imageio is missing, with the cure.
+        ImportError: Pillow or imageio is missing, with the fix.
     """
-    height, width = check_whole("height", height), check_whole("width", width)
+    height, width = check_positive_int("height", height), check_positive_int("width", width)
     if num_clips is not None:
-        num_clips = check_whole("num_clips", num_clips)
+        num_clips = check_positive_int("num_clips", num_clips)
     if str(source) == "procedural":
         check_choice("split of procedural clips", split, procedural.SPLITS)
         names = procedural.names(split)[:num_clips]
@@ -150,8 +150,8 @@ def load_clips(
         return _procedural(tuple(names), split, height, width)
     folder = Path(source).expanduser()
     sources = folders.find(folder, split)[:num_clips]
-    pictures = sum(len(s.files) for s in sources if not s.is_video)
-    _check_size(pictures, height, width, max_bytes)
+    images = sum(len(s.files) for s in sources if not s.is_video)
+    _check_size(images, height, width, max_bytes)
     home = _cache_home(cache_dir) / f"{_digest(sources, height, width)}.npz"
     frames, length = _read_cache(home) or _decode(sources, height, width, max_bytes, progress)
     _check_size(len(frames), height, width, max_bytes)
@@ -168,7 +168,7 @@ def _procedural(names: tuple[str, ...], split: str, height: int, width: int) -> 
 
 
 def warn_procedural() -> None:
-    """Says, once for each place in the user's code, that these clips are not DAVIS."""
+    """Say, once for each place in the user's code, that these clips are not DAVIS."""
     warnings.warn(
         "the background plays procedural clips, as no clips= were given; results are not results "
         "on DAVIS. Say clips='procedural' if that is what you want, or clips='<folder of "
@@ -179,9 +179,9 @@ def warn_procedural() -> None:
 
 
 def _stacklevel_of_the_user() -> int:
-    """What ``warnings.warn`` wants in the calling function to point at the user's own line.
+    """Return what ``warnings.warn`` wants in the calling function to point at the user's own line.
 
-    An environment is made at many depths: by ``make``, by Gymnasium's, by the class of a door.
+    An environment is made at many depths: by ``make``, by Gymnasium's, by the class of a adapter.
     """
     level, frame = 1, sys._getframe(1)
     while frame.f_globals.get("__name__", "").partition(".")[0] in _NOT_THE_USER:
@@ -197,7 +197,7 @@ def _check_size(frames: int, height: int, width: int, max_bytes: int) -> None:
         raise MemoryError(
             f"{frames} frames of {height} x {width} pixels take {needed / 1e6:.0f} MB on the "
             f"device, and max_bytes allows {max_bytes / 1e6:.0f} MB; take fewer clips "
-            "(num_clips), smaller pictures, or load_clips(..., max_bytes=...)."
+            "(num_clips), smaller images, or load_clips(..., max_bytes=...)."
         )
 
 
@@ -227,7 +227,7 @@ def _with_progress(sources: list[folders.Source], progress: bool) -> Iterable[fo
 
 
 def _frames(source: folders.Source, height: int, width: int, max_bytes: int) -> list[np.ndarray]:
-    """The clip's frames at the wanted size."""
+    """Return the clip's frames at the wanted size."""
     if source.is_video:
         return _video_frames(source.files[0], height, width, max_bytes)
     with ThreadPoolExecutor() as pool:  # Pillow decodes and scales without Python's lock
@@ -240,7 +240,7 @@ def _picture(file: Path, height: int, width: int) -> np.ndarray:
             return _fit(image.convert("RGB"), height, width)
     except OSError as error:
         raise ValueError(
-            f"{file} cannot be read as a picture ({error}); unpack it again."
+            f"{file} cannot be read as an image ({error}); unpack it again."
         ) from error
 
 
@@ -265,7 +265,7 @@ def _video_frames(file: Path, height: int, width: int, max_bytes: int) -> list[n
 
 
 def _fit(image: Any, height: int, width: int) -> np.ndarray:
-    """The middle of a picture at the wanted proportions, scaled; (height, width, 3) uint8."""
+    """Return the middle of an image at the wanted proportions, scaled; (height, width, 3) uint8."""
     scale = min(image.width / width, image.height / height)
     across, down = round(scale * width), round(scale * height)
     left, top = (image.width - across) // 2, (image.height - down) // 2
@@ -274,17 +274,15 @@ def _fit(image: Any, height: int, width: int) -> np.ndarray:
 
 
 def pillow() -> Any:
-    """Pillow's module of images.
+    """Return Pillow's module of images.
 
     Raises:
-        ImportError: it is missing, with the cure.
+        ImportError: it is missing, with the fix.
     """
     try:
         from PIL import Image
     except ImportError as error:
-        raise ImportError(
-            f"reading pictures needs Pillow; try: {install_extra('clips')}"
-        ) from error
+        raise ImportError(f"reading images needs Pillow; try: {install_extra('clips')}") from error
     return Image
 
 
@@ -294,13 +292,13 @@ def _cache_home(given: str | Path | None) -> Path:
 
 
 def _digest(sources: list[folders.Source], height: int, width: int) -> str:
-    """A name for the content of these files at this size, wherever they lie."""
+    """Return a name for the content of these files at this size, wherever they lie."""
     digest = hashlib.sha256(json.dumps([_CACHE_VERSION, height, width]).encode())
     for source in sources:
         digest.update(json.dumps([source.name, len(source.files)]).encode())
         # One after the other: threads would wait for Python's lock longer than for a hash.
         for file in source.files:
-            with file.open("rb") as opened:  # a film need not fit into memory
+            with file.open("rb") as opened:  # a video need not fit into memory
                 digest.update(hashlib.file_digest(opened, "sha256").digest())
     return digest.hexdigest()[:32]
 
@@ -320,7 +318,7 @@ def _read_cache(file: Path) -> tuple[np.ndarray, np.ndarray] | None:
 
 
 def _write_cache(file: Path, frames: np.ndarray, length: np.ndarray) -> None:
-    """Written beside and then renamed: a half-written cache never has the name that is read."""
+    """Write beside and then rename: a half-written cache never has the name that is read."""
     if file.is_file():
         return
     half: Path | None = None

@@ -1,4 +1,4 @@
-"""Colors that change: of the whole picture, or of each thing in it."""
+"""Colors that change: of the whole image, or of each thing in it."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
-from pixelbrax_jax.choices import check_choice, check_share
 from pixelbrax_jax.distractors.base import Distractor
 from pixelbrax_jax.types import EnvParams, Frame, GeomKind
+from pixelbrax_jax.validation import check_choice, check_fraction
 
 MODES = ("frame", "geom")
 DYNAMICS = ("iid", "walk", "static")
@@ -33,7 +33,7 @@ class Color(Distractor):
     decided by ``dynamics``:
 
     * ``"static"``: once for each episode,
-    * ``"iid"``: anew for each frame,
+    * ``"iid"``: for each frame,
     * ``"walk"``: once for each episode, and then ``x += N(0, (0.03 scale)^2)`` for each frame,
       clipped to [-scale, scale].
 
@@ -57,7 +57,7 @@ class Color(Distractor):
     stream: ClassVar[int] = 1
 
     def __post_init__(self) -> None:
-        """Checks the options.
+        """Check the options.
 
         Raises:
             ValueError: an option is unknown or out of range; the message says what is allowed.
@@ -65,10 +65,10 @@ class Color(Distractor):
         check_choice("mode of Color", self.mode, MODES)
         check_choice("dynamics of Color", self.dynamics, DYNAMICS)
         check_choice("distribution of Color", self.distribution, DISTRIBUTIONS)
-        check_share("scale of Color", self.scale)
+        check_fraction("scale of Color", self.scale)
 
-    def begin(self, key: jax.Array, params: EnvParams) -> jax.Array:
-        """The shift: (3,) of the frame, or (M, 3) of the materials."""
+    def reset(self, key: jax.Array, params: EnvParams) -> jax.Array:
+        """Return the shift: (3,) of the frame, or (M, 3) of the materials."""
         shift = self._draw(key, params)
         # A walk starts inside the box that it stays in.
         return self._in_box(shift, params) if self.dynamics == "walk" else shift
@@ -76,7 +76,7 @@ class Color(Distractor):
     def advance(
         self, state: jax.Array, key: jax.Array, frame: jax.Array, params: EnvParams
     ) -> jax.Array:
-        """The next shift."""
+        """Return the next shift."""
         del frame
         if self.dynamics == "static":
             return state
@@ -86,19 +86,19 @@ class Color(Distractor):
         return self._in_box(state + step, params)
 
     def change_params(self, state: jax.Array, params: EnvParams) -> EnvParams:
-        """Materials and ground in other colors."""
+        """Return materials and ground in other colors."""
         if self.mode == "frame":
             return params
         geoms, look = params.geoms, params.look
         plane = _plane_material(params)
         if plane is not None:
             look = look.replace(ground_rgb=look.ground_rgb + state[plane])
-        # A plane may share its material with other geoms, which have less room.
+        # A plane may share its material with other geoms, which may have tighter bounds.
         rgb = jnp.clip(geoms.rgb + state, 0.0, 1.0)
         return params.replace(geoms=geoms.replace(rgb=rgb), look=look)
 
     def change_frame(self, state: jax.Array, frame: Frame, backdrop: jax.Array | None) -> Frame:
-        """The frame with the offset."""
+        """Return the frame with the offset."""
         del backdrop
         if self.mode == "geom":
             return frame
@@ -109,22 +109,22 @@ class Color(Distractor):
         )
 
     def info(self, state: jax.Array) -> dict[str, jax.Array]:
-        """``color``: the shift."""
+        """Return ``color``: the shift."""
         return {"color": state}
 
     def _draw(self, key: jax.Array, params: EnvParams) -> jax.Array:
-        low, high = self._room(params)
+        low, high = self._bounds(params)
         if self.distribution == "normal":
             return jnp.clip(self.scale * jax.random.normal(key, low.shape), low, high)
         low, high = jnp.maximum(low, -self.scale), jnp.minimum(high, self.scale)
         return jax.random.uniform(key, low.shape, minval=low, maxval=high)
 
     def _in_box(self, shift: jax.Array, params: EnvParams) -> jax.Array:
-        low, high = self._room(params)
+        low, high = self._bounds(params)
         return jnp.clip(shift, jnp.maximum(low, -self.scale), jnp.minimum(high, self.scale))
 
-    def _room(self, params: EnvParams) -> tuple[jax.Array, jax.Array]:
-        """Bounds of a shift: of materials, those that leave every color in [0, 1]."""
+    def _bounds(self, params: EnvParams) -> tuple[jax.Array, jax.Array]:
+        """Return bounds of a shift: of materials, those that leave every color in [0, 1]."""
         if self.mode == "frame":
             # The sum is clipped, and not the shift.
             return jnp.full(3, -jnp.inf), jnp.full(3, jnp.inf)
@@ -139,7 +139,7 @@ class Color(Distractor):
 
 
 def _plane_material(params: EnvParams) -> int | None:
-    """The material of the first plane."""
+    """Return the material of the first plane."""
     for kind, material in zip(params.geoms.kind, params.geoms.material, strict=True):
         if kind == GeomKind.PLANE:
             return material

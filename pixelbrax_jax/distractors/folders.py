@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from pixelbrax_jax.choices import check_choice, suggest
+from pixelbrax_jax.validation import check_choice, suggest
 
 IMAGES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".webp"})
 VIDEOS = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".gif"})
@@ -41,7 +41,7 @@ class Source:
 
     Attributes:
         name: of the clip.
-        files: its pictures in order, or a single video file.
+        files: its images in order, or a single video file.
     """
 
     name: str
@@ -54,11 +54,11 @@ class Source:
 
 
 def find(folder: Path, split: str) -> list[Source]:
-    """The clips of a split.
+    """Return the clips of a split.
 
     A folder in DAVIS's layout has the splits ``"train"``, ``"test"`` (DAVIS's validation set),
     ``"paper-train"`` and ``"paper-test"``. Any other folder holds video files, or folders of
-    pictures, in subfolders named like the splits; without subfolders all are in split ``"all"``.
+    images, in subfolders named like the splits; without subfolders all are in split ``"all"``.
 
     Args:
         folder: where to look; its subfolder ``DAVIS`` counts as well.
@@ -75,7 +75,7 @@ def find(folder: Path, split: str) -> list[Source]:
     if not folder.is_dir():
         raise FileNotFoundError(
             f"there is no folder of clips at {folder}. {_DAVIS_LAYOUT}. Or give a folder with "
-            "video files or folders of pictures; or clips='procedural', which needs no files."
+            "video files or folders of images; or clips='procedural', which needs no files."
             + suggest(folder, ["procedural"])
         )
     for root in (folder, folder / "DAVIS"):
@@ -86,9 +86,9 @@ def find(folder: Path, split: str) -> list[Source]:
 
 def _davis(root: Path, split: str) -> list[Source]:
     check_choice(f"split of {root}", split, DAVIS_SPLITS)
-    pictures = root / "JPEGImages" / _RESOLUTION
-    if not pictures.is_dir():
-        raise FileNotFoundError(f"{pictures} is missing. {_DAVIS_LAYOUT}.")
+    images = root / "JPEGImages" / _RESOLUTION
+    if not images.is_dir():
+        raise FileNotFoundError(f"{images} is missing. {_DAVIS_LAYOUT}.")
     if split in _PAPER:
         listed: Iterable[str] = _PAPER[split]
         where = f"split {split!r}"
@@ -100,19 +100,19 @@ def _davis(root: Path, split: str) -> list[Source]:
         where = str(file)
     sources = []
     for name in listed:
-        if not (pictures / name).is_dir():
+        if not (images / name).is_dir():
             raise FileNotFoundError(
-                f"clip {name!r}, listed in {where}, has no folder {pictures / name}; unpack "
+                f"clip {name!r}, listed in {where}, has no folder {images / name}; unpack "
                 "the archive again."
             )
-        sources.append(_sequence(pictures / name))
+        sources.append(_sequence(images / name))
     if not sources:
         raise ValueError(f"{where} lists no clips.")
     return sources
 
 
 def _plain(folder: Path, split: str) -> list[Source]:
-    # A folder of pictures is a clip; one that holds clips is a split; others do not matter.
+    # A folder of images is a clip; one that holds clips is a split; others do not matter.
     parts = [p.name for p in _entries(folder) if p.is_dir() and _holds_clips(p)]
     if parts and _holds_clips(folder):
         raise ValueError(
@@ -129,7 +129,7 @@ def _plain(folder: Path, split: str) -> list[Source]:
             sources.append(Source(entry.stem, (entry,)))
     if not sources:
         kinds = ", ".join(sorted(VIDEOS))
-        raise ValueError(f"{home} has neither videos ({kinds}) nor folders of pictures.")
+        raise ValueError(f"{home} has neither videos ({kinds}) nor folders of images.")
     return sources
 
 
@@ -144,7 +144,7 @@ def _sequence(folder: Path) -> Source:
     files = _pictures(folder)
     if not files:
         kinds = ", ".join(sorted(IMAGES))
-        raise ValueError(f"clip {folder} has no pictures ({kinds}); remove it or fill it.")
+        raise ValueError(f"clip {folder} has no images ({kinds}); remove it or fill it.")
     return Source(folder.name, tuple(files))
 
 
@@ -153,7 +153,7 @@ def _pictures(folder: Path) -> list[Path]:
 
 
 def _entries(folder: Path) -> list[Path]:
-    """By name, 2 before 10; what begins with a dot is not meant."""
+    """Return entries by name, 2 before 10; what begins with a dot is not meant."""
     return sorted(
         (p for p in folder.iterdir() if not p.name.startswith(".")), key=lambda p: _natural(p.name)
     )

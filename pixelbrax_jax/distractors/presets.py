@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from pixelbrax_jax.choices import check_choice
 from pixelbrax_jax.distractors.base import Distractor
 from pixelbrax_jax.distractors.camera import Camera
 from pixelbrax_jax.distractors.color import Color
 from pixelbrax_jax.distractors.video import Video
+from pixelbrax_jax.validation import check_choice
 
 _SCALES = {"easy": 0.1, "medium": 0.2, "hard": 0.3}
 _NUM_CLIPS = {"easy": 4, "medium": 8, "hard": None}
@@ -35,7 +35,7 @@ PRESETS = (
 
 
 def preset(name: str, task: str) -> tuple[Distractor, ...]:
-    """The distractors of a benchmark.
+    """Return the distractors of a benchmark.
 
     * ``"color"``, ``"video"``, ``"camera"``: each with its defaults.
     * ``"paper-color"``, ``"paper-video"``: those of the paper, arXiv 2502.00021.
@@ -76,20 +76,12 @@ def preset(name: str, task: str) -> tuple[Distractor, ...]:
     )
 
 
-def resolve(
-    distractors: str | Distractor | Iterable[str | Distractor] | None, task: str
-) -> tuple[Distractor, ...]:
-    """What the user gave, as distractors.
-
-    Args:
-        distractors: a name or a distractor, or several, or None.
-        task: the task.
-
-    Returns:
-        The distractors.
+def as_tuple(
+    distractors: str | Distractor | Iterable[str | Distractor] | None,
+) -> tuple[str | Distractor, ...]:
+    """Return one or several distractors, or their names, as a tuple.
 
     Raises:
-        ValueError: a name is unknown.
         TypeError: something is neither a name nor a distractor.
     """
     if distractors is None:
@@ -100,15 +92,26 @@ def resolve(
             f"names: {', '.join(PRESETS)}."
         )
     given = (distractors,) if isinstance(distractors, (str, Distractor)) else tuple(distractors)
-    resolved: list[Distractor] = []
     for item in given:
-        if isinstance(item, str):
-            resolved += preset(item, task)
-        elif isinstance(item, Distractor):
-            resolved.append(item)
-        else:
+        if not isinstance(item, (str, Distractor)):
             raise TypeError(
                 f"a distractor is a name or a Distractor, got {type(item).__name__}; names: "
                 f"{', '.join(PRESETS)}."
             )
+    return given
+
+
+def resolve(distractors: Iterable[str | Distractor], task: str) -> tuple[Distractor, ...]:
+    """Return distractors, those of a preset in place of its name.
+
+    Args:
+        distractors: of ``as_tuple``.
+        task: the task, which decides details of some presets.
+
+    Raises:
+        ValueError: a name is unknown.
+    """
+    resolved: list[Distractor] = []
+    for item in distractors:
+        resolved += preset(item, task) if isinstance(item, str) else [item]
     return tuple(resolved)

@@ -23,25 +23,25 @@ SPLITS = tuple(_FAMILIES)
 
 
 def names(split: str) -> list[str]:
-    """Names of a split's clips: family and seed."""
+    """Return names of a split's clips: family and seed."""
     families, first = _FAMILIES[split], _FIRST_SEED[split]
     return [f"{families[i % len(families)]}-{first + i}" for i in range(_CLIPS[split])]
 
 
 def clip(name: str, height: int, width: int) -> np.ndarray:
-    """One clip.
+    """Return one clip.
 
     Args:
         name: of ``names``.
         height: pixels.
         width: pixels.
 
-    Returns:
+    Rephase:
         (FRAMES, height, width, 3) uint8.
     """
     family, seed = name.split("-")
     draw = _Draws(int(seed))
-    # Units of a picture's smaller side, whatever its size.
+    # Units of an image's smaller side, whatever its size.
     unit = 1.0 / min(height, width)
     y = (np.arange(height) + 0.5)[:, None] * unit
     x = (np.arange(width) + 0.5)[None, :] * unit
@@ -60,7 +60,7 @@ class _Draws:
         self._state = np.uint64(seed)
 
     def uniform(self, shape: tuple[int, ...]) -> np.ndarray:
-        """Float64 in [0, 1)."""
+        """Return float64 in [0, 1)."""
         count = int(np.prod(shape, dtype=np.int64))
         with np.errstate(over="ignore"):
             steps = np.arange(1, count + 1, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)
@@ -72,12 +72,12 @@ class _Draws:
         return ((z >> np.uint64(11)) * 2.0**-53).reshape(shape)
 
     def integer(self, low: int, high: int) -> int:
-        """In [low, high]."""
+        """Return an integer in [low, high]."""
         return low + int(self.uniform((1,))[0] * (high - low + 1))
 
 
 def _colored(plane: np.ndarray, palette: np.ndarray) -> np.ndarray:
-    """A plane of values in [0, 1] in colors between the three of a palette."""
+    """Return a plane of values in [0, 1] in colors between the three of a palette."""
     value = np.minimum(np.maximum(plane, 0.0), 1.0)[..., None] * 2.0
     low = palette[0] + (palette[1] - palette[0]) * np.minimum(value, 1.0)
     colors = low + (palette[2] - palette[1]) * np.maximum(value - 1.0, 0.0)
@@ -88,26 +88,26 @@ def _smooth(t: np.ndarray) -> np.ndarray:
     return t * t * (3.0 - 2.0 * t)
 
 
-def _wave(turns: np.ndarray) -> np.ndarray:
-    """A wave of period 1 between 0 and 1, much like a sine."""
-    fraction = turns - np.floor(turns)
+def _wave(phase: np.ndarray) -> np.ndarray:
+    """Return a wave of period 1 between 0 and 1, much like a sine."""
+    fraction = phase - np.floor(phase)
     return _smooth(np.abs(2.0 * fraction - 1.0))
 
 
 def _noise(x: np.ndarray, y: np.ndarray, draw: _Draws) -> list[np.ndarray]:
-    """Drifting value noise in three octaves, on lattices that repeat."""
+    """Return drifting value noise in three octaves, on lattices that repeat."""
     lattices = [draw.uniform((size, size)) for size in (8, 16, 32)]
     # Whole repeats in a clip, so that its end meets its beginning.
     drift = [(draw.integer(-1, 1), draw.integer(-1, 1)) for _ in lattices]
     drift[0] = (1, drift[0][1])
     planes = []
     for frame in range(FRAMES):
-        share = frame / FRAMES
+        fraction = frame / FRAMES
         plane = np.zeros(np.broadcast_shapes(x.shape, y.shape))
         for octave, (lattice, (dx, dy)) in enumerate(zip(lattices, drift, strict=True)):
             size = lattice.shape[0]
             cells = 4.0 * 2.0**octave
-            u, v = x * cells + dx * share * size, y * cells + dy * share * size
+            u, v = x * cells + dx * fraction * size, y * cells + dy * fraction * size
             plane = plane + _value_noise(lattice, u, v) * 0.5**octave
         planes.append((plane / 1.75 - 0.5) * 1.8 + 0.5)
     return planes
@@ -126,7 +126,7 @@ def _value_noise(lattice: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarra
 
 
 def _gratings(x: np.ndarray, y: np.ndarray, draw: _Draws) -> list[np.ndarray]:
-    """Two gratings that run across each other."""
+    """Return two gratings that run across each other."""
     waves = []
     for _ in range(2):
         along = (draw.integer(-4, 4), draw.integer(1, 4))
@@ -143,7 +143,7 @@ def _gratings(x: np.ndarray, y: np.ndarray, draw: _Draws) -> list[np.ndarray]:
 
 
 def _blobs(x: np.ndarray, y: np.ndarray, draw: _Draws) -> list[np.ndarray]:
-    """Soft discs on closed paths."""
+    """Return soft discs on closed paths."""
     number = 7
     centers, radii = draw.uniform((number, 2)), 0.08 + 0.17 * draw.uniform((number,))
     reach, phases = 0.3 * draw.uniform((number, 2)), draw.uniform((number, 2))
@@ -162,7 +162,7 @@ def _blobs(x: np.ndarray, y: np.ndarray, draw: _Draws) -> list[np.ndarray]:
 
 
 def _tiles(x: np.ndarray, y: np.ndarray, draw: _Draws) -> list[np.ndarray]:
-    """A scrolling page of small glyphs: 5 x 5 dots each, with a gap."""
+    """Return a scrolling page of small glyphs: 5 x 5 dots each, with a gap."""
     size = 48
     dots = (draw.uniform((size, size)) < 0.45).astype(np.float64)
     gap = np.arange(size) % 6 == 5

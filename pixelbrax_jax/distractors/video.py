@@ -1,4 +1,4 @@
-"""A video in place of the background, or over the whole picture."""
+"""A video in place of the background, or over the whole image."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from pixelbrax_jax.choices import check_choice, check_share, check_whole
 from pixelbrax_jax.distractors.base import Distractor
 from pixelbrax_jax.types import Clips, EnvParams, Frame
+from pixelbrax_jax.validation import check_choice, check_fraction, check_positive_int
 
 MODES = ("overlay", "background")
 DYNAMICS = ("pingpong", "loop", "static")
@@ -23,7 +23,7 @@ class VideoState(struct.PyTreeNode):
 
     Attributes:
         clip: () int32, index of the clip.
-        start: () int32, its frame at the beginning of the episode.
+        start: () int32, its frame at the start of the episode.
         direction: () int32, +1 or -1.
         frame: () int32, its frame now.
     """
@@ -44,7 +44,7 @@ class Video(Distractor):
     * ``mode="background"``: the sky s becomes ``(1 - a) s + a v``, the ground g
       ``g ground_alpha + (1 - ground_alpha) v``; all else stays as it is, to the bit.
 
-    A clip, its first frame and its direction are drawn when an episode begins. At frame t of
+    A clip, its first frame and its direction are sampled at an episode's reset. At frame t of
     the episode a clip of L frames that started at s in direction d shows
 
     * ``"loop"``: frame ``(s + d t) mod L``,
@@ -59,8 +59,8 @@ class Video(Distractor):
 
     Attributes:
         mode: ``"overlay"`` or ``"background"``.
-        alpha: share of the video, in [0, 1]; None means 0.5 for an overlay, 1 for a background.
-        ground_alpha: share of the ground that is kept, in [0, 1]; of a background only.
+        alpha: fraction of the video, in [0, 1]; None means 0.5 for an overlay, 1 for a background.
+        ground_alpha: fraction of the ground that is kept, in [0, 1]; of a background only.
         dynamics: ``"pingpong"``, ``"loop"`` or ``"static"``.
         num_clips: how many clips of the split are used, the first ones; None means all.
         random_start: whether the first frame is drawn; else it is the clip's first.
@@ -77,29 +77,29 @@ class Video(Distractor):
     stream: ClassVar[int] = 2
 
     def __post_init__(self) -> None:
-        """Checks the options.
+        """Check the options.
 
         Raises:
             ValueError: an option is unknown or out of range; the message says what is allowed.
         """
         check_choice("mode of Video", self.mode, MODES)
         check_choice("dynamics of Video", self.dynamics, DYNAMICS)
-        check_share("alpha of Video", self.share)
-        check_share("ground_alpha of Video", self.ground_alpha)
+        check_fraction("alpha of Video", self.fraction)
+        check_fraction("ground_alpha of Video", self.ground_alpha)
         if self.mode == "overlay" and self.ground_alpha != 1.0:
             raise ValueError("ground_alpha of Video means something with mode='background' alone.")
         if self.num_clips is not None:
-            check_whole("num_clips of Video", self.num_clips)
+            check_positive_int("num_clips of Video", self.num_clips)
 
     @property
-    def share(self) -> float:
-        """Of the video, in [0, 1]."""
+    def fraction(self) -> float:
+        """Weight of the video, in [0, 1]."""
         if self.alpha is not None:
             return self.alpha
         return 0.5 if self.mode == "overlay" else 1.0
 
-    def begin(self, key: jax.Array, params: EnvParams) -> VideoState:
-        """A clip, where it starts and which way it goes."""
+    def reset(self, key: jax.Array, params: EnvParams) -> VideoState:
+        """Return a clip, where it starts and which way it goes."""
         clips = _clips(params)
         clip_key, start_key, direction_key = jax.random.split(key, 3)
         count = clips.length.shape[0]
@@ -117,7 +117,7 @@ class Video(Distractor):
     def advance(
         self, state: VideoState, key: jax.Array, frame: jax.Array, params: EnvParams
     ) -> VideoState:
-        """The clip's next frame."""
+        """Return the clip's next frame."""
         del key
         length = jnp.asarray(_clips(params).length)[state.clip]
         return state.replace(
@@ -127,28 +127,28 @@ class Video(Distractor):
     def backdrop(
         self, state: VideoState, params: EnvParams, rows: jax.Array, height: int, width: int
     ) -> jax.Array:
-        """Rows of the clip's frame, its nearest pixels where the picture is of another size."""
+        """Return rows of the clip's frame, nearest pixels where the image is of another size."""
         clips = _clips(params)
         index = jnp.asarray(clips.first)[state.clip] + state.frame
-        words = jnp.asarray(clips.words)
-        _, present_height, present_width = words.shape
+        packed = jnp.asarray(clips.packed)
+        _, present_height, present_width = packed.shape
         if present_height != height:
             rows = (2 * rows + 1) * present_height // (2 * height)
-        picture = words[index, rows]
+        image = packed[index, rows]
         if present_width == width:
-            return picture
-        return picture[:, (2 * np.arange(width) + 1) * present_width // (2 * width)]
+            return image
+        return image[:, (2 * np.arange(width) + 1) * present_width // (2 * width)]
 
     def change_frame(self, state: VideoState, frame: Frame, backdrop: jax.Array | None) -> Frame:
-        """The frame with the video in it."""
+        """Return the frame with the video in it."""
         del state
         assert backdrop is not None
-        kept: float | jax.Array = 1.0 - self.share
+        kept: float | jax.Array = 1.0 - self.fraction
         if self.mode == "background":
             kept = jnp.where(jnp.isinf(frame.depth), kept, 1.0)
             if self.ground_alpha != 1.0:
                 kept = jnp.where(frame.ground, self.ground_alpha, kept)
-        # Where all is kept, the video's share is an exact zero and the pixel stays to the bit.
+        # Where all is kept, the video's fraction is an exact zero and the pixel stays to the bit.
         added = (1.0 - kept) * (1.0 / 255.0)
         video = [(backdrop >> shift & 0xFF).astype(jnp.float32) for shift in (0, 8, 16)]
         r, g, b = (
@@ -158,7 +158,7 @@ class Video(Distractor):
         return frame.replace(r=r, g=g, b=b)
 
     def info(self, state: VideoState) -> dict[str, jax.Array]:
-        """``video_clip`` and ``video_frame``: which clip, and which of its frames."""
+        """Return ``video_clip`` and ``video_frame``: which clip, and which of its frames."""
         return {"video_clip": state.clip, "video_frame": state.frame}
 
 
@@ -169,7 +169,7 @@ def frame_index(
     direction: jax.Array | int,
     frame: jax.Array | int,
 ) -> jax.Array:
-    """The clip's frame at frame ``frame`` of the episode; see ``Video``.
+    """Return the clip's frame at frame ``frame`` of the episode; see ``Video``.
 
     Args:
         dynamics: ``"pingpong"``, ``"loop"`` or ``"static"``.

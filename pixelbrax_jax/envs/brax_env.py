@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from typing import Any
 
 import jax
@@ -11,7 +10,7 @@ import numpy as np
 
 from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.envs.vector import VectorPixelEnv
-from pixelbrax_jax.physics.compatibility import accept_device_put_replicated, import_silenced
+from pixelbrax_jax.physics.brax.compatibility import accept_device_put_replicated, import_silenced
 from pixelbrax_jax.types import EnvParams, Timestep
 
 with import_silenced():
@@ -19,7 +18,7 @@ with import_silenced():
     from brax.envs.wrappers.training import EpisodeWrapper, VmapWrapper
 
 PIXELS = "pixels/view_0"
-"""Name of the picture in an observation; Brax takes what begins with ``pixels/`` for pictures."""
+"""Name of the image in an observation; Brax takes entries named ``pixels/...`` for images."""
 
 _LEVEL = np.float32(1 / 255)
 """One of the 255 steps from black to white. It is multiplied with: where XLA divides by a constant,
@@ -40,21 +39,21 @@ class BraxPixelEnv(Env):
     Brax's would draw frames that nobody sees, and step on beyond a termination.
 
     Brax's ``AutoResetWrapper`` returns to the first state of the first episode whenever one
-    ends; ``wrap_fresh_episodes`` begins new ones instead.
+    ends; ``wrap_fresh_episodes`` goes on to the next ones instead.
 
     Example:
         >>> env = BraxPixelEnv(*pixelbrax_jax.make("inverted_pendulum"))
         >>> ppo.train(env, 1_000_000, episode_length=env.episode_length, ...)
 
     Attributes:
-        env: the pixel environment, a copy without a time limit.
-        sys: its ``EnvParams``, called as what Brax's ``randomization_fn`` is given: that
-            function may randomise them per environment.
-        episode_length: time limit of the given environment, in calls of ``step``.
+        env: the pixel environment.
+        sys: its ``EnvParams`` without a time limit, called as what Brax's ``randomization_fn`` is
+            given: that function may randomise them per environment.
+        episode_length: time limit of the given parameters, in calls of ``step``.
     """
 
     def __init__(self, env: PixelEnv, params: EnvParams) -> None:
-        """Joins the two; compiles nothing.
+        """Join the two; compile nothing.
 
         Args:
             env: the pixel environment; never modified.
@@ -65,17 +64,16 @@ class BraxPixelEnv(Env):
         """
         if not isinstance(env, PixelEnv):
             raise TypeError(f"env must be a PixelEnv, got {type(env).__name__}.")
-        _mend_trainers()
-        self.env = copy.copy(env)
-        self.env.episode_length = _NO_LIMIT
-        self.sys = params
-        self.episode_length = -(-env.episode_length // env.action_repeat)
+        _patch_trainers()
+        self.env = env
+        self.sys = params.replace(episode_length=np.int32(_NO_LIMIT))
+        self.episode_length = -(-int(params.episode_length) // env.action_repeat)
 
     def reset(self, rng: jax.Array) -> State:
-        """Begins episode 0 of the environment that ``rng`` stands for.
+        """Reset to episode 0 of the environment that ``rng`` stands for.
 
         Args:
-            rng: one PRNG key, raw as Brax's are or typed.
+            rng: one PRNG key, uint32 as Brax's are or typed.
 
         Returns:
             The first state. Its ``pipeline_state`` is the pixel environment's ``EnvState``.
@@ -86,10 +84,10 @@ class BraxPixelEnv(Env):
         if not jnp.issubdtype(rng.dtype, jax.dtypes.prng_key):
             rng = jax.random.wrap_key_data(rng)
         state, timestep = self.env.reset(rng, self.sys)
-        return State(pipeline_state=state, **self._told(timestep))
+        return State(pipeline_state=state, **self._fields(timestep))
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Acts, and draws one frame.
+        """Act, and draw one frame.
 
         Args:
             state: what ``reset`` or ``step`` returned, wrapped or not.
@@ -104,19 +102,19 @@ class BraxPixelEnv(Env):
             TypeError: ``action`` is not floating point.
         """
         pipeline, timestep = self.env.step(state.pipeline_state, action, self.sys)
-        told = self._told(timestep)
+        fields = self._fields(timestep)
         # Brax's wrappers keep metrics of their own beside ours.
-        told["metrics"] = {**state.metrics, **told["metrics"]}
-        return state.replace(pipeline_state=pipeline, **told)
+        fields["metrics"] = {**state.metrics, **fields["metrics"]}
+        return state.replace(pipeline_state=pipeline, **fields)
 
     def observation(self, obs: Any) -> Any:
-        """An observation of the pixel environment in Brax's form.
+        """Return an observation of the pixel environment in Brax's form.
 
         Args:
             obs: as ``Timestep.obs``, of one environment or many.
 
         Returns:
-            The array itself with ``obs_mode="state"``. Otherwise a dict with the picture,
+            The array itself with ``obs_mode="state"``. Otherwise a dict with the image,
             (..., H, W, 3K) float32 in [0, 1], under ``"pixels/view_0"``, and with ``"both"`` the
             (..., S) float32 state under ``"state"``.
         """
@@ -142,7 +140,7 @@ class BraxPixelEnv(Env):
 
     @property
     def backend(self) -> str:
-        """Name of the physics engine."""
+        """Name of the physics backend."""
         return self.env.physics.backend
 
     @property
@@ -150,8 +148,8 @@ class BraxPixelEnv(Env):
         """Seconds of simulated time per call of ``step``."""
         return self.env.dt
 
-    def _told(self, timestep: Timestep) -> dict[str, Any]:
-        """The fields of a Brax state that a timestep decides."""
+    def _fields(self, timestep: Timestep) -> dict[str, Any]:
+        """Return the fields of a Brax state that a timestep decides."""
         return {
             "obs": self.observation(timestep.obs),
             "reward": timestep.reward,
@@ -166,10 +164,10 @@ def wrap_fresh_episodes(
     action_repeat: int = 1,
     randomization_fn: Any = None,
 ) -> Wrapper:
-    """Brax's wrappers for training, but every episode begins from a fresh draw.
+    """Wrap for training as Brax does, but let every episode start from a sampled initial state.
 
     For ``wrap_env_fn`` of Brax's trainers. Episode e of an environment is that of
-    ``PixelEnv.next_episode``. Beginning costs where episodes end, not at every step.
+    ``PixelEnv.next_episode``. A reset costs where episodes end, not at every step.
 
     Args:
         env: the environment.
@@ -189,19 +187,14 @@ def wrap_fresh_episodes(
         raise TypeError(f"env must be a bare BraxPixelEnv, got {type(env).__name__}.")
     if randomization_fn is not None:
         raise ValueError(
-            "wrap_fresh_episodes begins all episodes with the same EnvParams: leave out "
+            "wrap_fresh_episodes resets all episodes with the same EnvParams: leave out "
             "randomization_fn, or leave out wrap_env_fn."
         )
     return _FreshEpisodes(EpisodeWrapper(VmapWrapper(env), episode_length, action_repeat))
 
 
 class _FreshEpisodes(Wrapper):
-    """Begins the next episode in the step that ends one, as ``AutoResetWrapper`` does."""
-
-    def __init__(self, env: Env) -> None:
-        super().__init__(env)
-        # One for each batch size: their compiled programs belong to the object.
-        self._vectors: dict[int, VectorPixelEnv] = {}
+    """Resets to the next episode in the step that ends one, as ``AutoResetWrapper`` does."""
 
     def step(self, state: State, action: jax.Array) -> State:
         # After a step that ends an episode Brax reads its flag and its count of steps; only the
@@ -210,13 +203,13 @@ class _FreshEpisodes(Wrapper):
         info = {**state.info, "steps": steps}
         state = self.env.step(state.replace(done=jnp.zeros_like(state.done), info=info), action)
         inner, num_envs = self.env.unwrapped, state.done.shape[0]
-        vector = self._vectors.setdefault(num_envs, VectorPixelEnv(inner.env, num_envs))
+        vector = VectorPixelEnv(inner.env, num_envs)
         pipeline, timestep = vector.reset_where(state.pipeline_state, state.done > 0.5, inner.sys)
         return state.replace(pipeline_state=pipeline, obs=inner.observation(timestep.obs))
 
 
-def _mend_trainers() -> None:
-    """Lets Brax's trainers run on current JAX."""
+def _patch_trainers() -> None:
+    """Let Brax's trainers run on current JAX."""
     # Only now: who does not train with Brax need not wait for its trainers to load.
     with import_silenced():
         from brax.training import pmap

@@ -19,12 +19,12 @@ class ContractError(AssertionError):
 
 
 def check_env(env: PixelEnv, params: EnvParams, *, seed: int = 0) -> None:
-    """Runs an environment for a few steps and checks everything others rely on.
+    """Run an environment for a few steps and check everything others rely on.
 
     Checked are: shapes and dtypes of observation, reward and flags; that state and timestep keep
     their structure; one compilation for any state; equal results under jit, ``vmap`` and
     ``lax.scan``; equal bits for equal keys and different ones for different keys; frame stacks
-    that begin with copies of the first frame; termination and truncation apart; and that a NaN
+    that start as copies of the first frame; termination and truncation apart; and that a NaN
     action ends the episode and leaves nothing but finite numbers.
 
     Args:
@@ -42,7 +42,7 @@ def check_env(env: PixelEnv, params: EnvParams, *, seed: int = 0) -> None:
     state, first = env.reset(key, params)
     _check_timestep(env, first, "reset")
     _require(float(first.reward) == 0.0, "the reward after a reset must be 0")
-    _require(not bool(first.truncated), "an episode must not begin truncated")
+    _require(not bool(first.truncated), "an episode must not start truncated")
     _check_stack(env, first)
 
     loop_states, loop_steps = [state], []
@@ -117,8 +117,8 @@ def _check_determinism(env: PixelEnv, params: EnvParams, key: jax.Array, first: 
     other_state, _ = env.reset(jax.random.fold_in(key, 2), params)
     next_state, _ = env.next_episode(again_state, params)
     for other, rule in ((other_state, "different keys"), (next_state, "successive episodes")):
-        same = _equal(again_state.physics, other.physics)
-        _require(not same, f"{rule} must begin differently")
+        same = _equal(again_state.sim.physics, other.sim.physics)
+        _require(not same, f"{rule} must start differently")
 
 
 def _check_transforms(
@@ -147,11 +147,11 @@ def _check_single_trace(
     @jax.jit
     def step(state: EnvState, action: jax.Array, params: EnvParams) -> jax.Array:
         traces.append(None)
-        return env.step(state, action, params)[0].step_count
+        return env.step(state, action, params)[0].sim.step_count
 
     for state in (first, later):
         step(state, action, params)
-    _require(len(traces) == 1, "a later state must not compile the step anew")
+    _require(len(traces) == 1, "a later state must not compile the step again")
 
 
 def _equal(a: Any, b: Any) -> bool:
@@ -162,11 +162,11 @@ def _equal(a: Any, b: Any) -> bool:
 
 
 def _close(a: Any, b: Any) -> bool:
-    """Equal up to what another order of float operations may change in a few steps."""
+    """Return whether two are equal up to what another order of float operations may change in a few steps."""
     for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
         x, y = np.asarray(x), np.asarray(y)
         if x.dtype == np.uint8:
-            # A pixel on a silhouette may tip over; a picture may not.
+            # A pixel on a silhouette may tip over; an image may not.
             if (np.abs(x.astype(int) - y.astype(int)) > 1).mean() > 0.01:
                 return False
         elif not np.allclose(x, y, rtol=1e-2, atol=1e-2):

@@ -9,7 +9,7 @@ from pixelbrax_jax.types import Frame
 
 
 def pack(frame: Frame) -> jax.Array:
-    """A frame as one 32-bit word a pixel: red in the low byte, then green, then blue.
+    """Pack a frame into 32 bits a pixel: red in the low byte, then green, then blue.
 
     Returns:
         (H, W) uint32; each channel is ``floor(255 x + 1/2)``.
@@ -21,23 +21,23 @@ def pack(frame: Frame) -> jax.Array:
     return level(frame.r) | level(frame.g) << 8 | level(frame.b) << 16
 
 
-def unpack(words: jax.Array) -> jax.Array:
-    """Packed pixels as channels-last ones: (..., H, W) uint32 -> (..., H, W, 3) uint8."""
-    return jax.lax.bitcast_convert_type(words, jnp.uint8)[..., :3]
+def unpack(packed: jax.Array) -> jax.Array:
+    """Unpack pixels, channels last: (..., H, W) uint32 -> (..., H, W, 3) uint8."""
+    return jax.lax.bitcast_convert_type(packed, jnp.uint8)[..., :3]
 
 
-def push(frames: jax.Array, newest: jax.Array, cleared: jax.Array) -> jax.Array:
-    """The frame stack after one more frame.
+def push(frames: jax.Array, newest: jax.Array, is_first: jax.Array) -> jax.Array:
+    """Return the frame stack after one more frame.
 
     Args:
         frames: (H, W, 3 K) uint8, oldest first.
-        newest: (H, W) uint32, packed.
-        cleared: () bool, an episode begins: the stack becomes K copies of ``newest``.
+        newest: (H, W) uint32 packed pixels.
+        is_first: () bool, the first frame of an episode: the stack becomes K copies of ``newest``.
 
     Returns:
         (H, W, 3 K) uint8.
     """
     pixels = unpack(newest)
     copies = jnp.tile(pixels, (1, 1, frames.shape[-1] // 3 - 1))
-    older = jnp.where(cleared, copies, frames[..., 3:])
+    older = jnp.where(is_first, copies, frames[..., 3:])
     return jnp.concatenate([older, pixels], axis=-1)

@@ -2,36 +2,38 @@
 
 from __future__ import annotations
 
-from functools import partial
+import warnings
+from dataclasses import dataclass
+from functools import cached_property, partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from pixelbrax_jax.choices import check_choice, check_whole
-from pixelbrax_jax.distractors.base import Chain, Distractor
+from pixelbrax_jax.config import ProgramConfig
+from pixelbrax_jax.distractors.base import Chain
+from pixelbrax_jax.distractors.presets import as_tuple
 from pixelbrax_jax.envs import observe
+from pixelbrax_jax.envs.fusion_barrier import fusion_barrier
 from pixelbrax_jax.memory import check_fits
 from pixelbrax_jax.physics.base import Physics
-from pixelbrax_jax.renderer.base import RENDERERS, render
+from pixelbrax_jax.renderer.base import render
 from pixelbrax_jax.scene.place import place
-from pixelbrax_jax.types import EnvParams, EnvState, Frame, Scene, Timestep
-
-OBS_MODES = ("pixels", "state", "both")
+from pixelbrax_jax.types import EnvParams, EnvState, Frame, Scene, SimState, Timestep
+from pixelbrax_jax.validation import check_positive_int
 
 _RESET_STREAM = 0
 """Name of the random stream of physics resets, folded into an episode's key."""
 
-_BANDS = 2
-"""Parts in which an accelerator draws a picture, one above the other: a loop of one is none."""
 
-
-class PixelEnv:
+@dataclass(frozen=True)
+class PixelEnv(ProgramConfig):
     """A continuous-control task that is seen through a camera.
 
     Functional: ``reset`` and ``step`` are pure, jitted, and work under ``jax.vmap``, ``lax.scan``
-    and a jit of your own. Everything that decides the program is an attribute; everything that
-    may be randomised is in ``EnvParams``, an ordinary argument.
+    and a jit of your own. Everything that decides the program is a field, and environments whose
+    fields are equal are equal and share compiled programs. Everything that may be randomised is
+    in ``EnvParams``, an ordinary argument.
 
     All randomness of episode e comes from ``fold_in(key, e)``.
 
@@ -41,55 +43,30 @@ class PixelEnv:
         >>> state, timestep = env.step(state, jnp.zeros(env.action_size), params)
 
     Attributes:
-        physics: the physics engine with its task.
-        height, width: pixels of one frame.
-        frame_stack: frames in one observation.
-        obs_mode: ``"pixels"``, ``"state"`` or ``"both"``.
-        action_repeat: control steps per call of ``step``.
-        episode_length: time limit, in control steps.
-        distractors: what changes the picture, a ``Chain``; empty without pixels.
+        physics: the physics with its task; further fields are those of ``ProgramConfig``. Of
+            ``distractors`` there may be one of a kind, none of them a name; without pixels there
+            are none.
+
+    Raises:
+        ValueError: a field is out of range; the message says what is allowed.
+        TypeError: a field is of another type, or an array or tracer.
+        MemoryError: frames would not fit into this machine's memory.
     """
 
-    def __init__(
-        self,
-        physics: Physics,
-        *,
-        height: int = 84,
-        width: int = 84,
-        frame_stack: int = 3,
-        obs_mode: str = "pixels",
-        action_repeat: int = 1,
-        episode_length: int = 1000,
-        renderer: str = "fused",
-        distractors: tuple[Distractor, ...] = (),
-    ) -> None:
-        """Checks the options.
+    physics: Physics
 
-        Args:
-            physics: the physics engine with its task.
-            height: pixels, at least 1.
-            width: pixels, at least 1.
-            frame_stack: frames in one observation, at least 1.
-            obs_mode: ``"pixels"``, ``"state"`` (nothing is rendered) or ``"both"``.
-            action_repeat: control steps per call of ``step``, at least 1.
-            episode_length: time limit in control steps, at least 1.
-            renderer: ``"fused"`` or ``"reference"``.
-            distractors: what changes the picture; at most one of a kind.
-
-        Raises:
-            ValueError: an option is out of range; the message says what is allowed.
-            MemoryError: frames would not fit into this machine's memory.
-        """
-        self.physics = physics
-        self.height = check_whole("height", height)
-        self.width = check_whole("width", width)
-        self.frame_stack = check_whole("frame_stack", frame_stack)
-        self.obs_mode = check_choice("obs_mode", obs_mode, OBS_MODES)
-        self.action_repeat = check_whole("action_repeat", action_repeat)
-        self.episode_length = check_whole("episode_length", episode_length)
-        self.renderer = check_choice("renderer", renderer, RENDERERS)
-        self.distractors = Chain(distractors if obs_mode != "state" else ())
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        super().__post_init__()
+        self._static("physics")
+        chain = Chain(as_tuple(self.distractors) if self.obs_mode != "state" else ())
+        self._store("distractors", chain.links)
         self.check_memory(1)
+
+    @cached_property
+    def chain(self) -> Chain:
+        """The distractors, one after the other."""
+        return Chain(as_tuple(self.distractors))
 
     @property
     def action_size(self) -> int:
@@ -128,7 +105,7 @@ class PixelEnv:
 
     @partial(jax.jit, static_argnums=0)
     def reset(self, key: jax.Array, params: EnvParams) -> tuple[EnvState, Timestep]:
-        """Begins episode 0 of the environment that ``key`` stands for.
+        """Reset to episode 0 of the environment that ``key`` stands for.
 
         Args:
             key: a typed PRNG key, ``jax.random.key(seed)``.
@@ -141,18 +118,16 @@ class PixelEnv:
             TypeError: ``key`` is not a single typed key.
         """
         check_key(key)
-        state = self.begin(key, jnp.uint32(0), params)
-        state = self.show(state, params, jnp.bool_(True))
-        return state, self.timestep(state, jnp.float32(0.0))
+        return self._reset(key, jnp.uint32(0), params)
 
     @partial(jax.jit, static_argnums=0)
     def step(
         self, state: EnvState, action: jax.Array, params: EnvParams
     ) -> tuple[EnvState, Timestep]:
-        """Acts for ``action_repeat`` control steps and draws one frame.
+        """Act for ``action_repeat`` control steps and draw one frame.
 
-        Nothing resets by itself: when ``state.done`` is set, call ``reset`` or ``next_episode``,
-        or let ``VectorPixelEnv`` do so.
+        Nothing is reset by itself: when ``state.done`` is set, call ``reset`` or
+        ``next_episode``, or let ``VectorPixelEnv`` do so.
 
         Args:
             state: the current state.
@@ -169,19 +144,20 @@ class PixelEnv:
             * ``non_finite``: () bool, the physics diverged; the episode is then terminated with
               reward 0 and the last finite pose is shown,
 
-            and what the distractors tell of themselves.
+            and the info of the distractors.
 
         Raises:
             ValueError: ``action`` has another shape.
             TypeError: ``action`` is not floating point.
         """
-        state, reward = self.advance(state, action, params)
-        state = self.show(state, params, jnp.bool_(False))
-        return state, self.timestep(state, reward)
+        sim, reward = self.advance(state.sim, state.key, action, params)
+        frames = self.push_frame(state.frames, sim, params, jnp.bool_(False))
+        state = state.replace(sim=sim, frames=frames)
+        return state, self.timestep(state, reward, params)
 
     @partial(jax.jit, static_argnums=0)
     def next_episode(self, state: EnvState, params: EnvParams) -> tuple[EnvState, Timestep]:
-        """Begins the environment's next episode, from a fresh draw.
+        """Reset to the environment's next episode.
 
         Args:
             state: any state of the environment.
@@ -190,9 +166,15 @@ class PixelEnv:
         Returns:
             The state and the first timestep, with reward 0.
         """
-        state = self.begin(state.key, state.episode + 1, params)
-        state = self.show(state, params, jnp.bool_(True))
-        return state, self.timestep(state, jnp.float32(0.0))
+        return self._reset(state.key, state.sim.episode + 1, params)
+
+    def _reset(
+        self, key: jax.Array, episode: jax.Array, params: EnvParams
+    ) -> tuple[EnvState, Timestep]:
+        sim = self.reset_sim(key, episode, params)
+        frames = self.push_frame(self.blank_frames(), sim, params, jnp.bool_(True))
+        state = EnvState(sim=sim, frames=frames, key=key)
+        return state, self.timestep(state, jnp.float32(0.0), params)
 
     @partial(jax.jit, static_argnums=(0, 3, 4))
     def render(
@@ -202,7 +184,7 @@ class PixelEnv:
         height: int | None = None,
         width: int | None = None,
     ) -> Frame:
-        """The float frame of a state, at any size, distractors included.
+        """Draw the float frame of a state, at any size, distractors included.
 
         Args:
             state: the state to draw.
@@ -214,20 +196,20 @@ class PixelEnv:
             Colors, depth and segmentation.
         """
         height, width = self._size(height, width)
-        frame = render(self._scene(state, params), height, width, self.renderer)
-        rows = jnp.arange(height)
-        backdrops = self.distractors.backdrops(state.distraction, params, rows, height, width)
-        return self.distractors.change_frame(state.distraction, frame, backdrops)
+        frame = render(self._scene(state.sim, params), height, width, self.renderer)
+        rows, distractor_state = jnp.arange(height), state.sim.distractor_state
+        backdrops = self.chain.backdrops(distractor_state, params, rows, height, width)
+        return self.chain.change_frame(distractor_state, frame, backdrops)
 
     @partial(jax.jit, static_argnums=(0, 3, 4))
-    def picture(
+    def image(
         self,
         state: EnvState,
         params: EnvParams,
         height: int | None = None,
         width: int | None = None,
     ) -> jax.Array:
-        """A state as pixels, rounded like an observation, at any size.
+        """Draw a state as pixels, rounded like an observation, at any size.
 
         Args:
             state: the state to draw.
@@ -239,30 +221,32 @@ class PixelEnv:
             (height, width, 3) uint8, row 0 at the top.
         """
         height, width = self._size(height, width)
-        return observe.unpack(self.draw_at(state, params, height, width))
+        return observe.unpack(self.draw(state.sim, params, height, width))
+
+    def image(self, *args: Any, **kwargs: Any) -> jax.Array:
+        """Draw a state; the former name of ``image``, which goes with the next release."""
+        warnings.warn("PixelEnv.image is PixelEnv.image now.", DeprecationWarning, stacklevel=2)
+        return self.image(*args, **kwargs)
 
     # The pieces of a step, which `VectorPixelEnv` puts together in another order.
 
-    def begin(self, key: jax.Array, episode: jax.Array, params: EnvParams) -> EnvState:
-        """The state at the start of an episode, with nothing drawn yet."""
+    def reset_sim(self, key: jax.Array, episode: jax.Array, params: EnvParams) -> SimState:
+        """Return the first state of an episode."""
         episode_key = jax.random.fold_in(key, episode)
-        shape = (self.height, self.width, 3 * self.frame_stack)
-        return EnvState(
+        return SimState(
             physics=self.physics.reset(jax.random.fold_in(episode_key, _RESET_STREAM)),
-            frames=jnp.zeros((0, 0, 0) if self.obs_mode == "state" else shape, jnp.uint8),
-            key=key,
             episode=episode,
             step_count=jnp.int32(0),
-            head_start=jnp.int32(0),
+            time_limit_offset=jnp.int32(0),
             episode_return=jnp.float32(0.0),
             done=jnp.bool_(False),
-            distraction=self.distractors.begin(episode_key, params),
+            distractor_state=self.chain.reset(episode_key, params),
         )
 
     def advance(
-        self, state: EnvState, action: jax.Array, params: EnvParams
-    ) -> tuple[EnvState, jax.Array]:
-        """The state after the action, with nothing drawn yet, and the reward."""
+        self, sim: SimState, key: jax.Array, action: jax.Array, params: EnvParams
+    ) -> tuple[SimState, jax.Array]:
+        """Return the state after the action, and the reward; ``key`` is the environment's."""
         action = self._check_action(action)
 
         def control_step(carry: Any, _: None) -> tuple[Any, None]:
@@ -273,105 +257,91 @@ class PixelEnv:
             count += jnp.where(over, 0, 1)
             return (physics, reward, count, over | moved.terminated | (count >= limit)), None
 
-        limit = self.episode_length - state.head_start
+        limit = params.episode_length - sim.time_limit_offset
         if self.action_repeat == 1:
-            physics = self.physics.step(state.physics, action)
-            reward, count = physics.reward, state.step_count + 1
+            physics = self.physics.step(sim.physics, action)
+            reward, count = physics.reward, sim.step_count + 1
         else:
-            start = (state.physics, jnp.float32(0.0), state.step_count, jnp.bool_(False))
+            start = (sim.physics, jnp.float32(0.0), sim.step_count, jnp.bool_(False))
             (physics, reward, count, _), _ = jax.lax.scan(
                 control_step, start, length=self.action_repeat
             )
         # The number of this frame in its episode; the last one may come early.
         frame = -(-count // self.action_repeat)
-        episode_key = jax.random.fold_in(state.key, state.episode)
-        state = state.replace(
+        episode_key = jax.random.fold_in(key, sim.episode)
+        sim = sim.replace(
             physics=physics,
             step_count=count,
-            episode_return=state.episode_return + reward,
+            episode_return=sim.episode_return + reward,
             done=physics.terminated | (count >= limit),
-            distraction=self.distractors.advance(state.distraction, episode_key, frame, params),
+            distractor_state=self.chain.advance(sim.distractor_state, episode_key, frame, params),
         )
-        return state, reward
+        return sim, reward
 
-    def draw(self, state: EnvState, params: EnvParams) -> jax.Array:
-        """The packed frame of a state, (H, W) uint32."""
-        return self.draw_at(state, params, self.height, self.width)
+    def draw(
+        self, sim: SimState, params: EnvParams, height: int | None = None, width: int | None = None
+    ) -> jax.Array:
+        """Return the image of a state, (height, width) uint32 packed pixels."""
+        height, width = self._size(height, width)
+        scene = self._scene(sim, params)
 
-    def draw_at(self, state: EnvState, params: EnvParams, height: int, width: int) -> jax.Array:
-        """The packed frame of a state at any size, (height, width) uint32."""
-        scene = self._scene(state, params)
-
-        # Both forms are walls that XLA does not fuse across: without one the renderer is fused
-        # into whoever reads the words, and runs again for every reader.
         def draw_rows(first_row: jax.Array, num_rows: int) -> jax.Array:
             frame = render(
                 scene, height, width, self.renderer, first_row=first_row, num_rows=num_rows
             )
-            # The last band may reach beyond the picture.
             rows = jnp.minimum(first_row + jnp.arange(num_rows), height - 1)
-            backdrops = self.distractors.backdrops(state.distraction, params, rows, height, width)
-            return observe.pack(self.distractors.change_frame(state.distraction, frame, backdrops))
+            backdrops = self.chain.backdrops(sim.distractor_state, params, rows, height, width)
+            return observe.pack(self.chain.change_frame(sim.distractor_state, frame, backdrops))
 
-        def draw_in_bands() -> jax.Array:
-            num_rows = -(-height // _BANDS)
-            first_rows = jnp.arange(_BANDS) * num_rows
-            words = jax.lax.map(lambda first_row: draw_rows(first_row, num_rows), first_rows)
-            return words.reshape(-1, width)[:height]
+        return fusion_barrier(draw_rows, height, width)
 
-        def draw_at_once() -> jax.Array:
-            # On a CPU, XLA clears the result of a loop beforehand, and runs in one thread whatever
-            # is fused into the writes to it. A conditional costs nothing; were it known to be
-            # always taken, the compiler would remove it, and the wall with it.
-            zero = jax.lax.optimization_barrier(jnp.int32(0))
-            blank = jnp.zeros(height * width, jnp.uint32)
-            # In one axis, as the renderer computes it.
-            words = jax.lax.cond(zero == 0, lambda: draw_rows(zero, height).ravel(), lambda: blank)
-            return words.reshape(height, width)
+    def blank_frames(self) -> jax.Array:
+        """Return a black frame stack; an empty one without pixels."""
+        shape = (self.height, self.width, 3 * self.frame_stack)
+        return jnp.zeros((0, 0, 0) if self.obs_mode == "state" else shape, jnp.uint8)
 
-        words: jax.Array = jax.lax.platform_dependent(cpu=draw_at_once, default=draw_in_bands)
-        return words
-
-    def show(self, state: EnvState, params: EnvParams, first: jax.Array) -> EnvState:
-        """``state`` with its present frame on the stack."""
+    def push_frame(
+        self, frames: jax.Array, sim: SimState, params: EnvParams, is_first: jax.Array
+    ) -> jax.Array:
+        """Return the frame stack with the image of a state, K copies of it if it is the first."""
         if self.obs_mode == "state":
-            return state
-        newest = self.draw(state, params)
-        return state.replace(frames=observe.push(state.frames, newest, first))
+            return frames
+        return observe.push(frames, self.draw(sim, params), is_first)
 
-    def timestep(self, state: EnvState, reward: jax.Array) -> Timestep:
-        """What the agent sees of ``state``."""
-        terminated = state.physics.terminated
+    def timestep(self, state: EnvState, reward: jax.Array, params: EnvParams) -> Timestep:
+        """Return what the agent sees of a state."""
+        sim, terminated = state.sim, state.sim.physics.terminated
+        limit_reached = sim.step_count + sim.time_limit_offset >= params.episode_length
         return Timestep(
             obs=self.obs(state),
             reward=reward,
             terminated=terminated,
-            truncated=~terminated & (state.step_count + state.head_start >= self.episode_length),
+            truncated=~terminated & limit_reached,
             info={
-                "episode_return": state.episode_return,
-                "episode_length": state.step_count,
-                "non_finite": state.physics.non_finite,
-                **self.distractors.info(state.distraction),
+                "episode_return": sim.episode_return,
+                "episode_length": sim.step_count,
+                "non_finite": sim.physics.non_finite,
+                **self.chain.info(sim.distractor_state),
             },
         )
 
     def obs(self, state: EnvState) -> Any:
-        """The observation of ``state``, as ``obs_mode`` says."""
+        """Return the observation of a state, as ``obs_mode`` says."""
         if self.obs_mode == "state":
-            return state.physics.obs
+            return state.sim.physics.obs
         if self.obs_mode == "pixels":
             return state.frames
-        return {"pixels": state.frames, "state": state.physics.obs}
+        return {"pixels": state.frames, "state": state.sim.physics.obs}
 
     def _size(self, height: int | None, width: int | None) -> tuple[int, int]:
         return (
-            self.height if height is None else check_whole("height", height),
-            self.width if width is None else check_whole("width", width),
+            self.height if height is None else check_positive_int("height", height),
+            self.width if width is None else check_positive_int("width", width),
         )
 
-    def _scene(self, state: EnvState, params: EnvParams) -> Scene:
-        params = self.distractors.change_params(state.distraction, params)
-        physics = state.physics
+    def _scene(self, sim: SimState, params: EnvParams) -> Scene:
+        params = self.chain.change_params(sim.distractor_state, params)
+        physics = sim.physics
         return place(params.geoms, params.rig, params.look, physics.xpos, physics.xquat)
 
     def _check_action(self, action: jax.Array) -> jax.Array:
@@ -386,10 +356,10 @@ class PixelEnv:
 
 
 def check_key(key: jax.Array, shape: tuple[int, ...] = ()) -> None:
-    """Rejects anything but typed PRNG keys of the given shape.
+    """Reject anything but typed PRNG keys of the given shape.
 
     Raises:
-        TypeError: it is not, with the cure.
+        TypeError: it is not; the message says how to get one.
     """
     is_array = isinstance(key, jax.Array)
     if not (is_array and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)):

@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
-from functools import partial
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property, partial
 from typing import Any
 
 import jax
 from jax.sharding import AxisType, Mesh, PartitionSpec
 
-from pixelbrax_jax.choices import check_whole
 from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.types import EnvParams, EnvState, Timestep
+from pixelbrax_jax.validation import check_positive_int
 
 AXIS = "envs"
 """Name of the mesh axis along which environments are spread."""
 
 
 def make_env_mesh(num_devices: int | None = None) -> Mesh:
-    """A mesh of devices along the axis ``"envs"``, whose shardings the compiler propagates.
+    """Make a mesh of devices along the axis ``"envs"``, whose shardings the compiler propagates.
 
     Args:
         num_devices: how many; None takes all, those of other processes too.
@@ -27,6 +29,7 @@ def make_env_mesh(num_devices: int | None = None) -> Mesh:
     return jax.make_mesh((num_devices,), (AXIS,), axis_types=(AxisType.Auto,))
 
 
+@dataclass(frozen=True)
 class ShardedVectorEnv:
     """``VectorPixelEnv`` with equally many environments on each device of a mesh.
 
@@ -35,45 +38,31 @@ class ShardedVectorEnv:
 
     Attributes:
         env: the environment.
-        num_envs: N, over all devices.
-        mesh: the devices, along an axis ``"envs"``.
+        num_envs: N, over all devices; a multiple of their number.
+        mesh: the devices, along an axis ``"envs"``, of `make_env_mesh`.
         autoreset_mode: as of ``VectorPixelEnv``.
+
+    Raises:
+        ValueError: the environments cannot be spread evenly.
     """
 
-    def __init__(
-        self, env: PixelEnv, num_envs: int, mesh: Mesh, autoreset_mode: str = "next_step"
-    ) -> None:
-        """Checks the options.
+    env: PixelEnv
+    num_envs: int
+    mesh: Mesh
+    autoreset_mode: str = "next_step"
 
-        Args:
-            env: the environment.
-            num_envs: N, a multiple of the number of devices.
-            mesh: of `make_env_mesh`.
-            autoreset_mode: as of ``VectorPixelEnv``.
-
-        Raises:
-            ValueError: the environments cannot be spread evenly.
-        """
-        self.env = env
-        self.num_envs = check_whole("num_envs", num_envs)
-        self.mesh = mesh
-        self.autoreset_mode = autoreset_mode
-        size = mesh.shape[AXIS]
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        num_envs, size = check_positive_int("num_envs", self.num_envs), self.mesh.shape[AXIS]
         if num_envs % size:
             raise ValueError(f"num_envs={num_envs} must be a multiple of the {size} devices.")
-        self._here = VectorPixelEnv(env, num_envs // size, autoreset_mode)
-        spread, same = PartitionSpec(AXIS), PartitionSpec()
-        # Loops and branches inside differ between devices, which the checker cannot follow.
-        shard = partial(jax.shard_map, mesh=mesh, out_specs=spread, check_vma=False)
-        self._reset = shard(self._here.reset, in_specs=(spread, same))
-        self._step = shard(self._here.step, in_specs=(spread, spread, same))
+        object.__setattr__(self, "num_envs", num_envs)
 
     @partial(jax.jit, static_argnums=0)
     def reset(self, key: jax.Array, params: EnvParams) -> tuple[EnvState, Timestep]:
         """As ``VectorPixelEnv.reset``, of one key."""
-        result: tuple[EnvState, Timestep] = self._reset(
-            self._here.keys_of(key, self.num_envs), params
-        )
+        keys = self._local.env_keys(key, self.num_envs)
+        result: tuple[EnvState, Timestep] = self._shard(self._local.reset, 1)(keys, params)
         return result
 
     @partial(jax.jit, static_argnums=0)
@@ -81,9 +70,27 @@ class ShardedVectorEnv:
         self, state: EnvState, action: jax.Array, params: EnvParams
     ) -> tuple[EnvState, Timestep]:
         """As ``VectorPixelEnv.step``."""
-        result: tuple[EnvState, Timestep] = self._step(state, action, params)
+        result: tuple[EnvState, Timestep] = self._shard(self._local.step, 2)(state, action, params)
         return result
 
     def obs(self, state: EnvState) -> Any:
-        """Observations of the states, with a leading axis N."""
-        return self._here.obs(state)
+        """Return the observations of the states, with a leading axis N."""
+        return self._local.obs(state)
+
+    @cached_property
+    def _local(self) -> VectorPixelEnv:
+        """The environments of one device."""
+        num_envs = self.num_envs // self.mesh.shape[AXIS]
+        return VectorPixelEnv(self.env, num_envs, self.autoreset_mode)
+
+    def _shard(self, fn: Callable[..., Any], num_spread: int) -> Callable[..., Any]:
+        """Return ``fn`` on each device, of its rows of the first arguments and the same params."""
+        spread, same = PartitionSpec(AXIS), PartitionSpec()
+        # Loops and branches inside differ between devices, which the checker cannot follow.
+        return jax.shard_map(
+            fn,
+            mesh=self.mesh,
+            in_specs=(spread,) * num_spread + (same,),
+            out_specs=spread,
+            check_vma=False,
+        )

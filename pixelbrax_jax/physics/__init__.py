@@ -1,18 +1,29 @@
-"""Dynamics and tasks: what moves, what it earns, when it ends."""
+"""Dynamics: what moves, what it earns, when it ends. One folder for each engine."""
 
-from pixelbrax_jax.physics.base import BACKENDS, Kinematics, Physics
-from pixelbrax_jax.physics.brax_physics import BraxPhysics
-from pixelbrax_jax.physics.mjcf_task import mjcf_physics
-from pixelbrax_jax.physics.tasks import REWARD_PRESETS, TASKS, TaskSpec, make_physics
+from __future__ import annotations
 
-__all__ = [
-    "BACKENDS",
-    "REWARD_PRESETS",
-    "TASKS",
-    "BraxPhysics",
-    "Kinematics",
-    "Physics",
-    "TaskSpec",
-    "make_physics",
-    "mjcf_physics",
-]
+from importlib import import_module
+
+from pixelbrax_jax.physics.base import Physics
+from pixelbrax_jax.tasks import TASKS
+from pixelbrax_jax.validation import check_choice
+
+
+def make_physics(task: str, *, backend: str | None = None, reward_preset: str = "brax") -> Physics:
+    """Make the physics of a built-in task, by the engine of its row.
+
+    Args:
+        task: a name in ``TASKS``.
+        backend: a physics backend that the task supports; None for its default.
+        reward_preset: ``"brax"`` or ``"paper"``.
+
+    Returns:
+        The physics; equal arguments give equal objects.
+
+    Raises:
+        ValueError: for an unknown name; the message lists what is allowed.
+    """
+    engine = TASKS[check_choice("task", task, TASKS)].engine
+    module = import_module(f"pixelbrax_jax.physics.{engine}.tasks")
+    physics: Physics = module.make_physics(task, backend=backend, reward_preset=reward_preset)
+    return physics

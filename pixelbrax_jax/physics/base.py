@@ -1,7 +1,8 @@
-"""The interface between a physics engine and the rest of the package."""
+"""The interface between physics and the rest of the package."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
 import jax
@@ -9,12 +10,9 @@ from flax import struct
 
 from pixelbrax_jax.types import Geoms, PhysicsState
 
-BACKENDS = ("generalized", "mjx", "positional", "spring")
-"""Names of Brax's engines."""
-
 
 class Kinematics(struct.PyTreeNode):
-    """The readable part of an engine's state; what task formulas are written in.
+    """The readable part of a simulator's state; what task formulas are written in.
 
     Attributes:
         q: (Q,) float32, joint positions in MuJoCo's order (metres, radians; a free joint is a
@@ -30,20 +28,26 @@ class Kinematics(struct.PyTreeNode):
     xquat: jax.Array
 
 
+RewardFn = Callable[[Kinematics, Kinematics, jax.Array], jax.Array]
+"""A reward of the states before and after a step and the (A,) action; returns a scalar."""
+
+
 @runtime_checkable
 class Physics(Protocol):
     """A task's dynamics for ONE environment, as pure functions.
 
     ``reset`` and ``step`` may be jitted, vmapped and scanned; every state they return has the
-    same tree, shapes and dtypes, so a jitted ``step`` is traced once. Whatever the engine does,
-    the fields of a ``PhysicsState`` other than ``engine`` are finite.
+    same tree, shapes and dtypes, so a jitted ``step`` is traced once. The fields of a
+    ``PhysicsState`` other than ``engine`` are always finite, as ``divergence.GuardedPhysics`` sees
+    to. Environments over equal physics share compiled programs; it must hence be hashable, and
+    equal only to what computes the same.
 
     Attributes:
         geoms: the visible shapes, each fixed in a link's frame.
         dt: seconds of simulated time per control step.
         action_size: A, number of actuators.
         state_size: S, length of ``PhysicsState.obs``.
-        backend: name of the engine.
+        backend: name of the physics backend.
         link_names: L names; ``link/index`` where the model has none. Row i of ``xpos`` and
             ``xquat`` belongs to ``link_names[i]``.
     """
@@ -56,20 +60,20 @@ class Physics(Protocol):
     link_names: tuple[str, ...]
 
     def reset(self, key: jax.Array) -> PhysicsState:
-        """A fresh draw of the task's initial state.
+        """Sample the task's initial state.
 
         Args:
             key: PRNG key, the only source of randomness.
 
         Returns:
             The first state of an episode, with reward 0 and ``terminated`` false. Should the
-            draw itself be non-finite, ``non_finite`` and ``terminated`` are true, the links
+            sample itself be non-finite, ``non_finite`` and ``terminated`` are true, the links
             are at the world's origin and the observation is 0.
         """
         ...
 
     def step(self, state: PhysicsState, action: jax.Array) -> PhysicsState:
-        """One control step.
+        """Advance by one control step.
 
         Args:
             state: what ``reset`` or ``step`` returned.

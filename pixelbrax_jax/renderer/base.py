@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pixelbrax_jax.choices import check_choice
 from pixelbrax_jax.renderer import fused, reference
 from pixelbrax_jax.types import Frame, Scene
+from pixelbrax_jax.validation import check_choice
 
 RENDERERS = ("fused", "reference")
 
@@ -24,7 +24,7 @@ def render(
     first_row: jax.Array | int = 0,
     num_rows: int | None = None,
 ) -> Frame:
-    """One picture of the scene.
+    """Draw an image of the scene.
 
     Colors and depth may be differentiated by everything in the scene that is an array: poses,
     sizes, colors, camera and light. The derivative is finite everywhere. It is that of the
@@ -36,7 +36,7 @@ def render(
         scene: what to draw, in the world frame.
         height: pixels, at least 1.
         width: pixels, at least 1.
-        renderer: ``"fused"`` or ``"reference"``; same picture, other speed.
+        renderer: ``"fused"`` or ``"reference"``; same image, other speed.
         first_row: () int, may be traced: first row of the band to draw.
         num_rows: rows of the band; None draws all rows.
 

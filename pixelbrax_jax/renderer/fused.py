@@ -6,7 +6,7 @@ float32 numbers sort like their bits, and the low bits, replaced by the geom's r
 winner along. A missed geom gives NaN or a negative distance, whose bits lose by themselves as
 unsigned integers. Only the winner is shaded, from two products of its normal.
 
-`docs/renderer.md` has the measurements behind this form. It draws the picture of
+`docs/renderer.md` has the measurements behind it. It draws the image of
 `reference.py`; it has no useful derivative of its own (see `base.py`).
 """
 
@@ -31,11 +31,11 @@ _SHADOW_BIAS = 1e-3
 def render(
     scene: Scene, height: int, width: int, first_row: jax.Array | int, num_rows: int
 ) -> Frame:
-    """A band of rows of a picture of the scene.
+    """Return a band of rows of an image of the scene.
 
     Args:
         scene: what to draw.
-        height: pixels of the whole picture.
+        height: pixels of the whole image.
         width: pixels.
         first_row: () int, the band's first row; may be traced.
         num_rows: rows of the band.
@@ -93,10 +93,10 @@ def render(
     color = _surface_colors(geoms, order, winner)
     for rank, kind in enumerate(kinds):
         if kind == GeomKind.PLANE:
-            share = _ground_share(look, ray, hits[rank].t, pixel, centers[rank], axes[rank])
+            fraction = _ground_fraction(look, ray, hits[rank].t, pixel, centers[rank], axes[rank])
             for c in range(3):
                 first, second = look.ground_rgb[0, c], look.ground_rgb[1, c]
-                color[c] = jnp.where(seen[rank], first + share * (second - first), color[c])
+                color[c] = jnp.where(seen[rank], first + fraction * (second - first), color[c])
 
     gloss = at_least(2.0 * n_l * n_z - light[2], 0.0) ** look.shininess
     gloss = jnp.where(lit & (n_l > 0.0), gloss, 0.0)
@@ -133,7 +133,7 @@ def _rays(
     first_row: jax.Array | int,
     num_rows: int,
 ) -> Vector:
-    """Unit rays through the pixels' centers in the camera's frame, row after row from the top."""
+    """Return unit rays through the pixels' centers, camera's frame, row after row from the top."""
     index = jnp.arange(num_rows * width, dtype=jnp.int32)
     row = jax.lax.div(index, np.int32(width)) + first_row
     column = jax.lax.rem(index, np.int32(width))
@@ -144,7 +144,7 @@ def _rays(
 
 
 def _nearest(hits: list[Hit], shape: tuple[int]) -> tuple[jax.Array, jax.Array]:
-    """Distance and rank of the nearest hit; the rank of the sky is ``len(hits)``."""
+    """Return distance and rank of the nearest hit; the rank of the sky is ``len(hits)``."""
     rank_bits = np.uint32((1 << len(hits).bit_length()) - 1)
     key = jnp.full(shape, (_INF_BITS & ~rank_bits) | np.uint32(len(hits)), jnp.uint32)
     for rank, hit in enumerate(hits):
@@ -155,7 +155,7 @@ def _nearest(hits: list[Hit], shape: tuple[int]) -> tuple[jax.Array, jax.Array]:
 
 
 def _surface_colors(geoms: Geoms, order: list[int], winner: jax.Array) -> list[jax.Array]:
-    """The winner's own color, one plane a channel. ``order`` must group the materials."""
+    """Return the winner's own color, one plane a channel. ``order`` must group the materials."""
     materials = [geoms.material[g] for g in order]
     color = [jnp.full(winner.shape, geoms.rgb[materials[0], c]) for c in range(3)]
     for rank in range(1, len(order)):
@@ -165,7 +165,7 @@ def _surface_colors(geoms: Geoms, order: list[int], winner: jax.Array) -> list[j
     return color
 
 
-def _ground_share(
+def _ground_fraction(
     look: Look,
     ray: Vector,
     t: jax.Array,
@@ -173,7 +173,7 @@ def _ground_share(
     center: Vector,
     axes: Axes,
 ) -> jax.Array:
-    """Share of the ground's second color in each pixel, for rays that hit a plane at ``t``."""
+    """Return the fraction of the ground's second color in pixels whose rays hit a plane at ``t``."""
     normal = axes[2]
     slope = 1.0 / at_most(dot(ray, normal), -1e-7)
     inv_pitch = 1.0 / look.ground_pitch
@@ -186,4 +186,4 @@ def _ground_share(
         right = axis[0] - ray_axis * slope * normal[0]
         above = axis[1] - ray_axis * slope * normal[1]
         widths.append(step * (jnp.abs(right) + jnp.abs(above)))
-    return ground.second_color_share(look.ground, *coords, *widths)
+    return ground.second_color_fraction(look.ground, *coords, *widths)

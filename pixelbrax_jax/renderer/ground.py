@@ -22,26 +22,26 @@ LINE_WIDTH = 1.0 / 84.0
 def _average(
     integral: Callable[[jax.Array], jax.Array], center: jax.Array, width: jax.Array
 ) -> jax.Array:
-    """Mean of a periodic function of period 1 over a window, given its integral."""
+    """Return the mean of a periodic function of period 1 over a window, given its integral."""
     width = at_least(width, 1e-4)
     return (integral(center + 0.5 * width) - integral(center - 0.5 * width)) / width
 
 
 def _square_wave_integral(x: jax.Array) -> jax.Array:
-    """Integral of the wave that is +1 on [0, 1/2) and -1 on [1/2, 1)."""
+    """Return the integral of the wave that is +1 on [0, 1/2) and -1 on [1/2, 1)."""
     return 0.5 - jnp.abs(x - jnp.floor(x) - 0.5)
 
 
 def _line_integral(x: jax.Array) -> jax.Array:
-    """Integral of the function that is 1 on [0, LINE_WIDTH) and 0 on the rest of [0, 1)."""
+    """Return the integral of what is 1 on [0, LINE_WIDTH) and 0 on the rest of [0, 1)."""
     whole = jnp.floor(x)
     return LINE_WIDTH * whole + at_most(x - whole, LINE_WIDTH)
 
 
-def second_color_share(
+def second_color_fraction(
     pattern: str, x: jax.Array, y: jax.Array, width_x: jax.Array, width_y: jax.Array
 ) -> jax.Array:
-    """How much of the ground's second color a pixel sees.
+    """Return how much of the ground's second color a pixel sees.
 
     Args:
         pattern: ``"checker"`` or ``"grid"``.

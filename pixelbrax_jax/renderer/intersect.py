@@ -42,7 +42,7 @@ class Hit(NamedTuple):
 
 
 def dot(a: Vector, b: Vector) -> jax.Array:
-    """Inner product."""
+    """Return the inner product."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
@@ -151,7 +151,7 @@ _BY_KIND = {
 
 
 def intersect(kind: int, ray: Vector, pos: Vector, axes: Axes, size: Vector) -> Hit:
-    """Where unit rays from the origin enter a geom.
+    """Return where unit rays from the origin enter a geom.
 
     Args:
         kind: a value of ``GeomKind``.

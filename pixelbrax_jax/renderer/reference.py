@@ -20,11 +20,11 @@ _SHADOW_BIAS = 1e-3
 def render(
     scene: Scene, height: int, width: int, first_row: jax.Array | int, num_rows: int
 ) -> Frame:
-    """A band of rows of a picture of the scene.
+    """Return a band of rows of an image of the scene.
 
     Args:
         scene: what to draw.
-        height: pixels of the whole picture.
+        height: pixels of the whole image.
         width: pixels.
         first_row: () int, the band's first row; may be traced.
         num_rows: rows of the band.
@@ -84,7 +84,7 @@ def render(
 
 
 def pixel_rays(camera: Camera, height: int, width: int, rows: jax.Array) -> jax.Array:
-    """Unit directions through the pixels' centers, world frame, (len(rows), W, 3)."""
+    """Return unit directions through the pixels' centers, world frame, (len(rows), W, 3)."""
     pixel = 2.0 * jnp.tan(jnp.deg2rad(camera.fovy) / 2.0) / height
     x = (jnp.arange(width) - 0.5 * (width - 1)) * pixel
     y = (0.5 * (height - 1) - rows) * pixel
@@ -100,7 +100,7 @@ def _cast(
     xmat: jax.Array,
     size: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
-    """Distance at which rays enter a geom (``inf`` if never) and the normals there, world."""
+    """Return distances at which rays enter a geom (``inf`` if never), and normals, world frame."""
     o = (origin - pos) @ xmat
     d = rays @ xmat
     o = jnp.broadcast_to(o, d.shape)
@@ -109,7 +109,7 @@ def _cast(
 
 
 def _entry(a: jax.Array, b: jax.Array, c: jax.Array) -> jax.Array:
-    """Smaller root of ``a t^2 + 2 b t + c`` where it is real and positive, else ``inf``."""
+    """Return the smaller root of ``a t^2 + 2 b t + c`` if it is real and positive, else ``inf``."""
     discriminant = b * b - a * c
     real = (discriminant > 0.0) & (a > 1e-7)
     root = jnp.sqrt(jnp.where(real, discriminant, 1.0))
@@ -118,7 +118,7 @@ def _entry(a: jax.Array, b: jax.Array, c: jax.Array) -> jax.Array:
 
 
 def _at(o: jax.Array, d: jax.Array, t: jax.Array) -> jax.Array:
-    """Points on the rays; the origin's neighbor where ``t`` is infinite."""
+    """Return points on the rays; the origin's neighbor where ``t`` is infinite."""
     return o + jnp.where(jnp.isfinite(t), t, 1.0)[..., None] * d
 
 
@@ -204,7 +204,7 @@ _LOCAL = {
 def _ground_color(
     look: Look, camera: Camera, rays: jax.Array, pos: jax.Array, xmat: jax.Array, height: int
 ) -> jax.Array:
-    """The plane's pattern where the rays meet it, (H, W, 3)."""
+    """Return the plane's pattern where the rays meet it, (H, W, 3)."""
     o, d = (camera.pos - pos) @ xmat, rays @ xmat
     pixel = 2.0 * jnp.tan(jnp.deg2rad(camera.fovy) / 2.0) / height
     # Rays of length 1 along the viewing axis are linear in the pixel's position, so their
@@ -220,8 +220,8 @@ def _ground_color(
         footprint += jnp.abs(moved)
     coords = (o[:2] + s[..., None] * d[..., :2]) / look.ground_pitch
     footprint = footprint / look.ground_pitch
-    share = ground.second_color_share(
+    fraction = ground.second_color_fraction(
         look.ground, coords[..., 0], coords[..., 1], footprint[..., 0], footprint[..., 1]
     )
     first, second = look.ground_rgb[0], look.ground_rgb[1]
-    return first + share[..., None] * (second - first)
+    return first + fraction[..., None] * (second - first)

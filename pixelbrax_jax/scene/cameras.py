@@ -1,4 +1,4 @@
-"""Camera rigs as data: one row per task, and views that every task has."""
+"""Camera rigs: the viewpoints of each task, and views that every task has."""
 
 from __future__ import annotations
 
@@ -10,10 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from pixelbrax_jax import spatial
-from pixelbrax_jax.choices import check_choice
+from pixelbrax_jax.tasks import TASKS, Vector, View
 from pixelbrax_jax.types import Camera, CameraRig
-
-Vector = tuple[float, float, float]
+from pixelbrax_jax.validation import check_choice
 
 
 def _f32(values: Any) -> Any:
@@ -30,7 +29,7 @@ def rig(
     track: Vector = (1.0, 1.0, 0.0),
     up: Vector = (0.0, 0.0, 1.0),
 ) -> CameraRig:
-    """A camera rig from plain numbers.
+    """Make a camera rig from plain numbers.
 
     Args:
         eye: metres; relative to the tracked link along tracked axes, absolute along others.
@@ -38,7 +37,7 @@ def rig(
         fovy: vertical field of view, degrees, between 0 and 180.
         link: index of the followed link, -1 for a camera at rest.
         track: how much of the link's position is followed, per world axis.
-        up: the world direction that is up in the picture.
+        up: the world direction that is up in the image.
 
     Returns:
         The rig, float32.
@@ -65,34 +64,18 @@ def rig(
     )
 
 
-_PLANAR = rig((0.0, -2.1, 0.8), (0.0, 0.0, 0.6), 55.0, link=0)
-_HUMANOID = rig((1.7, -1.7, 1.5), (0.0, 0.0, 1.1), 50.0, link=0)
+def _rig_of(view: View) -> CameraRig:
+    return rig(view.eye, view.target, view.fovy, link=view.link, up=view.up)
 
-# Viewpoints of the original renderer (arXiv 2502.00021). It gives a horizontal field of view;
-# at its square pictures that is the vertical one too.
-ORIGINAL: dict[str, CameraRig] = {
-    "ant": rig((1.6, -1.6, 3.5), (0.0, 0.0, 0.0), 40.0, link=0),
-    "halfcheetah": _PLANAR,
-    "hopper": _PLANAR,
-    "humanoid": _HUMANOID,
-    "humanoidstandup": _HUMANOID,
-    "inverted_pendulum": rig((0.0, -2.3, 0.0), (0.0, 0.0, 0.0), 55.0),
-    "pusher": rig((1.6, 1.6, 0.75), (0.0, 0.0, 0.0), 50.0, link=0),
-    "reacher": rig((0.0, -0.01, 0.81), (0.0, 0.0, 0.0), 45.0, link=0, up=(0.0, 1.0, 1.0)),
-    "swimmer": rig((2.4, 2.4, 1.25), (0.0, 0.0, 0.0), 50.0, link=1),
-    "walker2d": _PLANAR,
-}
 
-DEFAULT: dict[str, CameraRig] = ORIGINAL | {
-    # The original has no viewpoint for this task.
-    "inverted_double_pendulum": rig((0.0, -3.0, 0.6), (0.0, 0.0, 0.6), 55.0),
-    # The original aims above the lying torso, which then sits at the lower edge.
-    "humanoidstandup": rig((2.2, -2.2, 1.7), (0.0, 0.0, 0.55), 50.0, link=0),
+DEFAULT = {name: _rig_of(row.camera) for name, row in TASKS.items()}
+ORIGINAL = {
+    name: _rig_of(row.original_camera) for name, row in TASKS.items() if row.original_camera
 }
 
 
 def _around(base: CameraRig, direction: Vector, up: Vector) -> CameraRig:
-    """``base`` seen from another side, at the same distance from the same target."""
+    """Return ``base`` seen from another side, at the same distance from the same target."""
     away = np.array(direction) / np.linalg.norm(direction)
     distance = np.linalg.norm(base.eye - base.target)
     eye = base.target + np.float32(distance) * away.astype(np.float32)
@@ -100,7 +83,7 @@ def _around(base: CameraRig, direction: Vector, up: Vector) -> CameraRig:
 
 
 def named_rigs(task: str, fallback: CameraRig | None = None) -> dict[str, CameraRig]:
-    """All rigs of a task by name.
+    """Return all rigs of a task by name.
 
     Args:
         task: Brax's name of the task, or any name with ``fallback`` given.
@@ -108,7 +91,7 @@ def named_rigs(task: str, fallback: CameraRig | None = None) -> dict[str, Camera
 
     Returns:
         ``default``, ``side`` (seen along +y), ``front`` (along -x), ``top`` (from above, +y up
-        in the picture), and ``original`` where the paper has one.
+        in the image), and ``original`` where the paper has one.
     """
     default = DEFAULT.get(task, fallback)
     if default is None:
@@ -127,7 +110,7 @@ def named_rigs(task: str, fallback: CameraRig | None = None) -> dict[str, Camera
 def make_rig(
     task: str, camera: str | CameraRig | Camera = "default", fallback: CameraRig | None = None
 ) -> CameraRig:
-    """A rig by name, the given one, or one that holds a camera at rest.
+    """Return a rig by name, the given one, or one that holds a camera at rest.
 
     Args:
         task: the task's name.
@@ -155,7 +138,7 @@ def make_rig(
 
 
 def at_rest(camera: Camera) -> CameraRig:
-    """The rig that always yields ``camera``."""
+    """Return the rig that always yields ``camera``."""
     pos = _f32(camera.pos)
     xmat = _f32(camera.xmat)
     return CameraRig(
@@ -169,7 +152,7 @@ def at_rest(camera: Camera) -> CameraRig:
 
 
 def aim(rig: CameraRig, xpos: jax.Array) -> Camera:
-    """The camera of a rig for the current link positions.
+    """Return the camera of a rig for the current link positions.
 
     Args:
         rig: the rig.
@@ -184,7 +167,7 @@ def aim(rig: CameraRig, xpos: jax.Array) -> Camera:
 
 
 def rig_around(points: np.ndarray, link: int = 0) -> CameraRig:
-    """A rig that has all points in view, for a task without a viewpoint of its own.
+    """Make a rig that has all points in view, for a task without a viewpoint of its own.
 
     Args:
         points: (P, 3) metres, world frame, at least one.

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from pixelbrax_jax.choices import check_bool, check_choice
 from pixelbrax_jax.types import Look
+from pixelbrax_jax.validation import check_bool, check_choice
 
 
 def _f32(values: Any) -> Any:
@@ -50,7 +50,7 @@ LOOKS: dict[str, Look] = {
 
 
 def make_look(look: str | Look = "default", *, shadows: bool | None = None) -> Look:
-    """A look by name, or the given one.
+    """Return a look by name, or the given one.
 
     Args:
         look: ``"default"``, ``"original"`` or a ``Look``.

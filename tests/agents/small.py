@@ -9,11 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from pixelbrax_jax import PixelEnv, VectorPixelEnv
-from pixelbrax_jax.agents.algorithm import Algorithm, TrainState
-from tests.envs.toy import PARAMS, Ball
+from pixelbrax_jax.agents.core.algorithm import Algorithm, TrainState
+from tests.envs.toy import Ball, limited
 
-OPTIONS = {"height": 18, "width": 18, "frame_stack": 2, "episode_length": 5}
+EPISODE_LENGTH = 5
+PARAMS = limited(EPISODE_LENGTH)
+OPTIONS = {"height": 18, "width": 18, "frame_stack": 2}
 SMALL = OPTIONS | {
+    "episode_length": EPISODE_LENGTH,
     "encoder": "small",
     "num_envs": 4,
     "num_steps": 8,

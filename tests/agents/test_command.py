@@ -9,11 +9,11 @@ import imageio.v3 as imageio
 import jax
 import pytest
 
-from pixelbrax_jax.agents import command
-from pixelbrax_jax.agents.command import parse
-from pixelbrax_jax.agents.config import describe
-from pixelbrax_jax.agents.presets import CONFIGS, PRESETS, preset
-from pixelbrax_jax.agents.trained import load_config
+from pixelbrax_jax.agents.algorithms.presets import CONFIGS, PRESETS, preset
+from pixelbrax_jax.agents.core.config import describe
+from pixelbrax_jax.agents.runner import train_command as command
+from pixelbrax_jax.agents.runner.train_command import parse
+from pixelbrax_jax.agents.runner.trained import load_config
 from pixelbrax_jax.cli import main
 from tests.gpu.learning import commands
 

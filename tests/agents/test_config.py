@@ -8,13 +8,13 @@ from dataclasses import fields
 
 import pytest
 
-from pixelbrax_jax.agents.config import TrainConfig, describe, make_env
-from pixelbrax_jax.agents.dcpg import DCPGConfig
-from pixelbrax_jax.agents.ppg import PPGConfig
-from pixelbrax_jax.agents.ppo import PPOConfig, make_ppo, make_train
-from pixelbrax_jax.agents.presets import CONFIGS as OF_NAME
-from pixelbrax_jax.agents.presets import MAKERS
-from pixelbrax_jax.agents.train import RunConfig
+from pixelbrax_jax.agents.algorithms.dcpg import DCPGConfig
+from pixelbrax_jax.agents.algorithms.ppg import PPGConfig
+from pixelbrax_jax.agents.algorithms.ppo import PPOConfig, make_ppo, make_train
+from pixelbrax_jax.agents.algorithms.presets import CONFIGS as OF_NAME
+from pixelbrax_jax.agents.algorithms.presets import MAKERS
+from pixelbrax_jax.agents.core.config import TrainConfig, describe, make_env
+from pixelbrax_jax.agents.runner.train import RunConfig
 from pixelbrax_jax.envs.vector import VectorPixelEnv
 from tests.agents.small import SMALL, ball_envs
 
@@ -67,7 +67,7 @@ CHOICES = {
 }
 
 BAD = [
-    *((COUNTS, value, "a whole number of at least 1") for value in (0, -3, 1.5, True, "8")),
+    *((COUNTS, value, "a positive integer") for value in (0, -3, 1.5, True, "8")),
     *((COUNTS_OR_0, value, "a whole number of at least 0") for value in (-1, 1.5, True, "8")),
     *((SHARES, value, r"lie in \[0, 1\]") for value in (-0.1, 1.5, float("nan"), "1")),
     *(
@@ -105,7 +105,7 @@ def test_every_number_and_choice_is_checked():
 
 
 def test_dcpg_needs_its_delayed_phase():
-    with pytest.raises(ValueError, match="aux_epochs must be a whole number of at least 1, got 0"):
+    with pytest.raises(ValueError, match="aux_epochs must be a positive integer, got 0"):
         DCPGConfig(aux_epochs=0)
 
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pixelbrax_jax.agents.counter import StepCounter
+from pixelbrax_jax.agents.core.counter import StepCounter
 
 EDGES = [0, 1, 2**31 - 1, 2**31, 2**32 - 1, 2**32, 2**33 + 5, 2**63, 2**64 - 1]
 

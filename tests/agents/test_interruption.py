@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pixelbrax_jax.agents.checkpoint import latest_steps
-from pixelbrax_jax.agents.metrics import read_metrics
+from pixelbrax_jax.agents.runner.checkpoint import latest_steps
+from pixelbrax_jax.agents.runner.metrics import read_metrics
 from tests.agents.test_processes import PER_ITERATION, ROOT, command, leaves
 
 slow = pytest.mark.slow

@@ -13,9 +13,9 @@ import pytest
 from flax import linen as nn
 from scipy import integrate, stats
 
-from pixelbrax_jax.agents.convolution import convolve
-from pixelbrax_jax.agents.distributions import Normal
-from pixelbrax_jax.agents.networks import (
+from pixelbrax_jax.agents.core.convolution import convolve
+from pixelbrax_jax.agents.core.distributions import Normal
+from pixelbrax_jax.agents.core.networks import (
     ENCODERS,
     POLICIES,
     SMALLEST,

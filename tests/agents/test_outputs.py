@@ -15,13 +15,13 @@ import pytest
 from tensorboardX.proto.event_pb2 import Event
 from tensorboardX.record_writer import masked_crc32c
 
-from pixelbrax_jax.agents import interruption, metrics, saving, train
-from pixelbrax_jax.agents.checkpoint import CheckpointError, Checkpoints
-from pixelbrax_jax.agents.metrics import AppendedFile, MetricsWriter, read_metrics
-from pixelbrax_jax.agents.ppo import PPOConfig, make_ppo
-from pixelbrax_jax.agents.progress import Bar, Messages
-from pixelbrax_jax.agents.saving import Saver
-from pixelbrax_jax.agents.train import RunConfig, run
+from pixelbrax_jax.agents.algorithms.ppo import PPOConfig, make_ppo
+from pixelbrax_jax.agents.runner import interruption, metrics, saving, train
+from pixelbrax_jax.agents.runner.checkpoint import CheckpointError, Checkpoints
+from pixelbrax_jax.agents.runner.metrics import AppendedFile, MetricsWriter, read_metrics
+from pixelbrax_jax.agents.runner.progress import Bar, Messages
+from pixelbrax_jax.agents.runner.saving import Saver
+from pixelbrax_jax.agents.runner.train import RunConfig, run
 from tests.agents.small import PARAMS, SMALL, ball_envs, same
 
 PER_ITERATION = SMALL["num_envs"] * SMALL["num_steps"]

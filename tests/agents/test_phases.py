@@ -9,13 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pixelbrax_jax.agents import phasic
-from pixelbrax_jax.agents.dcpg import DCPGConfig, dynamics_loss, make_dcpg
-from pixelbrax_jax.agents.losses import mean
-from pixelbrax_jax.agents.networks import Dynamics
-from pixelbrax_jax.agents.ppg import PPGConfig, make_ppg
-from pixelbrax_jax.agents.ppo import ActorCritic
-from pixelbrax_jax.agents.rollout import observations
+from pixelbrax_jax.agents.algorithms.dcpg import DCPGConfig, dynamics_loss, make_dcpg
+from pixelbrax_jax.agents.algorithms.ppg import PPGConfig, make_ppg
+from pixelbrax_jax.agents.algorithms.ppo import ActorCritic
+from pixelbrax_jax.agents.core import phasic
+from pixelbrax_jax.agents.core.losses import mean
+from pixelbrax_jax.agents.core.networks import Dynamics
+from pixelbrax_jax.agents.core.rollout import observations
 from tests.agents.small import PHASIC, SMALL, Agent, assert_close, ball_envs, same
 
 NUM_AUX_STEPS = PHASIC["aux_epochs"] * PHASIC["aux_minibatches"]

@@ -14,14 +14,15 @@ import numpy as np
 import pytest
 
 from pixelbrax_jax import PixelEnv, VectorPixelEnv
-from pixelbrax_jax.agents.dcpg import DCPGConfig, make_dcpg
-from pixelbrax_jax.agents.networks import Actor, Critic
-from pixelbrax_jax.agents.ppg import PPGConfig, make_ppg
-from pixelbrax_jax.agents.ppo import PPOConfig, make_ppo
+from pixelbrax_jax.agents.algorithms.dcpg import DCPGConfig, make_dcpg
+from pixelbrax_jax.agents.algorithms.ppg import PPGConfig, make_ppg
+from pixelbrax_jax.agents.algorithms.ppo import PPOConfig, make_ppo
+from pixelbrax_jax.agents.core.networks import Actor, Critic
 from tests.agents.probes import NAMES, TARGETS, TIME_LIMIT, Probes, true_values
-from tests.envs.toy import PARAMS
+from tests.envs.toy import limited
 
 GAMMA = 0.7
+PARAMS = limited(TIME_LIMIT)
 SHARED = {
     "height": 18,
     "width": 18,
@@ -50,7 +51,7 @@ AGENTS = {
 
 @pytest.fixture(scope="module")
 def envs():
-    options = {k: SHARED[k] for k in ("height", "width", "frame_stack", "episode_length")}
+    options = {k: SHARED[k] for k in ("height", "width", "frame_stack")}
     return VectorPixelEnv(PixelEnv(Probes(), **options), SHARED["num_envs"])
 
 
@@ -61,9 +62,9 @@ def pictures(envs):
     @jax.jit
     @jax.vmap
     def picture(place):
-        state = envs.env.begin(jax.random.key(0), jnp.uint32(0), PARAMS)
+        state = envs.env.reset_sim(jax.random.key(0), jnp.uint32(0), PARAMS)
         state = state.replace(physics=Probes.at(place))
-        return envs.env.show(state, PARAMS, jnp.bool_(True)).frames
+        return envs.env.push_frame(envs.env.blank_frames(), state, PARAMS, jnp.bool_(True))
 
     return picture(jnp.arange(len(NAMES)))
 

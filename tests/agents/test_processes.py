@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pixelbrax_jax.agents.checkpoint import Checkpoints
+from pixelbrax_jax.agents.runner.checkpoint import Checkpoints
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
@@ -115,9 +115,9 @@ def test_frames_stay_on_their_devices(tmp_path):
     """What devices tell each other is gradients, not frames."""
     code = r"""
 import jax, re
-from pixelbrax_jax.agents.config import make_env
-from pixelbrax_jax.agents.ppg import PPGConfig, make_ppg
-from pixelbrax_jax.agents.sharding import everywhere, state_shardings
+from pixelbrax_jax.agents.core.config import make_env
+from pixelbrax_jax.agents.algorithms.ppg import PPGConfig, make_ppg
+from pixelbrax_jax.agents.runner.sharding import everywhere, state_shardings
 from pixelbrax_jax.envs.sharded import ShardedVectorEnv, make_env_mesh
 
 config = PPGConfig(

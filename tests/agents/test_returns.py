@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pixelbrax_jax.agents.counter import StepCounter
-from pixelbrax_jax.agents.returns import RewardScaler, gae
+from pixelbrax_jax.agents.core.counter import StepCounter
+from pixelbrax_jax.agents.core.returns import RewardScaler, gae
 
 T, N = 40, 16
 GAMMA, LAMBDA = 0.97, 0.9

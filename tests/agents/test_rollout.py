@@ -10,19 +10,20 @@ import numpy as np
 import pytest
 
 from pixelbrax_jax import PixelEnv, VectorPixelEnv
-from pixelbrax_jax.agents import phasic
-from pixelbrax_jax.agents.config import TrainConfig
-from pixelbrax_jax.agents.distributions import Normal
-from pixelbrax_jax.agents.rollout import (
+from pixelbrax_jax.agents.core import phasic
+from pixelbrax_jax.agents.core.config import TrainConfig
+from pixelbrax_jax.agents.core.distributions import Normal
+from pixelbrax_jax.agents.core.rollout import (
     Decision,
     collect,
     minibatch_times,
     observations,
     shifted,
 )
-from tests.envs.toy import PARAMS, Ball
+from tests.envs.toy import Ball, limited
 
 T, N = 15, 4
+PARAMS = limited(7)
 SPEED = jnp.array([1.0, 0.9, 0.1, -0.3])
 """The first two reach the end, the others the time limit."""
 
@@ -47,7 +48,7 @@ CASES = {"one frame": (1, 0), "three frames": (3, 0), "three frames, shifted": (
 def played(request):
     """Two rollouts, one after the other."""
     stack, shift = request.param
-    env = PixelEnv(FastBall(), height=10, width=12, frame_stack=stack, episode_length=7)
+    env = PixelEnv(FastBall(), height=10, width=12, frame_stack=stack)
     envs = VectorPixelEnv(env, N)
     play = jax.jit(lambda state, key: collect(envs, state, PARAMS, decide, key, T, shift))
     start, _ = envs.reset(jax.random.key(0), PARAMS)
@@ -174,7 +175,7 @@ def test_chunks_of_the_buffer_are_the_rollouts(played):
 
 
 def test_an_environment_does_not_depend_on_its_neighbours(played):
-    physics = played.start.physics
+    physics = played.start.sim.physics
     elsewhere = FastBall._state(jnp.float32(0.9), jnp.float32(0), jnp.float32(0), jnp.bool_(False))
     moved = jax.tree.map(lambda rows, one: rows.at[0].set(one), physics, elsewhere)
     _, changed = played.play(played.start.replace(physics=moved), jax.random.key(1))

@@ -16,19 +16,19 @@ import numpy as np
 import pytest
 
 from pixelbrax_jax import PixelEnv
-from pixelbrax_jax.agents import train
-from pixelbrax_jax.agents.checkpoint import (
+from pixelbrax_jax.agents.algorithms.ppg import PPGConfig, make_ppg
+from pixelbrax_jax.agents.core.config import describe
+from pixelbrax_jax.agents.runner import train
+from pixelbrax_jax.agents.runner.checkpoint import (
     CheckpointError,
     Checkpoints,
     best_steps,
     read_about,
     read_networks,
 )
-from pixelbrax_jax.agents.config import describe
-from pixelbrax_jax.agents.export import save_policy
-from pixelbrax_jax.agents.metrics import read_metrics, together
-from pixelbrax_jax.agents.ppg import PPGConfig, make_ppg
-from pixelbrax_jax.agents.train import RunConfig, TrainingDivergedError, run
+from pixelbrax_jax.agents.runner.export import save_policy
+from pixelbrax_jax.agents.runner.metrics import read_metrics, together
+from pixelbrax_jax.agents.runner.train import RunConfig, TrainingDivergedError, run
 from pixelbrax_jax.policy import load_policy
 from tests.agents.small import OPTIONS, PARAMS, SMALL, ball_envs, same
 from tests.envs.toy import Ball

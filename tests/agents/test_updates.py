@@ -7,13 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pixelbrax_jax.agents.algorithm import train_function
-from pixelbrax_jax.agents.dcpg import DCPGConfig, make_dcpg
-from pixelbrax_jax.agents.losses import value_loss
-from pixelbrax_jax.agents.ppg import PPGConfig, make_ppg
-from pixelbrax_jax.agents.ppo import ActorCritic, PPOConfig, make_ppo
-from tests.agents.small import PHASIC, SMALL, Agent, assert_close, ball_envs, same
-from tests.envs.toy import PARAMS
+from pixelbrax_jax.agents.algorithms.dcpg import DCPGConfig, make_dcpg
+from pixelbrax_jax.agents.algorithms.ppg import PPGConfig, make_ppg
+from pixelbrax_jax.agents.algorithms.ppo import ActorCritic, PPOConfig, make_ppo
+from pixelbrax_jax.agents.core.algorithm import train_function
+from pixelbrax_jax.agents.core.losses import value_loss
+from tests.agents.small import PARAMS, PHASIC, SMALL, Agent, assert_close, ball_envs, same
 
 ITERATIONS = 3
 """Of a run: an auxiliary phase comes after the second one."""
@@ -60,7 +59,7 @@ def test_every_iteration_draws_anew(agent):
     state = agent.init()
     first, _ = agent.iterate(state)
     later, _ = agent.iterate(state.replace(iteration=jnp.uint32(2)))
-    assert not same(first.env_state.physics.engine, later.env_state.physics.engine)
+    assert not same(first.env_state.sim.physics.engine, later.env_state.sim.physics.engine)
 
 
 def test_minibatches_find_the_policy_and_value_that_played(agent):

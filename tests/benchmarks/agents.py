@@ -19,8 +19,8 @@ import jax
 import numpy as np
 
 from pixelbrax_jax import VectorPixelEnv, make
-from pixelbrax_jax.agents.checkpoint import read_about
-from pixelbrax_jax.agents.metrics import read_metrics
+from pixelbrax_jax.agents.runner.checkpoint import read_about
+from pixelbrax_jax.agents.runner.metrics import read_metrics
 
 
 def curve_of(folder: Path) -> dict:

@@ -9,10 +9,10 @@ from typing import Any
 
 import jax
 
-from pixelbrax_jax.agents.config import make_env
-from pixelbrax_jax.agents.ppo import make_ppo
-from pixelbrax_jax.agents.presets import preset
-from pixelbrax_jax.agents.sharding import everywhere, state_shardings
+from pixelbrax_jax.agents.algorithms.ppo import make_ppo
+from pixelbrax_jax.agents.algorithms.presets import preset
+from pixelbrax_jax.agents.core.config import make_env
+from pixelbrax_jax.agents.runner.sharding import everywhere, state_shardings
 from pixelbrax_jax.envs.sharded import ShardedVectorEnv, make_env_mesh
 from tests.benchmarks.cases import ABSENT
 from tests.benchmarks.throughput import compiled, rate

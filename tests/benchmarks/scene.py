@@ -23,7 +23,7 @@ def describe(task: str) -> dict[str, Any]:
     file = Path(brax.envs.__file__).parent / "assets" / f"{_FILES.get(task, task)}.xml"
     env, params = pb.make(task)
     state, _ = env.reset(jax.random.key(0), params)
-    physics = state.physics
+    physics = state.sim.physics
     scene = pb.place(params.geoms, params.rig, params.look, physics.xpos, physics.xquat)
     quat = np.zeros(4)
     mujoco.mju_mat2Quat(quat, np.asarray(scene.camera.xmat, np.float64).ravel())

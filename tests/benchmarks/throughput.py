@@ -104,8 +104,8 @@ def operations(env: pb.PixelEnv, states: Any, params: Any) -> float:
 def first_states(env: pb.PixelEnv, params: Any, num_envs: int) -> Any:
     """States at the start of an episode, without key and frames, which drawing does not read."""
     keys = jax.random.split(jax.random.key(0), num_envs)
-    begin = jax.jit(jax.vmap(lambda key: env.begin(key, jnp.uint32(0), params)))
-    return begin(keys).replace(key=None, frames=None)
+    reset = jax.jit(jax.vmap(lambda key: env.reset_sim(key, jnp.uint32(0), params)))
+    return reset(keys)
 
 
 def scan(

@@ -20,9 +20,9 @@ import jax
 import numpy as np
 
 from pixelbrax_jax import VectorPixelEnv, compiler_options
-from pixelbrax_jax.agents.config import make_env
-from pixelbrax_jax.agents.networks import ENCODERS
-from pixelbrax_jax.agents.ppo import PPOConfig, make_ppo
+from pixelbrax_jax.agents.algorithms.ppo import PPOConfig, make_ppo
+from pixelbrax_jax.agents.core.config import make_env
+from pixelbrax_jax.agents.core.networks import ENCODERS
 
 REPETITIONS = 5
 

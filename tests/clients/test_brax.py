@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 import pixelbrax_jax as pb
-from tests.envs.toy import PARAMS, Ball
+from tests.envs.toy import Ball, limited
 
 
 def make(**options):
-    env = pb.PixelEnv(Ball(), height=16, width=16, frame_stack=1, episode_length=6, **options)
-    return pb.BraxPixelEnv(env, PARAMS)
+    env = pb.PixelEnv(Ball(), height=16, width=16, frame_stack=1, **options)
+    return pb.BraxPixelEnv(env, limited(6))
 
 
 def finite_and_changed(before, after):

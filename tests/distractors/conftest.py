@@ -31,7 +31,7 @@ def walk(distractor, params, steps, num):
             state = distractor.advance(state, jax.random.fold_in(key, t), t, params)
             return state, state
 
-        first = distractor.begin(jax.random.fold_in(key, 0), params)
+        first = distractor.reset(jax.random.fold_in(key, 0), params)
         return jax.lax.scan(step, first, jnp.arange(1, steps))[1]
 
     keys = jax.vmap(jax.random.key)(jnp.arange(num))

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from pixelbrax_jax import distractors, make, place
-from pixelbrax_jax.physics.tasks import TASKS
 from pixelbrax_jax.scene.cameras import aim, named_rigs, rig
+from pixelbrax_jax.tasks import TASKS
 from tests.distractors.conftest import walk
 from tests.envs.toy import PARAMS
 
@@ -71,7 +71,7 @@ def test_velocities_are_on_a_random_walk():
     params = PARAMS.replace(rig=RIG)
     camera = distractors.Camera(scale=b)
     middle = jnp.float32
-    still = camera.begin(jax.random.key(0), params).replace(
+    still = camera.reset(jax.random.key(0), params).replace(
         radius=middle(1.2),
         azimuth=middle(0.0),
         polar=middle(-0.1),
@@ -89,7 +89,7 @@ def test_velocities_are_on_a_random_walk():
 def test_starts_are_uniform_in_the_box():
     camera, params = distractors.Camera(scale=0.2, dynamic=False), PARAMS.replace(rig=RIG)
     keys = jax.vmap(jax.random.key)(jnp.arange(20_000))
-    states = jax.jit(jax.vmap(lambda key: camera.begin(key, params)))(keys)
+    states = jax.jit(jax.vmap(lambda key: camera.reset(key, params)))(keys)
     angle = 0.1 * np.pi
     for values, low, high in (
         (states.radius, 0.9, 1.3),
@@ -157,7 +157,7 @@ def test_the_agent_stays_in_view_at_the_easy_level(task):
     def centers_in_view(state_of_camera):
         """Which geom centers lie in the picture."""
         rig = camera.change_params(state_of_camera, params).rig
-        scene = place(geoms, rig, params.look, state.physics.xpos, state.physics.xquat)
+        scene = place(geoms, rig, params.look, state.sim.physics.xpos, state.sim.physics.xquat)
         seen = (scene.pos[moving] - scene.camera.pos) @ scene.camera.xmat
         reach = jnp.tan(jnp.deg2rad(scene.camera.fovy) / 2) * -seen[:, 2:]
         return (jnp.abs(seen[:, :2]) < reach).all(-1) & (seen[:, 2] < 0)
@@ -170,7 +170,7 @@ def test_the_agent_stays_in_view_at_the_easy_level(task):
 def test_roll_turns_the_picture():
     params = PARAMS.replace(rig=RIG)
     camera = distractors.Camera(scale=0.3, dynamic=False)
-    state = camera.begin(jax.random.key(0), params).replace(
+    state = camera.reset(jax.random.key(0), params).replace(
         radius=jnp.float32(1), azimuth=jnp.float32(0), polar=jnp.float32(0), roll=jnp.float32(0.3)
     )
     plain = aim(RIG, jnp.zeros((1, 3))).xmat
@@ -186,7 +186,7 @@ def test_gradients_are_finite_straight_above():
 
     def place_of_eye(eye):
         params = PARAMS.replace(rig=above.replace(eye=eye))
-        state = camera.begin(jax.random.key(0), params)
+        state = camera.reset(jax.random.key(0), params)
         state = camera.advance(state, jax.random.key(1), 1, params)
         return camera.change_params(state, params).rig.eye.sum()
 

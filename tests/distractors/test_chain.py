@@ -24,14 +24,15 @@ WITH_CLIPS = PARAMS.replace(clips=make_clips())
 ACTIONS = np.random.default_rng(0).uniform(-1, 1, (30, 8, 1)).astype(np.float32)
 
 
-def rollout(chain, mode="next_step", num_envs=8, **options):
+def rollout(chain, mode="next_step", num_envs=8, episode_length=7, **options):
     """Timesteps of thirty steps with episodes of seven."""
-    options = SIZE | {"episode_length": 7, "obs_mode": "both"} | options
+    options = SIZE | {"obs_mode": "both"} | options
+    params = WITH_CLIPS.replace(episode_length=np.int32(episode_length))
     env = pb.VectorPixelEnv(PixelEnv(Ball(), distractors=chain, **options), num_envs, mode)
-    state, timestep = env.reset(jax.random.key(0), WITH_CLIPS)
+    state, timestep = env.reset(jax.random.key(0), params)
     seen = [timestep]
     for action in ACTIONS[:, :num_envs]:
-        state, timestep = env.step(state, action, WITH_CLIPS)
+        state, timestep = env.step(state, action, params)
         info = {k: v for k, v in timestep.info.items() if not k.startswith("final")}
         seen.append(timestep.replace(info=info))
     return jax.tree.map(lambda *x: np.stack(x), *seen)
@@ -100,16 +101,17 @@ def test_frames_advance_once_for_each_step_under_action_repeat():
 
 def test_an_early_time_limit_does_not_move_the_video():
     loop = distractors.Video(dynamics="loop", num_clips=1, random_start=False)
-    env = PixelEnv(Ball(), **SIZE, episode_length=6, distractors=(loop,))
-    state, _ = env.reset(jax.random.key(0), WITH_CLIPS)
-    state = state.replace(head_start=jnp.int32(3))
+    env = PixelEnv(Ball(), **SIZE, distractors=(loop,))
+    params = WITH_CLIPS.replace(episode_length=np.int32(6))
+    state, _ = env.reset(jax.random.key(0), params)
+    state = state.replace(sim=state.sim.replace(time_limit_offset=jnp.int32(3)))
     for step in (1, 2, 3):
-        state, timestep = env.step(state, jnp.zeros(1), WITH_CLIPS)
+        state, timestep = env.step(state, jnp.zeros(1), params)
         assert int(timestep.info["video_frame"]) == step
         assert int(timestep.info["episode_length"]) == step
     assert timestep.truncated
     state, timestep = env.next_episode(state, WITH_CLIPS)
-    assert int(state.head_start) == 0
+    assert int(state.sim.time_limit_offset) == 0
 
 
 def test_order_of_giving_does_not_matter(runs):
@@ -139,7 +141,7 @@ def test_what_cannot_work_together_is_refused():
     for given, error, message in (
         (("color",), TypeError, "expected a Distractor, got str; names are for"),
         ((Nameless(),), TypeError, "Nameless needs a kind"),
-        ((Reset(),), ValueError, "Reset needs a stream, a whole number of at least 1, got 0"),
+        ((Reset(),), ValueError, "Reset needs a stream, a positive integer, got 0"),
         ((Twin(), distractors.Color()), ValueError, "twin, color must differ in their streams"),
         ((Unhashable(),), TypeError, "Unhashable cannot be hashed; make it a frozen"),
     ):
@@ -150,7 +152,7 @@ def test_what_cannot_work_together_is_refused():
 def test_state_observations_carry_no_distractors():
     env = PixelEnv(Ball(), obs_mode="state", distractors=ALL)
     state, timestep = env.reset(jax.random.key(0), PARAMS)
-    assert state.distraction == ()
+    assert state.sim.distractor_state == ()
     assert "color" not in timestep.info
 
 
@@ -158,7 +160,7 @@ def test_a_distractor_of_your_own():
     class Darkness(distractors.Distractor):
         kind, stream = "darkness", 9
 
-        def begin(self, key, params):
+        def reset(self, key, params):
             return jax.random.uniform(key)
 
         def change_frame(self, state, frame, backdrop):
@@ -168,7 +170,7 @@ def test_a_distractor_of_your_own():
     clean = PixelEnv(Ball(), **SIZE)
     state, _ = env.reset(jax.random.key(0), PARAMS)
     bare, _ = clean.reset(jax.random.key(0), PARAMS)
-    darkness = state.distraction[-1]
+    darkness = state.sim.distractor_state[-1]
     np.testing.assert_allclose(
         env.render(state, PARAMS).r, darkness * clean.render(bare, PARAMS).r, atol=1e-6
     )
@@ -215,7 +217,7 @@ def test_clips_of_a_folder_are_on_the_device_once(tmp_path, monkeypatch):
         return pb.make("inverted_pendulum", **source, **options)[1].clips
 
     one, other = make(), make()
-    assert one.words is other.words
+    assert one.packed is other.packed
     clips = weakref.ref(one)
     del one, other
     gc.collect()
@@ -233,13 +235,13 @@ def test_make_shares_clips_and_warns_of_procedural_ones():
     _, again = pb.make(
         "inverted_pendulum", distractors=("video",), clips="procedural", split="test", **options
     )
-    assert params.clips.words is again.clips.words
-    assert params.clips.words.shape == (8 * 64, 16, 16)
+    assert params.clips.packed is again.clips.packed
+    assert params.clips.packed.shape == (8 * 64, 16, 16)
     _, plain = pb.make("inverted_pendulum", distractors="color", **options)
     assert plain.clips is None
     bank = make_bank()
     _, own = pb.make("inverted_pendulum", distractors="video", clips=bank, **options)
-    assert own.clips.words.shape == (14, 24, 20)
+    assert own.clips.packed.shape == (14, 24, 20)
     assert pb.make("inverted_pendulum", distractors=None, **options)[1].clips is None
     with pytest.raises(ValueError, match="clips are given, but no video"):
         pb.make("inverted_pendulum", distractors="color", clips="procedural", **options)

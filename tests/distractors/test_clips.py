@@ -88,9 +88,9 @@ def test_splits_share_no_clip(davis):
 def test_words_are_packed_as_frames_are(davis):
     bank = load_clips(davis, "train", height=6, width=5)
     clips = bank.to_device()
-    unpacked = np.stack([np.asarray(clips.words) >> shift & 0xFF for shift in (0, 8, 16)], -1)
+    unpacked = np.stack([np.asarray(clips.packed) >> shift & 0xFF for shift in (0, 8, 16)], -1)
     np.testing.assert_array_equal(unpacked, bank.frames)
-    assert clips.words.nbytes == bank.device_bytes
+    assert clips.packed.nbytes == bank.device_bytes
 
 
 def test_pictures_are_cut_to_the_middle_and_scaled_smoothly(tmp_path):

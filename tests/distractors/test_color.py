@@ -16,7 +16,7 @@ KEYS = jax.vmap(jax.random.key)(jnp.arange(20_000))
 
 
 def starts(color):
-    return np.asarray(jax.jit(jax.vmap(lambda key: color.begin(key, PARAMS)))(KEYS))
+    return np.asarray(jax.jit(jax.vmap(lambda key: color.reset(key, PARAMS)))(KEYS))
 
 
 @pytest.mark.parametrize("scale", [0.1, 0.3])
@@ -115,7 +115,7 @@ def test_the_ground_has_room_of_its_own():
     params = PARAMS.replace(geoms=PARAMS.geoms.replace(rgb=white))
     for distribution in ("uniform", "normal"):
         color = distractors.Color("geom", "static", 0.2, distribution)
-        shifts = np.asarray(jax.jit(jax.vmap(lambda key, c=color: c.begin(key, params)))(KEYS))
+        shifts = np.asarray(jax.jit(jax.vmap(lambda key, c=color: c.reset(key, params)))(KEYS))
         assert abs((shifts[:, 0] > 0).mean() - 0.5) < 0.02
         if distribution == "uniform":
             assert (shifts != 0).all(), "nothing piles up on a bound"

@@ -57,7 +57,7 @@ def test_an_overlay_covers_everything():
     clips = make_clips()
     for (timestep, frame, _), (_, plain, _) in zip(video, clean, strict=True):
         info = timestep.info
-        word = clips.words[clips.first[info["video_clip"]] + info["video_frame"]]
+        word = clips.packed[clips.first[info["video_clip"]] + info["video_frame"]]
         for shift, plane, bare in ((0, frame.r, plain.r), (8, frame.g, plain.g)):
             expected = 0.75 * bare + 0.25 * ((word >> shift) & 0xFF) / 255.0
             np.testing.assert_allclose(plane, expected, atol=1e-6)
@@ -71,7 +71,7 @@ def test_a_background_leaves_the_agent_alone(ground_alpha, alpha):
     ground = Ball.geoms.kind.index(GeomKind.PLANE)
     for (timestep, frame, _), (bare, plain, _) in zip(video, clean, strict=True):
         info = timestep.info
-        word = clips.words[clips.first[info["video_clip"]] + info["video_frame"]]
+        word = clips.packed[clips.first[info["video_clip"]] + info["video_frame"]]
         red = (word & 0xFF) / 255.0
         sky, floor = plain.seg == -1, plain.seg == ground
         agent = ~sky & ~floor
@@ -94,7 +94,7 @@ def test_every_frame_shows_the_clip_in_order():
     for dynamics in ("loop", "pingpong", "static"):
         for key in range(4):
             steps = run(distractors.Video(dynamics=dynamics), frames=12, key=key, clips=clips)
-            state = steps[0][2].distraction[0]
+            state = steps[0][2].sim.distractor_state[0]
             expected = counted(
                 dynamics,
                 int(clips.length[state.clip]),
@@ -111,13 +111,13 @@ def test_an_episode_draws_a_clip_a_start_and_a_direction():
     )
     params = PARAMS.replace(clips=make_clips())
     state, _ = env.reset(jax.random.key(0), params)
-    video = state.distraction[0]
+    video = state.sim.distractor_state[0]
     assert set(np.asarray(video.clip).tolist()) == {0, 1, 2}
     assert set(np.asarray(video.direction).tolist()) == {-1, 1}
     longest = int(np.argmax(params.clips.length))
     assert len(set(np.asarray(video.start)[np.asarray(video.clip) == longest].tolist())) > 3
     later, _ = env.reset_where(state, jnp.ones(64, bool), params)
-    assert (np.asarray(later.distraction[0].clip) != np.asarray(video.clip)).any()
+    assert (np.asarray(later.sim.distractor_state[0].clip) != np.asarray(video.clip)).any()
     # A clip of one frame stays there.
     assert not np.asarray(video.start)[np.asarray(video.clip) == 1].any()
 
@@ -133,7 +133,7 @@ def test_pictures_of_another_size_show_the_same_video():
     env = PixelEnv(Ball(), **SIZE, distractors=(distractors.Video(mode="overlay", alpha=1.0),))
     params = PARAMS.replace(clips=make_clips())
     state, timestep = env.reset(jax.random.key(0), params)
-    large = env.picture(state, params, 2 * SIZE["height"], 3 * SIZE["width"])
+    large = env.image(state, params, 2 * SIZE["height"], 3 * SIZE["width"])
     small = timestep.obs[..., -3:]
     np.testing.assert_array_equal(large[::2, ::3], small)
     np.testing.assert_array_equal(large[1::2, 2::3], small)
@@ -153,7 +153,7 @@ def test_no_clips():
         ({"alpha": 1.5}, r"alpha of Video must lie in \[0, 1\], got 1.5"),
         ({"ground_alpha": -0.1}, r"ground_alpha of Video must lie in \[0, 1\], got -0.1"),
         ({"mode": "overlay", "ground_alpha": 0.0}, "mode='background' alone"),
-        ({"num_clips": 0}, "num_clips of Video must be a whole number of at least 1, got 0"),
+        ({"num_clips": 0}, "num_clips of Video must be a positive integer, got 0"),
     ],
 )
 def test_options_are_checked(options, message):

@@ -48,11 +48,11 @@ def test_environment_does_not_depend_on_the_batch(largest, num_envs):
     np.testing.assert_array_equal(
         small.info["episode_length"], large.info["episode_length"][:, rows]
     )
-    np.testing.assert_array_equal(small_state.episode, large_state.episode[rows])
+    np.testing.assert_array_equal(small_state.sim.episode, large_state.sim.episode[rows])
     np.testing.assert_array_equal(
         jax.random.key_data(small_state.key), jax.random.key_data(large_state.key[rows])
     )
-    assert (large_state.episode[rows] > 0).any()
+    assert (large_state.sim.episode[rows] > 0).any()
     # ... and so are pixels, but for a level on few of them; physics agrees to rounding, which
     # another batch size may do in another order.
     np.testing.assert_allclose(

@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pixelbrax_jax import PixelEnv, VectorPixelEnv
+from pixelbrax_jax import EnvParams, PixelEnv, VectorPixelEnv
 from pixelbrax_jax.envs.brax_env import PIXELS, BraxPixelEnv, wrap_fresh_episodes
-from pixelbrax_jax.physics.brax_physics import training
-from pixelbrax_jax.physics.compatibility import accept_device_put_replicated
-from tests.envs.toy import PARAMS, Ball
+from pixelbrax_jax.physics.brax.compatibility import accept_device_put_replicated
+from pixelbrax_jax.physics.brax.engine import training
+from tests.envs.toy import PARAMS, Ball, limited
 
 RIGHT = jnp.ones(1)
 # Five balls; the first three run until they leave, the others rest until time is up.
@@ -128,14 +128,14 @@ def brax_rollout(env, num_steps: int):
     return run()
 
 
-def pixel_rollout(env: PixelEnv, num_steps: int):
+def pixel_rollout(env: PixelEnv, num_steps: int, params: EnvParams):
     """(T, N) timesteps of the same environments under Gymnasium's same-step autoreset."""
     envs = VectorPixelEnv(env, NUM_ENVS, "same_step")
 
     def step(state, _):
-        return envs.step(state, ACTIONS, PARAMS)
+        return envs.step(state, ACTIONS, params)
 
-    state, _ = envs.reset(jax.random.wrap_key_data(keys()), PARAMS)
+    state, _ = envs.reset(jax.random.wrap_key_data(keys()), params)
     return jax.lax.scan(step, state, length=num_steps)[1]
 
 
@@ -156,7 +156,7 @@ def test_fresh_episodes_are_those_of_same_step_autoreset(limit):
     """Observations, rewards, termination, truncation, what is summed: at every step."""
     wrapped = wrap_fresh_episodes(make_brax(obs_mode="both"), episode_length=limit)
     _, states = brax_rollout(wrapped, 3 * limit)
-    expected = pixel_rollout(make(obs_mode="both", episode_length=limit), 3 * limit)
+    expected = pixel_rollout(make(obs_mode="both"), 3 * limit, limited(limit))
     ended = ends(expected)
     assert (ended.sum(axis=0) >= 3).all()
     assert expected.terminated[limit - 1].any()
@@ -177,7 +177,7 @@ def test_brax_itself_repeats_the_first_episode(limit):
     first, states = brax_rollout(
         training.wrap(make_brax(obs_mode="both"), episode_length=limit), 2 * limit
     )
-    expected = pixel_rollout(make(obs_mode="both", episode_length=limit), limit)
+    expected = pixel_rollout(make(obs_mode="both"), limit, limited(limit))
     ended = np.asarray(states.done, bool)
     for i in range(NUM_ENVS):
         length = int(np.argmax(ended[:, i])) + 1
@@ -193,16 +193,14 @@ def test_brax_itself_repeats_the_first_episode(limit):
 
 
 def test_the_time_limit_is_braxs_alone():
-    pixel = make(obs_mode="state", episode_length=5, action_repeat=2)
-    env = BraxPixelEnv(pixel, PARAMS)
-    assert pixel.episode_length == 5
+    env = BraxPixelEnv(make(obs_mode="state", action_repeat=2), limited(5))
     assert env.episode_length == 3  # calls, of which the last would have been cut short
     state = env.reset(jax.random.key(0))
     for _ in range(6):
         state = env.step(state, 0 * RIGHT)
         assert state.done == 0
     # Beyond its own limit the pixel environment would repeat no action.
-    assert state.pipeline_state.step_count == 12
+    assert state.pipeline_state.sim.step_count == 12
 
 
 def test_brax_randomises_the_parameters():
@@ -214,6 +212,7 @@ def test_brax_randomises_the_parameters():
         return randomised, axes.replace(geoms=axes.geoms.replace(rgb=0))
 
     env, pixel = make_brax(), make()
+    sys = env.sys
     wrapped = training.wrap(
         env, episode_length=9, randomization_fn=functools.partial(repaint, rng=keys())
     )
@@ -225,7 +224,7 @@ def test_brax_randomises_the_parameters():
         for t in range(2):
             state, timestep = pixel.step(state, ACTIONS[i], params)
             np.testing.assert_array_equal(states.obs[PIXELS][t, i], unit(timestep.obs))
-    assert env.sys is PARAMS  # nothing of the trace stays behind
+    assert env.sys is sys  # nothing of the trace stays behind
 
 
 def test_what_does_not_fit_is_told():

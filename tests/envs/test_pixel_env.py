@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 
 import jax
@@ -10,11 +11,11 @@ import numpy as np
 import pytest
 
 import pixelbrax_jax
-from pixelbrax_jax import PixelEnv, check_env
+from pixelbrax_jax import EnvConfig, PixelEnv, check_env
 from pixelbrax_jax.envs import observe
 from pixelbrax_jax.envs.check import ContractError
 from pixelbrax_jax.types import Frame
-from tests.envs.toy import PARAMS, Ball
+from tests.envs.toy import PARAMS, Ball, limited
 
 RIGHT = jnp.ones(1)
 
@@ -85,10 +86,10 @@ def test_any_size(height, width):
 
 
 def test_time_limit_truncates_and_does_not_terminate():
-    env = make(episode_length=4, obs_mode="state")
-    state, _ = env.reset(jax.random.key(0), PARAMS)
+    env, params = make(obs_mode="state"), limited(4)
+    state, _ = env.reset(jax.random.key(0), params)
     for k in range(1, 5):
-        state, timestep = env.step(state, 0 * RIGHT, PARAMS)
+        state, timestep = env.step(state, 0 * RIGHT, params)
         assert not timestep.terminated
         assert bool(timestep.truncated) == (k == 4)
         assert timestep.info["episode_length"] == k
@@ -102,10 +103,9 @@ def test_termination_at_the_time_limit_is_no_truncation():
         state, timestep = env.step(state, RIGHT, PARAMS)
         steps += 1
     assert timestep.terminated
-    limited = make(obs_mode="state", episode_length=steps)
-    state, _ = limited.reset(jax.random.key(0), PARAMS)
+    state, _ = env.reset(jax.random.key(0), limited(steps))
     for _ in range(steps):
-        state, timestep = limited.step(state, RIGHT, PARAMS)
+        state, timestep = env.step(state, RIGHT, limited(steps))
     assert timestep.terminated
     assert not timestep.truncated
 
@@ -115,7 +115,7 @@ def test_action_repeat_sums_rewards_until_the_end(action_repeat):
     env = make(obs_mode="state", action_repeat=action_repeat)
     assert env.dt == pytest.approx(0.1 * action_repeat)
     state, _ = env.reset(jax.random.key(1), PARAMS)
-    x, count, total = float(state.physics.obs[0]), 0, 0.0
+    x, count, total = float(state.sim.physics.obs[0]), 0, 0.0
     while not state.done:
         state, timestep = env.step(state, RIGHT, PARAMS)
         reward = 0.0
@@ -132,14 +132,14 @@ def test_action_repeat_sums_rewards_until_the_end(action_repeat):
 
 
 def test_action_repeat_stops_at_the_time_limit():
-    env = make(obs_mode="state", action_repeat=3, episode_length=4)
-    state, _ = env.reset(jax.random.key(1), PARAMS)
-    state, timestep = env.step(state, 0 * RIGHT, PARAMS)
+    env, params = make(obs_mode="state", action_repeat=3), limited(4)
+    state, _ = env.reset(jax.random.key(1), params)
+    state, timestep = env.step(state, 0 * RIGHT, params)
     assert not timestep.truncated
-    state, timestep = env.step(state, 0 * RIGHT, PARAMS)
+    state, timestep = env.step(state, 0 * RIGHT, params)
     assert timestep.truncated
     assert timestep.info["episode_length"] == 4
-    assert state.physics.obs[1] == 4
+    assert state.sim.physics.obs[1] == 4
 
 
 def test_actions_are_clipped_once():
@@ -166,12 +166,12 @@ def test_nan_action_ends_the_episode_and_a_reset_is_clean():
 @pytest.mark.parametrize(
     ("option", "value", "message"),
     [
-        ("height", 0, "height must be a whole number of at least 1, got 0"),
+        ("height", 0, "height must be a positive integer, got 0"),
         ("width", -3, "width must be"),
-        ("width", 2.5, "width must be a whole number"),
+        ("width", 2.5, "width must be a positive integer"),
         ("frame_stack", 0, "frame_stack must be"),
         ("action_repeat", 0, "action_repeat must be"),
-        ("episode_length", True, "episode_length must be"),
+        ("action_repeat", True, "action_repeat must be"),
         ("obs_mode", "pixel", "unknown obs_mode: 'pixel'.*Did you mean 'pixels'"),
         ("renderer", "fuse", "Did you mean 'fused'"),
     ],
@@ -195,10 +195,33 @@ def test_bad_actions_and_keys():
 
 
 class TestMake:
-    def test_equal_options_share_one_environment(self):
+    def test_equal_options_make_equal_environments(self):
         first, _ = pixelbrax_jax.make("inverted_pendulum", height=16, width=16)
-        second, _ = pixelbrax_jax.make("inverted_pendulum", width=16, height=16, look="original")
-        assert first is second
+        second, params = pixelbrax_jax.make(
+            "inverted_pendulum", width=16, height=16, look="original", episode_length=5
+        )
+        assert first == second
+        assert hash(first) == hash(second)
+        assert params.episode_length == 5
+        for options in ({"height": 17}, {"backend": "spring"}, {"obs_mode": "both"}):
+            other, _ = pixelbrax_jax.make(
+                "inverted_pendulum", **{"height": 16, "width": 16} | options
+            )
+            assert other != first
+
+    def test_physics_of_ones_own_are_compared_by_the_object(self):
+        ball = Ball()
+        assert PixelEnv(ball) == PixelEnv(ball)
+        assert PixelEnv(ball) != PixelEnv(Ball())
+
+    @pytest.mark.parametrize("value", [jnp.int32(16), np.zeros(2), [16]])
+    def test_arrays_are_no_options(self, value):
+        with pytest.raises(TypeError, match=r"height .*must be a single value"):
+            pixelbrax_jax.make("ant", height=value)
+
+    def test_a_traced_option_is_named(self):
+        with pytest.raises(TypeError, match="frame_stack decides which program is compiled"):
+            jax.jit(lambda n: pixelbrax_jax.make("ant", frame_stack=n)[1].look.light)(3)
 
     @pytest.mark.parametrize(
         ("options", "message"),
@@ -231,7 +254,7 @@ class TestMake:
         assert next(iter(parameters)) == "task"
         assert parameters["height"].default == 84
         assert parameters["height"].annotation == "int"
-        assert "Calls with equal options share one environment" in pixelbrax_jax.make.__doc__
+        assert set(parameters) == {field.name for field in dataclasses.fields(EnvConfig)}
 
     def test_a_rig_must_follow_a_link_that_exists(self):
         rig = pixelbrax_jax.rig((0, -3, 1), (0, 0, 0), 40.0, link=99)
@@ -262,7 +285,7 @@ class TestCheckEnv:
             state_size = 3
 
         for task, rule in (
-            (Forgetful, "different keys must begin differently"),
+            (Forgetful, "different keys must start differently"),
             (RewardedReset, "timestep after a step must keep its structure|reward of step"),
             (Leaky, "a NaN action must terminate"),
             (WrongSize, "the observation of reset must be"),

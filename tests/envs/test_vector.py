@@ -9,16 +9,17 @@ import pytest
 
 import pixelbrax_jax as pb
 from pixelbrax_jax import PixelEnv, VectorPixelEnv
-from pixelbrax_jax.envs import vector
-from tests.envs.toy import PARAMS, Ball
+from tests.envs import toy
+from tests.envs.toy import Ball
 
 N = 5
+PARAMS = toy.limited(20)
 # Environment 0 goes left for ever, the others reach the end at different times.
 ACTIONS = jnp.array([-0.2, 0.5, 0.7, 0.9, 1.0])[:, None]
 
 
 def make(mode: str, num_envs: int = N, **options) -> VectorPixelEnv:
-    options = {"height": 12, "width": 12, "frame_stack": 2, "episode_length": 20} | options
+    options = {"height": 12, "width": 12, "frame_stack": 2} | options
     return VectorPixelEnv(PixelEnv(Ball(), **options), num_envs, mode)
 
 
@@ -97,8 +98,8 @@ def test_disabled_resets_only_by_mask():
     assert done.all()
     mask = jnp.arange(N) == 2
     after, timestep = venv.reset_where(state, mask, PARAMS)
-    assert int(after.episode[2]) == 1
-    assert int(after.step_count[2]) == 0
+    assert int(after.sim.episode[2]) == 1
+    assert int(after.sim.step_count[2]) == 0
     assert not bool(after.done[2])
     for i in (0, 1, 3, 4):
         same = jax.tree.map(
@@ -123,8 +124,8 @@ def test_reset_where_with_keys_begins_episode_zero():
     after, timestep = venv.reset_where(state, jnp.ones(N, bool), PARAMS, keys)
     expected, first = venv.reset(keys, PARAMS)
     np.testing.assert_array_equal(timestep.obs, first.obs)
-    np.testing.assert_array_equal(after.physics.obs, expected.physics.obs)
-    assert (np.asarray(after.episode) == 0).all()
+    np.testing.assert_array_equal(after.sim.physics.obs, expected.sim.physics.obs)
+    assert (np.asarray(after.sim.episode) == 0).all()
 
 
 @pytest.mark.parametrize("mode", ["next_step", "same_step"])
@@ -151,12 +152,12 @@ def test_successive_episodes_begin_differently():
 
 @pytest.mark.parametrize("num_envs", [1, 33, 70])
 def test_more_ends_than_one_block_and_ragged_batches(num_envs):
-    venv = make("next_step", num_envs, obs_mode="state", episode_length=3)
-    state, first = venv.reset(jax.random.key(0), PARAMS)
+    venv, params = make("next_step", num_envs, obs_mode="state"), toy.limited(3)
+    state, first = venv.reset(jax.random.key(0), params)
     starts = np.asarray(first.obs[:, 0])
     for _ in range(4):
-        state, timestep = venv.step(state, jnp.zeros((num_envs, 1)), PARAMS)
-    assert (np.asarray(state.episode) == 1).all()
+        state, timestep = venv.step(state, jnp.zeros((num_envs, 1)), params)
+    assert (np.asarray(state.sim.episode) == 1).all()
     fresh = np.asarray(timestep.obs[:, 0])
     assert (fresh != starts).all()
     assert len(np.unique(fresh)) == num_envs
@@ -181,7 +182,7 @@ def test_works_inside_scan_and_is_traced_once():
 
 
 def test_bad_options_and_arguments():
-    with pytest.raises(ValueError, match="num_envs must be a whole number of at least 1, got 0"):
+    with pytest.raises(ValueError, match="num_envs must be a positive integer, got 0"):
         make("next_step", 0)
     with pytest.raises(
         ValueError, match=r"unknown autoreset_mode: 'next'.*Did you mean 'next_step'"
@@ -199,45 +200,12 @@ def test_bad_options_and_arguments():
         venv.reset(jax.random.split(jax.random.key(0), 4), PARAMS)
 
 
-@pytest.mark.parametrize(
-    ("num_envs", "size"),
-    [(1, 1), (100, 100), (128, 128), (130, 65), (256, 128), (257, 257), (1000, 125), (8192, 128)],
-)
-def test_chunks_divide_the_environments(num_envs, size):
-    assert vector._chunk_size(num_envs) == size
-
-
-@pytest.mark.parametrize("mode", ["next_step", "same_step"])
-def test_chunks_of_physics_change_nothing(mode, monkeypatch):
-    """Also where a chunk ends episodes and the other does not, and with the physics repeated."""
-    num_envs = 24
-    actions = jnp.linspace(-0.2, 1.0, num_envs)[:, None]
-    whole = make(mode, num_envs, action_repeat=2)
-    monkeypatch.setattr(vector, "_CHUNK", 12)
-    chunked = make(mode, num_envs, action_repeat=2)
-    state = run(chunked, 0, actions)[0].replace(frames=None)
-    text = jax.jit(chunked.advance).lower(state, actions, PARAMS).as_text()
-    assert "2x12x1xf32" in text
-    chunked_state, chunked_steps = run(chunked, 9, actions)
-    monkeypatch.undo()
-    whole_state, whole_steps = run(whole, 9, actions)
-    assert (whole_state.episode[:12] == 0).all()
-    assert (whole_state.episode[12:] > 0).any()
-    for a, b in zip(
-        jax.tree.leaves((chunked_state.replace(key=None), chunked_steps)),
-        jax.tree.leaves((whole_state.replace(key=None), whole_steps)),
-        strict=True,
-    ):
-        np.testing.assert_array_equal(a, b)
-
-
 def test_a_step_that_ends_no_episode_computes_no_first_state():
     env, params = pb.make("inverted_pendulum", obs_mode="state")
     venv = VectorPixelEnv(env, 2)
     state, _ = jax.eval_shape(venv.reset, jax.random.key(0), params)
-    reward = jax.ShapeDtypeStruct((2,), jnp.float32)
-    lowered = jax.jit(venv.finish).lower(state.frames, state.done, state, reward, params)
-    program = lowered.compile().as_text()
+    arguments = (state, state.done, state.sim.episode, params)
+    program = jax.jit(venv._reset_rows).lower(*arguments).compile().as_text()
     # XLA may take out of a loop what its turns have in common, such as physics at the first pose;
     # then every step pays for it.
     every_step = program[program.index("ENTRY") :]

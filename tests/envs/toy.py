@@ -23,6 +23,11 @@ PARAMS = EnvParams(
 )
 
 
+def limited(episode_length: int) -> EnvParams:
+    """``PARAMS`` with another time limit."""
+    return PARAMS.replace(episode_length=np.int32(episode_length))
+
+
 class Ball:
     """The action is the ball's velocity; beyond x = 1 the task ends. NaN actions diverge.
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from pixelbrax_gym import TorchPolicy
-from pixelbrax_jax.agents.export import save_policy
+from pixelbrax_jax.agents.runner.export import save_policy
 from tests.agents.small import PHASIC, SMALL, Agent, ball_envs, same
 
 pytestmark = pytest.mark.gpu
@@ -24,7 +24,7 @@ def _needs_a_gpu():
 
 @pytest.mark.parametrize("name", ["ppo", "ppg", "dcpg"])
 def test_the_same_key_gives_the_same_run(name):
-    from pixelbrax_jax.agents.presets import CONFIGS, MAKERS
+    from pixelbrax_jax.agents.algorithms.presets import CONFIGS, MAKERS
 
     if "deterministic_ops=true" not in os.environ.get("XLA_FLAGS", ""):
         pytest.fail("set XLA_FLAGS=--xla_gpu_deterministic_ops=true")
@@ -35,7 +35,7 @@ def test_the_same_key_gives_the_same_run(name):
 
 
 def test_an_exported_policy_acts_on_tensors_of_the_gpu(tmp_path):
-    from pixelbrax_jax.agents.ppo import PPOConfig, make_ppo
+    from pixelbrax_jax.agents.algorithms.ppo import PPOConfig, make_ppo
 
     agent = Agent(make_ppo(PPOConfig(**SMALL), ball_envs()))
     networks = agent.init().networks

@@ -9,7 +9,8 @@ import pytest
 import torch
 
 import pixelbrax_gym
-from pixelbrax_gym import dlpack, doctor
+from pixelbrax_gym import doctor
+from pixelbrax_gym.interop import dlpack
 
 pytestmark = pytest.mark.gpu
 

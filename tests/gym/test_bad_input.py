@@ -21,16 +21,16 @@ ACTIONS = np.array([[-0.2], [0.9], [1.0]], np.float32)
     [
         ({"output": "tensor"}, "unknown output: 'tensor'; allowed: jax, numpy, torch"),
         ({"render_mode": "ansi"}, "unknown render_mode: 'ansi'"),
-        ({"render_height": 0}, "render_height must be a whole number of at least 1"),
-        ({"render_width": 2.5}, "render_width must be a whole number of at least 1"),
-        ({"height": 0}, "height must be a whole number"),
+        ({"render_height": 0}, "render_height must be a positive integer"),
+        ({"render_width": 2.5}, "render_width must be a positive integer"),
+        ({"height": 0}, "height must be a positive integer"),
         ({"obs_mode": "pixel"}, r"Did you mean 'pixels'\?"),
         ({"camera": "nowhere"}, "camera"),
         ({"look": "nice"}, "unknown look"),
         ({"split": "test"}, "split='test' is given, but no distractor is: add"),
         ({"backend": "mjx"}, "registered with its own physics"),
-        ({"max_episode_steps": 0}, "max_episode_steps must be a whole number of at least 1"),
-        ({"max_episode_steps": -2}, "max_episode_steps must be a whole number of at least 1"),
+        ({"max_episode_steps": 0}, "max_episode_steps must be a positive integer"),
+        ({"max_episode_steps": -2}, "max_episode_steps must be a positive integer"),
     ],
 )
 def test_options(kind, options, message):
@@ -99,7 +99,7 @@ def test_mistyped_clips():
 
 @pytest.mark.parametrize("num_envs", [0, -1, 1.5, True])
 def test_num_envs(num_envs):
-    with pytest.raises(ValueError, match="num_envs must be a whole number of at least 1"):
+    with pytest.raises(ValueError, match="num_envs must be a positive integer"):
         PixelBraxVectorEnv(TASK, num_envs)
 
 

@@ -9,7 +9,7 @@ import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from pixelbrax_gym import check_vector_env
-from pixelbrax_gym.check import VectorEnvError, VectorEnvWarning
+from pixelbrax_gym.gymnasium.check import VectorEnvError, VectorEnvWarning
 from tests.gym.numpy_env import CountingVectorEnv
 
 NEXT, SAME, DISABLED = AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED

@@ -162,8 +162,8 @@ def test_specs_tell_the_time_limit(options, expected):
         assert env.spec.max_episode_steps == expected
         again = remake(env.spec)
         assert again.spec == env.spec
-        limit = again.unwrapped._stateful.env.episode_length
-        assert limit == env.unwrapped._stateful.env.episode_length
+        limit = again.unwrapped._stateful.episode_length
+        assert limit == env.unwrapped._stateful.episode_length
 
 
 def test_time_aware_observations_count_to_the_time_limit():

@@ -315,7 +315,7 @@ def test_use_out_of_order(make_sb3):
     ("options", "error", "message"),
     [
         ({"heigth": 12}, TypeError, "unexpected keyword argument 'heigth'.*Did you mean 'height'"),
-        ({"num_envs": 0}, ValueError, "at least 1, got 0"),
+        ({"num_envs": 0}, ValueError, "a positive integer, got 0"),
         ({"render_mode": "human"}, ValueError, "rgb_array"),
         ({"channels_first": "yes"}, TypeError, "channels_first must be True or False, got 'yes'"),
         ({"stagger": 2}, TypeError, "stagger must be True or False, got 2"),

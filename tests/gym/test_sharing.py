@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from pixelbrax_gym import dlpack
+from pixelbrax_gym.interop import dlpack
 
 ACTIONS = np.array([[-0.2], [0.9], [1.0]], np.float32)
 
@@ -132,6 +132,6 @@ def test_missing_torch_names_the_cure(monkeypatch):
         return real(name, *args, **kwargs)
 
     monkeypatch.setattr(builtins, "__import__", without_torch)
-    monkeypatch.delitem(sys.modules, "pixelbrax_gym.dlpack", raising=False)
+    monkeypatch.delitem(sys.modules, "pixelbrax_gym.interop.dlpack", raising=False)
     with pytest.raises(ImportError, match=r'pip install -c constraints\.txt -e "\.\[torch\]"'):
-        importlib.import_module("pixelbrax_gym.dlpack")
+        importlib.import_module("pixelbrax_gym.interop.dlpack")

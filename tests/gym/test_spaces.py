@@ -9,7 +9,7 @@ from gymnasium.spaces import Box, Dict, Tuple
 from gymnasium.vector.utils import batch_differing_spaces, batch_space, concatenate, iterate
 
 from pixelbrax_gym import PixelBraxSB3VecEnv
-from pixelbrax_gym.spaces import BroadcastBox, action_space, observation_space
+from pixelbrax_gym.gymnasium.spaces import BroadcastBox, action_space, observation_space
 from tests.gym.conftest import ID, SIZE, TASK
 
 

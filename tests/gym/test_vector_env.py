@@ -12,7 +12,7 @@ import torch
 from gymnasium.vector import AutoresetMode
 
 from pixelbrax_gym import PixelBraxEnv, PixelBraxVectorEnv, check_vector_env
-from pixelbrax_gym.export import to_numpy
+from pixelbrax_gym.interop.export import to_numpy
 from tests.gym.conftest import SIZE, TASK
 from tests.gym.test_registration import TASKS
 

@@ -7,10 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from brax.io import mjcf
 
-from pixelbrax_jax.physics import BraxPhysics
-from pixelbrax_jax.physics.brax_physics import envs, load_brax_env, mjcf, training
-from pixelbrax_jax.physics.compatibility import loading_silenced
+from pixelbrax_jax.physics.brax.compatibility import loading_silenced
+from pixelbrax_jax.physics.brax.engine import BraxPhysics, envs, training
+from pixelbrax_jax.physics.brax.tasks import load_brax_env
 
 SLIDER = """
 <mujoco>

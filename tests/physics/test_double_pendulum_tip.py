@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pixelbrax_jax.physics import TASKS
+from pixelbrax_jax.tasks import TASKS
 
 TASK = "inverted_double_pendulum"
 # (cart, first hinge, second hinge) -> tip (x, z); agrees with MuJoCo's site "tip".

@@ -6,8 +6,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from pixelbrax_jax.physics import BACKENDS, TASKS, make_physics
-from pixelbrax_jax.physics.brax_physics import load_brax_env
+from pixelbrax_jax.physics import make_physics
+from pixelbrax_jax.physics.brax.tasks import load_brax_env
+from pixelbrax_jax.tasks import BRAX_BACKENDS, TASKS
 
 ENVS = 2
 # MJX is slow on the pusher: its solver seems not to converge in float32 and to take all 20 x 50
@@ -70,7 +71,7 @@ def test_200_random_steps(task, backend, unfused_model):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("backend", sorted(set(BACKENDS) - {"generalized"}))
+@pytest.mark.parametrize("backend", sorted(set(BRAX_BACKENDS) - {"generalized"}))
 def test_brax_still_refuses_the_swimmer_elsewhere(backend):
     with pytest.raises(ValueError, match="Unsupported backend"):
         load_brax_env("swimmer", backend)

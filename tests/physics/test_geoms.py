@@ -4,8 +4,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from pixelbrax_jax.physics import TASKS
-from pixelbrax_jax.physics.geoms import read_geoms
+from pixelbrax_jax.physics.geometry import read_geoms
+from pixelbrax_jax.tasks import TASKS
 from pixelbrax_jax.types import GeomKind
 
 LOOKS = """

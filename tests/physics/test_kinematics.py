@@ -5,7 +5,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from pixelbrax_jax.physics import TASKS
+from pixelbrax_jax.tasks import TASKS
 
 ALL_TASKS = sorted(TASKS)
 

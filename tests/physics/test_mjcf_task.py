@@ -6,7 +6,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from pixelbrax_jax.physics import BACKENDS, Kinematics, Physics, mjcf_physics
+from pixelbrax_jax.physics.base import Kinematics, Physics
+from pixelbrax_jax.physics.brax.mjcf import mjcf_physics
+from pixelbrax_jax.tasks import BRAX_BACKENDS
 
 # A cart with a leaning pole; the knob is a body without a joint, rotated by Euler angles.
 CART = """
@@ -218,7 +220,7 @@ def test_bad_arguments(change, message):
         build(**change)
 
 
-@pytest.mark.parametrize("backend", sorted(set(BACKENDS) - {"mjx"}))
+@pytest.mark.parametrize("backend", sorted(set(BRAX_BACKENDS) - {"mjx"}))
 def test_models_beyond_brax_engines(backend):
     """What an engine cannot simulate is said when it is chosen, not when it runs."""
     xml = CART.replace('timestep="0.01"', 'timestep="0.01" integrator="RK4"')

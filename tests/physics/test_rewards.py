@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from pixelbrax_jax.physics import TASKS
+from pixelbrax_jax.tasks import TASKS
 
 
 def step_once(program, task, preset="brax", backend=None, scale=1.0):

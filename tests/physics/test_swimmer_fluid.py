@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from pixelbrax_jax.physics import compatibility
-from pixelbrax_jax.physics.brax_physics import fluid
+from pixelbrax_jax.physics.brax import compatibility
+from pixelbrax_jax.physics.brax.engine import fluid
 
 
 def test_fluid_force_is_mujocos(program, unfused_model):

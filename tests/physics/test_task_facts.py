@@ -6,8 +6,9 @@ import jax
 import numpy as np
 import pytest
 
-from pixelbrax_jax.physics import TASKS, Physics, make_physics
-from pixelbrax_jax.physics.base import BACKENDS
+from pixelbrax_jax.physics import make_physics
+from pixelbrax_jax.physics.base import Physics
+from pixelbrax_jax.tasks import BRAX_BACKENDS, TASKS
 from pixelbrax_jax.types import GeomKind
 
 # task: (planes, capsules, spheres), actions, observations, dt by backend
@@ -61,7 +62,7 @@ def test_dt_depends_on_the_backend(task):
 def test_default_backend_is_supported(task):
     spec = TASKS[task]
     assert spec.default_backend in spec.backends
-    assert set(spec.backends) <= set(BACKENDS)
+    assert set(spec.backends) <= set(BRAX_BACKENDS)
     assert list(spec.backends) == sorted(spec.backends)
 
 

@@ -14,7 +14,7 @@ from etils import epath
 
 import pixelbrax_jax
 from pixelbrax_jax import place, render
-from pixelbrax_jax.physics.tasks import TASKS
+from pixelbrax_jax.tasks import TASKS
 from tests.renderer import scenes
 from tests.renderer.mujoco_rays import cast
 

@@ -1,5 +1,6 @@
 """What XLA makes of the ray-caster: the fusion and the threads that its speed rests on."""
 
+import os
 import re
 
 import jax
@@ -7,7 +8,6 @@ import jax.numpy as jnp
 import pytest
 
 import pixelbrax_jax as pb
-from pixelbrax_gym.threads import num_cores
 from tests.benchmarks.throughput import operations
 
 NUM_ENVS, SIZE = 64, 84
@@ -23,8 +23,8 @@ def ants():
     """64 Ants at the start of their episodes."""
     env, params = pb.make("ant", height=SIZE, width=SIZE)
     keys = jax.random.split(jax.random.key(0), NUM_ENVS)
-    begin = jax.jit(jax.vmap(lambda key: env.begin(key, jnp.uint32(0), params)))
-    return env, begin(keys).replace(key=None, frames=None), params
+    reset = jax.jit(jax.vmap(lambda key: env.reset_sim(key, jnp.uint32(0), params)))
+    return env, reset(keys), params
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +61,7 @@ def test_pixels_are_computed_in_one_fusion(program):
     assert roots == 5 + 2 * 12
 
 
-@pytest.mark.skipif(num_cores() < 2, reason="needs two cores")
+@pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="needs two cores")
 def test_pixels_are_spread_over_the_cores(program):
     shape = rf"u32\[{NUM_ENVS},{SIZE * SIZE}\]"
     lines = [

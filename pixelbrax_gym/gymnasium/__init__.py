@@ -1,0 +1,1 @@
+"""Gymnasium: one environment, and many in one program."""

@@ -1,0 +1,115 @@
+"""Gymnasium spaces of pixel environments, which take no more memory for many than for one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import jax
+import numpy as np
+from gymnasium.vector.utils import batch_differing_spaces, iterate
+
+_BOUNDS = ("low", "high", "bounded_below", "bounded_above")
+
+
+class BroadcastBox(gymnasium.spaces.Box):
+    """A ``Box`` of a batch, with one lower and one upper bound, kept once.
+
+    An ordinary ``Box`` stores four arrays of its full shape: for 4096 stacks of 84x84 frames more
+    than a gigabyte, and seconds to fill it. Here they are views of a single number, also in
+    copies and after unpickling, and cannot be written to. It equals an ordinary ``Box`` of the
+    same bounds.
+    """
+
+    def __init__(self, low: float, high: float, shape: tuple[int, ...], dtype: Any) -> None:
+        """Make the space.
+
+        Args:
+            low: bound of every entry.
+            high: bound of every entry.
+            shape: of a sample.
+            dtype: of a sample.
+        """
+        super().__init__(low, high, (1,), dtype)
+        self._shape = tuple(shape)
+        self.low_repr, self.high_repr = str(self.low[0]), str(self.high[0])
+        self._spread({name: getattr(self, name)[0] for name in _BOUNDS})
+
+    def _spread(self, bounds: dict[str, Any]) -> None:
+        for name, value in bounds.items():
+            setattr(self, name, np.broadcast_to(value, self._shape))
+
+    def __getstate__(self) -> dict[str, Any]:
+        state = dict(self.__dict__)
+        state["bounds"] = {name: state.pop(name).flat[0] for name in _BOUNDS}
+        return state
+
+    def __setstate__(self, state: Any) -> None:
+        state = dict(state)
+        bounds = state.pop("bounds")
+        self.__dict__.update(state)
+        self._spread(bounds)
+
+    def __eq__(self, other: object) -> bool:
+        if isinstance(other, BroadcastBox):
+            return (
+                self.shape == other.shape
+                and self.dtype == other.dtype
+                and (self.low_repr, self.high_repr) == (other.low_repr, other.high_repr)
+            )
+        return super().__eq__(other)
+
+    __hash__ = None  # type: ignore[assignment]  # as every Gymnasium space that can be compared
+
+
+# Gymnasium looks up the exact class in these, not its bases.
+batch_differing_spaces.register(BroadcastBox, batch_differing_spaces.dispatch(gymnasium.spaces.Box))
+iterate.register(BroadcastBox, iterate.dispatch(gymnasium.spaces.Box))
+
+
+def observation_space(spec: Any, num_envs: int | None = None) -> gymnasium.Space:
+    """Return the space of an observation.
+
+    Args:
+        spec: ``PixelEnv.obs_spec``: a ``jax.ShapeDtypeStruct`` or a dict of them.
+        num_envs: of the batch; None for a single environment.
+
+    Returns:
+        uint8 boxes in [0, 255] for pixels, unbounded float32 boxes for state, a ``Dict`` for both.
+    """
+    if isinstance(spec, dict):
+        return gymnasium.spaces.Dict(
+            {name: observation_space(part, num_envs) for name, part in spec.items()}
+        )
+    return _box(spec, num_envs)
+
+
+def _box(spec: jax.ShapeDtypeStruct, num_envs: int | None) -> gymnasium.spaces.Box:
+    pixels = spec.dtype == np.uint8
+    low, high = (0, 255) if pixels else (-np.inf, np.inf)
+    return _batched(low, high, spec.shape, spec.dtype, num_envs)
+
+
+def action_space(action_size: int, num_envs: int | None = None) -> gymnasium.spaces.Box:
+    """Return the space of an action: float32 in [-1, 1], whatever the model's control range."""
+    return _batched(-1.0, 1.0, (action_size,), np.float32, num_envs)
+
+
+def channels_first_space(space: gymnasium.Space) -> gymnasium.Space:
+    """Return the space of an observation whose pixels are (3K, H, W) instead of (H, W, 3K)."""
+    if isinstance(space, gymnasium.spaces.Dict):
+        return gymnasium.spaces.Dict(
+            {name: channels_first_space(part) for name, part in space.spaces.items()}
+        )
+    if space.dtype != np.uint8 or space.shape is None:
+        return space
+    height, width, channels = space.shape
+    return gymnasium.spaces.Box(0, 255, (channels, height, width), np.uint8)
+
+
+def _batched(
+    low: float, high: float, shape: tuple[int, ...], dtype: Any, num_envs: int | None
+) -> gymnasium.spaces.Box:
+    if num_envs is None:
+        return gymnasium.spaces.Box(low, high, shape, dtype)
+    return BroadcastBox(low, high, (num_envs, *shape), dtype)

@@ -1,0 +1,318 @@
+"""Many pixel environments in one compiled program, as a ``gymnasium.vector.VectorEnv``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cached_property
+from typing import Any
+
+import gymnasium
+import jax
+import numpy as np
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.vector import AutoresetMode
+
+from pixelbrax_gym.gymnasium.single_env import check_render_size
+from pixelbrax_gym.gymnasium.spaces import action_space, observation_space
+from pixelbrax_gym.interop.export import exporter, to_numpy
+from pixelbrax_gym.member import Member, call_members
+from pixelbrax_gym.reset_options import reset_mask
+from pixelbrax_gym.seeds import check_seed
+from pixelbrax_gym.stateful import StatefulEnv, with_time_limit
+from pixelbrax_jax import AUTORESET_MODES
+from pixelbrax_jax.validation import check_choice
+
+_OWN_OPTIONS = (
+    "num_envs",
+    "autoreset_mode",
+    "output",
+    "render_mode",
+    "render_height",
+    "render_width",
+    "max_episode_steps",
+)
+
+
+class PixelBraxVectorEnv(gymnasium.vector.VectorEnv):
+    """``num_envs`` copies of a Brax task seen through a camera, stepped together.
+
+    Environment i seeded with s is the same whatever ``num_envs`` is and whoever its neighbors.
+
+    Autoreset, with Gymnasium's meanings:
+
+    * ``"next_step"`` (default): the step that ends an episode returns its last observation. The
+      next step ignores that environment's action and returns the first observation of the
+      next episode, reward 0 and both flags False.
+    * ``"same_step"``: the step that ends an episode returns the first observation of the next.
+      The last one is in ``infos["final_obs"]``, the infos it came with in
+      ``infos["final_info"]``.
+    * ``"disabled"``: the user calls ``reset(options={"reset_mask": mask})``.
+
+    Infos are ``episode_return`` (sum of the episode's rewards), ``episode_length`` (control
+    steps) and ``non_finite`` (the physics diverged and ended the episode), each (N,), with
+    masks ``_episode_return`` and so on that say which entries were set.
+
+    ``output`` decides what all of these are:
+
+    * ``"numpy"``: arrays that may be written to; observations share memory with what JAX has
+      computed on a CPU. ``final_obs`` is an object array with None where no episode ended,
+      absent when none did, as Gymnasium has it.
+    * ``"torch"`` and ``"jax"``: arrays on the environment's device. ``final_obs`` and
+      ``final_info`` are dense, present in every step, and mean something where the masks
+      ``_final_obs`` and ``_final_info`` are True: the host never waits to find out.
+
+    Observations are never overwritten, and an in-place operation on an array or tensor reaches no
+    later result.
+
+    ``call``, ``get_attr`` and ``set_attr`` are those of Gymnasium's own vector environments; what
+    they address is a ``Member`` that stands for one of the N.
+
+    Attributes:
+        autoreset_mode: an ``AutoresetMode``, also in ``metadata``.
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012  # as Gymnasium declares it
+        "render_modes": ["rgb_array"],
+        "render_fps": 20,
+        "autoreset_mode": AutoresetMode.NEXT_STEP,
+    }
+
+    def __init__(
+        self,
+        task: str,
+        num_envs: int = 1,
+        *,
+        autoreset_mode: str | AutoresetMode = "next_step",
+        output: str = "numpy",
+        render_mode: str | None = None,
+        render_height: int = 480,
+        render_width: int = 480,
+        max_episode_steps: int | None = None,
+        **options: Any,
+    ) -> None:
+        """Build the environments; the first ``reset`` compiles.
+
+        Args:
+            task: one of ``pixelbrax_jax.list_envs()``.
+            num_envs: N, at least 1.
+            autoreset_mode: ``"next_step"``, ``"same_step"``, ``"disabled"``, or Gymnasium's
+                ``AutoresetMode`` or its value.
+            output: ``"numpy"``, ``"torch"`` or ``"jax"`` arrays.
+            render_mode: None or ``"rgb_array"``.
+            render_height: pixels of ``render()``.
+            render_width: pixels of ``render()``.
+            max_episode_steps: time limit in calls of ``step``; None keeps ``episode_length``,
+                1000 control steps by default. A first step that only resets is
+                not counted.
+            **options: everything else that ``pixelbrax_jax.make`` takes, such as ``backend``,
+                ``camera``, ``height``, ``width``, ``frame_stack``, ``obs_mode``,
+                ``action_repeat`` and ``episode_length``.
+
+        Raises:
+            TypeError: an option is unknown; the message lists those there are.
+            ValueError: an option is out of range; the message lists what is allowed.
+            ImportError: torch is missing and wanted.
+            RuntimeError: this process is a fork that cannot run JAX.
+        """
+        if render_mode is not None:
+            check_choice("render_mode", render_mode, ("rgb_array",))
+        self.autoreset_mode = as_autoreset_mode(autoreset_mode)
+        self._output, self._export = output, exporter(output)
+        self._stateful = StatefulEnv(
+            task,
+            options,
+            num_envs=num_envs,
+            autoreset_mode=self.autoreset_mode.name.lower(),
+            max_episode_steps=max_episode_steps,
+            also_allowed=_OWN_OPTIONS,
+        )
+        env = self._stateful.env
+        self.num_envs = self._stateful.num_envs
+        self.single_observation_space = observation_space(env.obs_spec)
+        self.single_action_space = action_space(env.action_size)
+        self.observation_space = observation_space(env.obs_spec, self.num_envs)
+        self.action_space = action_space(env.action_size, self.num_envs)
+        self.render_mode = render_mode
+        self.metadata = {
+            **type(self).metadata,
+            "render_fps": self._stateful.fps,
+            "autoreset_mode": self.autoreset_mode,
+        }
+        self._render_size = check_render_size(render_height, render_width)
+        self._spec: EnvSpec | None = None
+
+    def reset(
+        self,
+        *,
+        seed: Any = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[Any, dict[str, Any]]:
+        """Reset to episodes.
+
+        Args:
+            seed: s seeds environment i with s + i; a list has a seed for each. A seeded
+                environment is reset to its episode 0; None goes on to its next episode,
+                or draws a seed if there was none yet.
+            options: ``{"reset_mask": mask}`` with an (N,) bool array or tensor, at least one
+                True, resets only those and repeats the observations of the others. Never changed.
+
+        Returns:
+            Observations and infos.
+
+        Raises:
+            TypeError: the mask is no array or tensor of bool, or a seed no integer.
+            ValueError: the mask has another shape or no True; a seed is out of range; or there
+                are other options.
+            ResetNeeded: the first reset has a mask that leaves environments out.
+            ClosedEnvironmentError: after ``close``.
+            RuntimeError: this process is a fork that cannot run JAX.
+        """
+        mask = reset_mask(options, self.num_envs)
+        # One seed for all also seeds the generator that Gymnasium's wrappers draw from.
+        super().reset(seed=None if seed is None or np.ndim(seed) else check_seed(seed))
+        outputs = self._stateful.reset(seed, self.np_random, mask)
+        return self._export(outputs["obs"]), self._infos(outputs)
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Step all environments.
+
+        Args:
+            actions: (N, A) floating point, a NumPy array, torch tensor or JAX array whatever
+                ``output`` is; rounded to float32 and clipped to [-1, 1].
+
+        Returns:
+            Observations; rewards, (N,) float32; terminated and truncated, (N,) bool; infos.
+
+        Raises:
+            ResetNeeded: before the first reset; or, with autoreset disabled, an episode has
+                ended and was not reset.
+            ClosedEnvironmentError: after ``close``.
+            RuntimeError: this process is a fork that cannot run JAX.
+            TypeError: the actions are not floating point.
+            ValueError: the actions have another shape, are on another device, or contain a NaN
+                (in a NumPy array or CPU tensor; elsewhere a NaN ends that episode with
+                ``non_finite``). Nothing was stepped.
+        """
+        outputs = self._stateful.step(actions)
+        flags = (outputs["reward"], outputs["terminated"], outputs["truncated"])
+        reward, terminated, truncated = (
+            jax.tree.map(np.array, flags) if self._output == "numpy" else self._export(flags)
+        )
+        return self._export(outputs["obs"]), reward, terminated, truncated, self._infos(outputs)
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """Draw the present states.
+
+        Returns:
+            N arrays (render_height, render_width, 3) of uint8; None without a render mode.
+
+        Raises:
+            ResetNeeded: before the first reset.
+            ClosedEnvironmentError: after ``close``.
+        """
+        if self.render_mode is None:
+            return None
+        return tuple(to_numpy(self._stateful.render(*self._render_size)))
+
+    def get_images(self) -> list[np.ndarray | None]:
+        """Draw the present states.
+
+        Returns:
+            N arrays (render_height, render_width, 3) of uint8; None without a render mode.
+
+        Raises:
+            ResetNeeded: before the first reset.
+            ClosedEnvironmentError: after ``close``.
+        """
+        return list(self.render() or [None] * self.num_envs)
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """Return what a method of each environment returns, or the attribute of that name.
+
+        Args:
+            name: of the method or attribute, such as ``"render"``.
+            *args: of the method.
+            **kwargs: of the method.
+        """
+        return tuple(call_members(self._members, name, *args, **kwargs))
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        """Return the attribute of each environment."""
+        return self.call(name)
+
+    def set_attr(self, name: str, values: Any) -> None:
+        """Set an attribute of the environments' members.
+
+        Args:
+            name: of the attribute.
+            values: a list or tuple has one for each environment; anything else is for all.
+
+        Raises:
+            ValueError: there are not N values.
+        """
+        each = values if isinstance(values, (list, tuple)) else [values] * self.num_envs
+        if len(each) != self.num_envs:
+            raise ValueError(f"expected one value for each of {self.num_envs}, got {len(each)}.")
+        for member, value in zip(self._members, each, strict=True):
+            member.set_wrapper_attr(name, value)
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """What Gymnasium knows of the environments, with their time limit in calls of ``step``."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = with_time_limit(spec, self._stateful)
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Forget the states."""
+        del kwargs
+        # Gymnasium also calls this on an environment whose construction failed.
+        if hasattr(self, "_stateful"):
+            self._stateful.close()
+
+    @cached_property
+    def _members(self) -> list[Member]:
+        spaces = (self.single_observation_space, self.single_action_space)
+        return [Member(self, i, *spaces) for i in range(self.num_envs)]
+
+    def _infos(self, outputs: Mapping[str, Any]) -> dict[str, Any]:
+        if self._output != "numpy":
+            return self._export(outputs["info"])
+        infos = dict(outputs["info"])
+        final_obs = infos.pop("final_obs", None)
+        final_info = infos.pop("final_info", None)
+        infos.pop("_final_obs", None), infos.pop("_final_info", None)
+        infos = jax.tree.map(np.array, infos)
+        done = np.array(outputs["done"])
+        if final_obs is None or not done.any():
+            return infos
+        final_obs = self._export(final_obs)
+        rows = np.full(self.num_envs, None, dtype=object)
+        for i in np.flatnonzero(done):
+            # A copy: a view would keep the frames of all environments alive.
+            rows[i] = jax.tree.map(lambda x, i=i: x[i].copy(), final_obs)
+        # Zero where no episode ended, as in Gymnasium's own vector environments.
+        final_info = jax.tree.map(np.array, final_info)
+        for value in final_info.values():
+            value[~done] = 0
+        infos |= {"final_obs": rows, "final_info": final_info}
+        return infos | {"_final_obs": done, "_final_info": done.copy()}
+
+
+def as_autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:
+    """Return Gymnasium's name of an autoreset mode.
+
+    Args:
+        mode: ours, Gymnasium's, or the value of Gymnasium's.
+
+    Raises:
+        ValueError: there is no such mode; the message lists them.
+    """
+    if isinstance(mode, AutoresetMode):
+        return mode
+    by_value = {member.value: member for member in AutoresetMode}
+    if isinstance(mode, str) and mode in by_value:
+        return by_value[mode]
+    return AutoresetMode[check_choice("autoreset_mode", mode, AUTORESET_MODES).upper()]

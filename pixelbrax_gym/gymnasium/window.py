@@ -1,0 +1,57 @@
+"""The window of ``render_mode="human"``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from pixelbrax_jax.extras import install_extra
+
+
+class Window:
+    """Shows images on the screen, no faster than a given rate."""
+
+    def __init__(self, title: str, fps: int) -> None:
+        """Open nothing yet.
+
+        Args:
+            title: of the window.
+            fps: images per second.
+
+        Raises:
+            ImportError: pygame is not installed, with the fix.
+        """
+        try:
+            import pygame
+        except ImportError as error:
+            raise ImportError(
+                f"render_mode='human' needs pygame; try: {install_extra('human')}"
+            ) from error
+        self._pygame, self._title, self._fps = pygame, title, fps
+        self._screen: Any = None
+        self._clock: Any = None
+
+    def show(self, image: np.ndarray) -> None:
+        """Show an image.
+
+        Args:
+            image: (H, W, 3) uint8.
+        """
+        pygame = self._pygame
+        if self._screen is None:
+            pygame.display.init()
+            pygame.display.set_caption(self._title)
+            self._screen = pygame.display.set_mode((image.shape[1], image.shape[0]))
+            self._clock = pygame.time.Clock()
+        # pygame counts columns first.
+        pygame.surfarray.blit_array(self._screen, image.swapaxes(0, 1))
+        pygame.event.pump()
+        pygame.display.flip()
+        self._clock.tick(self._fps)
+
+    def close(self) -> None:
+        """Close the window."""
+        if self._screen is not None:
+            self._pygame.display.quit()
+            self._screen = None

@@ -1,0 +1,1 @@
+"""Arrays that cross between JAX, NumPy and torch, and processes that fork."""

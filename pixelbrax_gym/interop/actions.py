@@ -1,0 +1,90 @@
+"""What a caller may hand to ``step``, made into what a jitted function takes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+_MANY = 8
+"""Environments named in a message at most."""
+
+
+def as_actions(action: Any, shape: tuple[int, ...], device: jax.Device) -> Any:
+    """Check and converts actions.
+
+    Args:
+        action: floating point: a NumPy array or what NumPy makes one of, a torch tensor, or a JAX
+            array. Everything but float32 is rounded to float32.
+        shape: expected, (A,) or (N, A).
+        device: the environment's device.
+
+    Returns:
+        float32 of that shape, never sharing memory that the caller can write to.
+
+    Raises:
+        TypeError: the action is not floating point.
+        ValueError: another shape; another device; or a NaN in host memory. Reading an
+            accelerator's memory would stop the pipeline, so a NaN in a JAX array or a GPU
+            tensor is not looked for: it ends the episode with ``info["non_finite"]``.
+    """
+    if type(action).__module__.partition(".")[0] == "torch":
+        from pixelbrax_gym.interop import dlpack
+
+        _check_shape(tuple(action.shape), shape)
+        values = dlpack.actions_to_jax(action, device)
+    elif isinstance(action, jax.Array):
+        _check_shape(action.shape, shape)
+        _check_floating(jnp.issubdtype(action.dtype, jnp.floating), action.dtype)
+        if action.devices() != {device}:
+            names = ", ".join(sorted(str(place) for place in action.devices()))
+            raise ValueError(
+                f"the action is on {names}, the environment on {device}; move the action with "
+                "jax.device_put."
+            )
+        return action if action.dtype == np.float32 else action.astype(np.float32)
+    else:
+        try:
+            given = np.asarray(action)
+        except ValueError as error:
+            raise ValueError(
+                f"action must be an array of shape {shape}, got rows of different lengths."
+            ) from error
+        _check_shape(given.shape, shape)
+        _check_floating(given.dtype.kind == "f", given.dtype)
+        # A copy: JAX may read it after the caller has begun to fill in the next action.
+        values = np.array(given, np.float32)
+    if isinstance(values, np.ndarray):
+        _check_nan(values)
+    return values
+
+
+def _check_shape(actual: tuple[int, ...], expected: tuple[int, ...]) -> None:
+    if actual != expected:
+        raise ValueError(f"action must have shape {expected}, got {actual}.")
+
+
+def _check_floating(is_floating: bool, dtype: Any) -> None:
+    if not is_floating:
+        raise TypeError(
+            f"action must be floating point in [-1, 1], got {dtype}; convert it to float32, "
+            "e.g. with .astype('float32')."
+        )
+
+
+def _check_nan(values: np.ndarray) -> None:
+    bad = np.isnan(values)
+    if not bad.any():
+        return
+    if values.ndim == 1:
+        raise ValueError("the action contains NaN; nothing was stepped.")
+    rows = name_rows(bad.any(axis=1))
+    raise ValueError(f"the action of environment {rows} contains NaN; nothing was stepped.")
+
+
+def name_rows(mask: np.ndarray) -> str:
+    """Return the environments of an (N,) mask for a message; of many, the first ones."""
+    rows = np.flatnonzero(mask)
+    return ", ".join(str(row) for row in rows[:_MANY]) + (", ..." if len(rows) > _MANY else "")

@@ -1,0 +1,257 @@
+"""Many pixel environments in one compiled program, as a Stable-Baselines3 ``VecEnv``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import gymnasium
+import jax
+import numpy as np
+
+from pixelbrax_jax.extras import install_extra
+
+try:
+    from stable_baselines3.common.vec_env import VecEnv
+except ImportError as missing:
+    raise ImportError(
+        f"Stable-Baselines3 is not installed; try: {install_extra('sb3')}"
+    ) from missing
+
+from pixelbrax_gym.gymnasium.single_env import check_render_size
+from pixelbrax_gym.gymnasium.spaces import action_space, channels_first_space, observation_space
+from pixelbrax_gym.interop.export import to_numpy
+from pixelbrax_gym.member import Member, call_members
+from pixelbrax_gym.reset_options import check_reset_options
+from pixelbrax_gym.seeds import SEEDS, spread_seeds
+from pixelbrax_gym.stateful import StatefulEnv
+from pixelbrax_jax.validation import check_bool, check_choice
+
+_OWN_OPTIONS = (
+    "num_envs",
+    "render_mode",
+    "render_height",
+    "render_width",
+    "channels_first",
+    "stagger",
+    "max_episode_steps",
+)
+
+
+class PixelBraxSB3VecEnv(VecEnv):
+    """``num_envs`` copies of a Brax task seen through a camera, stepped together.
+
+    What Stable-Baselines3 expects: NumPy arrays, autoreset in the same step, and for each
+    environment a dict ``infos[i]`` with ``TimeLimit.truncated``. Where an episode ended it also
+    has ``terminal_observation``, ``episode_return`` (sum of rewards), ``episode_length`` (control
+    steps) and ``non_finite`` (the physics diverged and ended the episode).
+
+    Observations share memory with what JAX has computed on a CPU, and are copied to the host
+    from anywhere else, since Stable-Baselines3 takes NumPy arrays only. They may be written to:
+    nothing reads them again.
+
+    Environment i seeded with s draws what environment i of a ``PixelBraxVectorEnv`` seeded with
+    s draws. There is one environment object and not N: what ``get_attr``, ``set_attr`` and
+    ``env_method`` address is a ``Member`` that stands for one of them.
+
+    Example:
+        >>> env = VecMonitor(PixelBraxSB3VecEnv("inverted_pendulum", num_envs=64))
+        >>> PPO("CnnPolicy", env).learn(100_000)
+    """
+
+    def __init__(
+        self,
+        task: str,
+        num_envs: int = 1,
+        *,
+        render_mode: str | None = None,
+        render_height: int = 480,
+        render_width: int = 480,
+        channels_first: bool = False,
+        stagger: bool = False,
+        max_episode_steps: int | None = None,
+        **options: Any,
+    ) -> None:
+        """Build the environments; the first ``reset`` compiles.
+
+        Args:
+            task: one of ``pixelbrax_jax.list_envs()``.
+            num_envs: N, at least 1.
+            render_mode: None or ``"rgb_array"``.
+            render_height: pixels of ``render()``.
+            render_width: pixels of ``render()``.
+            channels_first: whether pixels are (3K, H, W), as a view, and not (H, W, 3K), which
+                Stable-Baselines3 transposes itself.
+            stagger: whether time limits are spread evenly over the steps. Environments that
+                start together otherwise reach theirs in one step, in which Stable-Baselines3
+                evaluates the value function once for each of them. Environment i's first episode
+                after a full reset is cut short by ``i / N`` of the limit.
+            max_episode_steps: time limit in calls of ``step``; None keeps ``episode_length``,
+                1000 control steps by default.
+            **options: everything else that ``pixelbrax_jax.make`` takes, such as ``backend``,
+                ``camera``, ``height``, ``width``, ``frame_stack``, ``obs_mode``,
+                ``action_repeat`` and ``episode_length``.
+
+        Raises:
+            TypeError: an option is unknown; the message lists those there are.
+            ValueError: an option is out of range; the message lists what is allowed.
+            RuntimeError: this process is a fork that cannot run JAX.
+        """
+        if render_mode is not None:
+            check_choice("render_mode", render_mode, ("rgb_array",))
+        self._channels_first = check_bool("channels_first", channels_first)
+        stagger = check_bool("stagger", stagger)
+        self._stateful = StatefulEnv(
+            task,
+            options,
+            num_envs=num_envs,
+            autoreset_mode="same_step",
+            max_episode_steps=max_episode_steps,
+            also_allowed=_OWN_OPTIONS,
+        )
+        env, num_envs = self._stateful.env, self._stateful.num_envs
+        self._render_size = check_render_size(render_height, render_width)
+        space = observation_space(env.obs_spec)
+        space = channels_first_space(space) if channels_first else space
+        spaces = (space, action_space(env.action_size))
+        # Stable-Baselines3 asks them for their render mode while it makes the rest.
+        self.render_mode = render_mode
+        self._members = [Member(self, i, *spaces) for i in range(num_envs)]
+        super().__init__(num_envs, *spaces)
+        # SB3's wrappers ask for a number here, beside its lists.
+        self.metadata: dict[str, Any] = self.metadata | {"render_fps": self._stateful.fps}
+        offsets = np.arange(num_envs) * self._stateful.episode_length // num_envs
+        self._time_limit_offsets = offsets if stagger else None
+        self._actions: Any = None
+
+    def reset(self) -> Any:
+        """Reset to the next episode everywhere, or episode 0 after ``seed``.
+
+        Returns:
+            Observations.
+
+        Raises:
+            ValueError: there are options, of which no environment has any; they are dropped.
+            ClosedEnvironmentError: after ``close``.
+            RuntimeError: this process is a fork that cannot run JAX.
+        """
+        given = self._options
+        # What is refused must not be refused again at the next reset.
+        self._reset_options()
+        for options in given:
+            check_reset_options(options)
+        outputs = self._stateful.reset(self._seeds)
+        if self._time_limit_offsets is not None:
+            self._stateful.offset_time_limits(self._time_limit_offsets)
+        self._reset_seeds()
+        self.reset_infos = [{} for _ in range(self.num_envs)]
+        return self._observations(outputs["obs"])
+
+    def seed(self, seed: int | None = None) -> Sequence[int]:
+        """Let environment i draw from ``seed + i`` from the next reset on.
+
+        Args:
+            seed: an integer; beyond 2**32 - 1 they go on at 0. NumPy's global generator
+                draws one for None.
+
+        Returns:
+            The N seeds.
+
+        Raises:
+            TypeError: it is not an integer.
+        """
+        if seed is None:
+            seed = int(np.random.randint(SEEDS, dtype=np.uint64))  # noqa: NPY002  # as SB3 does
+        seeds = spread_seeds(seed, self.num_envs)
+        self._seeds = list(seeds)
+        return seeds
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Take the actions, (N, A) floating point, clipped to [-1, 1] by ``step_wait``."""
+        self._actions = actions
+
+    def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        """Step all environments.
+
+        Returns:
+            Observations; rewards, (N,) float32; dones, (N,) bool; infos.
+
+        Raises:
+            ResetNeeded: before the first reset.
+            ClosedEnvironmentError: after ``close``.
+            RuntimeError: this process is a fork that cannot run JAX.
+            TypeError: the actions are not floating point.
+            ValueError: the actions have another shape or contain a NaN; nothing was stepped.
+        """
+        outputs = self._stateful.step(self._actions)
+        dones, rewards = np.array(outputs["done"]), np.array(outputs["reward"])
+        truncated = np.asarray(outputs["truncated"]).tolist()
+        infos: list[dict[str, Any]] = [{"TimeLimit.truncated": value} for value in truncated]
+        if dones.any():
+            self._describe_ends(infos, np.flatnonzero(dones), outputs["info"])
+        return self._observations(outputs["obs"]), rewards, dones, infos
+
+    def _describe_ends(self, infos: list[dict[str, Any]], rows: np.ndarray, info: Any) -> None:
+        last = self._observations(info["final_obs"])
+        final = {
+            name: np.array(value)
+            for name, value in info["final_info"].items()
+            if not name.startswith("_")
+        }
+        for i in rows:
+            # A copy: a view would keep the frames of all environments alive.
+            infos[i]["terminal_observation"] = jax.tree.map(lambda x, i=i: x[i].copy(), last)
+            infos[i] |= {
+                name: value[i].copy() if value.ndim > 1 else value[i].item()
+                for name, value in final.items()
+            }
+
+    def get_images(self) -> list[np.ndarray | None]:
+        """Draw the present states.
+
+        Returns:
+            N arrays (render_height, render_width, 3) of uint8; None without a render mode.
+
+        Raises:
+            ResetNeeded: before the first reset.
+            ClosedEnvironmentError: after ``close``.
+        """
+        if self.render_mode is None:
+            return [None] * self.num_envs
+        return list(to_numpy(self._stateful.render(*self._render_size)))
+
+    def close(self) -> None:
+        """Forget the states."""
+        self._stateful.close()
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """Return an attribute of the members."""
+        return [getattr(member, attr_name) for member in self._selected(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Set an attribute of the members; the environments themselves know nothing of it."""
+        for member in self._selected(indices):
+            setattr(member, attr_name, value)
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """Return what a method of the members returns."""
+        members = self._selected(indices)
+        return call_members(members, method_name, *method_args, **method_kwargs)
+
+    def env_is_wrapped(
+        self, wrapper_class: type[gymnasium.Wrapper], indices: Any = None
+    ) -> list[bool]:
+        """Return False for all: there is nothing around them."""
+        del wrapper_class
+        return [False for _ in self._selected(indices)]
+
+    def _selected(self, indices: int | Iterable[int] | None) -> list[Member]:
+        return [self._members[i] for i in self._get_indices(indices)]
+
+    def _observations(self, obs: Any) -> Any:
+        arrays = to_numpy(obs)
+        if not self._channels_first:
+            return arrays
+        return jax.tree.map(lambda x: x.transpose(0, 3, 1, 2) if x.ndim == 4 else x, arrays)

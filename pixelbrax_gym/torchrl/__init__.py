@@ -1,0 +1,1 @@
+"""TorchRL: many environments in one program."""

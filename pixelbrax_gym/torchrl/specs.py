@@ -1,0 +1,93 @@
+"""TorchRL specs of a pixel environment, which cost no memory however many environments."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
+from torchrl.data.tensor_specs import TensorSpec, UnboundedDiscrete
+
+
+class _Itself(type(Unbounded)):  # type: ignore[misc]
+    # TorchRL's own metaclass replaces the class of what was made by one of two it knows.
+    def __call__(cls, *args: Any, **kwargs: Any) -> Any:
+        return type.__call__(cls, *args, **kwargs)
+
+
+class PixelSpec(UnboundedDiscrete, metaclass=_Itself):
+    """Pixels of any value, without tensors of bounds.
+
+    TorchRL's specs keep a lower and an upper bound for every entry: for 4096 stacks of 84 x 84
+    frames they take 26 s and gigabytes to build, and as much again in every transform. The
+    bounds of uint8 are those of its type, so this one has none (``space`` is None). It equals an
+    ordinary ``Unbounded`` of the same shape, dtype and device.
+    """
+
+    def __init__(
+        self,
+        shape: Any = (1,),
+        device: Any = None,
+        dtype: torch.dtype = torch.uint8,
+        **kwargs: Any,
+    ) -> None:
+        """Make the spec.
+
+        Args:
+            shape: of the pixels, batch axes first.
+            device: where they are; None means the CPU.
+            dtype: uint8, or another one after a transform.
+            **kwargs: ``domain``, ``"discrete"`` or ``"continuous"``.
+        """
+        kind = "continuous" if dtype.is_floating_point else "discrete"
+        TensorSpec.__init__(
+            self,
+            shape=torch.Size(shape),
+            space=None,
+            device=torch.device("cpu" if device is None else device),
+            dtype=dtype,
+            domain=kwargs.pop("domain", kind),
+            **kwargs,
+        )
+        self.encode = self._encode_eager
+
+    def to(self, dest: Any) -> PixelSpec:
+        """Return the spec with another dtype or on another device."""
+        if dest is None:
+            return self
+        if isinstance(dest, torch.dtype):
+            return PixelSpec(self.shape, self.device, dest)
+        return PixelSpec(self.shape, dest, self.dtype)
+
+
+def observation_spec(spec: Any, num_envs: int, device: torch.device) -> Composite:
+    """Return the spec of an observation: pixels under ``"pixels"``, state under ``"observation"``.
+
+    Args:
+        spec: ``PixelEnv.obs_spec``: a ``jax.ShapeDtypeStruct`` or a dict of them.
+        num_envs: N, the leading axis.
+        device: where observations are.
+    """
+    parts = spec if isinstance(spec, dict) else {"any": spec}
+    specs: dict[str, TensorSpec] = {}
+    for part in parts.values():
+        shape = (num_envs, *part.shape)
+        if part.dtype == "uint8":
+            specs["pixels"] = PixelSpec(shape, device)
+        else:
+            specs["observation"] = Unbounded(shape, device=device, dtype=torch.float32)
+    return Composite(specs, shape=(num_envs,), device=device)
+
+
+def action_spec(action_size: int, num_envs: int, device: torch.device) -> Bounded:
+    """Return the spec of an action: float32 in [-1, 1], whatever the model's control range."""
+    return Bounded(-1.0, 1.0, shape=(num_envs, action_size), device=device, dtype=torch.float32)
+
+
+def done_spec(num_envs: int, device: torch.device) -> Composite:
+    """Return the spec of ``done``, ``terminated`` and ``truncated``, each (N, 1) bool."""
+    names = ("done", "terminated", "truncated")
+    flags = {
+        name: Categorical(2, shape=(num_envs, 1), device=device, dtype=torch.bool) for name in names
+    }
+    return Composite(flags, shape=(num_envs,), device=device)

@@ -1,0 +1,1 @@
+"""One file for each algorithm, and the named settings of all."""

@@ -1,0 +1,269 @@
+"""Delayed critic policy gradient (Moon, Lee and Song, arXiv 2210.09960), and two variants.
+
+Policy and value share an encoder, and the value learns from returns only in the delayed phase,
+long after they were collected: that keeps the encoder from memorising. DDCPG adds a dynamics
+head to the delayed phase; the decoupled variant has a critic of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+
+from pixelbrax_jax.agents.algorithms.ppo import ActorCritic, epochs
+from pixelbrax_jax.agents.core import algorithm, phasic
+from pixelbrax_jax.agents.core.algorithm import Algorithm, TrainState, environments, train_function
+from pixelbrax_jax.agents.core.config import TrainConfig, check_positive
+from pixelbrax_jax.agents.core.losses import Batch, Metrics, mean, policy_loss, value_loss
+from pixelbrax_jax.agents.core.networks import Dynamics
+from pixelbrax_jax.agents.core.optimizer import Networks, Optimizer
+from pixelbrax_jax.agents.core.rollout import Environments
+from pixelbrax_jax.types import EnvParams
+from pixelbrax_jax.validation import check_share, check_whole
+
+_PLAYED = ("actor", "critic")
+"""Networks that learn in the policy phase."""
+
+
+@dataclass(frozen=True)
+class DCPGConfig(TrainConfig):
+    """Settings of DCPG; of DDCPG with ``dynamics_coef`` = 1."""
+
+    update_epochs: int = 1
+    """Passes over a rollout in the policy phase."""
+    value_distill_coef: float = 1.0
+    """lambda_V, weight that keeps the value where it was while the policy learns."""
+    num_policy_phases: int = 16
+    """Rollouts between delayed phases, which learn from all of them."""
+    aux_epochs: int = 4
+    """E_aux, passes over the buffer."""
+    aux_minibatches: int = 16
+    """Minibatches of such a pass, a multiple of ``num_policy_phases``."""
+    beta_clone: float = 1.0
+    """lambda_pi, weight of KL(old policy || policy) in the delayed phase."""
+    dynamics_coef: float = 0.0
+    """c_f, weight of DDCPG's dynamics loss in the delayed phase; 0 has no dynamics head."""
+    decoupled: bool = False
+    """Whether advantages come from a critic of its own, which learns in every policy phase."""
+    vf_coef: float = 1.0
+    """Weight of that critic's loss."""
+    target_rate: float = 0.05
+    """tau of the averaged actor whose value is kept in the decoupled variant."""
+
+    def __post_init__(self) -> None:
+        """Checks the settings.
+
+        Raises:
+            ValueError: a setting is out of range; the message says what is allowed.
+        """
+        super().__post_init__()
+        check_whole("update_epochs", self.update_epochs)
+        check_whole("aux_epochs", self.aux_epochs)
+        for name in ("value_distill_coef", "beta_clone", "dynamics_coef", "vf_coef"):
+            check_positive(name, getattr(self, name), or_zero=True)
+        check_share("target_rate", self.target_rate)
+        phasic.check_phases(self, self.num_policy_phases, self.aux_epochs, self.aux_minibatches)
+        if self.state_critic and not self.decoupled:
+            raise ValueError(
+                "state_critic needs decoupled=True, got False: else there is no critic apart."
+            )
+        if self.dynamics_coef and self.num_steps * self.num_policy_phases == self.aux_minibatches:
+            raise ValueError(
+                f"dynamics_coef={self.dynamics_coef} needs at least 2 steps in a chunk, got 1: "
+                f"aux_minibatches={self.aux_minibatches} must be less than num_steps * "
+                f"num_policy_phases={self.num_steps * self.num_policy_phases}."
+            )
+
+
+def make_train(
+    config: DCPGConfig,
+    envs: Environments | None = None,
+    env_params: EnvParams | None = None,
+) -> Callable[[jax.Array], tuple[TrainState, Metrics]]:
+    """A whole run as a pure function ``train(key) -> (state, metrics)``; see `train_function`.
+
+    Args:
+        config: settings.
+        envs: environments of your own; None makes those that ``config`` names.
+        env_params: of those.
+
+    Raises:
+        ValueError: one of the two is given without the other.
+    """
+    envs, env_params = environments(config, envs, env_params)
+    return train_function(make_dcpg(config, envs), env_params)
+
+
+def make_dcpg(config: DCPGConfig, envs: Environments) -> Algorithm:
+    """DCPG in the given environments."""
+    agent = ActorCritic(config, envs, shared=not config.decoupled, has_value=True)
+    dynamics = Dynamics()
+
+    def init_networks(key: jax.Array) -> Networks:
+        networks = agent.init(key)
+        if config.decoupled:
+            networks["target"] = networks["actor"]
+        if config.dynamics_coef:
+            pixels = jnp.zeros((1, config.height, config.width, 3 * config.frame_stack), jnp.uint8)
+            features = agent.actor(networks["actor"], pixels).features
+            action = jnp.zeros((1, envs.env.action_size))
+            dynamics_key = jax.random.fold_in(key, 2)
+            networks["dynamics"] = dynamics.init(dynamics_key, features, action, features)
+        return networks
+
+    def init(key: jax.Array, env_params: EnvParams) -> TrainState:
+        state = algorithm.begin(config, envs, init_networks, key, env_params)
+        decide = agent.decide(state.networks)
+        state = phasic.begin_phases(
+            config, envs, state, env_params, decide, config.num_policy_phases
+        )
+        # The averaged actor follows without a gradient; the dynamics head learns in one phase.
+        optimizer, networks = Optimizer(config), state.networks
+        return state.replace(
+            moments=optimizer.init({n: p for n, p in networks.items() if n in _PLAYED}),
+            aux_moments=optimizer.init({n: p for n, p in networks.items() if n != "target"}),
+        )
+
+    def iterate(state: TrainState, env_params: EnvParams) -> tuple[TrainState, Metrics]:
+        """The policy phase: the policy learns, and the value stays where it was."""
+        key, before = algorithm.update_key(state), state.iteration
+        state, rollout, advantage, returns, metrics = algorithm.play(
+            config, envs, state, env_params, agent.decide(state.networks)
+        )
+        target = state.networks.get("target")
+
+        def loss(networks: Networks, batch: Batch, key: jax.Array) -> tuple[jax.Array, Metrics]:
+            output = agent.actor(networks["actor"], batch.pixels)
+            loss, facts = policy_loss(output.policy, batch, config, key)
+            # Coupled, the actor's value is what played: its old values are in the batch.
+            kept = batch.value
+            if config.decoupled:
+                kept = agent.actor(target, batch.pixels).value
+                value = agent.critic(networks["critic"], batch.pixels, batch.state)
+                error = value_loss(value, batch.returns, batch.weight)
+                facts["loss/value"] = error
+                loss += config.vf_coef * error
+            distance = value_loss(output.value, kept, batch.weight)
+            facts |= {"loss/value_distill": distance} | algorithm.policy_metrics(output.policy.std)
+            return loss + config.value_distill_coef * distance, facts
+
+        trained = {n: p for n, p in state.networks.items() if n in _PLAYED}
+        networks, moments, facts = epochs(
+            config,
+            loss,
+            trained,
+            state.moments,
+            (rollout, advantage, returns),
+            config.update_epochs,
+            key,
+            before,
+        )
+        slot = before % config.num_policy_phases
+        state = state.replace(
+            networks=state.networks | networks,
+            moments=moments,
+            buffer=phasic.remember(state.buffer, slot, rollout, returns),
+        )
+        rate = Optimizer(config).learning_rate(before)
+        return state, metrics | facts | {"learning_rate": rate}
+
+    def auxiliary(state: TrainState) -> tuple[TrainState, Metrics]:
+        """The delayed phase: the value learns from old returns, and the policy stays."""
+
+        def loss(
+            networks: Networks, chunk: phasic.Chunk, key: jax.Array
+        ) -> tuple[jax.Array, Metrics]:
+            output = agent.actor(networks["actor"], chunk.pixels)
+            error = value_loss(output.value, chunk.returns, chunk.weight)
+            kl = mean(chunk.policy.kl_to(output.policy), chunk.weight)
+            loss = error + config.beta_clone * kl
+            facts = {"auxiliary/value_loss": error, "auxiliary/kl": kl}
+            if config.decoupled:
+                value = agent.critic(networks["critic"], chunk.pixels, chunk.state)
+                critic_error = value_loss(value, chunk.returns, chunk.weight)
+                loss += config.vf_coef * critic_error
+                facts["auxiliary/critic_loss"] = critic_error
+            if config.dynamics_coef:
+                wrong = dynamics_loss(dynamics, networks["dynamics"], output.features, chunk, key)
+                loss += config.dynamics_coef * wrong
+                facts["auxiliary/dynamics_loss"] = wrong
+            return loss, facts
+
+        def after_step(networks: Networks) -> Networks:
+            if not config.decoupled:
+                return networks
+            rate = config.target_rate
+            moved = jax.tree.map(
+                lambda old, new: (1 - rate) * old + rate * new,
+                networks["target"],
+                networks["actor"],
+            )
+            return networks | {"target": moved}
+
+        return phasic.auxiliary_phase(
+            config,
+            state,
+            lambda networks, pixels: agent.actor(networks["actor"], pixels).policy,
+            loss,
+            config.aux_epochs,
+            config.aux_minibatches,
+            after_step,
+        )
+
+    return Algorithm(
+        "dcpg", config, envs, init, iterate, agent.act, auxiliary, config.num_policy_phases
+    )
+
+
+def dynamics_loss(
+    dynamics: Dynamics,
+    params: Networks,
+    features: jax.Array,
+    chunk: phasic.Chunk,
+    key: jax.Array,
+) -> jax.Array:
+    """DDCPG's loss: what leads to what, true ones told from wrong ones.
+
+    With features z, action a and features z' one step later, and a logistic loss l:
+    ``l(f(z, a, z'), 1) + l(f(z, a~, z'), 0) / 2 + l(f(z, a, z~'), 0)``, with the weights of the
+    authors' code. Here a~ and z~' are those of another sample. Pairs that an episode's end parts
+    are left out.
+
+    Args:
+        dynamics: the head.
+        params: of the head.
+        features: (N C, F) float32 of the chunk.
+        chunk: C steps of N environments.
+        key: for the exchange.
+
+    Returns:
+        () float32.
+    """
+    num_steps = chunk.num_steps
+
+    def in_time(rows: jax.Array) -> jax.Array:
+        return rows.reshape(-1, num_steps, *rows.shape[1:])
+
+    def flat(rows: jax.Array) -> jax.Array:
+        return rows.reshape(-1, *rows.shape[2:])
+
+    now, following = flat(in_time(features)[:, :-1]), flat(in_time(features)[:, 1:])
+    action = flat(in_time(chunk.raw)[:, :-1])
+    # A step that ends an episode returns a true last observation; the one after it begins anew.
+    weight = flat(in_time(chunk.weight)[:, :-1])
+    action_key, following_key = jax.random.split(key)
+    others = jax.random.permutation(action_key, len(action))
+    strangers = jax.random.permutation(following_key, len(following))
+
+    def logistic(action: jax.Array, following: jax.Array, sign: float) -> jax.Array:
+        logit: jax.Array = dynamics.apply(params, now, action, following)  # type: ignore[assignment]
+        return mean(jax.nn.softplus(-sign * logit), weight)
+
+    return (
+        logistic(action, following, 1.0)
+        + 0.5 * logistic(action[others], following, -1.0)
+        + logistic(action, following[strangers], -1.0)
+    )

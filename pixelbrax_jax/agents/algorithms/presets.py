@@ -1,0 +1,112 @@
+"""Named settings of each algorithm."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from pixelbrax_jax.agents.algorithms.dcpg import DCPGConfig, make_dcpg
+from pixelbrax_jax.agents.algorithms.ppg import PPGConfig, make_ppg
+from pixelbrax_jax.agents.algorithms.ppo import PPOConfig, make_ppo
+from pixelbrax_jax.agents.core.algorithm import Algorithm
+from pixelbrax_jax.agents.core.config import TrainConfig
+from pixelbrax_jax.validation import check_choice
+
+CONFIGS: dict[str, type[TrainConfig]] = {"ppo": PPOConfig, "ppg": PPGConfig, "dcpg": DCPGConfig}
+"""Settings of each algorithm, by its name."""
+
+MAKERS: dict[str, Callable[..., Algorithm]] = {"ppo": make_ppo, "ppg": make_ppg, "dcpg": make_dcpg}
+"""``make(config, envs) -> Algorithm``, by the algorithm's name."""
+
+_DEACREP = {
+    "backend": "spring",
+    "height": 64,
+    "width": 64,
+    "num_envs": 32,
+    "num_steps": 32,
+    "policy": "deacrep",
+    "gamma": 0.999,
+    "learning_rate": 5e-4,
+    "adam_eps": 1e-8,
+    "ent_coef": 0.01,
+    "normalize_reward": False,
+}
+_PROCGEN = {
+    "height": 64,
+    "width": 64,
+    "frame_stack": 1,
+    "num_envs": 64,
+    "num_steps": 256,
+    "gamma": 0.999,
+    "learning_rate": 5e-4,
+    "ent_coef": 0.01,
+}
+_CI = {
+    "task": "inverted_pendulum",
+    "height": 32,
+    "width": 32,
+    "frame_stack": 2,
+    "num_envs": 128,
+    "num_steps": 32,
+    "total_steps": 1_400_000,
+    "encoder": "small",
+    "initial_std": 0.37,
+    "learning_rate": 1e-3,
+    "anneal": True,
+    "ent_coef": 0.0,
+}
+
+PRESETS: dict[str, dict[str, dict[str, Any]]] = {
+    # As each class says.
+    "default": {"ppo": {}, "ppg": {}, "dcpg": {}},
+    # Lyu et al.'s scripts for Brax (the code of arXiv 2502.00021).
+    "deacrep": {
+        "ppo": _DEACREP | {"update_epochs": 1},
+        "ppg": _DEACREP | {"aux_epochs": 1, "vf_coef": 0.5},
+        "dcpg": _DEACREP | {"aux_epochs": 1, "decoupled": True},
+    },
+    # Moon et al. for Procgen (arXiv 2210.09960), and Cobbe et al. for PPG (arXiv 2009.04416).
+    "procgen": {
+        "ppo": _PROCGEN | {"clip_value": True},
+        "ppg": _PROCGEN
+        | {
+            "num_policy_phases": 32,
+            "aux_minibatches": 32,
+            "aux_epochs": 6,
+            "adam_eps": 1e-8,
+            "max_grad_norm": 0.0,
+        },
+        "dcpg": _PROCGEN | {"num_policy_phases": 32, "aux_minibatches": 32, "aux_epochs": 6},
+    },
+    # Minutes on two CPU cores.
+    "ci": {
+        "ppo": _CI | {"layout": "shared", "update_epochs": 3},
+        "ppg": _CI
+        | {
+            "layout": "detach",
+            "policy_epochs": 3,
+            "value_epochs": 3,
+            "num_policy_phases": 8,
+            "aux_minibatches": 8,
+            "aux_epochs": 1,
+        },
+        "dcpg": _CI
+        | {"num_policy_phases": 2, "aux_minibatches": 8, "aux_epochs": 2, "update_epochs": 2},
+    },
+}
+"""Changes of the defaults, by name of the preset and of the algorithm."""
+
+
+def preset(algorithm: str, name: str = "default") -> TrainConfig:
+    """Settings of a preset.
+
+    Args:
+        algorithm: ``"ppo"``, ``"ppg"`` or ``"dcpg"``.
+        name: ``"default"``, ``"deacrep"``, ``"procgen"`` or ``"ci"``.
+
+    Raises:
+        ValueError: one of them is unknown.
+    """
+    check_choice("algorithm", algorithm, CONFIGS)
+    check_choice("preset", name, PRESETS)
+    return CONFIGS[algorithm](**PRESETS[name][algorithm])

@@ -1,0 +1,261 @@
+"""Playing in the environments, and storing what was seen in little memory.
+
+A rollout keeps every frame once. The stack of K frames that the agent saw is put together
+again by index when it is needed.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from pixelbrax_jax.types import EnvParams, EnvState, Timestep
+
+
+class Environments(Protocol):
+    """What agents need: N environments in mode ``"next_step"``."""
+
+    @property
+    def env(self) -> Any:
+        """The ``PixelEnv``."""
+
+    @property
+    def num_envs(self) -> int:
+        """N."""
+
+    @property
+    def autoreset_mode(self) -> str:
+        """``"next_step"``."""
+
+    def reset(self, key: jax.Array, params: EnvParams) -> tuple[EnvState, Timestep]:
+        """As ``VectorPixelEnv.reset``."""
+
+    def step(
+        self, state: EnvState, action: jax.Array, params: EnvParams
+    ) -> tuple[EnvState, Timestep]:
+        """As ``VectorPixelEnv.step``."""
+
+    def obs(self, state: EnvState) -> Any:
+        """As ``VectorPixelEnv.obs``."""
+
+
+class Frames(struct.PyTreeNode):
+    """Observations of T steps of N environments.
+
+    Attributes:
+        pixels: (K - 1 + T, N, H, W, 3) uint8, single frames; the first K - 1 are from before.
+        age: (T, N) int32, frames of its episode that are older than the observation's newest
+            one, at most K - 1.
+        shift: (N, 2) int32, pixels down and right by which observations are shifted.
+        state: (T, N, S) float32, the simulator's state; None unless a critic sees it.
+    """
+
+    pixels: jax.Array
+    age: jax.Array
+    shift: jax.Array
+    state: jax.Array | None
+
+
+class Rollout(struct.PyTreeNode):
+    """T steps of N environments.
+
+    Attributes:
+        frames: what was seen.
+        raw: (T, N, A) float32, raw actions.
+        log_prob: (T, N) float32, of the actions when they were drawn.
+        value: (T, N) float32, of the observations, at that time.
+        last_value: (N,) float32, of the observation after the last step.
+        reward: (T, N) float32.
+        terminated: (T, N) bool.
+        truncated: (T, N) bool.
+        valid: (T, N) bool. False where the step began an episode and the action was ignored;
+            such a step teaches nothing.
+        episode_return: (T, N) float32, sum of rewards of the episode so far.
+        episode_length: (T, N) int32, control steps of the episode so far.
+    """
+
+    frames: Frames
+    raw: jax.Array
+    log_prob: jax.Array
+    value: jax.Array
+    last_value: jax.Array
+    reward: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    valid: jax.Array
+    episode_return: jax.Array
+    episode_length: jax.Array
+
+    @property
+    def done(self) -> jax.Array:
+        """(T, N) bool, an episode ended."""
+        return self.terminated | self.truncated
+
+
+class Decision(NamedTuple):
+    """What an agent does about N observations: raw and final action, log-probability, value."""
+
+    raw: jax.Array
+    action: jax.Array
+    log_prob: jax.Array
+    value: jax.Array
+
+
+def collect(
+    envs: Environments,
+    env_state: EnvState,
+    env_params: EnvParams,
+    decide: Any,
+    key: jax.Array,
+    num_steps: int,
+    random_shift: int,
+) -> tuple[EnvState, Rollout]:
+    """Plays ``num_steps`` steps.
+
+    Args:
+        envs: the environments.
+        env_state: where they are.
+        env_params: of the environments.
+        decide: ``decide(pixels, state, key) -> Decision``.
+        key: of this rollout alone.
+        num_steps: T.
+        random_shift: pixels by which observations are shifted at most.
+
+    Returns:
+        Where the environments are then, and what happened.
+    """
+    num_envs = envs.num_envs
+    shift = jax.random.randint(
+        jax.random.fold_in(key, num_steps + 1),
+        (num_envs, 2),
+        -random_shift,
+        random_shift + 1,
+    )
+    first, _ = split_obs(envs.obs(env_state))
+    stack = first.shape[-1] // 3
+    before = jnp.moveaxis(first.reshape(*first.shape[:-1], stack, 3), -2, 0)[:-1]
+
+    def step(carry: tuple[EnvState, jax.Array], number: jax.Array) -> tuple[Any, Any]:
+        env_state, age = carry
+        pixels, state = split_obs(envs.obs(env_state))
+        seen = shifted(pixels, shift, random_shift)
+        choice = decide(seen, state, jax.random.fold_in(key, number))
+        begins = env_state.done
+        env_state, timestep = envs.step(env_state, choice.action, env_params)
+        kept = (pixels[..., -3:], age, state)
+        facts = (
+            choice.raw,
+            choice.log_prob,
+            choice.value,
+            timestep.reward,
+            timestep.terminated,
+            timestep.truncated,
+            ~begins,
+            timestep.info["episode_return"],
+            timestep.info["episode_length"],
+        )
+        age = jnp.where(begins, 0, jnp.minimum(age + 1, stack - 1))
+        return (env_state, age), (kept, facts)
+
+    # The stack that is there already needs no frames of before to be left out: an episode that
+    # has just begun repeats its first frame in it.
+    start = (env_state, jnp.full(num_envs, stack - 1))
+    (env_state, _), (kept, facts) = jax.lax.scan(step, start, jnp.arange(num_steps))
+    newest, age, state = kept
+    pixels, last_state = split_obs(envs.obs(env_state))
+    last_seen = shifted(pixels, shift, random_shift)
+    last = decide(last_seen, last_state, jax.random.fold_in(key, num_steps))
+    frames = Frames(pixels=jnp.concatenate([before, newest]), age=age, shift=shift, state=state)
+    raw, log_prob, value, *rest = facts
+    return env_state, Rollout(frames, raw, log_prob, value, last.value, *rest)
+
+
+def observations(frames: Frames, times: jax.Array, random_shift: int = 0) -> jax.Array:
+    """The pixels that the agent saw at some times, as it saw them.
+
+    Args:
+        frames: of T steps of N environments.
+        times: (B, N) int32, steps of each environment.
+        random_shift: pixels by which observations were shifted at most.
+
+    Returns:
+        (N B, H, W, 3 K) uint8, one environment after the other, oldest frame first.
+    """
+    stack = frames.pixels.shape[0] - frames.age.shape[0] + 1
+    age = jnp.take_along_axis(frames.age, times, axis=0)
+    back = jnp.minimum(jnp.arange(stack - 1, -1, -1), age[..., None])
+    index = times[..., None] + stack - 1 - back
+    picked = jax.vmap(lambda pixels, index: pixels[index], in_axes=1)(frames.pixels, index)
+    stacked = jnp.moveaxis(picked, 2, -2)
+    stacked = stacked.reshape(*stacked.shape[:-2], 3 * stack)
+    if random_shift:
+        of_times = jax.vmap(shifted, in_axes=(1, None, None), out_axes=1)
+        stacked = of_times(stacked, frames.shift, random_shift)
+    return stacked.reshape(-1, *stacked.shape[2:])
+
+
+def at_times(rows: jax.Array, times: jax.Array) -> jax.Array:
+    """Rows of some times.
+
+    Args:
+        rows: (T, N, ...).
+        times: (B, N) int32.
+
+    Returns:
+        (N B, ...), one environment after the other: what is spread over devices along
+        environments then stays where it is.
+    """
+    picked = jax.vmap(lambda rows, index: rows[index], in_axes=1)(rows, times)
+    return picked.reshape(-1, *rows.shape[2:])
+
+
+def minibatch_times(key: jax.Array, num_steps: int, num_envs: int, parts: int) -> jax.Array:
+    """A random partition of a rollout into minibatches.
+
+    Every minibatch has equally many steps of each environment. So a minibatch is cut along the
+    environments alike, on however many devices they live.
+
+    Args:
+        key: of this epoch alone.
+        num_steps: T.
+        num_envs: N.
+        parts: number of minibatches M, a divisor of T.
+
+    Returns:
+        (M, T / M, N) int32.
+    """
+    keys = jax.vmap(lambda i: jax.random.fold_in(key, i))(jnp.arange(num_envs))
+    order = jax.vmap(lambda key: jax.random.permutation(key, num_steps), out_axes=1)(keys)
+    return order.reshape(parts, num_steps // parts, num_envs)
+
+
+def split_obs(obs: Any) -> tuple[jax.Array, jax.Array | None]:
+    """Pixels and state of an observation; None for a state that is not there."""
+    if isinstance(obs, dict):
+        return obs["pixels"], obs["state"]
+    return obs, None
+
+
+def shifted(pixels: jax.Array, shift: jax.Array, at_most: int) -> jax.Array:
+    """Pictures shifted, their edges repeated (Yarats et al., arXiv 2004.13649).
+
+    Args:
+        pixels: (N, H, W, C).
+        shift: (N, 2) int32, pixels down and right.
+        at_most: bound of the shifts, static.
+
+    Returns:
+        (N, H, W, C).
+    """
+    if not at_most:
+        return pixels
+    rows = jnp.arange(pixels.shape[1])[None] - shift[:, :1]
+    columns = jnp.arange(pixels.shape[2])[None] - shift[:, 1:]
+    rows, columns = (
+        jnp.clip(rows, 0, pixels.shape[1] - 1),
+        jnp.clip(columns, 0, pixels.shape[2] - 1),
+    )
+    return jax.vmap(lambda picture, r, c: picture[r][:, c])(pixels, rows, columns)

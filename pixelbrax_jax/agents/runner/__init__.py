@@ -1,0 +1,1 @@
+"""What runs an algorithm: training, checkpoints, evaluation, videos, metrics."""

@@ -1,0 +1,425 @@
+"""Where training stands, on disk: written whole or not at all, and read back to the bit."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import shutil
+from collections.abc import Iterator
+from importlib import metadata
+from pathlib import Path
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import orbax.checkpoint as ocp
+
+from pixelbrax_jax.agents.runner.sharding import anywhere
+
+FORMAT = 2
+"""Number of the format; raised when what is stored changes its meaning."""
+
+_FREE = ("total_steps", "memory_budget_gb")
+"""Settings that a run may go on with although they differ."""
+
+_ROOM = 1.2
+"""Free bytes on the disk that are asked for, in sizes of a checkpoint."""
+
+_PACKAGES = ("pixelbrax", "jax", "jaxlib", "brax", "mujoco", "flax", "optax")
+"""Packages whose versions a run's last bits depend on."""
+
+Tree = TypeVar("Tree")
+
+
+class CheckpointError(RuntimeError):
+    """A checkpoint cannot be written or read; the message says why and what to do."""
+
+
+class DiskFullError(CheckpointError):
+    """There is no room for a checkpoint; raised in all processes alike, before any writes."""
+
+
+class Checkpoints:
+    """The checkpoints of one run.
+
+    Each is a folder named by the number of control steps. It appears under that name only when
+    it is complete, so that a run that is killed while writing leaves the one before.
+
+    Attributes:
+        folder: where they are.
+    """
+
+    def __init__(
+        self, folder: str | Path, settings: dict[str, Any], algorithm: str, *, keep: int = 3
+    ) -> None:
+        """Opens the folder, which is made if need be.
+
+        Args:
+            folder: where the checkpoints are.
+            settings: by name, stored with every checkpoint.
+            algorithm: name of the algorithm, stored likewise.
+            keep: how many of the latest are kept, besides the best one.
+
+        Raises:
+            CheckpointError: the folder cannot be written to.
+        """
+        self.folder = Path(folder).absolute()
+        self._about: dict[str, Any] = {
+            "format": FORMAT,
+            "algorithm": algorithm,
+            "config": settings,
+            "versions": _versions(),
+        }
+        self._free = tuple(n for n in _FREE if n != "total_steps" or not settings.get("anneal"))
+        check_writable(self.folder)
+        policy = ocp.checkpoint_managers
+        best = policy.BestN(
+            get_metric_fn=lambda m: m["score"], n=1, keep_checkpoints_without_metrics=False
+        )
+        options = ocp.CheckpointManagerOptions(
+            preservation_policy=policy.AnyPreservationPolicy([policy.LatestN(keep), best]),
+            # Without it scores are not written, and a resumed run would drop the best.
+            best_fn=lambda metrics: metrics["score"],
+            cleanup_tmp_directories=True,
+        )
+        self._manager = ocp.CheckpointManager(self.folder, options=options)
+        self._writing = False
+        logging.getLogger("absl").addFilter(_not_a_traceback)
+
+    def steps(self) -> list[int]:
+        """Control steps of all checkpoints, ascending."""
+        return sorted(self._manager.all_steps())
+
+    def best(self) -> int | None:
+        """Control steps of the checkpoint with the highest score; None if none has a score."""
+        return best_steps(self.folder)
+
+    def save(self, state: Any, steps: int, score: float | None) -> None:
+        """Begins to write a checkpoint; training may go on meanwhile.
+
+        Args:
+            state: any pytree of arrays.
+            steps: control steps so far.
+            score: the higher, the better; None if it is not known.
+
+        Raises:
+            DiskFullError: there is no room for it.
+            CheckpointError: it cannot be written, or the one before, which was being written,
+                could not be.
+        """
+        self.wait()
+        leaves = _plain(state)
+        size = sum(leaf.nbytes for leaf in leaves.values())
+        try:
+            free = shutil.disk_usage(self.folder).free
+        except OSError as error:
+            raise self._failed(error) from error
+        if anywhere(free < _ROOM * size):
+            raise DiskFullError(
+                f"a checkpoint takes {_bytes(size)}, but {self.folder} has only {_bytes(free)} "
+                "free."
+            )
+        about = self._about | {"steps": steps, "score": score}
+        arguments = ocp.args.Composite(
+            state=ocp.args.StandardSave(leaves), about=ocp.args.JsonSave(about)
+        )
+        metrics = None if score is None else {"score": score}
+        try:
+            with _without_warnings():  # That there is no score is no mistake.
+                self._manager.save(steps, args=arguments, metrics=metrics, force=True)
+        except (OSError, ValueError) as error:
+            raise self._failed(error) from error
+        self._writing = True
+
+    def is_written(self) -> bool:
+        """Return whether nothing is being written any more.
+
+        Raises:
+            CheckpointError: the checkpoint that was being written could not be.
+        """
+        if self._writing and not self._manager.is_saving_in_progress():
+            self.wait()
+        return not self._writing
+
+    def wait(self) -> None:
+        """Returns when everything is written.
+
+        Raises:
+            CheckpointError: it could not be.
+        """
+        self._writing = False
+        try:
+            self._manager.wait_until_finished()
+        except (OSError, ValueError) as error:  # TensorStore has a ValueError for a full disk.
+            raise self._failed(error) from error
+
+    def _failed(self, error: Exception) -> CheckpointError:
+        """Return what to raise for a checkpoint that cannot be written; removes what there is."""
+        if jax.process_index() == 0:
+            for path in self.folder.glob("*.orbax-checkpoint-tmp*"):
+                shutil.rmtree(path, ignore_errors=True)
+        # The manager has left out those that the new one would have replaced.
+        with contextlib.suppress(OSError):
+            self._manager.reload()
+        # TensorStore's messages end with the system's own words.
+        reason = str(error).partition("\n")[0].rsplit(": ", 1)[-1]
+        reason = getattr(error, "strerror", None) or reason or type(error).__name__
+        return CheckpointError(f"cannot write a checkpoint to {self.folder}: {reason}.")
+
+    def restore(self, template: Tree, steps: int | None = None) -> Tree:
+        """The state of a checkpoint.
+
+        Args:
+            template: a state of the same shapes, or its ``jax.eval_shape``.
+            steps: of which checkpoint; None takes the latest.
+
+        Returns:
+            The state, equal to the bit to what was saved.
+
+        Raises:
+            CheckpointError: there is none, or it is of another configuration or format.
+        """
+        steps = self._which(steps)
+        self._check(steps)
+        wanted = _plain(template)
+        targets = {
+            name: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=_sharding(leaf))
+            for name, leaf in wanted.items()
+        }
+        leaves = self._manager.restore(
+            steps, args=ocp.args.Composite(state=ocp.args.StandardRestore(targets))
+        )["state"]
+        return _typed(template, leaves)
+
+    def other_versions(self, steps: int | None = None) -> list[str]:
+        """Packages whose versions, and devices whose kind or number, were others then.
+
+        Args:
+            steps: of which checkpoint; None takes the latest.
+        """
+        old = read_about(self.folder, self._which(steps))["versions"]
+        new = self._about["versions"]
+        return [
+            f"{name} {old.get(name)} there, {new.get(name)} here"
+            for name in sorted(old.keys() | new.keys())
+            if old.get(name) != new.get(name)
+        ]
+
+    def close(self) -> None:
+        """Waits for what is being written, and lets go of the folder."""
+        try:
+            self.wait()
+        finally:
+            # `wait` has raised what it may raise of a full disk.
+            with contextlib.suppress(OSError, ValueError):
+                self._manager.close()
+            logging.getLogger("absl").removeFilter(_not_a_traceback)
+
+    def _which(self, steps: int | None) -> int:
+        known = self.steps()
+        if not known:
+            raise CheckpointError(f"there is no checkpoint in {self.folder}.")
+        if steps is not None and steps not in known:
+            raise CheckpointError(
+                f"there is no checkpoint of {steps} steps in {self.folder}; there are those of "
+                f"{', '.join(map(str, known))}."
+            )
+        return known[-1] if steps is None else steps
+
+    def _check(self, steps: int) -> None:
+        about = read_about(self.folder, steps)
+        if about["algorithm"] != self._about["algorithm"]:
+            raise CheckpointError(
+                f"{self.folder} is a run of {about['algorithm']}, not of "
+                f"{self._about['algorithm']}; give another --output-dir."
+            )
+        old, new = about["config"], self._about["config"]
+        other = [
+            f"{name}: {old.get(name)!r} there, {new.get(name)!r} here"
+            for name in sorted(old.keys() | new.keys())
+            if old.get(name) != new.get(name) and name not in self._free
+        ]
+        if other:
+            why = ""
+            if old.get("total_steps") != new.get("total_steps") and new.get("anneal"):
+                why = "A step size that falls over all of total_steps leaves them fixed. "
+            raise CheckpointError(
+                f"the checkpoint in {self.folder} has other settings: {'; '.join(other)}. "
+                f"{why}Use the same ones, or another --output-dir."
+            )
+
+
+def best_steps(folder: str | Path) -> int | None:
+    """Control steps of the checkpoint with the highest score; None if none has a score.
+
+    Of equal scores the later one is taken.
+
+    Args:
+        folder: of the checkpoints.
+    """
+    scores = {steps: read_about(folder, steps)["score"] for steps in _all_steps(Path(folder))}
+    scores = {steps: score for steps, score in scores.items() if score is not None}
+    return max(scores, key=lambda steps: (scores[steps], steps)) if scores else None
+
+
+def latest_steps(folder: str | Path) -> int | None:
+    """Return the control steps of the latest checkpoint in a folder; None if there is none."""
+    return max(_all_steps(Path(folder)), default=None)
+
+
+def read_about(folder: str | Path, steps: int | None = None) -> dict[str, Any]:
+    """What is stored beside a checkpoint's arrays: algorithm, config, steps, score.
+
+    Args:
+        folder: of the checkpoints.
+        steps: of which one; None takes the latest.
+
+    Raises:
+        CheckpointError: there is none, or it is of another format.
+    """
+    folder = Path(folder)
+    known = _all_steps(folder)
+    if not known:
+        raise CheckpointError(f"there is no checkpoint in {folder}.")
+    path = folder / str(known[-1] if steps is None else steps) / "about" / "metadata"
+    if not path.exists():
+        raise CheckpointError(
+            f"there is no checkpoint in {path.parents[1]}; there are those of "
+            f"{', '.join(map(str, known))} steps."
+        )
+    about: dict[str, Any] = json.loads(path.read_text("utf-8"))
+    if about.get("format") != FORMAT:
+        raise CheckpointError(
+            f"{path.parents[1]} has format {about.get('format')!r}, this version reads {FORMAT}."
+        )
+    return about
+
+
+def read_networks(folder: str | Path, template: Tree, steps: int | None = None) -> Tree:
+    """Parameters alone, of a checkpoint of any settings with equal networks.
+
+    Args:
+        folder: of the checkpoints.
+        template: networks of the same shapes, or their ``jax.eval_shape``.
+        steps: of which checkpoint; None takes the latest.
+
+    Raises:
+        CheckpointError: there is none, or its networks have other shapes.
+    """
+    about = read_about(folder, steps)
+    path = Path(folder).absolute() / str(about["steps"]) / "state"
+    wanted = _plain({"networks": template})
+    reader = ocp.Checkpointer(ocp.PyTreeCheckpointHandler())
+    with _without_warnings():
+        stored = reader.metadata(path).item_metadata.tree
+    for name, leaf in wanted.items():
+        if name not in stored or tuple(stored[name].shape) != leaf.shape:
+            found = tuple(stored[name].shape) if name in stored else "missing"
+            raise CheckpointError(f"{path.parent}: {name} is {found}, not {leaf.shape}.")
+    as_numpy = {name: ocp.RestoreArgs(restore_type=np.ndarray) for name in wanted}
+    with _without_warnings():
+        restored = reader.restore(
+            path, args=ocp.args.PyTreeRestore(wanted, restore_args=as_numpy, partial_restore=True)
+        )
+    leaves = {name: jnp.asarray(restored[name]) for name in wanted}
+    return _typed({"networks": template}, leaves)["networks"]
+
+
+def check_writable(folder: Path) -> None:
+    """Rejects a folder that cannot be made or written to.
+
+    Raises:
+        CheckpointError: naming the folder and the reason.
+    """
+    probe = folder / ".writable"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe.write_bytes(b"")
+        probe.unlink(missing_ok=True)  # Other processes try the same.
+    except OSError as error:
+        raise CheckpointError(
+            f"cannot write to {folder}: {error.strerror or error}. Give another --output-dir."
+        ) from error
+
+
+def _plain(tree: Any) -> dict[str, Any]:
+    """Leaves by their place, keys as numbers; without empty arrays, which tell nothing."""
+    leaves = {}
+    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            if isinstance(leaf, jax.ShapeDtypeStruct):
+                data = jax.eval_shape(jax.random.key_data, leaf)
+                leaf = jax.ShapeDtypeStruct(data.shape, data.dtype, sharding=leaf.sharding)
+            else:
+                leaf = jax.random.key_data(leaf)
+        if leaf.size:
+            leaves[jax.tree_util.keystr(path, simple=True, separator=".")] = leaf
+    return leaves
+
+
+def _typed(template: Tree, leaves: dict[str, Any]) -> Tree:
+    """The tree that `_plain` took apart."""
+
+    def leaf(path: Any, like: Any) -> Any:
+        if not like.size:
+            empty = jax.jit(
+                lambda: jnp.zeros(like.shape, like.dtype), out_shardings=_sharding(like)
+            )
+            return empty()
+        value = leaves[jax.tree_util.keystr(path, simple=True, separator=".")]
+        if jnp.issubdtype(like.dtype, jax.dtypes.prng_key):
+            return jax.random.wrap_key_data(value)
+        return value
+
+    return jax.tree_util.tree_map_with_path(leaf, template)
+
+
+def _all_steps(folder: Path) -> list[int]:
+    # Without the file, a folder is one that is being deleted.
+    found = (path for path in folder.glob("*") if path.name.isdigit())
+    return sorted(int(path.name) for path in found if (path / "about" / "metadata").exists())
+
+
+def _not_a_traceback(record: logging.LogRecord) -> bool:
+    """Return whether a record is no traceback of Orbax, whose errors `Checkpoints` raises."""
+    return not (record.exc_info and "orbax" in record.pathname)
+
+
+@contextlib.contextmanager
+def _without_warnings() -> Iterator[None]:
+    """Orbax's warnings are not shown."""
+    logger = logging.getLogger("absl")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
+
+
+def _versions() -> dict[str, str]:
+    """Of packages, and number and kind of devices."""
+    kind = jax.devices()[0].device_kind
+    found = {"devices": f"{jax.device_count()} x {kind}"}
+    for name in _PACKAGES:
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            found[name] = metadata.version(name)
+    return found
+
+
+def _sharding(leaf: Any) -> Any:
+    if getattr(leaf, "sharding", None) is not None:
+        return leaf.sharding
+    return jax.sharding.SingleDeviceSharding(jax.devices()[0])
+
+
+def _bytes(number: float) -> str:
+    """Return a number of bytes with a unit in which it shows."""
+    return f"{number / 1e9:.2f} GB" if number >= 1e8 else f"{number / 1e6:.2f} MB"
+
+
+def nbytes(tree: Any) -> int:
+    """Bytes of all arrays of a tree, or of its ``jax.eval_shape``."""
+    return sum(int(np.prod(leaf.shape)) * leaf.dtype.itemsize for leaf in _plain(tree).values())

@@ -1,0 +1,45 @@
+"""``pixelbrax evaluate``: returns of a trained agent."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+
+from pixelbrax_jax.agents.runner.checkpoint import CheckpointError
+from pixelbrax_jax.agents.runner.evaluate import Evaluator, make_split, splits_of
+from pixelbrax_jax.agents.runner.trained import load_trained
+from pixelbrax_jax.validation import check_whole
+
+
+def evaluate(options: argparse.Namespace) -> int:
+    """Runs the command; see ``pixelbrax evaluate --help``.
+
+    Returns:
+        The exit status.
+    """
+    try:
+        check_whole("episodes", options.episodes)
+        agent = load_trained(
+            options.folder, steps=options.steps, best=options.best, run=options.run_index
+        )
+        config = agent.algorithm.config
+        for name in options.split or splits_of(config):
+            env, params = make_split(config, name)
+            evaluator = Evaluator(agent.algorithm, env, params, num_episodes=options.episodes)
+            result = evaluator(agent.networks)
+            line = {
+                "steps": agent.steps,
+                "split": name,
+                "episodes": options.episodes,
+                "return": result.mean,
+                "length": float(result.lengths.mean()),
+            }
+            if options.episodes > 1:
+                line["standard_error"] = result.standard_error
+            sys.stdout.write(json.dumps(line) + "\n")
+            sys.stdout.flush()
+    except (CheckpointError, ValueError, OSError, ImportError) as error:
+        sys.stderr.write(f"pixelbrax evaluate: {error}\n")
+        return 1
+    return 0

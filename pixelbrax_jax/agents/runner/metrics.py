@@ -1,0 +1,313 @@
+"""Numbers of a training run: put together over iterations, and written where people look."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import struct
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pixelbrax_jax.agents.runner.progress import reason
+
+_SUMS = ("episode/return_sum", "episode/length_sum", "episode/count")
+
+_MAX_WAITING = 64 * 2**20
+"""Bytes kept in memory for a file that cannot be written."""
+
+
+def together(records: list[Mapping[str, Any]]) -> dict[str, float]:
+    """One record of several iterations.
+
+    Episodes count equally, whichever iteration they ended in; all else is the mean over
+    iterations. Without a finished episode there is no return and no length.
+
+    Args:
+        records: metrics of iterations; some may have more names than others. Of several runs
+            they have a leading axis; the summary is over all of them, with each run's return.
+    """
+    names = {name: None for record in records for name in record}
+    values = {
+        name: np.asarray([record[name] for record in records if name in record], np.float64)
+        for name in names
+    }
+    count = float(values["episode/count"].sum())
+    summary = {"episode/count": count}
+    if count:
+        summary["episode/return"] = float(values["episode/return_sum"].sum()) / count
+        summary["episode/length"] = float(values["episode/length_sum"].sum()) / count
+        counts, sums = values["episode/count"].sum(0), values["episode/return_sum"].sum(0)
+        for run in np.flatnonzero(counts) if np.ndim(counts) else ():
+            summary[f"episode/return/run_{run}"] = float(sums[run] / counts[run])
+    return summary | {n: float(v.mean()) for n, v in values.items() if n not in _SUMS}
+
+
+class AppendedFile:
+    """A file that bytes are appended to; those the disk does not take are kept for the next time.
+
+    Nothing is written twice or left out in between: the file is complete as soon as all could be
+    written, and lacks only its end until then.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Open the file.
+
+        Args:
+            path: of the file, which is made if need be.
+        """
+        self._file = path.open("ab", buffering=0)
+        self._waiting = bytearray()
+        self._ended = False
+
+    def append(self, block: bytes = b"") -> None:
+        """Write what waits, then a block.
+
+        Raises:
+            OSError: some of it waits still, or more than 64 MiB did, behind which the file ends.
+        """
+        self._ended = self._ended or len(self._waiting) + len(block) > _MAX_WAITING
+        if not self._ended:
+            self._waiting += block
+        while self._waiting:
+            # The disk may take a part of it.
+            del self._waiting[: self._file.write(self._waiting)]
+        if self._ended:
+            raise OSError("more waited for room on the disk than is kept in memory")
+
+    def close(self) -> None:
+        """Write what waits and close the file.
+
+        Raises:
+            OSError: some of it could not be written.
+        """
+        try:
+            self.append()
+        finally:
+            self._file.close()
+
+
+class _Lines:
+    """``metrics.jsonl``."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = AppendedFile(path)
+        self.close = self._file.close
+
+    def write(self, steps: int, seconds: float, record: Mapping[str, float]) -> None:
+        line = {"steps": steps, "seconds": round(seconds, 3)} | dict(record)
+        self._file.append(json.dumps(line).encode() + b"\n")
+
+
+class _TensorBoard:
+    """An event file of TensorBoard.
+
+    It is written by the thread that trains. tensorboardX's own writer has a thread that ends at
+    the first error, behind which ``add_scalar`` blocks for ever.
+    """
+
+    def __init__(self, folder: Path, first_step: int) -> None:
+        from tensorboardX.proto.event_pb2 import Event, SessionLog
+
+        folder.mkdir(parents=True, exist_ok=True)
+        name = f"events.out.tfevents.{int(time.time())}.{socket.gethostname()}.{os.getpid()}"
+        self._file = AppendedFile(folder / name)
+        self.close = self._file.close
+        # TensorBoard forgets what an earlier attempt wrote beyond this step.
+        first_step = first_step + 1 if first_step else 0
+        self._add(Event(step=first_step, file_version="brain.Event:2"))
+        self._add(Event(step=first_step, session_log=SessionLog(status=SessionLog.START)))
+
+    def write(self, steps: int, seconds: float, record: Mapping[str, float]) -> None:
+        del seconds
+        from tensorboardX.proto.event_pb2 import Event
+        from tensorboardX.proto.summary_pb2 import Summary
+
+        values = [Summary.Value(tag=name, simple_value=value) for name, value in record.items()]
+        self._add(Event(step=steps, summary=Summary(value=values)))
+
+    def _add(self, event: Any) -> None:
+        """Append an event in the TFRecord format: length and bytes, each with its checksum."""
+        from tensorboardX.record_writer import masked_crc32c
+
+        event.wall_time = time.time()
+        data = event.SerializeToString()
+        length = struct.pack("<Q", len(data))
+        ends = [struct.pack("<I", masked_crc32c(part)) for part in (length, data)]
+        self._file.append(length + ends[0] + data + ends[1])
+
+
+class _WandB:
+    """A run of Weights & Biases."""
+
+    def __init__(self, project: str, config: dict[str, Any], folder: Path) -> None:
+        try:
+            import wandb
+        except ImportError as error:
+            raise ImportError(
+                "wandb_project is given, but wandb is not installed: pip install wandb"
+            ) from error
+        self._run = wandb.init(project=project, config=config, dir=str(folder))
+        self.close = self._run.finish
+
+    def write(self, steps: int, seconds: float, record: Mapping[str, float]) -> None:
+        del seconds
+        self._run.log(dict(record) | {"steps": steps})
+
+
+@dataclass
+class _Output:
+    """A place that records are written to.
+
+    Attributes:
+        name: as messages have it.
+        writer: has ``write`` and ``close``, which may raise.
+        retries: whether ``write`` keeps what it could not write, and tries again the next time.
+        failure: why records are missing; empty while none is.
+        last: steps of the last record that is there for certain.
+    """
+
+    name: str
+    writer: Any
+    retries: bool
+    failure: str = ""
+    last: int = 0
+
+
+class MetricsWriter:
+    """Writes records to ``metrics.jsonl`` and TensorBoard, and to Weights & Biases if asked.
+
+    Once it is open none of them can raise: what fails is reported, once, and the others go on.
+
+    The settings are written to ``config.json``, for people and scripts; nothing reads it back.
+
+    Attributes:
+        path: of the JSONL file: one object a line with ``steps``, ``seconds`` and the metrics.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        config: dict[str, Any],
+        *,
+        first_step: int = 0,
+        wandb_project: str | None = None,
+        report: Callable[[str], None],
+    ) -> None:
+        """Opens the files.
+
+        Args:
+            folder: where they are.
+            config: settings by name, as JSON has them.
+            first_step: control steps at which the run goes on; later records of an earlier
+                attempt are dropped, for they will be written again.
+            wandb_project: project of Weights & Biases; None writes nothing there.
+            report: gets a line about what cannot be written.
+
+        Raises:
+            ImportError: a project is given, but wandb is not installed.
+            OSError: a file cannot be opened.
+        """
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "config.json").write_text(json.dumps(config, indent=2) + "\n", "utf-8")
+        self.path = folder / "metrics.jsonl"
+        self._report = report
+        self._seconds = _keep_until(self.path, first_step)
+        self._began = time.monotonic()
+        board = folder / "tensorboard"
+        self._outputs = [
+            _Output(str(self.path), _Lines(self.path), retries=True, last=first_step),
+            _Output(str(board), _TensorBoard(board, first_step), retries=True, last=first_step),
+        ]
+        if wandb_project is not None:
+            wandb = _WandB(wandb_project, config, folder)
+            self._outputs.append(_Output("Weights & Biases", wandb, retries=False, last=first_step))
+
+    def write(self, steps: int, record: Mapping[str, float]) -> None:
+        """One record.
+
+        Args:
+            steps: control steps so far, any size.
+            record: numbers by name.
+        """
+        seconds = self._seconds + time.monotonic() - self._began
+        for output in self._outputs:
+            if output.failure and not output.retries:
+                continue
+            try:
+                output.writer.write(steps, seconds, record)
+            except Exception as error:
+                self._fail(output, error)
+                continue
+            output.last = steps
+            if output.failure:
+                output.failure = ""
+                self._report(f"{output.name} can be written again; what it lacked is written")
+
+    def close(self) -> None:
+        """Close the files."""
+        for output in self._outputs:
+            try:
+                output.writer.close()
+            except Exception as error:
+                self._fail(output, error)
+            else:
+                if output.retries:
+                    output.failure = ""
+
+    def missing(self) -> list[str]:
+        """Return one line for each place that lacks records."""
+        return [
+            f"{output.name} may lack records after {output.last} steps: {output.failure}"
+            for output in self._outputs
+            if output.failure
+        ]
+
+    def _fail(self, output: _Output, error: Exception) -> None:
+        if not output.failure:
+            then = "its records wait in memory" if output.retries else f"all are in {self.path}"
+            self._report(
+                f"cannot write to {output.name}: {reason(error)}; training goes on, {then}"
+            )
+        output.failure = reason(error)
+
+
+class NoWriter:
+    """What processes other than the first write: nothing."""
+
+    def write(self, steps: int, record: Mapping[str, float]) -> None:
+        """Nothing."""
+
+    def close(self) -> None:
+        """Nothing."""
+
+    def missing(self) -> list[str]:
+        """Nothing."""
+        return []
+
+
+def read_metrics(path: str | Path) -> list[dict[str, float]]:
+    """All records of a ``metrics.jsonl``; a last line that was cut off is left out."""
+    records = []
+    for line in Path(path).read_text("utf-8").splitlines():
+        try:
+            records.append(json.loads(line))
+        except json.JSONDecodeError:
+            break
+    return records
+
+
+def _keep_until(path: Path, first_step: int) -> float:
+    """Drops records beyond a step; the seconds that the kept ones took."""
+    if not path.exists():
+        return 0.0
+    kept = [r for r in read_metrics(path) if first_step and r["steps"] <= first_step]
+    fresh = path.with_suffix(".part")
+    fresh.write_text("".join(json.dumps(record) + "\n" for record in kept), "utf-8")
+    fresh.replace(path)
+    return kept[-1]["seconds"] if kept else 0.0

@@ -1,0 +1,186 @@
+"""``pixelbrax train``: settings from the command line, then a run."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import sys
+from dataclasses import make_dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import tyro
+from tqdm import tqdm
+
+from pixelbrax_jax.agents.algorithms.presets import CONFIGS, MAKERS, PRESETS, preset
+from pixelbrax_jax.agents.core.config import TrainConfig, make_env
+from pixelbrax_jax.agents.runner.checkpoint import CheckpointError, latest_steps
+from pixelbrax_jax.agents.runner.option_types import names_for_objects
+from pixelbrax_jax.agents.runner.run_config import RunConfig
+from pixelbrax_jax.agents.runner.train import TrainingDivergedError, run
+from pixelbrax_jax.envs.sharded import ShardedVectorEnv, make_env_mesh
+from pixelbrax_jax.envs.vector import VectorPixelEnv
+from pixelbrax_jax.validation import check_whole
+
+INTERRUPTED = 130
+"""Exit status of a run that was stopped by Ctrl-C, as shells have it."""
+
+
+def train(arguments: list[str]) -> int:
+    """Runs the command.
+
+    Args:
+        arguments: those behind ``pixelbrax train``.
+
+    Returns:
+        The exit status: 0 when all is well, 1 for an error, which stderr names, and for a run
+        that was stopped 128 plus the signal's number, as shells have it: 130 for Ctrl-C, 143 for
+        SIGTERM, 129 for SIGHUP.
+    """
+    try:
+        return _train(arguments)
+    finally:
+        for stream in filter(None, (sys.stdout, sys.stderr)):
+            _flush(stream)
+
+
+def _train(arguments: list[str]) -> int:
+    first = argparse.ArgumentParser(prog="pixelbrax train", add_help=False)
+    first.add_argument("algorithm", choices=sorted(CONFIGS))
+    first.add_argument("--preset", choices=sorted(PRESETS), default="default")
+    first.add_argument("--coordinator", help="host:port of process 0, of several processes")
+    first.add_argument("--num-processes", type=int)
+    first.add_argument("--process-id", type=int)
+    first.add_argument("--cpu-devices", type=int)
+    if not arguments or arguments[0] in ("-h", "--help"):
+        sys.stdout.write(
+            "usage: pixelbrax train {"
+            + ",".join(CONFIGS)
+            + "} [--preset {"
+            + ",".join(PRESETS)
+            + "}] [options]\n\nAll options: pixelbrax train ppo --help\n"
+        )
+        return 0
+    chosen, rest = first.parse_known_args(arguments)
+    spread = (chosen.coordinator, chosen.num_processes, chosen.process_id)
+    if None in spread and any(given is not None for given in spread):
+        first.error("--coordinator, --num-processes and --process-id belong together")
+    options = None
+    try:
+        if chosen.cpu_devices is not None:
+            _emulate(chosen.cpu_devices)
+        if chosen.coordinator is not None:
+            jax.distributed.initialize(*spread)
+        config, options = parse(chosen.algorithm, chosen.preset, rest)
+        return _run(chosen.algorithm, config, options)
+    except (
+        CheckpointError,
+        TrainingDivergedError,
+        ValueError,
+        OSError,
+        MemoryError,
+        ImportError,
+        jax.errors.JaxRuntimeError,
+    ) as error:
+        _write(f"pixelbrax train: {error}")
+        return 1
+    except KeyboardInterrupt:
+        folder = Path(options.output_dir) / "checkpoints" if options else None
+        latest = None if folder is None else latest_steps(folder)
+        kept = "there is no checkpoint"
+        if latest is not None:
+            kept = f"go on from the checkpoint of {latest} steps with --resume latest"
+        _write(f"pixelbrax train: stopped at once; {kept}")
+        return INTERRUPTED
+
+
+def _write(line: str) -> None:
+    """Writes a line above the bar, if anybody is left to read it."""
+    with contextlib.suppress(OSError, ValueError):
+        tqdm.write(line, file=sys.stderr)
+
+
+def _flush(stream: Any) -> None:
+    """Empties a stream, or gives up its text: Python would exit with 120 on account of it."""
+    try:
+        stream.flush()
+    except ValueError:  # It is closed.
+        return
+    except OSError:
+        with Path(os.devnull).open("wb") as nowhere, contextlib.suppress(OSError):
+            os.dup2(nowhere.fileno(), stream.fileno())
+
+
+def _emulate(cpu_devices: int) -> None:
+    """Has JAX show the CPU as several devices, each of which computes in threads of its own.
+
+    Raises:
+        ValueError: the number is below 1, or JAX is at work already.
+    """
+    check_whole("--cpu-devices", cpu_devices)
+    try:
+        jax.config.update("jax_num_cpu_devices", cpu_devices)
+    except RuntimeError as error:
+        raise ValueError(
+            f"--cpu-devices {cpu_devices} comes too late: JAX is at work in this process."
+        ) from error
+
+
+def parse(algorithm: str, name: str, arguments: list[str]) -> tuple[TrainConfig, RunConfig]:
+    """Settings of an algorithm and of the run, from options over a preset.
+
+    Args:
+        algorithm: its name.
+        name: of the preset.
+        arguments: options, as ``--num-envs 64``.
+
+    Raises:
+        ValueError: a setting is out of range.
+        SystemExit: an option is unknown.
+    """
+    defaults = preset(algorithm, name)
+    options = RunConfig(output_dir=f"runs/{algorithm}")
+    # One flat list of options for both.
+    parts: dict[str, Any] = {"config": defaults, "options": options}
+    flat: Any = tyro.conf.OmitArgPrefixes
+    kinds = [(part, flat[type(value)]) for part, value in parts.items()]
+    command = make_dataclass("Train", kinds)
+    description = (
+        f"Trains {algorithm.upper()} from pixels. --preset {{{','.join(PRESETS)}}} changes the "
+        "defaults; --cpu-devices D spreads the environments over D emulated devices, one a core, "
+        "on a machine without an accelerator; --coordinator HOST:PORT --num-processes P "
+        "--process-id I spreads a run over P processes."
+    )
+    with names_for_objects:
+        parsed = tyro.cli(
+            command,
+            prog=f"pixelbrax train {algorithm}",
+            description=description,
+            default=command(**parts),
+            args=arguments,
+        )
+    return parsed.config, parsed.options
+
+
+def _run(algorithm: str, config: TrainConfig, options: RunConfig) -> int:
+    def report(line: str) -> None:
+        if jax.process_index() == 0:
+            tqdm.write(line, file=sys.stderr)
+
+    env, env_params = make_env(config)
+    devices = jax.device_count()
+    if devices > 1:
+        envs: Any = ShardedVectorEnv(env, config.num_envs, make_env_mesh())
+    else:
+        envs = VectorPixelEnv(env, config.num_envs)
+    with contextlib.suppress(OSError):
+        report(
+            f"{algorithm} on {config.task}, {config.num_envs} environments, {devices} "
+            f"{jax.default_backend()} device{'s' * (devices > 1)}, {config.num_iterations} "
+            f"iterations of {config.steps_per_iteration} control steps; "
+            f"into {Path(options.output_dir).resolve()}"
+        )
+    outcome = run(MAKERS[algorithm](config, envs), env_params, options, report=report)
+    return 128 + outcome.signal if outcome.interrupted else 0

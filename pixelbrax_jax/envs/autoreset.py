@@ -1,0 +1,46 @@
+"""Work for those rows of a batch alone that need it, such as environments that are reset."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+AUTORESET_MODES = ("next_step", "same_step", "disabled")
+
+_BLOCK = 32
+"""Environments that are reset together; their number is rounded up to a multiple."""
+
+
+def replace_rows(
+    fn: Callable[..., Any], arguments: tuple[Any, ...], mask: jax.Array, rows: Any
+) -> Any:
+    """Return ``rows`` with ``fn`` of the arguments' rows in place of those where ``mask``.
+
+    The work is done in blocks and grows with the number of masked rows, not with N: most steps
+    end no episode, and a select over the whole batch would pay for all of them.
+
+    The loop carries which rows are left. With a counter in their place XLA takes what the blocks
+    have in common, such as physics at the initial pose, out of the loop and into every step.
+
+    Args:
+        fn: of one row of each argument; returns one row of ``rows``.
+        arguments: trees of arrays with a leading axis N.
+        mask: (N,) bool.
+        rows: tree of arrays with a leading axis N.
+    """
+    num_rows = mask.shape[0]
+    block = min(_BLOCK, num_rows)
+
+    def put(carry: tuple[jax.Array, Any]) -> tuple[jax.Array, Any]:
+        left, rows = carry
+        # Past the last one of those left: read as the last row, never written.
+        index = jnp.nonzero(left, size=block, fill_value=num_rows)[0]
+        inputs = jax.tree.map(lambda x: jnp.take(x, index, axis=0, mode="clip"), arguments)
+        outputs = jax.vmap(fn)(*inputs)
+        rows = jax.tree.map(lambda x, new: x.at[index].set(new, mode="drop"), rows, outputs)
+        return left.at[index].set(False, mode="drop"), rows
+
+    return jax.lax.while_loop(lambda carry: jnp.any(carry[0]), put, (mask, rows))[1]

@@ -1,0 +1,337 @@
+"""Brax's environments behind the ``Physics`` interface."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+from collections.abc import Callable, Collection, Hashable, Iterator, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from flax import struct
+
+from pixelbrax_jax.physics.base import Kinematics, RewardFn
+from pixelbrax_jax.physics.brax.compatibility import (
+    accept_old_clip,
+    import_silenced,
+    known_warnings_silenced,
+)
+from pixelbrax_jax.physics.divergence import GuardedPhysics
+from pixelbrax_jax.physics.geometry import VISIBLE_GROUPS, read_geoms
+from pixelbrax_jax.spatial import quat_normalize
+from pixelbrax_jax.tasks import Color
+from pixelbrax_jax.types import PhysicsState
+
+with import_silenced():
+    from brax import envs, fluid
+    from brax.envs.wrappers import training
+
+# These decide on batches, time limits and resets, which is the caller's business here.
+_TRAINING_WRAPPERS = (
+    training.AutoResetWrapper,
+    training.DomainRandomizationVmapWrapper,
+    training.EpisodeWrapper,
+    training.EvalWrapper,
+    training.VmapWrapper,
+)
+
+
+@struct.dataclass
+class BraxCarry:
+    """What Brax needs for the next step and ``PhysicsState`` does not hold already.
+
+    Attributes:
+        pipeline: the backend's state.
+        metrics: Brax's metrics of the last step.
+        info: Brax's info.
+    """
+
+    pipeline: Any
+    metrics: dict[str, Any]
+    info: dict[str, Any]
+
+
+class BraxPhysics(GuardedPhysics):
+    """A Brax environment as ``Physics``. The given environment is never modified.
+
+    Two things differ from the environment itself. Quaternions of free and ball joints are
+    normalized before the first state is computed: Brax adds its reset noise to each of their
+    numbers. And a diverging step ends the episode instead of returning NaN; watched are joint and
+    link positions and velocities, the observation, the reward and the done flag.
+
+    On the ``"mjx"`` backend link poses are one physics step older than joint positions after a
+    ``step`` (never after a ``reset``), because MuJoCo computes them before it integrates.
+    """
+
+    def __init__(
+        self,
+        env: envs.Env,
+        *,
+        colors: Mapping[str, Color] | None = None,
+        drawn_radius: Mapping[str, float] | None = None,
+        geom_groups: Collection[int] = VISIBLE_GROUPS,
+        unscale_actions: bool = False,
+        reward: RewardFn | None = None,
+        identity: Hashable | None = None,
+    ):
+        """Read the model and check that the environment fits; compile nothing.
+
+        Args:
+            env: a bare environment, such as ``brax.envs.get_environment("ant")``.
+            colors: replacements for colors by geom name, see ``read_geoms``.
+            drawn_radius: metres by name of a sphere to draw larger, see ``read_geoms``.
+            geom_groups: MuJoCo's geom groups that are visible.
+            unscale_actions: for environments that map actions from [-1, 1] to the control
+                range: undo that map, so that costs and actuators see the action as given.
+            reward: replaces the environment's reward; called with the state before the step,
+                the state after it and the action, returns a scalar.
+            identity: objects of one identity are equal, and environments over them share compiled
+                programs; None makes the object equal to itself alone.
+
+        Raises:
+            ValueError: if ``env`` is wrapped for training, has no MuJoCo model, does not
+                observe one flat array, changes the tree of its state in ``step``, uses
+                features its backend lacks, or has geoms that cannot be drawn.
+        """
+        _check_env(env)
+        accept_old_clip(fluid)
+        model: mujoco.MjModel = env.unwrapped.sys.mj_model
+        self.geoms = read_geoms(
+            model, colors=colors, drawn_radius=drawn_radius, geom_groups=geom_groups
+        )
+        # Brax keeps the time step in float32; six digits give back the model's own number.
+        self.dt = float(f"{float(env.dt):.6g}")
+        self.action_size = int(env.action_size)
+        self.backend: str = env.backend
+        self.link_names = tuple(
+            model.body(i).name or f"link/{i - 1}" for i in range(1, model.nbody)
+        )
+        self._model = model
+        self._source = env
+        self._env = _replace_init(env, self._init)
+        self._reward = reward
+        self._control_range = _control_range(model) if unscale_actions else None
+        self._identity = object() if identity is None else identity
+        self._check_shapes()
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, BraxPhysics) and self._identity == other._identity
+
+    def __hash__(self) -> int:
+        return hash(self._identity)
+
+    def _reset(self, key: jax.Array) -> PhysicsState:
+        """See ``Physics.reset``. ``key`` may be typed, or uint32 as Brax's own are."""
+        return self._first_state(self._env, key)
+
+    def from_qpos(
+        self, q: jax.Array, qd: jax.Array | None = None, *, key: jax.Array | None = None
+    ) -> PhysicsState:
+        """Return the first state of an episode, in a chosen pose.
+
+        Runs the environment's reset with its joint positions and velocities replaced, so the
+        observation and everything else agree with the pose. ``terminated`` is false even if
+        the task would end in this pose; the next step says so.
+
+        Args:
+            q: (Q,) float32, joint positions, see ``Kinematics``; quaternions of any length.
+            qd: (V,) float32, joint velocities, 0 if not given.
+            key: decides what the environment samples besides ``q`` and ``qd``; none of the
+                built-in tasks samples anything else.
+
+        Returns:
+            A state that ``step`` accepts.
+
+        Raises:
+            ValueError: for a wrong shape.
+        """
+        q = jnp.asarray(q, jnp.float32)
+        qd = jnp.zeros(self._model.nv) if qd is None else jnp.asarray(qd, jnp.float32)
+        if q.shape != (self._model.nq,) or qd.shape != (self._model.nv,):
+            raise ValueError(
+                f"q and qd must have shapes ({self._model.nq},) and ({self._model.nv},), "
+                f"got {q.shape} and {qd.shape}"
+            )
+
+        def init(_q: jax.Array, _qd: jax.Array, *args: Any, **kwargs: Any) -> Any:
+            return self._init(q, qd, *args, **kwargs)
+
+        key = jax.random.key(0) if key is None else key
+        return self._guard_first(self._first_state(_replace_init(self._source, init), key))
+
+    def _step(self, state: PhysicsState, action: jax.Array) -> PhysicsState:
+        """See ``Physics.step``.
+
+        Raises:
+            ValueError: when traced, if the action's shape is not ``(action_size,)``.
+        """
+        action = jnp.asarray(action, jnp.float32)
+        if action.shape != (self.action_size,):
+            raise ValueError(f"action must have shape ({self.action_size},), got {action.shape}")
+        carry = state.engine
+        # Brax updates these dicts in place.
+        metrics, info = jax.tree.map(lambda leaf: leaf, (carry.metrics, carry.info))
+        with known_warnings_silenced():
+            after = self._env.step(
+                envs.State(
+                    pipeline_state=carry.pipeline,
+                    obs=state.obs.astype(self._obs_dtype),
+                    reward=state.reward,
+                    done=state.terminated.astype(jnp.float32),
+                    metrics=metrics,
+                    info=info,
+                ),
+                self._unscale(action),
+            )
+        reward = after.reward
+        if self._reward is not None:
+            now = kinematics(after.pipeline_state)
+            reward = self._reward(kinematics(carry.pipeline), now, action)
+        done = jnp.asarray(after.done)
+        # The guard watches the reward, and so a done flag that is not a number.
+        reward = jnp.where(jnp.abs(done) < jnp.inf, jnp.asarray(reward, jnp.float32), jnp.nan)
+        return self._state(after, reward, done > 0.5)
+
+    def _watched(self, state: PhysicsState) -> Any:
+        pipeline = state.engine.pipeline
+        return pipeline.q, pipeline.qd, pipeline.x, pipeline.xd
+
+    def _first_state(self, env: envs.Env, key: jax.Array) -> PhysicsState:
+        with known_warnings_silenced():
+            first = env.reset(key)
+        return self._state(first, jnp.zeros((), jnp.float32), jnp.zeros((), bool))
+
+    def _state(
+        self, brax_state: envs.State, reward: jax.Array, terminated: jax.Array
+    ) -> PhysicsState:
+        carry = _carry(brax_state)
+        if jax.tree.structure(carry) != self._tree:
+            raise ValueError("step changes the tree of the environment's state")
+        # Brax writes Python numbers into some fields. Fixed dtypes keep a jitted step from
+        # being traced again for its own output.
+        carry = jax.tree.map(_as_dtype, carry, self._dtypes)
+        seen = kinematics(brax_state.pipeline_state)
+        return PhysicsState(
+            engine=carry,
+            xpos=seen.xpos,
+            xquat=seen.xquat,
+            obs=jnp.asarray(brax_state.obs, jnp.float32),
+            reward=reward,
+            terminated=terminated,
+            non_finite=jnp.zeros((), bool),
+        )
+
+    def _init(self, q: jax.Array, qd: jax.Array, *args: Any, **kwargs: Any) -> Any:
+        """Call the environment's ``pipeline_init`` at a proper rotation."""
+        for kind, address in zip(self._model.jnt_type, self._model.jnt_qposadr, strict=True):
+            if kind == mujoco.mjtJoint.mjJNT_FREE:
+                rotation = slice(address + 3, address + 7)
+            elif kind == mujoco.mjtJoint.mjJNT_BALL:
+                rotation = slice(address, address + 4)
+            else:
+                continue
+            q = q.at[rotation].set(quat_normalize(q[rotation]))
+        return self._source.unwrapped.pipeline_init(q, qd, *args, **kwargs)
+
+    def _unscale(self, action: jax.Array) -> jax.Array:
+        if self._control_range is None:
+            return action
+        low, high = self._control_range
+        return (action - low) / (high - low) * 2 - 1
+
+    def _check_shapes(self) -> None:
+        key = jax.random.key(0)
+        with _explained(self.backend), known_warnings_silenced():
+            first = jax.eval_shape(self._env.reset, key)
+        if not hasattr(first.obs, "shape") or len(first.obs.shape) != 1:
+            raise ValueError(
+                "the environment must observe one flat array, got "
+                f"{jax.tree.map(lambda leaf: leaf.shape, first.obs)}"
+            )
+        links = first.pipeline_state.x.pos.shape[0]
+        if links != len(self.link_names):
+            raise ValueError(
+                f"the environment's state has {links} links, its model {len(self.link_names)}"
+            )
+        self.state_size = int(first.obs.shape[0])
+        self._obs_dtype = first.obs.dtype
+        self._dtypes = jax.tree.map(lambda leaf: leaf.dtype, _carry(first))
+        self._tree: Any = jax.tree.structure(self._dtypes)
+
+        state = jax.eval_shape(self.reset, key)
+        with _explained(self.backend):
+            after = jax.eval_shape(self.step, state, jnp.zeros(self.action_size))
+        if after.reward.shape != ():
+            raise ValueError(f"the reward must be a scalar, got shape {after.reward.shape}")
+        if after.terminated.shape != ():
+            raise ValueError(f"done must be a scalar, got shape {after.terminated.shape}")
+
+
+def kinematics(pipeline_state: Any) -> Kinematics:
+    """Return the readable part of a Brax backend's state."""
+    return Kinematics(
+        q=jnp.asarray(pipeline_state.q, jnp.float32),
+        qd=jnp.asarray(pipeline_state.qd, jnp.float32),
+        xpos=jnp.asarray(pipeline_state.x.pos, jnp.float32),
+        xquat=quat_normalize(jnp.asarray(pipeline_state.x.rot, jnp.float32)),
+    )
+
+
+def _check_env(env: envs.Env) -> None:
+    layer = env
+    while isinstance(layer, envs.Wrapper):
+        if isinstance(layer, _TRAINING_WRAPPERS):
+            raise ValueError(
+                f"the environment is wrapped in {type(layer).__name__}; pass the bare one, as "
+                "brax.envs.get_environment returns it"
+            )
+        layer = layer.env
+    if getattr(getattr(layer, "sys", None), "mj_model", None) is None:
+        raise ValueError(
+            f"{type(layer).__name__} has no MuJoCo model in env.sys.mj_model, so there is "
+            "nothing to draw"
+        )
+
+
+@contextlib.contextmanager
+def _explained(backend: str) -> Iterator[None]:
+    """Say which backend it is that lacks a feature of the model."""
+    try:
+        yield
+    except (AssertionError, NotImplementedError, RuntimeError) as error:
+        fix = "" if backend == "mjx" else " The 'mjx' backend simulates most of MuJoCo."
+        raise ValueError(
+            f"the {backend!r} backend cannot simulate this model: {error}{fix}"
+        ) from error
+
+
+def _replace_init(env: envs.Env, init: Callable[..., Any]) -> envs.Env:
+    """Copy ``env``, down through its wrappers, with another ``pipeline_init``."""
+    clone = copy.copy(env)
+    if isinstance(env, envs.Wrapper):
+        clone.env = _replace_init(env.env, init)
+    else:
+        clone.pipeline_init = init
+    return clone
+
+
+def _as_dtype(leaf: Any, dtype: Any) -> jax.Array:
+    # A key in Brax's info is typed or uint32, as the one given to reset was.
+    is_key = jnp.issubdtype(dtype, jax.dtypes.prng_key)
+    return leaf if is_key else jnp.asarray(leaf, dtype)
+
+
+def _carry(brax_state: envs.State) -> BraxCarry:
+    return BraxCarry(
+        pipeline=brax_state.pipeline_state, metrics=brax_state.metrics, info=brax_state.info
+    )
+
+
+def _control_range(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+    if not model.actuator_ctrllimited.all():
+        raise ValueError("unscale_actions needs a control range on every actuator")
+    low, high = model.actuator_ctrlrange.astype(np.float32).T
+    return low, high

@@ -1,0 +1,234 @@
+"""A task of your own from an MJCF file and three formulas, without writing a Brax class."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from pixelbrax_jax.physics.base import Kinematics, RewardFn
+from pixelbrax_jax.physics.brax.compatibility import import_silenced, loading_silenced
+from pixelbrax_jax.physics.brax.engine import BraxPhysics, kinematics
+from pixelbrax_jax.physics.geometry import VISIBLE_GROUPS, read_geoms
+from pixelbrax_jax.tasks import BRAX_BACKENDS, Color
+
+with import_silenced():
+    from brax import envs
+    from brax.io import mjcf
+from pixelbrax_jax.validation import check_choice
+
+
+def never(after: Kinematics) -> jax.Array:
+    """Return False: the task has no end of its own."""
+    del after
+    return jnp.zeros((), bool)
+
+
+def joint_state(after: Kinematics) -> jax.Array:
+    """Return (Q + V,) float32, joint positions, then joint velocities."""
+    return jnp.concatenate([after.q, after.qd])
+
+
+@dataclass(frozen=True, eq=False)
+class MjcfTask:
+    """What a model needs to become a task. Functions are pure and see ONE environment.
+
+    Attributes:
+        reward: of the state before a step, the state after it and the (A,) action in [-1, 1];
+            returns a scalar.
+        terminated: of the state after a step; returns a () bool, true when the task ended.
+        observation: of a state; returns the (S,) float state observation.
+        reset_noise: joint positions and velocities start within plus or minus this of
+            ``init_q`` and 0, uniformly (metres, radians, per second).
+        n_frames: physics steps per control step.
+        init_q: (Q,) joint positions to start from; None for the model's own.
+    """
+
+    reward: RewardFn
+    terminated: Callable[[Kinematics], jax.Array] = never
+    observation: Callable[[Kinematics], jax.Array] = joint_state
+    reset_noise: float = 0.01
+    n_frames: int = 5
+    init_q: np.ndarray | None = None
+
+
+class MjcfEnv(envs.PipelineEnv):
+    """A Brax environment for any model, with the formulas of an ``MjcfTask``."""
+
+    def __init__(self, model: mujoco.MjModel, task: MjcfTask, backend: str):
+        with loading_silenced():
+            system = mjcf.load_model(model)
+        super().__init__(system, backend=backend, n_frames=task.n_frames)
+        self._task = task
+        self._model = model
+        limited = model.actuator_ctrllimited.astype(bool)
+        # An unlimited actuator takes the action as it is: the map from [-1, 1] to [-1, 1].
+        self._low = np.where(limited, model.actuator_ctrlrange[:, 0], -1).astype(np.float32)
+        self._high = np.where(limited, model.actuator_ctrlrange[:, 1], 1).astype(np.float32)
+
+    @property
+    def action_size(self) -> int:
+        """Return the number of actuators; Brax itself counts only those that act on joints."""
+        return int(self._model.nu)
+
+    def reset(self, rng: jax.Array) -> envs.State:
+        """Sample uniform noise around the initial pose."""
+        q_key, qd_key = jax.random.split(rng)
+        noise = self._task.reset_noise
+        q = self.sys.init_q if self._task.init_q is None else jnp.asarray(self._task.init_q)
+        q = q + jax.random.uniform(q_key, q.shape, minval=-noise, maxval=noise)
+        qd = jax.random.uniform(qd_key, (self._model.nv,), minval=-noise, maxval=noise)
+        pipeline = self.pipeline_init(q, qd)
+        zero = jnp.zeros(())
+        return envs.State(pipeline, self._task.observation(kinematics(pipeline)), zero, zero)
+
+    def step(self, state: envs.State, action: jax.Array) -> envs.State:
+        """Advance by one control step, with the task's formulas."""
+        control = self._low + (action + 1) * 0.5 * (self._high - self._low)
+        pipeline = self.pipeline_step(state.pipeline_state, control)
+        before, after = kinematics(state.pipeline_state), kinematics(pipeline)
+        return state.replace(
+            pipeline_state=pipeline,
+            obs=self._task.observation(after),
+            reward=self._task.reward(before, after, action),
+            done=jnp.asarray(self._task.terminated(after), jnp.float32),
+        )
+
+
+def mjcf_physics(
+    source: str | Path,
+    *,
+    reward: RewardFn,
+    terminated: Callable[[Kinematics], jax.Array] = never,
+    observation: Callable[[Kinematics], jax.Array] = joint_state,
+    reset_noise: float = 0.01,
+    n_frames: int = 5,
+    init_q: np.ndarray | None = None,
+    backend: str = "mjx",
+    colors: Mapping[str, Color] | None = None,
+    geom_groups: Collection[int] = VISIBLE_GROUPS,
+) -> BraxPhysics:
+    """Make physics of a model in MuJoCo's MJCF (or URDF) format.
+
+    An action in [-1, 1] is mapped linearly to an actuator's control range, or passed as it is
+    if the actuator has none. Bodies without joints are fused with their parents, because links
+    are what moves. The model starts at ``qpos0``, or at its custom numeric ``init_qpos``.
+
+    Args:
+        source: a file, or the XML itself.
+        reward: see ``MjcfTask``.
+        terminated: see ``MjcfTask``.
+        observation: see ``MjcfTask``.
+        reset_noise: see ``MjcfTask``.
+        n_frames: see ``MjcfTask``; the control step lasts this many of the model's time steps.
+        init_q: see ``MjcfTask``.
+        backend: ``"mjx"`` simulates most of MuJoCo; the others are Brax's own backends for
+            trees of hinges, slides and free joints.
+        colors: replacements for the model's colors by geom name, red, green, blue in [0, 1].
+        geom_groups: MuJoCo's geom groups that are visible.
+
+    Returns:
+        The physics, to be used as any other.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if the model cannot be compiled, simulated or drawn, has no joint or no
+            actuator, or a function returns the wrong shape or dtype.
+    """
+    check_choice("backend", backend, BRAX_BACKENDS)
+    if not math.isfinite(reset_noise) or reset_noise < 0:
+        raise ValueError(f"reset_noise must be finite and not negative, got {reset_noise}")
+    if n_frames < 1 or n_frames != int(n_frames):
+        raise ValueError(f"n_frames must be a positive integer, got {n_frames}")
+    model = _compile(source)
+    _check_model(model, backend)
+    # A geom that cannot be drawn should be reported before anything slow is loaded.
+    read_geoms(model, colors=colors, geom_groups=geom_groups)
+    if init_q is not None:
+        init_q = np.asarray(init_q, np.float32)
+        if init_q.shape != (model.nq,):
+            raise ValueError(f"init_q must have shape ({model.nq},), got {init_q.shape}")
+    task = MjcfTask(reward, terminated, observation, float(reset_noise), int(n_frames), init_q)
+    _check_functions(task, model)
+    return BraxPhysics(MjcfEnv(model, task, backend), colors=colors, geom_groups=geom_groups)
+
+
+def _compile(source: str | Path) -> mujoco.MjModel:
+    is_xml = isinstance(source, str) and source.lstrip().startswith("<")
+    what = "the given XML" if is_xml else f"{str(source)!r}"
+    if not is_xml and not Path(source).is_file():
+        raise FileNotFoundError(f"there is no MJCF file {str(Path(source).absolute())!r}")
+    try:
+        with loading_silenced():
+            spec = (
+                mujoco.MjSpec.from_string(str(source))
+                if is_xml
+                else mujoco.MjSpec.from_file(str(source))
+            )
+            # Every body is then a link that moves. Brax's own loader also fuses, but on the
+            # XML text, where it misses rotations that are not given as quaternions.
+            spec.compiler.fusestatic = True
+            return spec.compile()
+    except ValueError as error:
+        raise ValueError(f"MuJoCo cannot compile {what}: {error}") from error
+
+
+def _check_model(model: mujoco.MjModel, backend: str) -> None:
+    if model.nv == 0:
+        raise ValueError("the model has no joint, so nothing can move")
+    if model.nu == 0:
+        raise ValueError("the model has no actuator, so an agent could not act on it")
+    if backend == "mjx":
+        return
+    # Brax's other backends would leave these out silently.
+    left_out = [
+        what
+        for what, count in (
+            ("equality constraints", model.neq),
+            ("tendons", model.ntendon),
+            ("bodies without a joint", int((model.body_jntnum[1:] == 0).sum())),
+        )
+        if count
+    ]
+    if left_out:
+        raise ValueError(
+            f"the {backend!r} backend does not simulate {' or '.join(left_out)}; use backend='mjx'"
+        )
+
+
+def _check_functions(task: MjcfTask, model: mujoco.MjModel) -> None:
+    links = model.nbody - 1
+    shapes = jax.eval_shape(
+        lambda: Kinematics(
+            q=jnp.zeros(model.nq),
+            qd=jnp.zeros(model.nv),
+            xpos=jnp.zeros((links, 3)),
+            xquat=jnp.zeros((links, 4)),
+        )
+    )
+    action = jax.ShapeDtypeStruct((model.nu,), jnp.float32)
+    _check_result("reward", "a scalar number", jax.eval_shape(task.reward, shapes, shapes, action))
+    _check_result("terminated", "a scalar bool", jax.eval_shape(task.terminated, shapes))
+    _check_result("observation", "a flat float array", jax.eval_shape(task.observation, shapes))
+
+
+def _check_result(name: str, expected: str, result: object) -> None:
+    shape, dtype = getattr(result, "shape", None), getattr(result, "dtype", None)
+    if shape is not None and dtype is not None:
+        is_bool, is_float = dtype == jnp.bool_, jnp.issubdtype(dtype, jnp.floating)
+        is_number = is_float or jnp.issubdtype(dtype, jnp.integer)
+        fits = {
+            "reward": shape == () and is_number,
+            "terminated": shape == () and is_bool,
+            "observation": len(shape) == 1 and shape[0] > 0 and is_float,
+        }[name]
+        if fits:
+            return
+        result = f"shape {shape} and dtype {dtype}"
+    raise ValueError(f"{name} must return {expected}, got {result}")

@@ -1,0 +1,79 @@
+"""The guard against diverging physics, which every engine gets."""
+
+from __future__ import annotations
+
+import abc
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from pixelbrax_jax.spatial import quat_normalize
+from pixelbrax_jax.types import PhysicsState
+
+# MuJoCo calls a number bad beyond this magnitude (``mju_isBad``). It is well inside float32, so
+# that an image of the scene can still be computed from it.
+_LARGEST = 1e10
+
+
+class GuardedPhysics(abc.ABC):
+    """Base of a ``Physics`` that ends an episode cleanly where its simulation diverges.
+
+    A step counts as diverged if a watched number is not finite or larger than 1e10 in magnitude.
+    It returns the state before it, with reward 0 and ``terminated`` and ``non_finite`` true.
+    """
+
+    @abc.abstractmethod
+    def _reset(self, key: jax.Array) -> PhysicsState:
+        """Sample an initial state, finite or not; see ``Physics.reset``."""
+
+    @abc.abstractmethod
+    def _step(self, state: PhysicsState, action: jax.Array) -> PhysicsState:
+        """Advance by one control step, finite or not; see ``Physics.step``."""
+
+    @abc.abstractmethod
+    def _watched(self, state: PhysicsState) -> Any:
+        """Return a tree of what must be finite besides observation and reward."""
+
+    def reset(self, key: jax.Array) -> PhysicsState:
+        """See ``Physics.reset``."""
+        return self._guard_first(self._reset(key))
+
+    def step(self, state: PhysicsState, action: jax.Array) -> PhysicsState:
+        """See ``Physics.step``."""
+        after = self._step(state, action)
+        finite = self._is_finite(after)
+
+        def keep(name: str) -> Any:
+            return _select(finite, getattr(after, name), getattr(state, name))
+
+        return PhysicsState(
+            engine=keep("engine"),
+            xpos=keep("xpos"),
+            xquat=keep("xquat"),
+            obs=keep("obs"),
+            reward=jnp.where(finite, after.reward, 0.0),
+            terminated=~finite | after.terminated,
+            non_finite=~finite,
+        )
+
+    def _guard_first(self, state: PhysicsState) -> PhysicsState:
+        finite = self._is_finite(state)
+        return state.replace(
+            xpos=_select(finite, state.xpos, jnp.zeros_like(state.xpos)),
+            xquat=_select(finite, state.xquat, quat_normalize(jnp.zeros_like(state.xquat))),
+            obs=_select(finite, state.obs, jnp.zeros_like(state.obs)),
+            reward=jnp.zeros((), jnp.float32),
+            terminated=~finite,
+            non_finite=~finite,
+        )
+
+    def _is_finite(self, state: PhysicsState) -> jax.Array:
+        watched = (self._watched(state), state.obs, state.reward)
+        # False for NaN too.
+        leaves = [jnp.all(jnp.abs(leaf) < _LARGEST) for leaf in jax.tree.leaves(watched)]
+        return jnp.all(jnp.stack(leaves))
+
+
+def _select(choose_first: jax.Array, first: Any, second: Any) -> Any:
+    return jax.tree.map(lambda a, b: jnp.where(choose_first, a, b), first, second)

@@ -1,0 +1,146 @@
+"""One way each to reject unknown names and options, and values of the wrong kind."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+from numbers import Integral, Real
+
+import numpy as np
+
+_SIMILAR = 0.65
+"""Likeness, of at most 1, from which a name is suggested in place of an unknown one."""
+
+_SIMILAR_OPTION = 0.75
+"""The same of options, whose names have parts such as ``render`` and ``mode`` in common."""
+
+_ELSEWHERE = {
+    "batch_size": "num_envs",
+    "frame_skip": "action_repeat",
+    "frameskip": "action_repeat",
+    "max_episode_length": "episode_length",
+    "n_envs": "num_envs",
+    "num_frames": "frame_stack",
+    "num_stack": "frame_stack",
+    "time_limit": "episode_length",
+}
+"""Options under the names that other libraries give them."""
+
+
+def check_choice(what: str, value: object, allowed: Iterable[str]) -> str:
+    """Return ``value`` if it is one of ``allowed``.
+
+    Args:
+        what: what the value stands for, as the message should call it.
+        value: what the user gave.
+        allowed: every accepted name.
+
+    Returns:
+        ``value``.
+
+    Raises:
+        ValueError: otherwise, naming the value, all allowed names and the nearest one.
+    """
+    names = sorted(allowed)
+    if isinstance(value, str) and value in names:
+        return value
+    raise ValueError(
+        f"unknown {what}: {value!r}; allowed: {', '.join(names)}.{suggest(value, names)}"
+    )
+
+
+def check_options(given: Iterable[str], allowed: Iterable[str]) -> None:
+    """Check that keyword arguments are known.
+
+    Args:
+        given: their names.
+        allowed: every accepted name.
+
+    Raises:
+        TypeError: one is not, naming it, all allowed names and the nearest one. It is phrased as
+            Python's own message, by which some libraries find out which options there are.
+    """
+    names = sorted(allowed)
+    for name in given:
+        if name not in names:
+            raise TypeError(
+                f"got an unexpected keyword argument {name!r}; allowed: {', '.join(names)}."
+                + suggest(_ELSEWHERE.get(name, name), names, _SIMILAR_OPTION)
+            )
+
+
+def suggest(value: object, names: Iterable[str], likeness: float = _SIMILAR) -> str:
+    """Ask whether a similar name was meant.
+
+    Args:
+        value: what the user gave.
+        names: what there is.
+        likeness: of at most 1, from which a name is similar.
+
+    Returns:
+        A question with a space before it; empty if no name is similar.
+    """
+    by_lower = {name.lower(): name for name in names}
+    given = str(value).lower()
+    nearest = difflib.get_close_matches(given, by_lower, n=1, cutoff=likeness)
+    if not nearest and len(given) > 3:
+        parts = [name for name in by_lower if given in name]
+        nearest = parts if len(parts) == 1 else []
+    return f" Did you mean {by_lower[nearest[0]]!r}?" if nearest else ""
+
+
+def check_bool(what: str, value: object) -> bool:
+    """Return ``value`` if it is a truth value.
+
+    Args:
+        what: what the value stands for, as the message should call it.
+        value: what the user gave; Python's or NumPy's.
+
+    Returns:
+        ``value`` as Python's own.
+
+    Raises:
+        TypeError: otherwise, naming the value.
+    """
+    if isinstance(value, (bool, np.bool_)):
+        return bool(value)
+    raise TypeError(f"{what} must be True or False, got {value!r}.")
+
+
+def check_positive_int(what: str, value: object) -> int:
+    """Return ``value`` if it is a positive integer.
+
+    Args:
+        what: what the value stands for, as the message should call it.
+        value: what the user gave; Python's or NumPy's integers, but no truth values.
+
+    Returns:
+        ``value`` as Python's own.
+
+    Raises:
+        ValueError: otherwise, naming the value.
+    """
+    if isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= 1:
+        return int(value)
+    raise ValueError(f"{what} must be a positive integer, got {value!r}.")
+
+
+def check_fraction(what: str, value: object) -> float:
+    """Return ``value`` if it is a number in [0, 1].
+
+    Args:
+        what: what the value stands for, as the message should call it.
+        value: what the user gave.
+
+    Returns:
+        ``value`` as Python's own.
+
+    Raises:
+        ValueError: otherwise, naming the value.
+    """
+    if isinstance(value, Real) and not isinstance(value, bool) and 0.0 <= float(value) <= 1.0:
+        return float(value)
+    raise ValueError(f"{what} must lie in [0, 1], got {value!r}.")
+
+
+check_positive_int, check_fraction = check_positive_int, check_fraction

@@ -1,0 +1,70 @@
+"""Unknown names and options: what the message says, and when it suggests another one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pixelbrax_jax.validation import check_bool, check_choice, check_options, suggest
+
+TASKS = ("ant", "halfcheetah", "inverted_double_pendulum", "inverted_pendulum", "walker2d")
+OPTIONS = ("action_repeat", "frame_stack", "height", "num_envs", "obs_mode", "renderer", "width")
+
+
+@pytest.mark.parametrize(
+    ("given", "names", "nearest"),
+    [
+        ("Ant", TASKS, "ant"),
+        ("cheetah", TASKS, "halfcheetah"),
+        ("HalfCheeta", TASKS, "halfcheetah"),
+        ("walker", TASKS, "walker2d"),
+        ("double", TASKS, "inverted_double_pendulum"),
+        ("pendulum", TASKS, None),
+        ("2d", TASKS, None),
+        ("mjs", ("generalized", "mjx"), "mjx"),
+        (3, TASKS, None),
+    ],
+)
+def test_suggestions(given, names, nearest):
+    assert suggest(given, names) == (f" Did you mean {nearest!r}?" if nearest else "")
+
+
+@pytest.mark.parametrize("given", ["render_mode", "autoreset_mode", "seed"])
+def test_far_options_are_not_suggested(given):
+    with pytest.raises(TypeError, match=r"allowed: .*, width\.$"):
+        check_options([given], OPTIONS)
+
+
+@pytest.mark.parametrize(
+    ("given", "nearest"),
+    [
+        ("heigth", "height"),
+        ("frame_skip", "action_repeat"),
+        ("frameskip", "action_repeat"),
+        ("n_envs", "num_envs"),
+    ],
+)
+def test_options_that_were_meant(given, nearest):
+    # The first words are Python's own, which TorchRL looks for.
+    message = rf"^got an unexpected keyword argument '{given}'; allowed: .* mean '{nearest}'\?$"
+    with pytest.raises(TypeError, match=message):
+        check_options([given], OPTIONS)
+    with pytest.raises(TypeError, match=r"allowed: look\.$"):
+        check_options([given], ["look"])
+
+
+@pytest.mark.parametrize("value", [True, False, np.True_])
+def test_truth_values(value):
+    assert check_bool("shadows", value) is bool(value)
+
+
+@pytest.mark.parametrize("value", ["yes", "", 1, 0, None, np.ones(1, bool)])
+def test_what_is_no_truth_value(value):
+    with pytest.raises(TypeError, match="shadows must be True or False, got"):
+        check_bool("shadows", value)
+
+
+@pytest.mark.parametrize("value", [None, 3, ["spring"], {"a": 1}])
+def test_what_is_no_name(value):
+    with pytest.raises(ValueError, match=r"unknown backend: .*; allowed: mjx, spring"):
+        check_choice("backend", value, ["spring", "mjx"])
