@@ -71,16 +71,17 @@ def play(task: str, links: tuple, states: Any) -> np.ndarray:
     env, params = pixelbrax_jax.make(
         task, distractors=links, clips=clips, frame_stack=1, height=SIZE, width=SIZE
     )
-    chain = env.distractors
+    chain = env.chain
 
     def run(states, params):
         key = jax.random.fold_in(states.key[0], 0)  # that of the first episode
 
-        def step(distraction, state):
-            later = chain.advance(distraction, key, state.step_count + 1, params)
-            return later, env.image(state.replace(distraction=distraction), params)
+        def step(distractor_state, state):
+            later = chain.advance(distractor_state, key, state.sim.step_count + 1, params)
+            shown = state.replace(sim=state.sim.replace(distractor_state=distractor_state))
+            return later, env.image(shown, params)
 
-        return jax.lax.scan(step, chain.begin(key, params), states)[1]
+        return jax.lax.scan(step, chain.reset(key, params), states)[1]
 
     return np.asarray(jax.jit(jax.vmap(run, in_axes=(0, None), out_axes=1))(states, params))
 

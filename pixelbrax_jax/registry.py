@@ -15,7 +15,7 @@ import numpy as np
 from pixelbrax_jax import spatial
 from pixelbrax_jax.config import PROGRAM_OPTIONS, EnvConfig, env_config
 from pixelbrax_jax.distractors.clips import ClipBank, load_clips, warn_procedural
-from pixelbrax_jax.distractors.presets import as_tuple, resolve
+from pixelbrax_jax.distractors.presets import resolve
 from pixelbrax_jax.distractors.video import Video
 from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.physics import make_physics
@@ -101,7 +101,7 @@ def make(task: str | EnvConfig, **options: Any) -> tuple[PixelEnv, EnvParams]:
     config = env_config(task, options)
     physics = _physics(config)
     program = {name: getattr(config, name) for name in PROGRAM_OPTIONS}
-    program["distractors"] = resolve(as_tuple(config.distractors), config.task)
+    program["distractors"] = resolve(config.distractors, config.task)
     env = PixelEnv(physics, **program)
     fallback = None if config.task in TASKS else _OWN_TASKS[config.task].default_rig
     rig = make_rig(config.task, config.camera, fallback)

@@ -75,7 +75,7 @@ def make_targets() -> set[str]:
 @pytest.fixture
 def _own_registries():
     """A page may register tasks; the next test does not see them."""
-    tables = (gymnasium.registry, registry._REGISTRY)
+    tables = (gymnasium.registry, registry._OWN_TASKS)
     before = [dict(table) for table in tables]
     yield
     for table, kept in zip(tables, before, strict=True):

@@ -105,7 +105,7 @@ class PixelBraxEnv(gymnasium.Env):
         """Reset to an episode.
 
         Args:
-            seed: s resets to episode 0 of ``jax.random.key(s)``; None goes on to the next episode, or
+            seed: s resets to episode 0 of ``jax.random.key(s)``; None goes on to the next, or
                 draws a seed if there was none yet.
             options: None or an empty dict; there are none.
 

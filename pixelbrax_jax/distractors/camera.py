@@ -144,7 +144,7 @@ class Camera(Distractor):
         return params.replace(rig=rig.replace(eye=rig.target + away, up=up))
 
     def info(self, state: CameraState) -> dict[str, jax.Array]:
-        """Return ``camera``, (4,): distance over the undisturbed one, azimuth, polar angle, roll."""
+        """Return ``camera``, (4,): distance over the undisturbed, azimuth, polar angle, roll."""
         return {"camera": jnp.stack([state.radius, state.azimuth, state.polar, state.roll])}
 
     def _box(self, rig: CameraRig) -> tuple[jax.Array, jax.Array]:

@@ -101,17 +101,20 @@ def as_tuple(
     return given
 
 
-def resolve(distractors: Iterable[str | Distractor], task: str) -> tuple[Distractor, ...]:
+def resolve(
+    distractors: str | Distractor | Iterable[str | Distractor] | None, task: str
+) -> tuple[Distractor, ...]:
     """Return distractors, those of a preset in place of its name.
 
     Args:
-        distractors: of ``as_tuple``.
+        distractors: one or several, or their names.
         task: the task, which decides details of some presets.
 
     Raises:
         ValueError: a name is unknown.
+        TypeError: something is neither a name nor a distractor.
     """
     resolved: list[Distractor] = []
-    for item in distractors:
+    for item in as_tuple(distractors):
         resolved += preset(item, task) if isinstance(item, str) else [item]
     return tuple(resolved)

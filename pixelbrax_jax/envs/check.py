@@ -162,7 +162,7 @@ def _equal(a: Any, b: Any) -> bool:
 
 
 def _close(a: Any, b: Any) -> bool:
-    """Return whether two are equal up to what another order of float operations may change in a few steps."""
+    """Return whether two are equal but for the order of float operations in a few steps."""
     for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
         x, y = np.asarray(x), np.asarray(y)
         if x.dtype == np.uint8:

@@ -223,9 +223,9 @@ class PixelEnv(ProgramConfig):
         height, width = self._size(height, width)
         return observe.unpack(self.draw(state.sim, params, height, width))
 
-    def image(self, *args: Any, **kwargs: Any) -> jax.Array:
+    def picture(self, *args: Any, **kwargs: Any) -> jax.Array:
         """Draw a state; the former name of ``image``, which goes with the next release."""
-        warnings.warn("PixelEnv.image is PixelEnv.image now.", DeprecationWarning, stacklevel=2)
+        warnings.warn("PixelEnv.picture is PixelEnv.image now.", DeprecationWarning, stacklevel=2)
         return self.image(*args, **kwargs)
 
     # The pieces of a step, which `VectorPixelEnv` puts together in another order.

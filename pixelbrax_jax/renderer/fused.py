@@ -173,7 +173,7 @@ def _ground_fraction(
     center: Vector,
     axes: Axes,
 ) -> jax.Array:
-    """Return the fraction of the ground's second color in pixels whose rays hit a plane at ``t``."""
+    """Return the fraction of the ground's second color in pixels that see a plane at ``t``."""
     normal = axes[2]
     slope = 1.0 / at_most(dot(ray, normal), -1e-7)
     inv_pitch = 1.0 / look.ground_pitch

@@ -8,8 +8,6 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from pixelbrax_gym.threads import num_cores
-
 PACKAGES = (
     "pixelbrax",
     "jax",
@@ -22,6 +20,13 @@ PACKAGES = (
     "stable-baselines3",
     "numpy",
 )
+
+
+def num_cores() -> int:
+    """Return how many CPU cores this process may run on; quotas of containers are not seen."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def describe() -> dict[str, Any]:

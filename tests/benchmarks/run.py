@@ -27,10 +27,9 @@ from typing import Any
 
 from tqdm import tqdm
 
-from pixelbrax_gym.threads import num_cores
 from tests.benchmarks import report
 from tests.benchmarks.cases import ABSENT, GROUPS, TASKS, Case
-from tests.benchmarks.machine import file_stem
+from tests.benchmarks.machine import file_stem, num_cores
 from tests.benchmarks.peers.install import AbsentError, peer_python
 
 ROOT = Path(__file__).parents[2]

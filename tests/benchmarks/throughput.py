@@ -92,12 +92,12 @@ def renderer(
 
 
 def operations(env: pb.PixelEnv, states: Any, params: Any) -> float:
-    """Floating-point operations of all pictures, as the program is written.
+    """Count the floating-point operations of all images, as the program is written.
 
     XLA counts the body of a loop once, however often it runs; here is no loop.
     """
-    whole = jax.vmap(lambda state: env.render(state, params))
-    cost = jax.jit(whole).lower(states).cost_analysis() or {}
+    draw = jax.vmap(env.draw, in_axes=(0, None))
+    cost = jax.jit(draw).lower(states, params).cost_analysis() or {}
     return float(cost.get("flops", 0.0))
 
 

@@ -22,7 +22,7 @@ from pixelbrax_jax.agents.core.networks import Dynamics
 from pixelbrax_jax.agents.core.optimizer import Networks, Optimizer
 from pixelbrax_jax.agents.core.rollout import Environments
 from pixelbrax_jax.types import EnvParams
-from pixelbrax_jax.validation import check_share, check_whole
+from pixelbrax_jax.validation import check_fraction, check_positive_int
 
 _PLAYED = ("actor", "critic")
 """Networks that learn in the policy phase."""
@@ -60,11 +60,11 @@ class DCPGConfig(TrainConfig):
             ValueError: a setting is out of range; the message says what is allowed.
         """
         super().__post_init__()
-        check_whole("update_epochs", self.update_epochs)
-        check_whole("aux_epochs", self.aux_epochs)
+        check_positive_int("update_epochs", self.update_epochs)
+        check_positive_int("aux_epochs", self.aux_epochs)
         for name in ("value_distill_coef", "beta_clone", "dynamics_coef", "vf_coef"):
             check_positive(name, getattr(self, name), or_zero=True)
-        check_share("target_rate", self.target_rate)
+        check_fraction("target_rate", self.target_rate)
         phasic.check_phases(self, self.num_policy_phases, self.aux_epochs, self.aux_minibatches)
         if self.state_critic and not self.decoupled:
             raise ValueError(

@@ -15,7 +15,7 @@ from pixelbrax_jax.agents.core.losses import Batch, Metrics, mean, policy_loss, 
 from pixelbrax_jax.agents.core.optimizer import Networks, Optimizer
 from pixelbrax_jax.agents.core.rollout import Environments
 from pixelbrax_jax.types import EnvParams
-from pixelbrax_jax.validation import check_choice, check_whole
+from pixelbrax_jax.validation import check_choice, check_positive_int
 
 LAYOUTS = ("dual", "detach", "shared")
 
@@ -51,8 +51,8 @@ class PPGConfig(TrainConfig):
         """
         super().__post_init__()
         check_choice("layout", self.layout, LAYOUTS)
-        check_whole("policy_epochs", self.policy_epochs)
-        check_whole("value_epochs", self.value_epochs)
+        check_positive_int("policy_epochs", self.policy_epochs)
+        check_positive_int("value_epochs", self.value_epochs)
         check_count("aux_epochs", self.aux_epochs)
         for name in ("vf_coef", "beta_clone", "aux_value_coef"):
             check_positive(name, getattr(self, name), or_zero=True)

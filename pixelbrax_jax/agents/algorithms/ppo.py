@@ -25,7 +25,7 @@ from pixelbrax_jax.agents.core.networks import Actor, ActorOutput, Critic
 from pixelbrax_jax.agents.core.optimizer import Networks, Optimizer
 from pixelbrax_jax.agents.core.rollout import Decision, Environments, Rollout, minibatch_times
 from pixelbrax_jax.types import EnvParams
-from pixelbrax_jax.validation import check_choice, check_whole
+from pixelbrax_jax.validation import check_choice, check_positive_int
 
 LAYOUTS = ("separate", "shared")
 
@@ -53,7 +53,7 @@ class PPOConfig(TrainConfig):
         """
         super().__post_init__()
         check_choice("layout", self.layout, LAYOUTS)
-        check_whole("update_epochs", self.update_epochs)
+        check_positive_int("update_epochs", self.update_epochs)
         check_positive("vf_coef", self.vf_coef, or_zero=True)
         if self.target_kl is not None:
             check_positive("target_kl", self.target_kl)

@@ -27,7 +27,7 @@ from pixelbrax_jax.agents.core.rollout import (
     observations,
 )
 from pixelbrax_jax.types import EnvParams
-from pixelbrax_jax.validation import check_whole
+from pixelbrax_jax.validation import check_positive_int
 
 
 class Buffer(struct.PyTreeNode):
@@ -83,8 +83,8 @@ def check_phases(
     Raises:
         ValueError: the message says what is allowed.
     """
-    check_whole("num_policy_phases", num_policy_phases)
-    check_whole("aux_minibatches", aux_minibatches)
+    check_positive_int("num_policy_phases", num_policy_phases)
+    check_positive_int("aux_minibatches", aux_minibatches)
     if aux_epochs and config.num_iterations < num_policy_phases:
         raise ValueError(
             f"the auxiliary phase would never run: it comes after every {num_policy_phases} "

@@ -9,7 +9,7 @@ import sys
 from pixelbrax_jax.agents.runner.checkpoint import CheckpointError
 from pixelbrax_jax.agents.runner.evaluate import Evaluator, make_split, splits_of
 from pixelbrax_jax.agents.runner.trained import load_trained
-from pixelbrax_jax.validation import check_whole
+from pixelbrax_jax.validation import check_positive_int
 
 
 def evaluate(options: argparse.Namespace) -> int:
@@ -19,7 +19,7 @@ def evaluate(options: argparse.Namespace) -> int:
         The exit status.
     """
     try:
-        check_whole("episodes", options.episodes)
+        check_positive_int("episodes", options.episodes)
         agent = load_trained(
             options.folder, steps=options.steps, best=options.best, run=options.run_index
         )

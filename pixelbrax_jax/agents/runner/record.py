@@ -18,7 +18,7 @@ from pixelbrax_jax.agents.runner.evaluate import SPLITS, make_split
 from pixelbrax_jax.agents.runner.trained import load_trained
 from pixelbrax_jax.compilation import compiler_options
 from pixelbrax_jax.envs.vector import VectorPixelEnv
-from pixelbrax_jax.validation import check_choice, check_whole
+from pixelbrax_jax.validation import check_choice, check_positive_int
 
 
 def record(options: argparse.Namespace) -> int:
@@ -81,9 +81,9 @@ def film(
         CheckpointError: there is no such checkpoint.
         ValueError: an option is out of range.
     """
-    check_whole("grid", grid)
-    check_whole("size", size)
-    check_whole("num_frames", num_frames)
+    check_positive_int("grid", grid)
+    check_positive_int("size", size)
+    check_positive_int("num_frames", num_frames)
     if split is not None:
         check_choice("split", split, SPLITS)
     agent = load_trained(folder, steps=steps, best=best, run=run)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from pixelbrax_jax.agents.core.config import check_count, check_positive
-from pixelbrax_jax.validation import check_choice, check_whole
+from pixelbrax_jax.validation import check_choice, check_positive_int
 
 RESUME = ("never", "latest")
 
@@ -50,7 +50,7 @@ class RunConfig:
         """
         check_choice("resume", self.resume, RESUME)
         for name in ("seeds", "log_every", "eval_episodes", "keep_checkpoints"):
-            check_whole(name, getattr(self, name))
+            check_positive_int(name, getattr(self, name))
         for name in ("seed", "num_evals", "checkpoint_every"):
             check_count(name, getattr(self, name))
         check_positive("checkpoint_minutes", self.checkpoint_minutes, or_zero=True)

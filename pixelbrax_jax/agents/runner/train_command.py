@@ -22,7 +22,7 @@ from pixelbrax_jax.agents.runner.run_config import RunConfig
 from pixelbrax_jax.agents.runner.train import TrainingDivergedError, run
 from pixelbrax_jax.envs.sharded import ShardedVectorEnv, make_env_mesh
 from pixelbrax_jax.envs.vector import VectorPixelEnv
-from pixelbrax_jax.validation import check_whole
+from pixelbrax_jax.validation import check_positive_int
 
 INTERRUPTED = 130
 """Exit status of a run that was stopped by Ctrl-C, as shells have it."""
@@ -119,7 +119,7 @@ def _emulate(cpu_devices: int) -> None:
     Raises:
         ValueError: the number is below 1, or JAX is at work already.
     """
-    check_whole("--cpu-devices", cpu_devices)
+    check_positive_int("--cpu-devices", cpu_devices)
     try:
         jax.config.update("jax_num_cpu_devices", cpu_devices)
     except RuntimeError as error:
