@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from pixelbrax_jax import PixelEnv, VectorPixelEnv
-from pixelbrax_jax.agents.core.algorithm import Algorithm, TrainState
+from pixelbrax_jax.agents.core.algorithm import Algorithm
+from pixelbrax_jax.agents.core.train_state import TrainState
 from tests.envs.toy import Ball, limited
 
 EPISODE_LENGTH = 5
@@ -42,7 +43,7 @@ class Agent:
         self.algorithm = algorithm
         self.config = algorithm.config
         self.iterate = jax.jit(lambda state: algorithm.iterate(state, PARAMS))
-        self.auxiliary = jax.jit(algorithm.auxiliary) if algorithm.auxiliary else None
+        self.auxiliary = jax.jit(algorithm.auxiliary) if algorithm.num_phases else None
 
     def init(self, seed: int = 0) -> TrainState:
         return self.algorithm.init(jax.random.key(seed), PARAMS)

@@ -9,7 +9,8 @@ import imageio.v3 as imageio
 import jax
 import pytest
 
-from pixelbrax_jax.agents.algorithms.presets import CONFIGS, PRESETS, preset
+from pixelbrax_jax.agents.algorithms.presets import PRESETS, preset
+from pixelbrax_jax.agents.algorithms.registry import ALGORITHMS
 from pixelbrax_jax.agents.core.config import describe
 from pixelbrax_jax.agents.runner import train_command as command
 from pixelbrax_jax.agents.runner.train_command import parse
@@ -25,7 +26,7 @@ TINY = (
 
 
 @pytest.mark.parametrize("name", PRESETS)
-@pytest.mark.parametrize("algorithm", CONFIGS)
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_every_preset_is_valid_and_comes_back_from_json(algorithm, name):
     config = preset(algorithm, name)
     stored = {"algorithm": algorithm, "config": describe(config) | {"seed": 3}}

@@ -10,9 +10,8 @@ import pytest
 
 from pixelbrax_jax.agents.algorithms.dcpg import DCPGConfig
 from pixelbrax_jax.agents.algorithms.ppg import PPGConfig
-from pixelbrax_jax.agents.algorithms.ppo import PPOConfig, make_ppo, make_train
-from pixelbrax_jax.agents.algorithms.presets import CONFIGS as OF_NAME
-from pixelbrax_jax.agents.algorithms.presets import MAKERS
+from pixelbrax_jax.agents.algorithms.ppo import PPO, PPOConfig
+from pixelbrax_jax.agents.algorithms.registry import ALGORITHMS, make_train
 from pixelbrax_jax.agents.core.config import TrainConfig, describe, make_env
 from pixelbrax_jax.agents.runner.train import RunConfig
 from pixelbrax_jax.envs.vector import VectorPixelEnv
@@ -219,17 +218,17 @@ def test_the_environment_is_the_one_that_is_described():
         ({"height": 20}, "height is 20 in the settings, but 18 in the environments."),
     ],
 )
-@pytest.mark.parametrize("name", MAKERS)
+@pytest.mark.parametrize("name", ALGORITHMS)
 def test_environments_that_are_not_those_of_the_settings_are_told(name, changes, message):
-    config = OF_NAME[name](**SMALL | {"total_steps": 10_000_000} | changes)
+    config = ALGORITHMS[name].config_class(**SMALL | {"total_steps": 10_000_000} | changes)
     with pytest.raises(ValueError, match=re.escape(message)):
-        MAKERS[name](config, ball_envs())
+        ALGORITHMS[name](config, ball_envs())
 
 
 def test_environments_must_begin_episodes_in_steps_of_their_own():
     envs = VectorPixelEnv(ball_envs().env, SMALL["num_envs"], "same_step")
     with pytest.raises(ValueError, match="must be 'next_step', got 'same_step'"):
-        make_ppo(PPOConfig(**SMALL), envs)
+        PPO(PPOConfig(**SMALL), envs)
 
 
 def test_environments_come_with_their_parameters():

@@ -34,7 +34,7 @@ def batch(seed: int = 0) -> Batch:
     }
     return Batch(
         pixels=jnp.zeros((B, 1, 1, 3), jnp.uint8), state=None,
-        raw=jnp.asarray(rng.normal(size=(B, 2)), jnp.float32),
+        unclipped_action=jnp.asarray(rng.normal(size=(B, 2)), jnp.float32),
         weight=jnp.asarray(weight, jnp.float32), **numbers,
     )  # fmt: skip
 
@@ -48,7 +48,9 @@ def test_the_policy_loss_is_ppo_s():
     samples, now = batch(), policy()
     loss, facts = policy_loss(now, samples, CONFIG, KEY)
     kept = np.asarray(samples.weight) == 1
-    ratio = np.exp(np.asarray(now.log_prob(samples.raw) - samples.log_prob, np.float64))[kept]
+    ratio = np.exp(
+        np.asarray(now.log_prob(samples.unclipped_action) - samples.log_prob, np.float64)
+    )[kept]
     advantage = np.asarray(samples.advantage, np.float64)[kept]
     objective = np.minimum(ratio * advantage, np.clip(ratio, 0.8, 1.2) * advantage).mean()
     entropy = 2 * (np.log(0.8) + 0.5 * np.log(2 * np.pi * np.e))
@@ -70,7 +72,7 @@ def test_the_gradient_stops_where_the_policy_has_moved_far_enough(ratio, advanta
 
     def loss(mean):
         now = policy().replace(mean=mean)
-        old = jax.lax.stop_gradient(now.log_prob(samples.raw)) - np.log(ratio)
+        old = jax.lax.stop_gradient(now.log_prob(samples.unclipped_action)) - np.log(ratio)
         return policy_loss(now, samples._replace(log_prob=old), config, KEY)[0]
 
     assert bool(jnp.any(jax.grad(loss)(policy().mean) != 0)) == goes_on
@@ -148,7 +150,7 @@ def test_steps_are_those_of_adam_with_each_network_s_gradient_clipped(max_grad_n
     clip = optax.clip_by_global_norm(max_grad_norm) if max_grad_norm else optax.identity()
     reference = optax.chain(clip, optax.adam(0.01, eps=1e-5))
     networks = {name: {"w": jnp.ones(3), "b": jnp.zeros(2)} for name in ("one", "other")}
-    moments = optimizer.init(networks)
+    opt_state = optimizer.init(networks)
     expected, theirs = dict(networks), {n: reference.init(p) for n, p in networks.items()}
     for t in range(5):
         # One gradient is far beyond the bound and one far below: they are clipped apart.
@@ -158,7 +160,7 @@ def test_steps_are_those_of_adam_with_each_network_s_gradient_clipped(max_grad_n
             )
             for name, scale in (("one", 30.0), ("other", 1e-3))
         }
-        networks, moments, norms = optimizer.step(networks, moments, gradients, jnp.uint32(t))
+        networks, opt_state, norms = optimizer.step(networks, opt_state, gradients, jnp.uint32(t))
         for name, gradient in gradients.items():
             assert float(norms[name]) == pytest.approx(float(optax.tree.norm(gradient)))
             updates, theirs[name] = reference.update(gradient, theirs[name])
@@ -170,14 +172,14 @@ def test_steps_are_those_of_adam_with_each_network_s_gradient_clipped(max_grad_n
 def test_networks_without_a_gradient_stay():
     optimizer = Optimizer(TrainConfig())
     networks = {name: jnp.ones(3) for name in ("learns", "stays")}
-    moments = optimizer.init(networks)
+    opt_state = optimizer.init(networks)
     for t in range(3):
-        networks, moments, norms = optimizer.step(
-            networks, moments, {"learns": jnp.ones(3)}, jnp.uint32(t)
+        networks, opt_state, norms = optimizer.step(
+            networks, opt_state, {"learns": jnp.ones(3)}, jnp.uint32(t)
         )
     assert set(norms) == {"learns"}
-    assert int(moments["learns"].count) == 3
-    assert int(moments["stays"].count) == 0
+    assert int(opt_state["learns"].count) == 3
+    assert int(opt_state["stays"].count) == 0
     np.testing.assert_array_equal(networks["stays"], 1.0)
 
 

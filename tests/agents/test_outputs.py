@@ -15,7 +15,7 @@ import pytest
 from tensorboardX.proto.event_pb2 import Event
 from tensorboardX.record_writer import masked_crc32c
 
-from pixelbrax_jax.agents.algorithms.ppo import PPOConfig, make_ppo
+from pixelbrax_jax.agents.algorithms.ppo import PPO, PPOConfig
 from pixelbrax_jax.agents.runner import interruption, metrics, saving, train
 from pixelbrax_jax.agents.runner.checkpoint import CheckpointError, Checkpoints
 from pixelbrax_jax.agents.runner.metrics import AppendedFile, MetricsWriter, read_metrics
@@ -168,7 +168,7 @@ def test_a_bar_that_cannot_be_drawn_is_told_once(monkeypatch):
 
 def test_a_run_without_a_reader_is_the_same(tmp_path, monkeypatch):
     def ppo():
-        return make_ppo(PPOConfig(**SMALL), ball_envs())
+        return PPO(PPOConfig(**SMALL), ball_envs())
 
     def report(line):
         raise BrokenPipeError(32, "Broken pipe")
@@ -193,7 +193,7 @@ def test_a_policy_that_cannot_be_written_costs_no_checkpoint(tmp_path, monkeypat
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(train, "save_policy", full)
-    algorithm = make_ppo(PPOConfig(**SMALL), ball_envs())
+    algorithm = PPO(PPOConfig(**SMALL), ball_envs())
     with pytest.raises(OSError, match=r"policy.jax: No space left on device.*160 steps is whole"):
         run(algorithm, PARAMS, RunConfig(str(tmp_path), progress=False))
     checkpoints = Checkpoints(tmp_path / "checkpoints", {}, "ppo")

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pixelbrax_jax.agents.algorithms.dcpg import DCPGConfig, dynamics_loss, make_dcpg
-from pixelbrax_jax.agents.algorithms.ppg import PPGConfig, make_ppg
-from pixelbrax_jax.agents.algorithms.ppo import ActorCritic
+from pixelbrax_jax.agents.algorithms.dcpg import DCPG, DCPGConfig, dynamics_loss
+from pixelbrax_jax.agents.algorithms.ppg import PPG, PPGConfig
 from pixelbrax_jax.agents.core import phasic
+from pixelbrax_jax.agents.core.actor_critic import ActorCritic
 from pixelbrax_jax.agents.core.losses import mean
 from pixelbrax_jax.agents.core.networks import Dynamics
 from pixelbrax_jax.agents.core.rollout import observations
@@ -29,19 +29,19 @@ def envs():
 
 @pytest.fixture(scope="module")
 def ppg(envs):
-    return Agent(make_ppg(PPGConfig(**SMALL, **PHASIC), envs))
+    return Agent(PPG(PPGConfig(**SMALL, **PHASIC), envs))
 
 
 @pytest.fixture(scope="module")
 def dcpg(envs):
-    return Agent(make_dcpg(DCPGConfig(**SMALL, **PHASIC), envs))
+    return Agent(DCPG(DCPGConfig(**SMALL, **PHASIC), envs))
 
 
 @pytest.fixture(scope="module")
 def decoupled(envs):
     """With everything there is: a critic of its own, an averaged actor, and a dynamics head."""
     config = DCPGConfig(**SMALL, **PHASIC, decoupled=True, dynamics_coef=1.0)
-    return Agent(make_dcpg(config, envs))
+    return Agent(DCPG(config, envs))
 
 
 @pytest.fixture(params=["ppg", "dcpg", "decoupled"])
@@ -80,11 +80,11 @@ def test_rollouts_are_remembered_in_turn(agent):
 def test_each_phase_has_an_adam_of_its_own(agent):
     state = full(agent)
     after, _ = agent.auxiliary(state)
-    assert same(after.moments, state.moments)
-    assert {int(m.count) for m in state.aux_moments.values()} == {0}
-    assert {int(m.count) for m in after.aux_moments.values()} == {NUM_AUX_STEPS}
+    assert same(after.opt_state, state.opt_state)
+    assert {int(m.count) for m in state.aux_opt_state.values()} == {0}
+    assert {int(m.count) for m in after.aux_opt_state.values()} == {NUM_AUX_STEPS}
     steps = ROLLOUTS * SMALL["num_minibatches"]
-    assert {int(m.count) for m in after.moments.values()} == {steps}
+    assert {int(m.count) for m in after.opt_state.values()} == {steps}
     # Everything else is as it was.
     names = ("env_state", "scaler", "buffer", "key", "iteration", "steps")
     for name in names:
@@ -147,7 +147,7 @@ def test_dcpg_s_value_stays_where_it_was_while_the_policy_learns(envs):
     config = DCPGConfig(
         **SMALL | PHASIC | {"anneal": False}, update_epochs=16, value_distill_coef=100.0
     )
-    algorithm = make_dcpg(config, envs)
+    algorithm = DCPG(config, envs)
     agent = Agent(algorithm)
     before = agent.init(2)
     after, _ = agent.iterate(before)
@@ -171,7 +171,7 @@ def test_dcpg_s_value_stays_where_it_was_while_the_policy_learns(envs):
 def test_dcpg_s_value_head_has_no_gradient_while_values_are_the_old_ones(envs):
     """With one minibatch the value is the old one at the only step: returns do not reach it."""
     config = DCPGConfig(**SMALL | PHASIC | {"num_minibatches": 1})
-    agent = Agent(make_dcpg(config, envs))
+    agent = Agent(DCPG(config, envs))
     before = agent.init()
     after, facts = agent.iterate(before)
     old, new = (state.networks["actor"]["params"] for state in (before, after))
@@ -184,7 +184,7 @@ def test_dcpg_s_value_head_has_no_gradient_while_values_are_the_old_ones(envs):
 
 def test_a_dynamics_head_without_weight_changes_nothing(dcpg, envs):
     config = DCPGConfig(**SMALL, **PHASIC, dynamics_coef=1e-30)
-    agent = Agent(make_dcpg(config, envs))
+    agent = Agent(DCPG(config, envs))
     plain, state = full(dcpg), agent.init()
     head = state.networks["dynamics"]
     assert same(state.networks, dcpg.init().networks | {"dynamics": head})
@@ -192,7 +192,7 @@ def test_a_dynamics_head_without_weight_changes_nothing(dcpg, envs):
     state = state.replace(
         **{
             name: getattr(plain, name)
-            for name in ("moments", "env_state", "scaler", "buffer", "iteration", "steps")
+            for name in ("opt_state", "env_state", "scaler", "buffer", "iteration", "steps")
         },
         networks=plain.networks | {"dynamics": head},
     )

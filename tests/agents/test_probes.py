@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from pixelbrax_jax import PixelEnv, VectorPixelEnv
-from pixelbrax_jax.agents.algorithms.dcpg import DCPGConfig, make_dcpg
-from pixelbrax_jax.agents.algorithms.ppg import PPGConfig, make_ppg
-from pixelbrax_jax.agents.algorithms.ppo import PPOConfig, make_ppo
+from pixelbrax_jax.agents.algorithms.dcpg import DCPG, DCPGConfig
+from pixelbrax_jax.agents.algorithms.ppg import PPG, PPGConfig
+from pixelbrax_jax.agents.algorithms.ppo import PPO, PPOConfig
 from pixelbrax_jax.agents.core.networks import Actor, Critic
 from tests.agents.probes import NAMES, TARGETS, TIME_LIMIT, Probes, true_values
 from tests.envs.toy import limited
@@ -43,9 +43,9 @@ SHARED = {
 PHASIC = {"num_policy_phases": 2, "aux_minibatches": 4, "aux_epochs": 4}
 
 AGENTS = {
-    "ppo": (make_ppo, PPOConfig(**SHARED, update_epochs=4)),
-    "ppg": (make_ppg, PPGConfig(**SHARED, **PHASIC, policy_epochs=2, value_epochs=2)),
-    "dcpg": (make_dcpg, DCPGConfig(**SHARED, **PHASIC, update_epochs=2)),
+    "ppo": (PPO, PPOConfig(**SHARED, update_epochs=4)),
+    "ppg": (PPG, PPGConfig(**SHARED, **PHASIC, policy_epochs=2, value_epochs=2)),
+    "dcpg": (DCPG, DCPGConfig(**SHARED, **PHASIC, update_epochs=2)),
 }
 
 
@@ -81,7 +81,7 @@ def learned(request, envs, pictures):
         state, _ = jax.lax.scan(
             lambda state, _: algorithm.iterate(state, PARAMS), state, length=number
         )
-        return algorithm.auxiliary(state)[0] if algorithm.auxiliary else state
+        return algorithm.auxiliary(state)[0] if algorithm.num_phases else state
 
     state = algorithm.init(jax.random.key(0), PARAMS)
     for _ in range(config.num_iterations // number):

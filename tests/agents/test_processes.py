@@ -116,8 +116,8 @@ def test_frames_stay_on_their_devices(tmp_path):
     code = r"""
 import jax, re
 from pixelbrax_jax.agents.core.config import make_env
-from pixelbrax_jax.agents.algorithms.ppg import PPGConfig, make_ppg
-from pixelbrax_jax.agents.runner.sharding import everywhere, state_shardings
+from pixelbrax_jax.agents.algorithms.ppg import PPG, PPGConfig
+from pixelbrax_jax.agents.runner.sharding import replicate, state_shardings
 from pixelbrax_jax.envs.sharded import ShardedVectorEnv, make_env_mesh
 
 config = PPGConfig(
@@ -127,8 +127,8 @@ config = PPGConfig(
 )
 env, params = make_env(config)
 mesh = make_env_mesh()
-algorithm = make_ppg(config, ShardedVectorEnv(env, config.num_envs, mesh))
-params = everywhere(mesh, params)
+algorithm = PPG(config, ShardedVectorEnv(env, config.num_envs, mesh))
+params = replicate(mesh, params)
 template = jax.eval_shape(algorithm.init, jax.random.key(0), params)
 shardings = state_shardings(mesh, template)
 state = jax.tree.map(

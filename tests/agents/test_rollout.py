@@ -67,7 +67,7 @@ def step_by_step(played) -> SimpleNamespace:
         for t in range(T):
             seen.append(np.asarray(played.envs.obs(state)))
             began.append(np.asarray(state.done))
-            state, timestep = played.envs.step(state, rollout.raw[t], PARAMS)
+            state, timestep = played.envs.step(state, rollout.unclipped_action[t], PARAMS)
             timesteps.append(timestep)
     timesteps = jax.tree.map(lambda *x: np.stack(x), *timesteps)
     return SimpleNamespace(seen=np.stack(seen), began=np.stack(began), timesteps=timesteps)

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from pixelbrax_jax import PixelEnv
-from pixelbrax_jax.agents.algorithms.ppg import PPGConfig, make_ppg
+from pixelbrax_jax.agents.algorithms.ppg import PPG, PPGConfig
 from pixelbrax_jax.agents.core.config import describe
 from pixelbrax_jax.agents.runner import train
 from pixelbrax_jax.agents.runner.checkpoint import (
@@ -27,7 +27,7 @@ from pixelbrax_jax.agents.runner.checkpoint import (
     read_networks,
 )
 from pixelbrax_jax.agents.runner.export import save_policy
-from pixelbrax_jax.agents.runner.metrics import read_metrics, together
+from pixelbrax_jax.agents.runner.metrics import read_metrics, summarize
 from pixelbrax_jax.agents.runner.train import RunConfig, TrainingDivergedError, run
 from pixelbrax_jax.policy import load_policy
 from tests.agents.small import OPTIONS, PARAMS, SMALL, ball_envs, same
@@ -42,7 +42,7 @@ def ppg(iterations: int, **changes):
     # Annealed, the step size would depend on the length of the run.
     settings = SMALL | PHASES | {"anneal": False} | changes
     settings["total_steps"] = iterations * PER_ITERATION
-    return make_ppg(PPGConfig(**settings), ball_envs())
+    return PPG(PPGConfig(**settings), ball_envs())
 
 
 def options(folder, **changes) -> RunConfig:
@@ -385,7 +385,7 @@ def test_episodes_count_equally_whichever_iteration_they_ended_in():
         },
         {"episode/count": 0, "episode/return_sum": 0.0, "episode/length_sum": 0, "x": 5.0},
     ]
-    summary = together(records)
+    summary = summarize(records)
     assert summary == {
         "episode/count": 4.0,
         "episode/return": 2.5,
@@ -393,7 +393,7 @@ def test_episodes_count_equally_whichever_iteration_they_ended_in():
         "x": 3.0,
         "y": 7.0,
     }
-    assert "episode/return" not in together(records[2:])
+    assert "episode/return" not in summarize(records[2:])
 
 
 def test_seeds_of_one_program_are_those_of_their_own(whole, tmp_path):

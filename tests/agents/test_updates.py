@@ -7,9 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pixelbrax_jax.agents.algorithms.dcpg import DCPGConfig, make_dcpg
-from pixelbrax_jax.agents.algorithms.ppg import PPGConfig, make_ppg
-from pixelbrax_jax.agents.algorithms.ppo import ActorCritic, PPOConfig, make_ppo
+from pixelbrax_jax.agents.algorithms.dcpg import DCPG, DCPGConfig
+from pixelbrax_jax.agents.algorithms.ppg import PPG, PPGConfig
+from pixelbrax_jax.agents.algorithms.ppo import PPO, PPOConfig
+from pixelbrax_jax.agents.core.actor_critic import ActorCritic
 from pixelbrax_jax.agents.core.algorithm import train_function
 from pixelbrax_jax.agents.core.losses import value_loss
 from tests.agents.small import PARAMS, PHASIC, SMALL, Agent, assert_close, ball_envs, same
@@ -25,17 +26,17 @@ def envs():
 
 @pytest.fixture(scope="module")
 def ppo(envs):
-    return Agent(make_ppo(PPOConfig(**SMALL, update_epochs=1, vf_coef=1.0), envs))
+    return Agent(PPO(PPOConfig(**SMALL, update_epochs=1, vf_coef=1.0), envs))
 
 
 @pytest.fixture(scope="module")
 def ppg(envs):
-    return Agent(make_ppg(PPGConfig(**SMALL, **PHASIC, vf_coef=1.0), envs))
+    return Agent(PPG(PPGConfig(**SMALL, **PHASIC, vf_coef=1.0), envs))
 
 
 @pytest.fixture(scope="module")
 def dcpg(envs):
-    return Agent(make_dcpg(DCPGConfig(**SMALL, **PHASIC), envs))
+    return Agent(DCPG(DCPGConfig(**SMALL, **PHASIC), envs))
 
 
 @pytest.fixture(params=["ppo", "ppg", "dcpg"])
@@ -87,7 +88,7 @@ def test_the_step_size_of_a_run_falls_along_a_line(agent):
 
 def test_ppg_without_auxiliary_phases_is_ppo(ppo, ppg, envs):
     config = PPGConfig(**SMALL | PHASIC | {"aux_epochs": 0}, vf_coef=1.0)
-    assert make_ppg(config, envs).num_phases == 0
+    assert PPG(config, envs).num_phases == 0
 
     def shared(networks):
         """All but the value head, which PPO's actor does not have."""
@@ -123,30 +124,30 @@ def test_ppg_s_actor_keeps_its_value_head_until_the_auxiliary_phase(ppg):
 
 def test_ppg_s_passes_of_the_value_alone_leave_the_policy_alone(ppg, envs):
     config = PPGConfig(**SMALL, **PHASIC, vf_coef=1.0, value_epochs=3)
-    longer = Agent(make_ppg(config, envs))
+    longer = Agent(PPG(config, envs))
     state = ppg.init()
     # Adam's moments are not 0 then, so that it would move what has a gradient of 0.
     state, _ = ppg.iterate(state)
     one, _ = ppg.iterate(state)
     three, _ = longer.iterate(state)
     assert_close(one.networks["actor"], three.networks["actor"], rtol=1e-4, atol=1e-6)
-    assert_close(one.moments["actor"], three.moments["actor"], rtol=1e-3, atol=1e-6)
-    counts = {name: int(three.moments[name].count) for name in ("actor", "critic")}
+    assert_close(one.opt_state["actor"], three.opt_state["actor"], rtol=1e-3, atol=1e-6)
+    counts = {name: int(three.opt_state[name].count) for name in ("actor", "critic")}
     # One iteration of one pass, and one of one and of three.
     assert counts == {"actor": 2 + 2, "critic": 2 + 6}
 
 
 def test_an_update_stops_once_the_policy_has_moved_too_far(envs):
     config = PPOConfig(**SMALL | {"learning_rate": 0.03}, update_epochs=3, target_kl=1e-4)
-    agent = Agent(make_ppo(config, envs))
+    agent = Agent(PPO(config, envs))
     state, facts = agent.iterate(agent.init())
     # The first of 6 minibatches sees the policy that played; the second one sees that it has
     # moved, and is the last one that is used.
-    assert {int(moments.count) for moments in state.moments.values()} == {2}
+    assert {int(moments.count) for moments in state.opt_state.values()} == {2}
     assert float(facts["policy/approx_kl"]) > 1e-4 / 2
     # A policy that does not move never stops.
     still, facts = agent.iterate(agent.without_steps(state))
-    assert {int(moments.count) for moments in still.moments.values()} == {2 + 6}
+    assert {int(moments.count) for moments in still.opt_state.values()} == {2 + 6}
 
 
 @pytest.fixture(scope="module")

@@ -9,10 +9,10 @@ from typing import Any
 
 import jax
 
-from pixelbrax_jax.agents.algorithms.ppo import make_ppo
+from pixelbrax_jax.agents.algorithms.ppo import PPO
 from pixelbrax_jax.agents.algorithms.presets import preset
 from pixelbrax_jax.agents.core.config import make_env
-from pixelbrax_jax.agents.runner.sharding import everywhere, state_shardings
+from pixelbrax_jax.agents.runner.sharding import replicate, state_shardings
 from pixelbrax_jax.envs.sharded import ShardedVectorEnv, make_env_mesh
 from tests.benchmarks.cases import ABSENT
 from tests.benchmarks.throughput import compiled, rate
@@ -36,9 +36,9 @@ def training(task: str, num_devices: int, cores: int, num_envs: int) -> dict[str
     config = replace(preset("ppo", "ci"), task=task, num_envs=num_envs)  # type: ignore[arg-type]
     env, params = make_env(config)
     mesh = make_env_mesh(num_devices)
-    algorithm = make_ppo(config, ShardedVectorEnv(env, num_envs, mesh))  # type: ignore[arg-type]
+    algorithm = PPO(config, ShardedVectorEnv(env, num_envs, mesh))  # type: ignore[arg-type]
     key = jax.random.key(0)
-    params = everywhere(mesh, params)
+    params = replicate(mesh, params)
     shardings = state_shardings(mesh, jax.eval_shape(algorithm.init, key, params))
     init = jax.jit(lambda params: algorithm.init(key, params), out_shardings=shardings)
     state = init(params)

@@ -20,7 +20,7 @@ import jax
 import numpy as np
 
 from pixelbrax_jax import VectorPixelEnv, compiler_options
-from pixelbrax_jax.agents.algorithms.ppo import PPOConfig, make_ppo
+from pixelbrax_jax.agents.algorithms.ppo import PPO, PPOConfig
 from pixelbrax_jax.agents.core.config import make_env
 from pixelbrax_jax.agents.core.networks import ENCODERS
 
@@ -39,7 +39,7 @@ def measure(encoder: str, num_envs: int, num_steps: int) -> dict[str, Any]:
     )
     env, params = make_env(config)
     envs = VectorPixelEnv(env, num_envs)
-    algorithm = make_ppo(config, envs)
+    algorithm = PPO(config, envs)
     carry = {"train": jax.jit(algorithm.init)(jax.random.key(0), params)}
     carry["play"] = carry["train"].env_state
 

@@ -24,20 +24,20 @@ def _needs_a_gpu():
 
 @pytest.mark.parametrize("name", ["ppo", "ppg", "dcpg"])
 def test_the_same_key_gives_the_same_run(name):
-    from pixelbrax_jax.agents.algorithms.presets import CONFIGS, MAKERS
+    from pixelbrax_jax.agents.algorithms.registry import ALGORITHMS
 
     if "deterministic_ops=true" not in os.environ.get("XLA_FLAGS", ""):
         pytest.fail("set XLA_FLAGS=--xla_gpu_deterministic_ops=true")
     settings = SMALL | ({} if name == "ppo" else PHASIC)
-    agent = Agent(MAKERS[name](CONFIGS[name](**settings), ball_envs()))
+    agent = Agent(ALGORITHMS[name](ALGORITHMS[name].config_class(**settings), ball_envs()))
     one, other = (agent.run(agent.init(), 4)[0] for _ in range(2))
     assert same(one, other)
 
 
 def test_an_exported_policy_acts_on_tensors_of_the_gpu(tmp_path):
-    from pixelbrax_jax.agents.algorithms.ppo import PPOConfig, make_ppo
+    from pixelbrax_jax.agents.algorithms.ppo import PPO, PPOConfig
 
-    agent = Agent(make_ppo(PPOConfig(**SMALL), ball_envs()))
+    agent = Agent(PPO(PPOConfig(**SMALL), ball_envs()))
     networks = agent.init().networks
     path = save_policy(agent.algorithm, networks, tmp_path / "policy.jax")
     pixels = np.random.default_rng(0).integers(0, 256, (4, 18, 18, 6), np.uint8)

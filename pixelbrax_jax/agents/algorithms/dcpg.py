@@ -7,24 +7,34 @@ head to the delayed phase; the decoupled variant has a critic of its own.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 
-from pixelbrax_jax.agents.algorithms.ppo import ActorCritic, epochs
-from pixelbrax_jax.agents.core import algorithm, phasic
-from pixelbrax_jax.agents.core.algorithm import Algorithm, TrainState, environments, train_function
+from pixelbrax_jax.agents.core import phasic
+from pixelbrax_jax.agents.core.actor_critic import ActorCritic
+from pixelbrax_jax.agents.core.algorithm import Algorithm
 from pixelbrax_jax.agents.core.config import TrainConfig, check_positive
-from pixelbrax_jax.agents.core.losses import Batch, Metrics, mean, policy_loss, value_loss
+from pixelbrax_jax.agents.core.experience import gather
+from pixelbrax_jax.agents.core.losses import (
+    Batch,
+    Metrics,
+    mean,
+    policy_loss,
+    policy_metrics,
+    value_loss,
+)
 from pixelbrax_jax.agents.core.networks import Dynamics
 from pixelbrax_jax.agents.core.optimizer import Networks, Optimizer
-from pixelbrax_jax.agents.core.rollout import Environments
+from pixelbrax_jax.agents.core.train_state import TrainState, update_key
+from pixelbrax_jax.agents.core.update import update
 from pixelbrax_jax.types import EnvParams
 from pixelbrax_jax.validation import check_fraction, check_positive_int
 
-_PLAYED = ("actor", "critic")
+_LEARNERS = ("actor", "critic")
 """Networks that learn in the policy phase."""
 
 
@@ -78,100 +88,98 @@ class DCPGConfig(TrainConfig):
             )
 
 
-def make_train(
-    config: DCPGConfig,
-    envs: Environments | None = None,
-    env_params: EnvParams | None = None,
-) -> Callable[[jax.Array], tuple[TrainState, Metrics]]:
-    """A whole run as a pure function ``train(key) -> (state, metrics)``; see `train_function`.
+@dataclass(frozen=True)
+class DCPG(Algorithm):
+    """DCPG with its settings, in the given environments."""
 
-    Args:
-        config: settings.
-        envs: environments of your own; None makes those that ``config`` names.
-        env_params: of those.
+    config: DCPGConfig
+    name: ClassVar[str] = "dcpg"
+    config_class: ClassVar[type[TrainConfig]] = DCPGConfig
 
-    Raises:
-        ValueError: one of the two is given without the other.
-    """
-    envs, env_params = environments(config, envs, env_params)
-    return train_function(make_dcpg(config, envs), env_params)
+    @property
+    def num_phases(self) -> int:
+        """As ``Algorithm.num_phases``."""
+        return self.config.num_policy_phases
 
+    @cached_property
+    def agent(self) -> ActorCritic:
+        """Its networks, but for the dynamics head."""
+        return ActorCritic(self.config, self.envs, shared=not self.config.decoupled, has_value=True)
 
-def make_dcpg(config: DCPGConfig, envs: Environments) -> Algorithm:
-    """DCPG in the given environments."""
-    agent = ActorCritic(config, envs, shared=not config.decoupled, has_value=True)
-    dynamics = Dynamics()
-
-    def init_networks(key: jax.Array) -> Networks:
-        networks = agent.init(key)
+    def init_networks(self, key: jax.Array) -> Networks:
+        """As ``Algorithm.init_networks``."""
+        config, networks = self.config, self.agent.init(key)
         if config.decoupled:
             networks["target"] = networks["actor"]
         if config.dynamics_coef:
             pixels = jnp.zeros((1, config.height, config.width, 3 * config.frame_stack), jnp.uint8)
-            features = agent.actor(networks["actor"], pixels).features
-            action = jnp.zeros((1, envs.env.action_size))
+            features = self.agent.actor(networks["actor"], pixels).features
+            action = jnp.zeros((1, self.envs.env.action_size))
             dynamics_key = jax.random.fold_in(key, 2)
-            networks["dynamics"] = dynamics.init(dynamics_key, features, action, features)
+            networks["dynamics"] = Dynamics().init(dynamics_key, features, action, features)
         return networks
 
-    def init(key: jax.Array, env_params: EnvParams) -> TrainState:
-        state = algorithm.begin(config, envs, init_networks, key, env_params)
-        decide = agent.decide(state.networks)
-        state = phasic.begin_phases(
-            config, envs, state, env_params, decide, config.num_policy_phases
+    def init(self, key: jax.Array, env_params: EnvParams) -> TrainState:
+        """As ``Algorithm.init``, with an empty buffer."""
+        state = super().init(key, env_params)
+        decide = self.agent.decide(state.networks)
+        state = phasic.with_buffer(
+            self.config, self.envs, state, env_params, decide, self.config.num_policy_phases
         )
         # The averaged actor follows without a gradient; the dynamics head learns in one phase.
-        optimizer, networks = Optimizer(config), state.networks
+        optimizer, networks = Optimizer(self.config), state.networks
         return state.replace(
-            moments=optimizer.init({n: p for n, p in networks.items() if n in _PLAYED}),
-            aux_moments=optimizer.init({n: p for n, p in networks.items() if n != "target"}),
+            opt_state=optimizer.init({n: p for n, p in networks.items() if n in _LEARNERS}),
+            aux_opt_state=optimizer.init({n: p for n, p in networks.items() if n != "target"}),
         )
 
-    def iterate(state: TrainState, env_params: EnvParams) -> tuple[TrainState, Metrics]:
-        """The policy phase: the policy learns, and the value stays where it was."""
-        key, before = algorithm.update_key(state), state.iteration
-        state, rollout, advantage, returns, metrics = algorithm.play(
-            config, envs, state, env_params, agent.decide(state.networks)
+    def iterate(self, state: TrainState, env_params: EnvParams) -> tuple[TrainState, Metrics]:
+        """Learn the policy, and keep the value where it was (the policy phase)."""
+        config, agent = self.config, self.agent
+        key, iteration = update_key(state), state.iteration
+        state, experience, metrics = gather(
+            config, self.envs, state, env_params, agent.decide(state.networks)
         )
         target = state.networks.get("target")
 
         def loss(networks: Networks, batch: Batch, key: jax.Array) -> tuple[jax.Array, Metrics]:
             output = agent.actor(networks["actor"], batch.pixels)
-            loss, facts = policy_loss(output.policy, batch, config, key)
+            loss, metrics = policy_loss(output.policy, batch, config, key)
             # Coupled, the actor's value is what played: its old values are in the batch.
             kept = batch.value
             if config.decoupled:
                 kept = agent.actor(target, batch.pixels).value
                 value = agent.critic(networks["critic"], batch.pixels, batch.state)
                 error = value_loss(value, batch.returns, batch.weight)
-                facts["loss/value"] = error
+                metrics["loss/value"] = error
                 loss += config.vf_coef * error
             distance = value_loss(output.value, kept, batch.weight)
-            facts |= {"loss/value_distill": distance} | algorithm.policy_metrics(output.policy.std)
-            return loss + config.value_distill_coef * distance, facts
+            metrics |= {"loss/value_distill": distance} | policy_metrics(output.policy.std)
+            return loss + config.value_distill_coef * distance, metrics
 
-        trained = {n: p for n, p in state.networks.items() if n in _PLAYED}
-        networks, moments, facts = epochs(
+        trained = {n: p for n, p in state.networks.items() if n in _LEARNERS}
+        networks, opt_state, update_metrics = update(
             config,
             loss,
             trained,
-            state.moments,
-            (rollout, advantage, returns),
+            state.opt_state,
+            experience,
             config.update_epochs,
             key,
-            before,
+            iteration,
         )
-        slot = before % config.num_policy_phases
+        slot = iteration % config.num_policy_phases
         state = state.replace(
             networks=state.networks | networks,
-            moments=moments,
-            buffer=phasic.remember(state.buffer, slot, rollout, returns),
+            opt_state=opt_state,
+            buffer=phasic.remember(state.buffer, slot, experience),
         )
-        rate = Optimizer(config).learning_rate(before)
-        return state, metrics | facts | {"learning_rate": rate}
+        rate = Optimizer(config).learning_rate(iteration)
+        return state, metrics | update_metrics | {"learning_rate": rate}
 
-    def auxiliary(state: TrainState) -> tuple[TrainState, Metrics]:
-        """The delayed phase: the value learns from old returns, and the policy stays."""
+    def auxiliary(self, state: TrainState) -> tuple[TrainState, Metrics]:
+        """Learn the value from old returns, and keep the policy (the delayed phase)."""
+        config, agent, dynamics = self.config, self.agent, Dynamics()
 
         def loss(
             networks: Networks, chunk: phasic.Chunk, key: jax.Array
@@ -180,17 +188,17 @@ def make_dcpg(config: DCPGConfig, envs: Environments) -> Algorithm:
             error = value_loss(output.value, chunk.returns, chunk.weight)
             kl = mean(chunk.policy.kl_to(output.policy), chunk.weight)
             loss = error + config.beta_clone * kl
-            facts = {"auxiliary/value_loss": error, "auxiliary/kl": kl}
+            metrics = {"auxiliary/value_loss": error, "auxiliary/kl": kl}
             if config.decoupled:
                 value = agent.critic(networks["critic"], chunk.pixels, chunk.state)
                 critic_error = value_loss(value, chunk.returns, chunk.weight)
                 loss += config.vf_coef * critic_error
-                facts["auxiliary/critic_loss"] = critic_error
+                metrics["auxiliary/critic_loss"] = critic_error
             if config.dynamics_coef:
                 wrong = dynamics_loss(dynamics, networks["dynamics"], output.features, chunk, key)
                 loss += config.dynamics_coef * wrong
-                facts["auxiliary/dynamics_loss"] = wrong
-            return loss, facts
+                metrics["auxiliary/dynamics_loss"] = wrong
+            return loss, metrics
 
         def after_step(networks: Networks) -> Networks:
             if not config.decoupled:
@@ -212,10 +220,6 @@ def make_dcpg(config: DCPGConfig, envs: Environments) -> Algorithm:
             config.aux_minibatches,
             after_step,
         )
-
-    return Algorithm(
-        "dcpg", config, envs, init, iterate, agent.act, auxiliary, config.num_policy_phases
-    )
 
 
 def dynamics_loss(
@@ -251,7 +255,7 @@ def dynamics_loss(
         return rows.reshape(-1, *rows.shape[2:])
 
     now, following = flat(in_time(features)[:, :-1]), flat(in_time(features)[:, 1:])
-    action = flat(in_time(chunk.raw)[:, :-1])
+    action = flat(in_time(chunk.unclipped_action)[:, :-1])
     # A step that ends an episode returns a true last observation; the one after it begins anew.
     weight = flat(in_time(chunk.weight)[:, :-1])
     action_key, following_key = jax.random.split(key)

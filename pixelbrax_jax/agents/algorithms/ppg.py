@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar
 
 import jax
 
-from pixelbrax_jax.agents.algorithms.ppo import ActorCritic, epochs
-from pixelbrax_jax.agents.core import algorithm, phasic
-from pixelbrax_jax.agents.core.algorithm import Algorithm, TrainState, environments, train_function
+from pixelbrax_jax.agents.core import phasic
+from pixelbrax_jax.agents.core.actor_critic import ActorCritic
+from pixelbrax_jax.agents.core.algorithm import Algorithm
 from pixelbrax_jax.agents.core.config import TrainConfig, check_count, check_positive
-from pixelbrax_jax.agents.core.losses import Batch, Metrics, mean, policy_loss, value_loss
+from pixelbrax_jax.agents.core.experience import gather
+from pixelbrax_jax.agents.core.losses import (
+    Batch,
+    Metrics,
+    mean,
+    policy_loss,
+    policy_metrics,
+    value_loss,
+)
 from pixelbrax_jax.agents.core.optimizer import Networks, Optimizer
-from pixelbrax_jax.agents.core.rollout import Environments
+from pixelbrax_jax.agents.core.train_state import TrainState, update_key
+from pixelbrax_jax.agents.core.update import update
 from pixelbrax_jax.types import EnvParams
 from pixelbrax_jax.validation import check_choice, check_positive_int
 
@@ -69,52 +79,56 @@ class PPGConfig(TrainConfig):
             )
 
 
-def make_train(
-    config: PPGConfig,
-    envs: Environments | None = None,
-    env_params: EnvParams | None = None,
-) -> Callable[[jax.Array], tuple[TrainState, Metrics]]:
-    """A whole run as a pure function ``train(key) -> (state, metrics)``; see `train_function`.
+@dataclass(frozen=True)
+class PPG(Algorithm):
+    """PPG with its settings, in the given environments."""
 
-    Args:
-        config: settings.
-        envs: environments of your own; None makes those that ``config`` names.
-        env_params: of those.
+    config: PPGConfig
+    name: ClassVar[str] = "ppg"
+    config_class: ClassVar[type[TrainConfig]] = PPGConfig
 
-    Raises:
-        ValueError: one of the two is given without the other.
-    """
-    envs, env_params = environments(config, envs, env_params)
-    return train_function(make_ppg(config, envs), env_params)
+    @property
+    def num_phases(self) -> int:
+        """As ``Algorithm.num_phases``."""
+        return self.config.num_policy_phases if self.config.aux_epochs else 0
 
-
-def make_ppg(config: PPGConfig, envs: Environments) -> Algorithm:
-    """PPG in the given environments."""
-    dual = config.layout == "dual"
-    agent = ActorCritic(
-        config, envs, shared=not dual, detach_value=config.layout == "detach", has_value=True
-    )
-
-    def init(key: jax.Array, env_params: EnvParams) -> TrainState:
-        state = algorithm.begin(config, envs, agent.init, key, env_params)
-        decide = agent.decide(state.networks)
-        return phasic.begin_phases(
-            config, envs, state, env_params, decide, config.num_policy_phases
+    @cached_property
+    def agent(self) -> ActorCritic:
+        """Its networks."""
+        return ActorCritic(
+            self.config,
+            self.envs,
+            shared=self.config.layout != "dual",
+            detach_value=self.config.layout == "detach",
+            has_value=True,
         )
 
-    def iterate(state: TrainState, env_params: EnvParams) -> tuple[TrainState, Metrics]:
-        """The policy phase: PPO, and the rollout is remembered."""
-        key, before = algorithm.update_key(state), state.iteration
-        state, rollout, advantage, returns, metrics = algorithm.play(
-            config, envs, state, env_params, agent.decide(state.networks)
+    def init(self, key: jax.Array, env_params: EnvParams) -> TrainState:
+        """As ``Algorithm.init``, with an empty buffer."""
+        state = super().init(key, env_params)
+        return phasic.with_buffer(
+            self.config,
+            self.envs,
+            state,
+            env_params,
+            self.agent.decide(state.networks),
+            self.config.num_policy_phases,
+        )
+
+    def iterate(self, state: TrainState, env_params: EnvParams) -> tuple[TrainState, Metrics]:
+        """Learn as PPO does (the policy phase), and remember the rollout."""
+        config, agent = self.config, self.agent
+        key, iteration = update_key(state), state.iteration
+        state, experience, metrics = gather(
+            config, self.envs, state, env_params, agent.decide(state.networks)
         )
 
         def improve_policy(
             networks: Networks, batch: Batch, key: jax.Array
         ) -> tuple[jax.Array, Metrics]:
             policy, _ = agent(networks, batch.pixels, batch.state)
-            loss, facts = policy_loss(policy, batch, config, key)
-            return loss, facts | algorithm.policy_metrics(policy.std)
+            loss, metrics = policy_loss(policy, batch, config, key)
+            return loss, metrics | policy_metrics(policy.std)
 
         def improve_value(
             networks: Networks, batch: Batch, key: jax.Array
@@ -127,39 +141,40 @@ def make_ppg(config: PPGConfig, envs: Environments) -> Algorithm:
         def improve_both(
             networks: Networks, batch: Batch, key: jax.Array
         ) -> tuple[jax.Array, Metrics]:
-            loss, facts = improve_policy(networks, batch, key)
-            more, more_facts = improve_value(networks, batch, key)
-            return loss + more, facts | more_facts
+            loss, metrics = improve_policy(networks, batch, key)
+            error, value_metrics = improve_value(networks, batch, key)
+            return loss + error, metrics | value_metrics
 
         # Passes that both make are made together, then those that one makes alone.
-        together = min(config.policy_epochs, config.value_epochs)
-        networks, moments = state.networks, state.moments
+        shared_epochs = min(config.policy_epochs, config.value_epochs)
+        networks, opt_state = state.networks, state.opt_state
+        value_network = "critic" if config.layout == "dual" else "actor"
         plan = (
-            (improve_both, together, tuple(networks)),
-            (improve_policy, config.policy_epochs - together, ("actor",)),
-            (improve_value, config.value_epochs - together, ("critic" if dual else "actor",)),
+            (improve_both, shared_epochs, tuple(networks)),
+            (improve_policy, config.policy_epochs - shared_epochs, ("actor",)),
+            (improve_value, config.value_epochs - shared_epochs, (value_network,)),
         )
-        for part, (loss, number, learners) in enumerate(plan):
-            if number:
+        for part, (loss, num_epochs, learners) in enumerate(plan):
+            if num_epochs:
                 # Far from the numbers of passes, by which keys are split.
                 part_key = key if part == 0 else jax.random.fold_in(key, 2**31 + part)
-                experience = (rollout, advantage, returns)
-                learning = {name: moments[name] for name in learners}
-                networks, learning, facts = epochs(
-                    config, loss, networks, learning, experience, number, part_key, before
+                learning = {name: opt_state[name] for name in learners}
+                networks, learning, update_metrics = update(
+                    config, loss, networks, learning, experience, num_epochs, part_key, iteration
                 )
-                moments = moments | learning
-                metrics |= facts
-        slot = before % config.num_policy_phases
+                opt_state = opt_state | learning
+                metrics |= update_metrics
+        slot = iteration % config.num_policy_phases
         state = state.replace(
             networks=networks,
-            moments=moments,
-            buffer=phasic.remember(state.buffer, slot, rollout, returns),
+            opt_state=opt_state,
+            buffer=phasic.remember(state.buffer, slot, experience),
         )
-        return state, metrics | {"learning_rate": Optimizer(config).learning_rate(before)}
+        return state, metrics | {"learning_rate": Optimizer(config).learning_rate(iteration)}
 
-    def auxiliary(state: TrainState) -> tuple[TrainState, Metrics]:
-        """Values are distilled into the actor's encoder, and its policy is kept."""
+    def auxiliary(self, state: TrainState) -> tuple[TrainState, Metrics]:
+        """Distil values into the actor's encoder, and keep its policy."""
+        config, agent = self.config, self.agent
 
         def loss(
             networks: Networks, chunk: phasic.Chunk, key: jax.Array
@@ -169,13 +184,13 @@ def make_ppg(config: PPGConfig, envs: Environments) -> Algorithm:
             error = value_loss(output.value, chunk.returns, chunk.weight)
             kl = mean(chunk.policy.kl_to(output.policy), chunk.weight)
             loss = error + config.beta_clone * kl
-            facts = {"auxiliary/value_loss": error, "auxiliary/kl": kl}
-            if dual:
+            metrics = {"auxiliary/value_loss": error, "auxiliary/kl": kl}
+            if config.layout == "dual":
                 value = agent.critic(networks["critic"], chunk.pixels, chunk.state)
                 critic_error = value_loss(value, chunk.returns, chunk.weight)
                 loss += config.aux_value_coef * critic_error
-                facts["auxiliary/critic_loss"] = critic_error
-            return loss, facts
+                metrics["auxiliary/critic_loss"] = critic_error
+            return loss, metrics
 
         return phasic.auxiliary_phase(
             config,
@@ -185,6 +200,3 @@ def make_ppg(config: PPGConfig, envs: Environments) -> Algorithm:
             config.aux_epochs,
             config.aux_minibatches,
         )
-
-    phases = config.num_policy_phases if config.aux_epochs else 0
-    return Algorithm("ppg", config, envs, init, iterate, agent.act, auxiliary, phases)

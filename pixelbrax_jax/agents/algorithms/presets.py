@@ -2,21 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
-from pixelbrax_jax.agents.algorithms.dcpg import DCPGConfig, make_dcpg
-from pixelbrax_jax.agents.algorithms.ppg import PPGConfig, make_ppg
-from pixelbrax_jax.agents.algorithms.ppo import PPOConfig, make_ppo
-from pixelbrax_jax.agents.core.algorithm import Algorithm
+from pixelbrax_jax.agents.algorithms.registry import ALGORITHMS
 from pixelbrax_jax.agents.core.config import TrainConfig
 from pixelbrax_jax.validation import check_choice
-
-CONFIGS: dict[str, type[TrainConfig]] = {"ppo": PPOConfig, "ppg": PPGConfig, "dcpg": DCPGConfig}
-"""Settings of each algorithm, by its name."""
-
-MAKERS: dict[str, Callable[..., Algorithm]] = {"ppo": make_ppo, "ppg": make_ppg, "dcpg": make_dcpg}
-"""``make(config, envs) -> Algorithm``, by the algorithm's name."""
 
 _DEACREP = {
     "backend": "spring",
@@ -58,7 +48,7 @@ _CI = {
 
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     # As each class says.
-    "default": {"ppo": {}, "ppg": {}, "dcpg": {}},
+    "default": {},
     # Lyu et al.'s scripts for Brax (the code of arXiv 2502.00021).
     "deacrep": {
         "ppo": _DEACREP | {"update_epochs": 1},
@@ -98,7 +88,7 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
 
 
 def preset(algorithm: str, name: str = "default") -> TrainConfig:
-    """Settings of a preset.
+    """Return the settings of a preset.
 
     Args:
         algorithm: ``"ppo"``, ``"ppg"`` or ``"dcpg"``.
@@ -107,6 +97,6 @@ def preset(algorithm: str, name: str = "default") -> TrainConfig:
     Raises:
         ValueError: one of them is unknown.
     """
-    check_choice("algorithm", algorithm, CONFIGS)
-    check_choice("preset", name, PRESETS)
-    return CONFIGS[algorithm](**PRESETS[name][algorithm])
+    check_choice("algorithm", algorithm, ALGORITHMS)
+    check_choice("preset", name, [n for n in PRESETS if n == "default" or algorithm in PRESETS[n]])
+    return ALGORITHMS[algorithm].config_class(**PRESETS[name].get(algorithm, {}))

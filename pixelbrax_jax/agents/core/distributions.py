@@ -10,16 +10,16 @@ _LOG_2PI = 1.8378770664093453
 
 
 class Normal(struct.PyTreeNode):
-    """Independent normal distributions, over raw actions.
+    """Independent normal distributions, over unclipped actions.
 
-    The environment gets ``action(raw)``: the raw action itself, which the environment clips to
-    [-1, 1], or its ``tanh``. Probabilities are always of the raw action that was drawn; a
-    clipped action with the density of an unclipped one would bias the gradient.
+    The environment gets ``action(unclipped)``: the unclipped action itself, which the environment
+    clips to [-1, 1], or its ``tanh``. Probabilities are always of the unclipped action that was
+    sampled; a clipped action with the density of an unclipped one would bias the gradient.
 
     Attributes:
         mean: (..., A) float32.
         std: (..., A) float32, positive.
-        squash: static; whether the action is ``tanh(raw)``.
+        squash: static; whether the action is ``tanh(unclipped)``.
     """
 
     mean: jax.Array
@@ -27,23 +27,23 @@ class Normal(struct.PyTreeNode):
     squash: bool = struct.field(pytree_node=False)
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """A raw action, (..., A)."""
+        """A unclipped action, (..., A)."""
         return self.mean + self.std * jax.random.normal(key, self.mean.shape)
 
-    def action(self, raw: jax.Array) -> jax.Array:
-        """What the environment gets for a raw action."""
-        return jnp.tanh(raw) if self.squash else raw
+    def action(self, unclipped: jax.Array) -> jax.Array:
+        """What the environment gets for a unclipped action."""
+        return jnp.tanh(unclipped) if self.squash else unclipped
 
-    def log_prob(self, raw: jax.Array) -> jax.Array:
-        """(...) logarithm of the density of ``action(raw)``.
+    def log_prob(self, unclipped: jax.Array) -> jax.Array:
+        """(...) logarithm of the density of ``action(unclipped)``.
 
         With a = tanh(u), ``log p(a) = log N(u) - sum 2 (log 2 - u - softplus(-2 u))``, the
         stable form of ``log(1 - tanh^2 u)`` (Haarnoja et al., arXiv 1801.01290, appendix C).
         """
-        scaled = (raw - self.mean) / self.std
+        scaled = (unclipped - self.mean) / self.std
         log_prob = -0.5 * scaled**2 - jnp.log(self.std) - 0.5 * _LOG_2PI
         if self.squash:
-            log_prob -= _log_slope(raw)
+            log_prob -= _log_slope(unclipped)
         return log_prob.sum(-1)
 
     def entropy(self, key: jax.Array) -> jax.Array:
@@ -70,6 +70,6 @@ class Normal(struct.PyTreeNode):
         return (jnp.log(new.std) - jnp.log(self.std) + distance - 0.5).sum(-1)
 
 
-def _log_slope(raw: jax.Array) -> jax.Array:
+def _log_slope(unclipped: jax.Array) -> jax.Array:
     """``log(1 - tanh^2 u)``, each coordinate."""
-    return 2.0 * (jnp.log(2.0) - raw - jax.nn.softplus(-2.0 * raw))
+    return 2.0 * (jnp.log(2.0) - unclipped - jax.nn.softplus(-2.0 * unclipped))

@@ -1,4 +1,4 @@
-"""The terms that the algorithms' losses are made of, and what is told of them."""
+"""The terms that the algorithms' losses are made of, and their metrics."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Batch(NamedTuple):
     Attributes:
         pixels: (B, H, W, 3 K) uint8.
         state: (B, S) float32, or None.
-        raw: (B, A) float32, raw actions.
+        unclipped_action: (B, A) float32.
         log_prob, value: (B,) float32, of the policy and value that played.
         advantage, returns: (B,) float32.
         weight: (B,) float32, 1 or, for steps that teach nothing, 0.
@@ -28,7 +28,7 @@ class Batch(NamedTuple):
 
     pixels: jax.Array
     state: jax.Array | None
-    raw: jax.Array
+    unclipped_action: jax.Array
     log_prob: jax.Array
     value: jax.Array
     advantage: jax.Array
@@ -48,7 +48,7 @@ def batch_at(
     return Batch(
         pixels=observations(frames, times, config.random_shift),
         state=None if frames.state is None else at_times(frames.state, times),
-        raw=at_times(rollout.raw, times),
+        unclipped_action=at_times(rollout.unclipped_action, times),
         log_prob=at_times(rollout.log_prob, times),
         value=at_times(rollout.value, times),
         advantage=at_times(advantage, times),
@@ -85,7 +85,7 @@ def policy_loss(
     advantage = batch.advantage
     if config.normalize_advantage == "minibatch":
         advantage = normalized(advantage, batch.weight)
-    log_ratio = policy.log_prob(batch.raw) - batch.log_prob
+    log_ratio = policy.log_prob(batch.unclipped_action) - batch.log_prob
     ratio = jnp.exp(log_ratio)
     clipped = jnp.clip(ratio, 1.0 - config.clip_coef, 1.0 + config.clip_coef)
     objective = mean(jnp.minimum(ratio * advantage, clipped * advantage), batch.weight)
@@ -110,3 +110,8 @@ def clipped_value_loss(value: jax.Array, batch: Batch, clip_coef: float) -> jax.
     near = batch.value + jnp.clip(value - batch.value, -clip_coef, clip_coef)
     error = jnp.maximum((value - batch.returns) ** 2, (near - batch.returns) ** 2)
     return 0.5 * mean(error, batch.weight)
+
+
+def policy_metrics(std: jax.Array) -> Metrics:
+    """Return what is logged of a policy's standard deviations, (..., A)."""
+    return {"policy/std_min": std.min(), "policy/std_mean": std.mean(), "policy/std_max": std.max()}

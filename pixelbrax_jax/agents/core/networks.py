@@ -210,7 +210,7 @@ class Dynamics(nn.Module):
 
     @nn.compact
     def __call__(self, features: jax.Array, action: jax.Array, following: jax.Array) -> jax.Array:
-        """(B,) logits of (B, F) features, (B, A) raw actions and (B, F) features."""
+        """(B,) logits of (B, F) features, (B, A) unclipped actions and (B, F) features."""
         x = jnp.concatenate([features, action, following], axis=-1)
         for _ in range(2):
             x = nn.relu(_dense(256)(x))

@@ -1,4 +1,4 @@
-"""Adam for several networks, each with its own moments and its own clipped gradient."""
+"""Adam for several networks, each with its own state and its own clipped gradient."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Optimizer:
         self._adam = optax.scale_by_adam(eps=config.adam_eps)
 
     def init(self, networks: Networks) -> Networks:
-        """Moments of the named networks."""
+        """Return the optimiser's state of the named networks."""
         return {name: self._adam.init(params) for name, params in networks.items()}
 
     def learning_rate(self, iteration: jax.Array) -> jax.Array:
@@ -34,26 +34,26 @@ class Optimizer:
         return rate
 
     def step(
-        self, networks: Networks, moments: Networks, gradients: Networks, iteration: jax.Array
+        self, networks: Networks, opt_state: Networks, gradients: Networks, iteration: jax.Array
     ) -> tuple[Networks, Networks, dict[str, jax.Array]]:
-        """One step of those networks that have gradients; the others stay.
+        """Step those networks that have gradients; the others stay.
 
         Args:
             networks: parameters.
-            moments: of ``init``.
+            opt_state: of ``init``.
             gradients: of some of the networks.
             iteration: () uint32, of the step size.
 
         Returns:
-            Parameters, moments, and the gradients' global norms before clipping.
+            Parameters, the optimiser's state, and the gradients' global norms before clipping.
         """
-        networks, moments, norms = dict(networks), dict(moments), {}
+        networks, opt_state, norms = dict(networks), dict(opt_state), {}
         rate = self.learning_rate(iteration)
         for name, gradient in gradients.items():
             norm = norms[name] = optax.tree.norm(gradient)
             if self._config.max_grad_norm:
                 scale = jnp.minimum(1.0, self._config.max_grad_norm / (norm + 1e-6))
                 gradient = jax.tree.map(lambda g, scale=scale: g * scale, gradient)
-            updates, moments[name] = self._adam.update(gradient, moments[name])
+            updates, opt_state[name] = self._adam.update(gradient, opt_state[name])
             networks[name] = jax.tree.map(lambda p, u: p - rate * u, networks[name], updates)
-        return networks, moments, norms
+        return networks, opt_state, norms

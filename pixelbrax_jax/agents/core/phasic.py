@@ -1,4 +1,4 @@
-"""What PPG and DCPG share: several rollouts remembered, and a phase that learns from all of them.
+"""What PPG and DCPG share: a buffer of rollouts, and a phase that learns from all of them.
 
 A buffer holds P rollouts of N environments. The phase cuts each rollout into equal chunks of
 consecutive steps, and each of its minibatches has one chunk of every environment.
@@ -13,19 +13,20 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from pixelbrax_jax.agents.core.algorithm import TrainState, auxiliary_key, play
 from pixelbrax_jax.agents.core.config import TrainConfig, check_divides
 from pixelbrax_jax.agents.core.distributions import Normal
+from pixelbrax_jax.agents.core.env_axis import along_envs, as_declared
+from pixelbrax_jax.agents.core.experience import Experience, gather
 from pixelbrax_jax.agents.core.losses import Metrics
 from pixelbrax_jax.agents.core.optimizer import Networks, Optimizer
 from pixelbrax_jax.agents.core.rollout import (
     Decision,
     Environments,
     Frames,
-    Rollout,
     minibatch_times,
     observations,
 )
+from pixelbrax_jax.agents.core.train_state import TrainState, auxiliary_key
 from pixelbrax_jax.types import EnvParams
 from pixelbrax_jax.validation import check_positive_int
 
@@ -35,17 +36,17 @@ class Buffer(struct.PyTreeNode):
 
     Attributes:
         frames: what was seen.
-        raw: (P, T, N, A) float32, raw actions.
+        unclipped_action: (P, T, N, A) float32.
         returns: (P, T, N) float32.
         done: (P, T, N) bool, an episode ended.
         valid: (P, T, N) bool, the step did not merely begin an episode.
     """
 
-    frames: Frames
-    raw: jax.Array
-    returns: jax.Array
-    done: jax.Array
-    valid: jax.Array
+    frames: Frames = as_declared(leading_axes=1)
+    unclipped_action: jax.Array = along_envs(2)
+    returns: jax.Array = along_envs(2)
+    done: jax.Array = along_envs(2)
+    valid: jax.Array = along_envs(2)
 
 
 class Chunk(NamedTuple):
@@ -54,7 +55,7 @@ class Chunk(NamedTuple):
     Attributes:
         pixels: (B, H, W, 3 K) uint8.
         state: (B, S) float32, or None.
-        raw: (B, A) float32.
+        unclipped_action: (B, A) float32.
         returns: (B,) float32.
         weight: (B,) float32, 0 for steps that teach nothing.
         done: (B,) bool.
@@ -64,7 +65,7 @@ class Chunk(NamedTuple):
 
     pixels: jax.Array
     state: jax.Array | None
-    raw: jax.Array
+    unclipped_action: jax.Array
     returns: jax.Array
     weight: jax.Array
     done: jax.Array
@@ -104,7 +105,7 @@ def check_phases(
     )
 
 
-def begin_phases(
+def with_buffer(
     config: TrainConfig,
     envs: Environments,
     state: TrainState,
@@ -112,31 +113,29 @@ def begin_phases(
     decide: Callable[..., Decision],
     num_policy_phases: int,
 ) -> TrainState:
-    """``state`` with an empty buffer and a second optimiser."""
+    """Return ``state`` with an empty buffer and a second optimiser."""
 
     def one() -> Buffer:
-        _, rollout, _, returns, _ = play(config, envs, state, env_params, decide)
-        return _entry(rollout, returns)
+        return _entry(gather(config, envs, state, env_params, decide)[1])
 
     buffer = jax.tree.map(
         lambda x: jnp.zeros((num_policy_phases, *x.shape), x.dtype), jax.eval_shape(one)
     )
-    return state.replace(buffer=buffer, aux_moments=Optimizer(config).init(state.networks))
+    return state.replace(buffer=buffer, aux_opt_state=Optimizer(config).init(state.networks))
 
 
-def remember(buffer: Buffer, slot: jax.Array, rollout: Rollout, returns: jax.Array) -> Buffer:
-    """The buffer with one rollout more.
+def remember(buffer: Buffer, slot: jax.Array, experience: Experience) -> Buffer:
+    """Return the buffer with one rollout more.
 
     Args:
         buffer: with P rollouts.
         slot: () where to put it, in [0, P).
-        rollout: what was played.
-        returns: (T, N) float32.
+        experience: the rollout.
     """
     return jax.tree.map(
         lambda whole, one: jax.lax.dynamic_update_index_in_dim(whole, one, slot, 0),
         buffer,
-        _entry(rollout, returns),
+        _entry(experience),
     )
 
 
@@ -180,15 +179,15 @@ def auxiliary_phase(
     squash = config.policy == "tanh_gaussian"
 
     def step(carry: Any, inputs: tuple[jax.Array, jax.Array]) -> tuple[Any, Metrics]:
-        networks, moments = carry
+        networks, opt_state = carry
         which, key = inputs
         mean, std = (_of_each(x, which) for x in old)
         chunk = _chunk(config, buffer, which, parts, Normal(mean, std, squash))
-        gradients, facts = jax.grad(loss, has_aux=True)(networks, chunk, key)
-        gradients = {name: gradients[name] for name in moments}
-        networks, moments, norms = optimizer.step(networks, moments, gradients, iteration)
-        facts |= {f"auxiliary/grad_norm/{name}": norm for name, norm in norms.items()}
-        return (after_step(networks), moments), facts
+        gradients, metrics = jax.grad(loss, has_aux=True)(networks, chunk, key)
+        gradients = {name: gradients[name] for name in opt_state}
+        networks, opt_state, norms = optimizer.step(networks, opt_state, gradients, iteration)
+        metrics |= {f"auxiliary/grad_norm/{name}": norm for name, norm in norms.items()}
+        return (after_step(networks), opt_state), metrics
 
     def epoch(carry: Any, key: jax.Array) -> tuple[Any, Metrics]:
         order = minibatch_times(
@@ -197,14 +196,17 @@ def auxiliary_phase(
         keys = jax.random.split(jax.random.fold_in(key, 1), num_minibatches)
         return jax.lax.scan(step, carry, (order[:, 0], keys))
 
-    carry = (state.networks, state.aux_moments)
-    (networks, moments), facts = jax.lax.scan(epoch, carry, jax.random.split(key, number))
-    state = state.replace(networks=networks, aux_moments=moments)
-    return state, jax.tree.map(jnp.mean, facts)
+    carry = (state.networks, state.aux_opt_state)
+    (networks, opt_state), metrics = jax.lax.scan(epoch, carry, jax.random.split(key, number))
+    state = state.replace(networks=networks, aux_opt_state=opt_state)
+    return state, jax.tree.map(jnp.mean, metrics)
 
 
-def _entry(rollout: Rollout, returns: jax.Array) -> Buffer:
-    return Buffer(rollout.frames, rollout.raw, returns, rollout.done, rollout.valid)
+def _entry(experience: Experience) -> Buffer:
+    rollout = experience.rollout
+    return Buffer(
+        rollout.frames, rollout.unclipped_action, experience.returns, rollout.done, rollout.valid
+    )
 
 
 def _of_each(chunks: jax.Array, which: jax.Array) -> jax.Array:
@@ -243,7 +245,7 @@ def _chunk(
     return Chunk(
         pixels=observations(seen, times, config.random_shift),
         state=None if frames.state is None else flat(frames.state),
-        raw=flat(buffer.raw),
+        unclipped_action=flat(buffer.unclipped_action),
         returns=flat(buffer.returns),
         weight=flat(buffer.valid).astype(jnp.float32),
         done=flat(buffer.done),

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from pixelbrax_jax.agents.core.counter import StepCounter
+from pixelbrax_jax.agents.core.env_axis import along_envs, without_envs
 
 
 def gae(
@@ -67,10 +68,10 @@ class RewardScaler(struct.PyTreeNode):
         square: () float32, mean squared deviation from the mean.
     """
 
-    discounted: jax.Array
-    count: StepCounter
-    mean: jax.Array
-    square: jax.Array
+    discounted: jax.Array = along_envs(0)
+    count: StepCounter = without_envs()
+    mean: jax.Array = without_envs()
+    square: jax.Array = without_envs()
 
     @classmethod
     def start(cls, num_envs: int) -> RewardScaler:
@@ -112,14 +113,16 @@ class RewardScaler(struct.PyTreeNode):
         weight = valid / jnp.maximum(number, 1)
         mean = jnp.sum(weight * seen)
         square = jnp.sum(weight * (seen - mean) ** 2)
-        # Chan et al.'s union of two samples, in shares of their sizes.
+        # Chan et al.'s union of two samples, in fractions of their sizes.
         count = self.count + number
-        share = number.astype(jnp.float32) / jnp.maximum(count.as_float(), 1.0)
+        fraction = number.astype(jnp.float32) / jnp.maximum(count.as_float(), 1.0)
         shift = mean - self.mean
         scaler = RewardScaler(
             discounted=after,
             count=count,
-            mean=self.mean + share * shift,
-            square=(1 - share) * self.square + share * square + share * (1 - share) * shift**2,
+            mean=self.mean + fraction * shift,
+            square=(1 - fraction) * self.square
+            + fraction * square
+            + fraction * (1 - fraction) * shift**2,
         )
         return scaler, jnp.clip(reward / scaler.scale, -10.0, 10.0)

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from pixelbrax_jax.agents.core.env_axis import along_envs
 from pixelbrax_jax.types import EnvParams, EnvState, Timestep
 
 
@@ -53,10 +54,10 @@ class Frames(struct.PyTreeNode):
         state: (T, N, S) float32, the simulator's state; None unless a critic sees it.
     """
 
-    pixels: jax.Array
-    age: jax.Array
-    shift: jax.Array
-    state: jax.Array | None
+    pixels: jax.Array = along_envs(1)
+    age: jax.Array = along_envs(1)
+    shift: jax.Array = along_envs(0)
+    state: jax.Array | None = along_envs(1)
 
 
 class Rollout(struct.PyTreeNode):
@@ -64,7 +65,7 @@ class Rollout(struct.PyTreeNode):
 
     Attributes:
         frames: what was seen.
-        raw: (T, N, A) float32, raw actions.
+        unclipped_action: (T, N, A) float32.
         log_prob: (T, N) float32, of the actions when they were drawn.
         value: (T, N) float32, of the observations, at that time.
         last_value: (N,) float32, of the observation after the last step.
@@ -78,7 +79,7 @@ class Rollout(struct.PyTreeNode):
     """
 
     frames: Frames
-    raw: jax.Array
+    unclipped_action: jax.Array
     log_prob: jax.Array
     value: jax.Array
     last_value: jax.Array
@@ -96,9 +97,9 @@ class Rollout(struct.PyTreeNode):
 
 
 class Decision(NamedTuple):
-    """What an agent does about N observations: raw and final action, log-probability, value."""
+    """What an agent does about N observations: its actions, their log-probabilities, values."""
 
-    raw: jax.Array
+    unclipped_action: jax.Array
     action: jax.Array
     log_prob: jax.Array
     value: jax.Array
@@ -146,8 +147,8 @@ def collect(
         begins = env_state.done
         env_state, timestep = envs.step(env_state, choice.action, env_params)
         kept = (pixels[..., -3:], age, state)
-        facts = (
-            choice.raw,
+        outcome = (
+            choice.unclipped_action,
             choice.log_prob,
             choice.value,
             timestep.reward,
@@ -158,19 +159,19 @@ def collect(
             timestep.info["episode_length"],
         )
         age = jnp.where(begins, 0, jnp.minimum(age + 1, stack - 1))
-        return (env_state, age), (kept, facts)
+        return (env_state, age), (kept, outcome)
 
     # The stack that is there already needs no frames of before to be left out: an episode that
     # has just begun repeats its first frame in it.
     start = (env_state, jnp.full(num_envs, stack - 1))
-    (env_state, _), (kept, facts) = jax.lax.scan(step, start, jnp.arange(num_steps))
+    (env_state, _), (kept, outcome) = jax.lax.scan(step, start, jnp.arange(num_steps))
     newest, age, state = kept
     pixels, last_state = split_obs(envs.obs(env_state))
     last_seen = shifted(pixels, shift, random_shift)
     last = decide(last_seen, last_state, jax.random.fold_in(key, num_steps))
     frames = Frames(pixels=jnp.concatenate([before, newest]), age=age, shift=shift, state=state)
-    raw, log_prob, value, *rest = facts
-    return env_state, Rollout(frames, raw, log_prob, value, last.value, *rest)
+    unclipped_action, log_prob, value, *rest = outcome
+    return env_state, Rollout(frames, unclipped_action, log_prob, value, last.value, *rest)
 
 
 def observations(frames: Frames, times: jax.Array, random_shift: int = 0) -> jax.Array:

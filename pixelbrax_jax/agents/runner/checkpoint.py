@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
-from pixelbrax_jax.agents.runner.sharding import anywhere
+from pixelbrax_jax.agents.runner.sharding import any_process
 
 FORMAT = 2
 """Number of the format; raised when what is stored changes its meaning."""
@@ -116,7 +116,7 @@ class Checkpoints:
             free = shutil.disk_usage(self.folder).free
         except OSError as error:
             raise self._failed(error) from error
-        if anywhere(free < _ROOM * size):
+        if any_process(free < _ROOM * size):
             raise DiskFullError(
                 f"a checkpoint takes {_bytes(size)}, but {self.folder} has only {_bytes(free)} "
                 "free."

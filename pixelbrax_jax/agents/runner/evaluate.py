@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax
@@ -13,7 +13,7 @@ import numpy as np
 from pixelbrax_jax.agents.core.algorithm import Algorithm
 from pixelbrax_jax.agents.core.config import TrainConfig, make_env
 from pixelbrax_jax.agents.core.optimizer import Networks
-from pixelbrax_jax.compilation import compiler_options
+from pixelbrax_jax.compilation import jit
 from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.types import EnvParams, EnvState
@@ -95,7 +95,7 @@ class Evaluator:
         seed: int = 1_000_003,
         deterministic: bool = True,
     ) -> None:
-        """Compiles nothing yet.
+        """Compile nothing yet.
 
         Args:
             algorithm: whose ``act`` plays.
@@ -103,46 +103,54 @@ class Evaluator:
             env_params: of it.
             num_episodes: E.
             seed: of the episodes.
-            deterministic: whether the mean action is played, or a drawn one.
+            deterministic: whether the mean action is played, or a sampled one.
         """
-        self._params = env_params
-        self._key = jax.random.key(seed)
         envs = VectorPixelEnv(env, num_episodes, "disabled")
-        num_steps = -(-int(env_params.episode_length) // env.action_repeat)
-
-        def play(networks: Networks, key: jax.Array, params: EnvParams) -> tuple[Any, Any]:
-            def goes_on(carry: tuple[EnvState, jax.Array, Any]) -> jax.Array:
-                _, number, (over, _, _) = carry
-                return ~over.all() & (number < num_steps)
-
-            def step(carry: tuple[EnvState, jax.Array, Any]) -> tuple[EnvState, jax.Array, Any]:
-                state, number, (over, returns, lengths) = carry
-                draw = None if deterministic else jax.random.fold_in(draws, number)
-                action = algorithm.act(networks, envs.obs(state), draw)
-                state, timestep = envs.step(state, action, params)
-                # Beyond its end an episode goes on without meaning.
-                returns = jnp.where(over, returns, timestep.info["episode_return"])
-                lengths = jnp.where(over, lengths, timestep.info["episode_length"])
-                over |= timestep.terminated | timestep.truncated
-                return state, number + 1, (over, returns, lengths)
-
-            # Episode i begins from fold_in(key, i).
-            draws = jax.random.fold_in(key, num_episodes)
-            state, _ = envs.reset(key, params)
-            nothing = jnp.zeros(num_episodes)
-            results = (nothing.astype(bool), nothing, nothing.astype(jnp.int32))
-            carry = jax.lax.while_loop(goes_on, step, (state, jnp.int32(0), results))
-            return carry[2][1], carry[2][2]
-
-        self._play: Callable[..., tuple[Any, Any]] = jax.jit(
-            play, compiler_options=compiler_options()
-        )
+        self._play = partial(_play, algorithm, envs, deterministic)
+        self._key = jax.random.key(seed)
+        self._params = env_params
 
     def __call__(self, networks: Networks) -> Result:
-        """The episodes of a policy."""
+        """Play the episodes of a policy."""
         actor = {"actor": networks["actor"]}
         returns, lengths = jax.device_get(self._play(actor, self._key, self._params))
         return Result(returns=returns.astype(np.float64), lengths=lengths)
+
+
+@jit(static_argnums=(0, 1, 2))
+def _play(
+    algorithm: Algorithm,
+    envs: VectorPixelEnv,
+    deterministic: bool,
+    networks: Networks,
+    key: jax.Array,
+    params: EnvParams,
+) -> tuple[jax.Array, jax.Array]:
+    """Return returns and lengths of episodes, (E,) each."""
+    num_steps = -(-params.episode_length // envs.env.action_repeat)
+
+    def goes_on(carry: tuple[EnvState, jax.Array, Any]) -> jax.Array:
+        _, number, (over, _, _) = carry
+        return ~over.all() & (number < num_steps)
+
+    def step(carry: tuple[EnvState, jax.Array, Any]) -> tuple[EnvState, jax.Array, Any]:
+        state, number, (over, returns, lengths) = carry
+        action_key = None if deterministic else jax.random.fold_in(action_keys, number)
+        action = algorithm.act(networks, envs.obs(state), action_key)
+        state, timestep = envs.step(state, action, params)
+        # Beyond its end an episode goes on without meaning.
+        returns = jnp.where(over, returns, timestep.info["episode_return"])
+        lengths = jnp.where(over, lengths, timestep.info["episode_length"])
+        over |= timestep.terminated | timestep.truncated
+        return state, number + 1, (over, returns, lengths)
+
+    # Episode i begins from fold_in(key, i).
+    action_keys = jax.random.fold_in(key, envs.num_envs)
+    state, _ = envs.reset(key, params)
+    nothing = jnp.zeros(envs.num_envs)
+    results = (nothing.astype(bool), nothing, nothing.astype(jnp.int32))
+    carry = jax.lax.while_loop(goes_on, step, (state, jnp.int32(0), results))
+    return carry[2][1], carry[2][2]
 
 
 @dataclass(frozen=True)

@@ -6,11 +6,11 @@ import math
 from collections.abc import Callable
 
 import jax
-from jax.sharding import Mesh
 
-from pixelbrax_jax.agents.core.algorithm import Algorithm, TrainState
+from pixelbrax_jax.agents.core.algorithm import Algorithm
+from pixelbrax_jax.agents.core.train_state import TrainState
 from pixelbrax_jax.agents.runner.checkpoint import nbytes
-from pixelbrax_jax.agents.runner.sharding import anywhere
+from pixelbrax_jax.agents.runner.sharding import any_process, mesh_of
 
 
 def check_memory(algorithm: Algorithm, template: TrainState, report: Callable[[str], None]) -> None:
@@ -29,7 +29,7 @@ def check_memory(algorithm: Algorithm, template: TrainState, report: Callable[[s
     rollout = frame * (config.num_steps + config.frame_stack - 1) * template.iteration.size
     buffer, parts = nbytes(template.buffer), _memories(algorithm)
     # What belongs to environments is spread over the devices; the rest is the same on all.
-    alike = nbytes((template.networks, template.moments, template.aux_moments))
+    alike = nbytes((template.networks, template.opt_state, template.aux_opt_state))
     stored = alike + (rollout + nbytes(template) - alike) / parts
     report(
         f"stored: rollout {rollout / 1e9:.2f} GB, auxiliary buffer {buffer / 1e9:.2f} GB, all "
@@ -37,7 +37,7 @@ def check_memory(algorithm: Algorithm, template: TrainState, report: Callable[[s
     )
     budget = config.memory_budget_gb
     limit = budget * 1e9 if budget is not None else _device_memory()
-    if anywhere(stored > limit):
+    if any_process(stored > limit):
         where = f" in each of {parts} memories" if parts > 1 else ""
         raise MemoryError(
             f"rollout and state take {stored / 1e9:.2f} GB{where}, of {limit / 1e9:.2f} GB that "
@@ -48,7 +48,7 @@ def check_memory(algorithm: Algorithm, template: TrainState, report: Callable[[s
 
 def _memories(algorithm: Algorithm) -> int:
     """Memories over which environments are spread; devices of a CPU share one."""
-    mesh: Mesh | None = getattr(algorithm.envs, "mesh", None)
+    mesh = mesh_of(algorithm)
     if mesh is None:
         return 1
     return jax.process_count() if jax.default_backend() == "cpu" else int(mesh.size)

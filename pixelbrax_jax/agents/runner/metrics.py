@@ -22,8 +22,8 @@ _MAX_WAITING = 64 * 2**20
 """Bytes kept in memory for a file that cannot be written."""
 
 
-def together(records: list[Mapping[str, Any]]) -> dict[str, float]:
-    """One record of several iterations.
+def summarize(records: list[Mapping[str, Any]]) -> dict[str, float]:
+    """Return one record of several iterations.
 
     Episodes count equally, whichever iteration they ended in; all else is the mean over
     iterations. Without a finished episode there is no return and no length.

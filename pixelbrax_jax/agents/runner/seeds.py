@@ -3,48 +3,69 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax.agents.core.algorithm import Algorithm
+from pixelbrax_jax.agents.core.losses import Metrics
+from pixelbrax_jax.agents.core.train_state import TrainState
+from pixelbrax_jax.types import EnvParams
 
 
-def over_seeds(algorithm: Algorithm) -> Algorithm:
-    """The algorithm for (S,) keys, each of which is a run of its own.
+@dataclass(frozen=True)
+class Runs:
+    """One or several runs of an algorithm, stepped by one program.
 
-    States and metrics get a leading axis S. ``act`` stays that of one run. On an accelerator the
-    runs go side by side. On a CPU they take turns within the program: convolutions with a kernel
-    for each run are slow there, and gain nothing.
+    With several, states and metrics have a leading axis S. On an accelerator the runs go side by
+    side. On a CPU they take turns within the program: convolutions with a kernel for each run are
+    slow there, and gain nothing.
+
+    Attributes:
+        algorithm: with its settings.
+        num_seeds: S.
     """
-    auxiliary = algorithm.auxiliary
-    return replace(
-        algorithm,
-        init=_mapped(algorithm.init),
-        iterate=_mapped(algorithm.iterate),
-        auxiliary=None if auxiliary is None else _mapped(auxiliary),
-    )
 
+    algorithm: Algorithm
+    num_seeds: int = 1
 
-def _mapped(function: Callable[..., Any]) -> Callable[..., Any]:
-    """``function`` over the leading axis of its first argument."""
+    def keys(self, seed: int | jax.Array) -> jax.Array:
+        """Return the keys of the seeds ``seed``, ``seed + 1``, ...: () of one run, else (S,)."""
+        if self.num_seeds == 1:
+            return jax.random.key(seed)
+        return jnp.stack([jax.random.key(seed + i) for i in range(self.num_seeds)])
 
-    def mapped(first: Any, *others: Any) -> Any:
+    def init(self, seed: int | jax.Array, env_params: EnvParams) -> TrainState:
+        """Return the state before the first iteration.
+
+        Args:
+            seed: () uint32, of the first run.
+            env_params: of the environments.
+        """
+        return self._each(self.algorithm.init, self.keys(seed), env_params)
+
+    def iterate(self, state: TrainState, env_params: EnvParams) -> tuple[TrainState, Metrics]:
+        """As ``Algorithm.iterate``."""
+        return self._each(self.algorithm.iterate, state, env_params)
+
+    def auxiliary(self, state: TrainState) -> tuple[TrainState, Metrics]:
+        """As ``Algorithm.auxiliary``."""
+        return self._each(self.algorithm.auxiliary, state)
+
+    def split(self, tree: Any) -> list[Any]:
+        """Return each run's part of a tree."""
+        if self.num_seeds == 1:
+            return [tree]
+        return [jax.tree.map(lambda x, i=i: x[i], tree) for i in range(self.num_seeds)]
+
+    def _each(self, function: Callable[..., Any], first: Any, *others: Any) -> Any:
+        """Map ``function`` over the runs of its first argument."""
+        if self.num_seeds == 1:
+            return function(first, *others)
+
         def one(first: Any) -> Any:
             return function(first, *others)
 
         return jax.lax.map(one, first) if jax.default_backend() == "cpu" else jax.vmap(one)(first)
-
-    return mapped
-
-
-def keys_of(seed: int, number: int) -> jax.Array:
-    """Keys of the seeds ``seed``, ``seed + 1``, ...; (number,)."""
-    return jnp.stack([jax.random.key(seed + i) for i in range(number)])
-
-
-def of_seed(tree: Any, index: int) -> Any:
-    """One run of several."""
-    return jax.tree.map(lambda leaf: leaf[index], tree)

@@ -1,8 +1,8 @@
-"""Where the parts of a training state live, when there are several devices.
+"""A training state spread over several devices, and what all processes must agree on.
 
-What belongs to environments is spread along them; networks, their moments and counters are the
-same everywhere. A minibatch has equally many steps of every environment, so that each device
-computes the gradient of its own, and XLA adds them up.
+What belongs to environments is spread along them; everything else is the same on every device. A
+minibatch has equally many steps of every environment, so that each device computes the gradient of
+its own, and XLA adds them up.
 """
 
 from __future__ import annotations
@@ -14,43 +14,50 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from pixelbrax_jax.agents.core.algorithm import Algorithm
+from pixelbrax_jax.agents.core.env_axis import env_axes
 from pixelbrax_jax.envs.sharded import AXIS
 
 
+def mesh_of(algorithm: Algorithm) -> Mesh | None:
+    """Return the devices over which an algorithm's environments are spread, if they are."""
+    mesh: Mesh | None = getattr(algorithm.envs, "mesh", None)
+    return mesh
+
+
 def state_shardings(mesh: Mesh, template: Any, num_seeds: int = 1) -> Any:
-    """A sharding for each leaf of a ``TrainState``.
+    """Return a sharding for each leaf of a ``TrainState``.
 
     Args:
         mesh: devices along an axis ``"envs"``.
         template: the state, or its ``jax.eval_shape``.
         num_seeds: if more than 1, leaves have a leading axis of that size.
+
+    Raises:
+        TypeError: a field does not say where its environments are.
     """
 
-    def of(path: Any, leaf: Any) -> NamedSharding:
-        del leaf
-        name = jax.tree_util.keystr(path, simple=True, separator=".")
-        if name.startswith("env_state.") or name == "scaler.discounted":
-            before = 0
-        elif name == "buffer.frames.shift":
-            before = 1
-        elif name.startswith("buffer."):
-            before = 2
-        else:
-            return NamedSharding(mesh, PartitionSpec())
-        before += num_seeds > 1
-        return NamedSharding(mesh, PartitionSpec(*[None] * before, AXIS))
+    def sharding(axis: int) -> NamedSharding:
+        if axis < 0:
+            return replicated(mesh)
+        return NamedSharding(mesh, PartitionSpec(*[None] * (axis + (num_seeds > 1)), AXIS))
 
-    return jax.tree_util.tree_map_with_path(of, template)
+    return jax.tree.map(sharding, env_axes(template))
 
 
-def everywhere(mesh: Mesh, tree: Any) -> Any:
-    """The same values on all devices of all processes."""
-    same = NamedSharding(mesh, PartitionSpec())
+def replicated(mesh: Mesh) -> NamedSharding:
+    """Return the sharding of what is the same on all devices."""
+    return NamedSharding(mesh, PartitionSpec())
+
+
+def replicate(mesh: Mesh, tree: Any) -> Any:
+    """Put the same values on all devices of all processes."""
+    same = replicated(mesh)
     return jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf), same), tree)
 
 
-def anywhere(here: bool) -> bool:
-    """Whether something is so in any process, when all must go the same way."""
+def any_process(here: bool) -> bool:
+    """Return whether something is so in any process, when all must go the same way."""
     return bool(highest(int(here))[0])
 
 

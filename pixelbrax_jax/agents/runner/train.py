@@ -3,32 +3,38 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from pixelbrax_jax.agents.core.algorithm import Algorithm, TrainState
+from pixelbrax_jax.agents.core.algorithm import Algorithm
 from pixelbrax_jax.agents.core.config import describe
-from pixelbrax_jax.agents.core.optimizer import Networks
+from pixelbrax_jax.agents.core.train_state import TrainState
+from pixelbrax_jax.agents.runner import programs
 from pixelbrax_jax.agents.runner.checkpoint import CheckpointError, Checkpoints
 from pixelbrax_jax.agents.runner.evaluate import Evaluator, Result, interquartile_mean, make_splits
 from pixelbrax_jax.agents.runner.export import save_policy
 from pixelbrax_jax.agents.runner.interruption import StopRequest, stop_requests
 from pixelbrax_jax.agents.runner.memory import check_memory
-from pixelbrax_jax.agents.runner.metrics import MetricsWriter, NoWriter, together
+from pixelbrax_jax.agents.runner.metrics import MetricsWriter, NoWriter, summarize
 from pixelbrax_jax.agents.runner.progress import Bar, Messages, reason
 from pixelbrax_jax.agents.runner.run_config import RunConfig
 from pixelbrax_jax.agents.runner.saving import Saver
-from pixelbrax_jax.agents.runner.seeds import keys_of, of_seed, over_seeds
-from pixelbrax_jax.agents.runner.sharding import anywhere, everywhere, highest, state_shardings
-from pixelbrax_jax.compilation import compiler_options
+from pixelbrax_jax.agents.runner.schedule import Schedule
+from pixelbrax_jax.agents.runner.seeds import Runs
+from pixelbrax_jax.agents.runner.sharding import (
+    any_process,
+    highest,
+    mesh_of,
+    replicate,
+    state_shardings,
+)
 from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.types import EnvParams
 
@@ -75,7 +81,7 @@ def run(
     report: Callable[[str], None] = _silent,
     splits: Splits | None = None,
 ) -> Outcome:
-    """Trains to the end, or until it is interrupted.
+    """Train to the end, or until it is interrupted.
 
     Ctrl-C, SIGTERM, or SIGHUP, lets the iteration finish, and one that waits behind it, writes a
     checkpoint and returns. What reports, draws or logs may fail without an effect on the training.
@@ -109,102 +115,105 @@ def _run(
     splits: Splits | None,
     stop: StopRequest,
 ) -> Outcome:
-    folder = Path(options.output_dir)
-    key = jax.random.key(options.seed)
-    if options.seeds > 1:
-        algorithm = over_seeds(algorithm)
-        key = keys_of(options.seed, options.seeds)
-    template = jax.eval_shape(algorithm.init, key, env_params)
-    mesh: Mesh | None = getattr(algorithm.envs, "mesh", None)
-    shardings, same = None, None
+    runs, mesh = Runs(algorithm, options.seeds), mesh_of(algorithm)
+    seed = jnp.uint32(options.seed)
     if mesh is not None:
-        shardings = state_shardings(mesh, template, options.seeds)
-        same = NamedSharding(mesh, PartitionSpec())
-        env_params = everywhere(mesh, env_params)
+        env_params = replicate(mesh, env_params)
+    template = jax.eval_shape(runs.init, seed, env_params)
+    if mesh is not None:
         template = jax.tree.map(
             lambda leaf, sharding: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding),
             template,
-            shardings,
+            state_shardings(mesh, template, options.seeds),
         )
     check_memory(algorithm, template, report)
     checkpoints = Checkpoints(
-        folder / "checkpoints",
+        Path(options.output_dir) / "checkpoints",
         _settings(algorithm, options),
         algorithm.name,
         keep=options.keep_checkpoints,
     )
     try:
-        found = bool(checkpoints.steps())
-        if anywhere(found) and anywhere(not found):
-            raise CheckpointError(
-                f"only some processes see checkpoints in {checkpoints.folder}; they must share "
-                "--output-dir."
-            )
-        if options.resume == "latest" and found:
+        if _goes_on(checkpoints, options, report):
             state = checkpoints.restore(template)
             if others := checkpoints.other_versions():
                 report(f"going on under other versions, so not to the bit: {', '.join(others)}")
             report(f"going on from the checkpoint of {_steps(algorithm, state)} steps")
         else:
-            if found:
-                raise FileExistsError(
-                    f"{checkpoints.folder} has checkpoints of an earlier run: go on with "
-                    "--resume latest, or give another --output-dir."
-                )
-            if options.resume == "latest":
-                report(f"no checkpoint in {checkpoints.folder}: a new run begins")
-            init = jax.jit(lambda params: algorithm.init(key, params), out_shardings=shardings)
-            state = init(env_params)
-        placed = None if mesh is None else (shardings, same)
+            state = programs.init(runs, seed, env_params)
         if options.num_evals and splits is None:
             splits = make_splits(algorithm.config)
-        loop = _Run(algorithm, env_params, options, checkpoints, report, placed, splits or {}, stop)
-        return loop.until_end(state)
+        return _Run(runs, env_params, options, checkpoints, report, splits or {}, stop).train(state)
     finally:
         checkpoints.close()
 
 
+def _goes_on(checkpoints: Checkpoints, options: RunConfig, report: Messages) -> bool:
+    """Return whether the run goes on from a checkpoint.
+
+    Raises:
+        FileExistsError: there is one of an earlier run.
+        CheckpointError: only some processes see it.
+    """
+    found = bool(checkpoints.steps())
+    if any_process(found) and any_process(not found):
+        raise CheckpointError(
+            f"only some processes see checkpoints in {checkpoints.folder}; they must share "
+            "--output-dir."
+        )
+    if found and options.resume != "latest":
+        raise FileExistsError(
+            f"{checkpoints.folder} has checkpoints of an earlier run: go on with "
+            "--resume latest, or give another --output-dir."
+        )
+    if not found and options.resume == "latest":
+        report(f"no checkpoint in {checkpoints.folder}: a new run begins")
+    return found
+
+
 class _Run:
-    """The loop over iterations."""
+    """One call of `run`: the loop over iterations, and what follows each."""
 
     def __init__(
         self,
-        algorithm: Algorithm,
+        runs: Runs,
         env_params: EnvParams,
         options: RunConfig,
         checkpoints: Checkpoints,
         report: Messages,
-        placed: Any,
         splits: Splits,
         stop: StopRequest,
     ) -> None:
-        self._algorithm = algorithm
-        self._config = algorithm.config
+        self._runs = runs
+        self._algorithm = runs.algorithm
+        self._config = runs.algorithm.config
         self._params = env_params
         self._options = options
         self._checkpoints = checkpoints
         self._report = report
         self._stop = stop
         self._folder = Path(options.output_dir)
-        self._first = jax.process_index() == 0
-        # The state before an iteration is not needed after it: its memory is used again.
-        compiled = partial(
-            jax.jit, donate_argnums=0, out_shardings=placed, compiler_options=compiler_options()
+        self._schedule = Schedule(
+            self._config.num_iterations,
+            runs.algorithm.num_phases,
+            options.log_every,
+            options.num_evals,
         )
-        self._iterate = compiled(algorithm.iterate)
-        if algorithm.auxiliary is not None:
-            self._auxiliary = compiled(algorithm.auxiliary)
+        self._first = jax.process_index() == 0
         self._evaluators: dict[str, Evaluator] = {}
         if options.num_evals:
             for split, (env, params) in splits.items():
                 self._evaluators[split] = Evaluator(
-                    algorithm, env, params, num_episodes=options.eval_episodes
+                    runs.algorithm, env, params, num_episodes=options.eval_episodes
                 )
         self._pending: list[dict[str, Any]] = []
         self._record: dict[str, float] = {}
         self._results: dict[str, Result] = {}
+        self._evaluated_steps = -1
+        self._timed_steps, self._timed_since = 0, 0.0
 
-    def until_end(self, state: TrainState) -> Outcome:
+    def train(self, state: TrainState) -> Outcome:
+        """Train from ``state`` to the end, or until a signal."""
         began = steps = _steps(self._algorithm, state)
         total = self._config.num_iterations
         writer = self._open_writer(steps)
@@ -245,16 +254,20 @@ class _Run:
                 )
             except (ImportError, OSError) as error:
                 failure = error
-        if anywhere(failure is not None):
+        if any_process(failure is not None):
             raise failure or RuntimeError("process 0 cannot write metrics; it says why.")
         return writer
 
     def _iterations(
         self, state: TrainState, steps: int, writer: MetricsWriter | NoWriter, bar: Bar
     ) -> tuple[TrainState, int, int]:
-        """Trains to the end, or until a signal; the state, its steps, the signal's number or 0."""
+        """Train to the end, or until a signal.
+
+        Returns:
+            The state, its steps, and the signal's number or 0.
+        """
         per_iteration, total = self._config.steps_per_iteration, self._config.num_iterations
-        options, done = self._options, steps // self._config.steps_per_iteration
+        done = steps // per_iteration
         bar.update(done)
         if done >= total:
             self._report(f"the run has had its {steps} steps")
@@ -268,53 +281,102 @@ class _Run:
             self._checkpoints,
             steps,
             self._report,
-            every=options.checkpoint_every,
-            minutes=options.checkpoint_minutes,
+            every=self._options.checkpoint_every,
+            minutes=self._options.checkpoint_minutes,
         )
-        began, began_steps = time.perf_counter(), steps
+        self._restart_timer(steps)
         for number in range(done + 1, total + 1):
-            state, steps = self._one(state, number), number * per_iteration
+            state, steps = self._iterate(state, number), number * per_iteration
             bar.update(1)
-            end = number == total
             # The clock is that of the first process.
             by_clock = self._first and saver.is_due_by_clock()
             stopped_by, due = highest(self._stop.signal, int(by_clock))
-            stopped_by = 0 if end else stopped_by
-            last = end or bool(stopped_by)
-            evaluates = self._evaluates_after(number)
-            saves = last or evaluates or bool(due) or saver.is_due_after(steps)
-            logs = number % options.log_every == 0 or evaluates or saves
-            if logs:
-                self._settle(steps, saver)
-                seconds = time.perf_counter() - began
-                if options.log_training_metrics:
-                    self._record["speed/steps_per_second"] = (steps - began_steps) / seconds
-                    writer.write(steps, self._record)
-                bar.update(0, self._record)
-            if evaluates and not stopped_by:
-                writer.write(steps, self._evaluate(state))
-            if saves:
-                score = self._score(evaluates and not stopped_by)
-                saver.save(state, steps, score, last=last)
-            else:
+            stopped_by = 0 if number == total else stopped_by
+            jobs = self._schedule.jobs(
+                number, save=bool(due) or saver.is_due_after(steps), stop=bool(stopped_by)
+            )
+            for job in jobs:
+                match job:
+                    case "log":
+                        self._log(steps, writer, bar, saver)
+                    case "evaluate":
+                        writer.write(steps, self._evaluate(state, steps))
+                    case "save":
+                        last = number == total or bool(stopped_by)
+                        saver.save(state, steps, self._score(steps), last=last)
+                    case "report_stop":
+                        self._report(f"stopped after {steps} steps; go on with --resume latest")
+            if "save" not in jobs:
                 saver.look_after()
-            if logs:
-                began, began_steps = time.perf_counter(), steps
+            if jobs:
+                self._restart_timer(steps)
             if stopped_by:
-                # Whoever is asked to stop may soon be killed: first what is not to be lost.
-                self._report(f"stopped after {steps} steps; go on with --resume latest")
-                if evaluates:
-                    writer.write(steps, self._evaluate(state))
                 break
         return state, steps, stopped_by
 
+    def _iterate(self, state: TrainState, number: int) -> TrainState:
+        """Run iteration ``number``, and the auxiliary phase if it is due."""
+        state, metrics = programs.iterate(self._runs, state, self._params)
+        if self._schedule.has_auxiliary_phase(number):
+            state, aux_metrics = programs.auxiliary(self._runs, state)
+            metrics |= aux_metrics
+        self._pending.append(metrics)
+        # One iteration is under way and the next one waits; were there more, the bar would run
+        # ahead and Ctrl-C would wait for all of them.
+        jax.block_until_ready(self._pending[-2:-1])
+        return state
+
+    def _restart_timer(self, steps: int) -> None:
+        self._timed_since, self._timed_steps = time.perf_counter(), steps
+
+    def _log(self, steps: int, writer: MetricsWriter | NoWriter, bar: Bar, saver: Saver) -> None:
+        """Write the metrics of the latest iterations.
+
+        Raises:
+            TrainingDivergedError: one is not finite.
+        """
+        if self._pending:
+            records = jax.device_get(self._pending)
+            self._pending = []
+            for record in records:
+                self._check_finite(record, steps, saver)
+            self._record = summarize(records)
+        if self._options.log_training_metrics:
+            seconds = time.perf_counter() - self._timed_since
+            self._record["speed/steps_per_second"] = (steps - self._timed_steps) / seconds
+            writer.write(steps, self._record)
+        bar.update(0, self._record)
+
+    def _check_finite(self, record: dict[str, Any], steps: int, saver: Saver) -> None:
+        wrong = {name: ~np.isfinite(value) for name, value in record.items()}
+        wrong = {name: where for name, where in wrong.items() if where.any()}
+        if not wrong:
+            return
+        seeds = ""
+        if self._options.seeds > 1:
+            those = np.flatnonzero(np.any(list(wrong.values()), axis=0))
+            names = (str(self._options.seed + int(i)) for i in those)
+            seeds = f" of seed {', '.join(names)}"
+        saver.look_after(wait=True)
+        latest = saver.latest()
+        kept = "there is none" if latest is None else f"that of {latest} steps is good"
+        raise TrainingDivergedError(
+            f"not finite within the iterations before step {steps}{seeds}: {', '.join(wrong)}. Of "
+            f"the checkpoints {kept}. Begin anew in another --output-dir; a lower learning_rate or "
+            "max_grad_norm may help."
+        )
+
     def _export(self, state: TrainState, steps: int) -> None:
-        """Writes the policies.
+        """Write the policies.
 
         Raises:
             OSError: one cannot be written.
         """
-        for networks, name in self._policies(state) if self._first else ():
+        if not self._first:
+            return
+        for i, networks in enumerate(self._runs.split(jax.device_get(state.networks))):
+            several = self._runs.num_seeds > 1
+            name = f"policy_seed{self._options.seed + i}.jax" if several else "policy.jax"
             try:
                 save_policy(self._algorithm, networks, self._folder / name)
             except OSError as error:
@@ -324,65 +386,12 @@ class _Run:
                     "writes the policy at its end."
                 ) from error
 
-    def _one(self, state: TrainState, number: int) -> TrainState:
-        """Iteration ``number``, from 1, and the auxiliary phase if it is due."""
-        state, metrics = self._iterate(state, self._params)
-        phases = self._algorithm.num_phases
-        if phases and number % phases == 0:
-            state, more = self._auxiliary(state)
-            metrics |= more
-        self._pending.append(metrics)
-        # One iteration is under way and the next one waits; were there more, the bar would run
-        # ahead and Ctrl-C would wait for all of them.
-        jax.block_until_ready(self._pending[-2:-1])
-        return state
-
-    def _settle(self, steps: int, saver: Saver) -> None:
-        """Puts the metrics of the latest iterations together, and looks at them.
-
-        Raises:
-            TrainingDivergedError: one is not finite.
-        """
-        if not self._pending:
-            return
-        records = jax.device_get(self._pending)
-        self._pending = []
-        for record in records:
-            bad = {n: ~np.isfinite(value) for n, value in record.items()}
-            bad = {n: where for n, where in bad.items() if where.any()}
-            if bad:
-                runs = ""
-                if self._options.seeds > 1:
-                    those = np.flatnonzero(np.any(list(bad.values()), axis=0))
-                    names = (str(self._options.seed + int(i)) for i in those)
-                    runs = f" of seed {', '.join(names)}"
-                saver.look_after(wait=True)
-                latest = saver.latest()
-                kept = "there is none" if latest is None else f"that of {latest} steps is good"
-                raise TrainingDivergedError(
-                    f"not finite within the iterations before step {steps}{runs}: "
-                    f"{', '.join(bad)}. Of the checkpoints {kept}. Begin anew in another "
-                    "--output-dir; a lower learning_rate or max_grad_norm may help."
-                )
-        self._record = together(records)
-
-    def _evaluates_after(self, number: int) -> bool:
-        evals, total = self._options.num_evals, self._config.num_iterations
-        return bool(evals) and number * evals // total > (number - 1) * evals // total
-
-    def _policies(self, state: TrainState) -> Iterator[tuple[Networks, str]]:
-        """Networks of each seed, and the name of its policy's file."""
-        networks = jax.device_get(state.networks)
-        if self._options.seeds == 1:
-            yield networks, "policy.jax"
-            return
-        for i in range(self._options.seeds):
-            yield of_seed(networks, i), f"policy_seed{self._options.seed + i}.jax"
-
-    def _evaluate(self, state: TrainState) -> dict[str, float]:
+    def _evaluate(self, state: TrainState, steps: int) -> dict[str, float]:
+        """Evaluate each run in each split, and return what is logged of it."""
         record = {}
+        policies = self._runs.split(jax.device_get(state.networks))
         for split, evaluator in self._evaluators.items():
-            runs = [evaluator(networks) for networks, _ in self._policies(state)]
+            runs = [evaluator(networks) for networks in policies]
             if len(runs) > 1:
                 middle = interquartile_mean(np.array([run.mean for run in runs]))
                 for number, run in enumerate(runs):
@@ -401,24 +410,25 @@ class _Run:
                 record[f"eval/{split}/standard_error"] = result.standard_error
                 line += f" +- {result.standard_error:.1f} (standard error)"
             self._report(line)
+        self._evaluated_steps = steps
         return record
 
-    def _score(self, evaluated: bool) -> float | None:
-        """By which the best checkpoint is chosen: one measure for all checkpoints of a run.
+    def _score(self, steps: int) -> float | None:
+        """Return by what the best checkpoint is chosen: one measure for all those of a run.
 
         It is the return in clean episodes of this moment, and without evaluations that of the
         latest training episodes.
         """
         if self._options.num_evals:
-            return self._results["clean"].mean if evaluated else None
+            return self._results["clean"].mean if self._evaluated_steps == steps else None
         return self._record.get("episode/return")
 
 
 def _settings(algorithm: Algorithm, options: RunConfig) -> dict[str, Any]:
-    """What decides the result of a run."""
+    """Return what decides the result of a run."""
     return describe(algorithm.config) | {"seed": options.seed, "seeds": options.seeds}
 
 
 def _steps(algorithm: Algorithm, state: TrainState) -> int:
-    """Control steps so far; all seeds are equally far."""
+    """Return the control steps so far; all seeds are equally far."""
     return int(np.ravel(state.iteration)[0]) * algorithm.config.steps_per_iteration

@@ -14,7 +14,8 @@ import jax
 import tyro
 from tqdm import tqdm
 
-from pixelbrax_jax.agents.algorithms.presets import CONFIGS, MAKERS, PRESETS, preset
+from pixelbrax_jax.agents.algorithms.presets import PRESETS, preset
+from pixelbrax_jax.agents.algorithms.registry import ALGORITHMS, make_algorithm
 from pixelbrax_jax.agents.core.config import TrainConfig, make_env
 from pixelbrax_jax.agents.runner.checkpoint import CheckpointError, latest_steps
 from pixelbrax_jax.agents.runner.option_types import names_for_objects
@@ -48,7 +49,7 @@ def train(arguments: list[str]) -> int:
 
 def _train(arguments: list[str]) -> int:
     first = argparse.ArgumentParser(prog="pixelbrax train", add_help=False)
-    first.add_argument("algorithm", choices=sorted(CONFIGS))
+    first.add_argument("algorithm", choices=sorted(ALGORITHMS))
     first.add_argument("--preset", choices=sorted(PRESETS), default="default")
     first.add_argument("--coordinator", help="host:port of process 0, of several processes")
     first.add_argument("--num-processes", type=int)
@@ -57,7 +58,7 @@ def _train(arguments: list[str]) -> int:
     if not arguments or arguments[0] in ("-h", "--help"):
         sys.stdout.write(
             "usage: pixelbrax train {"
-            + ",".join(CONFIGS)
+            + ",".join(ALGORITHMS)
             + "} [--preset {"
             + ",".join(PRESETS)
             + "}] [options]\n\nAll options: pixelbrax train ppo --help\n"
@@ -182,5 +183,5 @@ def _run(algorithm: str, config: TrainConfig, options: RunConfig) -> int:
             f"iterations of {config.steps_per_iteration} control steps; "
             f"into {Path(options.output_dir).resolve()}"
         )
-    outcome = run(MAKERS[algorithm](config, envs), env_params, options, report=report)
+    outcome = run(make_algorithm(config, envs), env_params, options, report=report)
     return 128 + outcome.signal if outcome.interrupted else 0

@@ -8,7 +8,7 @@ from typing import Any
 
 import jax
 
-from pixelbrax_jax.agents.algorithms.presets import CONFIGS, MAKERS
+from pixelbrax_jax.agents.algorithms.registry import ALGORITHMS
 from pixelbrax_jax.agents.core.algorithm import Algorithm
 from pixelbrax_jax.agents.core.config import TrainConfig, make_env
 from pixelbrax_jax.agents.core.optimizer import Networks
@@ -18,7 +18,7 @@ from pixelbrax_jax.agents.runner.checkpoint import (
     read_about,
     read_networks,
 )
-from pixelbrax_jax.agents.runner.seeds import of_seed
+from pixelbrax_jax.agents.runner.seeds import Runs
 from pixelbrax_jax.envs.vector import VectorPixelEnv
 
 
@@ -70,13 +70,10 @@ def load_trained(
         raise ValueError(f"run must be from 0 to {num_seeds - 1}, got {run}.")
     # The networks are those of training, whose environments may show more than pixels.
     env, params = make_env(config, distractors=(), clips=None)
-    algorithm = MAKERS[about["algorithm"]](config, VectorPixelEnv(env, config.num_envs))
-    key = jax.random.key(0)
-    keys = jax.random.split(key, num_seeds) if num_seeds > 1 else key
-    init = jax.vmap(algorithm.init, in_axes=(0, None)) if num_seeds > 1 else algorithm.init
-    template = jax.eval_shape(init, keys, params).networks
-    networks = read_networks(checkpoints, template, about["steps"])
-    networks = of_seed(networks, run) if num_seeds > 1 else networks
+    algorithm = ALGORITHMS[about["algorithm"]](config, VectorPixelEnv(env, config.num_envs))
+    runs = Runs(algorithm, num_seeds)
+    template = jax.eval_shape(runs.init, 0, params).networks
+    networks = runs.split(read_networks(checkpoints, template, about["steps"]))[run]
     return Trained(algorithm, networks, about["steps"])
 
 
@@ -86,12 +83,12 @@ def load_config(about: dict[str, Any]) -> TrainConfig:
     Raises:
         CheckpointError: it is of an algorithm that is not known here.
     """
-    if about["algorithm"] not in CONFIGS:
+    if about["algorithm"] not in ALGORITHMS:
         raise CheckpointError(
-            f"the checkpoint is of {about['algorithm']!r}, which is none of {', '.join(CONFIGS)}; "
-            "load one of your own with read_networks."
+            f"the checkpoint is of {about['algorithm']!r}, which is none of "
+            f"{', '.join(ALGORITHMS)}; load one of your own with read_networks."
         )
-    kind = CONFIGS[about["algorithm"]]
+    kind = ALGORITHMS[about["algorithm"]].config_class
     names = {field.name for field in fields(kind)}
     values: dict[str, Any] = {
         name: tuple(value) if isinstance(value, list) else value

@@ -1,0 +1,61 @@
+"""The algorithms by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+
+from pixelbrax_jax.agents.algorithms.dcpg import DCPG
+from pixelbrax_jax.agents.algorithms.ppg import PPG
+from pixelbrax_jax.agents.algorithms.ppo import PPO
+from pixelbrax_jax.agents.core.algorithm import Algorithm, environments, train_function
+from pixelbrax_jax.agents.core.config import TrainConfig
+from pixelbrax_jax.agents.core.losses import Metrics
+from pixelbrax_jax.agents.core.rollout import Environments
+from pixelbrax_jax.agents.core.train_state import TrainState
+from pixelbrax_jax.types import EnvParams
+
+ALGORITHMS: dict[str, type[Algorithm]] = {kind.name: kind for kind in (PPO, PPG, DCPG)}
+"""Class of each algorithm, by its name."""
+
+
+def make_algorithm(config: TrainConfig, envs: Environments) -> Algorithm:
+    """Return the algorithm that settings are of.
+
+    Args:
+        config: settings.
+        envs: environments of your own.
+
+    Raises:
+        TypeError: no algorithm has such settings.
+        ValueError: the environments are not what the settings say.
+    """
+    for kind in ALGORITHMS.values():
+        if type(config) is kind.config_class:
+            return kind(config, envs)
+    known = ", ".join(kind.config_class.__name__ for kind in ALGORITHMS.values())
+    raise TypeError(f"config must be one of {known}, got {type(config).__name__}.")
+
+
+def make_train(
+    config: TrainConfig,
+    envs: Environments | None = None,
+    env_params: EnvParams | None = None,
+) -> Callable[[jax.Array], tuple[TrainState, Metrics]]:
+    """Return a whole run as a pure function ``train(key) -> (state, metrics)``.
+
+    The function may be jitted, and mapped over keys by ``jax.vmap``. Metrics have a leading axis
+    of iterations, those of the auxiliary phase one of phases.
+
+    Args:
+        config: settings, which decide the algorithm.
+        envs: environments of your own; None makes those that ``config`` names.
+        env_params: of those.
+
+    Raises:
+        TypeError: no algorithm has such settings.
+        ValueError: one of the two is given without the other.
+    """
+    envs, env_params = environments(config, envs, env_params)
+    return train_function(make_algorithm(config, envs), env_params)

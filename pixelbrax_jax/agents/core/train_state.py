@@ -1,0 +1,68 @@
+"""Where training stands, and the random keys that follow from it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+from flax import struct
+
+from pixelbrax_jax.agents.core.counter import StepCounter
+from pixelbrax_jax.agents.core.env_axis import along_envs, as_declared, without_envs
+from pixelbrax_jax.agents.core.optimizer import Networks
+from pixelbrax_jax.agents.core.returns import RewardScaler
+from pixelbrax_jax.types import EnvState
+
+_ENVS, _NETWORKS, _ACTIONS, _UPDATES, _AUXILIARY = range(5)
+"""Names of random streams, folded into the key of a run."""
+
+
+class TrainState(struct.PyTreeNode):
+    """Where training stands; all of it, so that a run goes on from it as if never stopped.
+
+    Attributes:
+        networks: parameters by name of the network.
+        opt_state: of the optimiser, by name of the network.
+        aux_opt_state: of the optimiser of the auxiliary phase; None where there is none.
+        env_state: where the environments are.
+        scaler: statistics of rewards.
+        buffer: what the auxiliary phase will learn from; None where there is none.
+        key: typed PRNG key of the run; never changes.
+        iteration: () uint32, rollouts so far.
+        steps: control steps so far, over all environments.
+    """
+
+    networks: Networks = without_envs()
+    opt_state: Networks = without_envs()
+    aux_opt_state: Networks | None = without_envs()
+    env_state: EnvState = along_envs(0)
+    scaler: RewardScaler = as_declared()
+    buffer: Any = as_declared()
+    key: jax.Array = without_envs()
+    iteration: jax.Array = without_envs()
+    steps: StepCounter = without_envs()
+
+
+def env_key(key: jax.Array) -> jax.Array:
+    """Return the environments' key of a run."""
+    return jax.random.fold_in(key, _ENVS)
+
+
+def network_key(key: jax.Array) -> jax.Array:
+    """Return the key of a run's initial parameters."""
+    return jax.random.fold_in(key, _NETWORKS)
+
+
+def action_key(state: TrainState) -> jax.Array:
+    """Return the key of this iteration's actions."""
+    return jax.random.fold_in(jax.random.fold_in(state.key, _ACTIONS), state.iteration)
+
+
+def update_key(state: TrainState) -> jax.Array:
+    """Return the key of this iteration's update."""
+    return jax.random.fold_in(jax.random.fold_in(state.key, _UPDATES), state.iteration)
+
+
+def auxiliary_key(state: TrainState) -> jax.Array:
+    """Return the key of the auxiliary phase that follows this iteration."""
+    return jax.random.fold_in(jax.random.fold_in(state.key, _AUXILIARY), state.iteration)
