@@ -12,8 +12,8 @@ ARGS ?=
 RUN := $(VENV)/bin/python
 PIP := $(RUN) -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-# Two processes; a file of tests stays in one of them, because its tests share programs.
-WORKERS := -n 2 --dist loadfile
+# Two processes; the one that is done first takes over tests of the other.
+WORKERS := -n 2 --dist worksteal
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
@@ -40,7 +40,7 @@ test: $(VENV)/.installed-dev ## run the tests that take minutes at most
 	$(RUN) -m pytest $(WORKERS) -m "not slow and not gpu" $(ARGS)
 
 test-slow: $(VENV)/.installed-dev ## run the tests that take longer
-	$(RUN) -m pytest $(WORKERS) -m "slow and not gpu" $(ARGS)
+	PIXELBRAX_TESTS_OPTIMIZE=1 $(RUN) -m pytest $(WORKERS) -m "slow and not gpu" $(ARGS)
 
 test-newest: .venv-newest/.installed ## run those that need no torch with the newest releases
 	.venv-newest/bin/python -m pytest $(WORKERS) -m "$(SPEED) and not gpu" $(TORCHLESS) $(ARGS)

@@ -4,6 +4,8 @@ import gc
 import os
 from pathlib import Path
 
+from tests.xla_flags import xla_flags
+
 # Nothing here may need a display.
 os.environ.setdefault("MPLBACKEND", "Agg")
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
@@ -12,28 +14,23 @@ os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".jax_cache"))
 os.environ.setdefault("JAX_COMPILATION_CACHE_MAX_SIZE", str(2**30))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
-# Every program of the tests is compiled as those are that the package compiles by itself, or
-# results of different ones could not be compared to the bit (`compiler_options`).
-os.environ["XLA_FLAGS"] = "--xla_cpu_prefer_vector_width=512 " + os.environ.get("XLA_FLAGS", "")
+# `make test-slow` compiles as users do.
+OPTIMIZE = os.environ.get("PIXELBRAX_TESTS_OPTIMIZE") == "1"
+os.environ["XLA_FLAGS"] = f"{xla_flags(OPTIMIZE)} {os.environ.get('XLA_FLAGS', '')}"
 
 import jax
-import pytest
 
 MAX_MAPS = 25_000
 """Memory maps of this process beyond which compiled programs are forgotten."""
 
 
-def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
-    """Forgets compiled programs where one folder of tests ends, or when there are too many.
+def pytest_runtest_teardown() -> None:
+    """Forget compiled programs when there are too many.
 
     Every program maps memory of its own, and a process may have some 65,000 maps on Linux
     (vm.max_map_count). The compiler crashes beyond them.
     """
-    if (
-        nextitem is None
-        or nextitem.path.parent != item.path.parent
-        or (item.get_closest_marker("slow") and number_of_maps() > MAX_MAPS)
-    ):
+    if number_of_maps() > MAX_MAPS:
         jax.clear_caches()
         gc.collect()
 

@@ -28,6 +28,7 @@ def _below(*names: str) -> set[str]:
 ALLOWED: dict[str, set[str]] = {
     **{f"pixelbrax_jax.{name}": set() for name in FOUNDATIONS},
     "pixelbrax_jax.spatial": {"pixelbrax_jax.types"},
+    "pixelbrax_jax.deprecation": set(),
     "pixelbrax_jax.policy": {"pixelbrax_jax.extras"},
     **{f"pixelbrax_jax.{name}": _below() for name in LAYERS},
     "pixelbrax_jax.config": _below("scene", "renderer", "distractors"),
@@ -36,7 +37,7 @@ ALLOWED: dict[str, set[str]] = {
     "pixelbrax_jax.envs": _below("config", "_cpu", *LAYERS),
     "pixelbrax_jax.registry": _below("config", "envs", *LAYERS),
     # The package itself, which names what is public.
-    "pixelbrax_jax": _below("config", "envs", "registry", "policy", *LAYERS),
+    "pixelbrax_jax": _below("config", "deprecation", "envs", "registry", "policy", *LAYERS),
     "pixelbrax_jax.agents": {"pixelbrax_jax", *_below("config", "envs", "registry", "distractors")},
     "pixelbrax_gym": {"pixelbrax_jax", *_below("config", "registry", "policy")},
 }

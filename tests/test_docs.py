@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import html
-import inspect
 import re
 import shlex
 import textwrap
@@ -14,10 +13,7 @@ from pathlib import Path
 import gymnasium
 import pytest
 
-import pixelbrax_gym  # registers PixelBrax/*
-import pixelbrax_jax
 from pixelbrax_jax import registry
-from pixelbrax_jax.tasks import TASKS
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
@@ -139,50 +135,6 @@ def test_every_inclusion_is_understood(name):
     """A formatter may take the scissors of an inclusion for Python and spread them out."""
     text = (ROOT / name).read_text("utf-8")
     assert len(re.findall(r"^\s*-+ ?8 ?<", text, re.MULTILINE)) == len(SNIPPET.findall(text))
-
-
-def table_of(section: str) -> list[list[str]]:
-    """Rows of the table in a section of the README, without heading and code marks."""
-    text = (ROOT / "README.md").read_text("utf-8")
-    text = text.split(f"[start:{section}]")[1].split(f"[end:{section}]")[0]
-    rows = [line for line in text.splitlines() if line.startswith("| ")][2:]
-    return [[cell.strip().replace("`", "") for cell in row.split("|")[1:-1]] for row in rows]
-
-
-def test_the_table_of_tasks_is_true():
-    rows = table_of("tasks")
-    assert [row[1] for row in rows] == sorted(TASKS)
-    for id_, task, actions, backend, _ in rows:
-        assert gymnasium.spec(id_).kwargs == {"task": task}
-        env, _ = pixelbrax_jax.make(task)
-        assert env.action_size == int(actions)
-        assert env.physics.backend == backend
-
-
-def test_the_table_of_options_is_true():
-    options = inspect.signature(pixelbrax_jax.make).parameters
-    for names, values, _ in table_of("options"):
-        for option, value in zip(names.split(", "), values.split(", "), strict=True):
-            assert repr(options[option].default).replace("'", '"') == value, option
-
-
-def test_the_table_of_adapters_options_is_true():
-    adapters = [
-        pixelbrax_gym.PixelBraxEnv,
-        pixelbrax_gym.PixelBraxVectorEnv,
-        pixelbrax_gym.PixelBraxTorchRLEnv,
-        pixelbrax_gym.PixelBraxSB3VecEnv,
-    ]
-    taken = [
-        set(inspect.signature(adapter.__init__).parameters) - {"self", "task", "options"}
-        for adapter in adapters
-    ]
-    listed: list[set[str]] = [set() for _ in adapters]
-    for names, *cells, _ in table_of("adapter-options"):
-        for option in names.split(", "):
-            for options, cell in zip(listed, cells, strict=True):
-                options |= {option} if cell == "yes" else set()
-    assert listed == taken
 
 
 def test_blocks_are_found():

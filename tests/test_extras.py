@@ -62,7 +62,7 @@ def test_a_framework_that_is_missing(monkeypatch, absent, door, extra):
 
 def test_a_reader_that_is_missing(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "PIL", None)
-    with pytest.raises(ImportError, match=r"pictures needs Pillow; try: .*\[clips\]"):
+    with pytest.raises(ImportError, match=r"images needs Pillow; try: .*\[clips\]"):
         clips.pillow()
     monkeypatch.setitem(sys.modules, "imageio", None)
     monkeypatch.setitem(sys.modules, "imageio.v3", None)

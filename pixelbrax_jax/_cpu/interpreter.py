@@ -7,33 +7,20 @@ of matrices is a call for every link. Over (links, 3, N) they are loops over env
 
 from __future__ import annotations
 
-import itertools
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.extend import core
 
+from pixelbrax_jax._cpu.rules import FEW, RULES, Operand, bind, row_aval, rule, spread
+
 _LANES = 16
 """Rows are padded to a multiple, so that loops over vectors leave no scalar remainder."""
-
-_FEW = 4
-"""So many rows are not padded, and their products of matrices not written out: loops over so few
-gain nothing."""
-
-_LONGEST_SUM = 16
-"""Products of matrices over longer axes stay calls of a library."""
-
-
-class _Operand(NamedTuple):
-    """A value for every row, with the batch as last axis, or one for all rows."""
-
-    value: Any
-    batched: bool
 
 
 def batch_last(fn: Callable[..., Any], in_axes: Sequence[int | None]) -> Callable[..., Any]:
@@ -68,11 +55,11 @@ def batch_last(fn: Callable[..., Any], in_axes: Sequence[int | None]) -> Callabl
         if any(_varies(x) for x, _ in leaves):
             return jax.vmap(fn, in_axes=tuple(in_axes))(*args)
         (size,) = sizes
-        padded = size if size <= _FEW else -(-size // _LANES) * _LANES
+        padded = size if size <= FEW else -(-size // _LANES) * _LANES
         row = [jax.tree.map(_row if batched else jax.typeof, arg) for arg, batched in by_argument]
         closed, shapes = jax.make_jaxpr(fn, return_shape=True)(*row)
         operands = [
-            _Operand(jnp.moveaxis(_pad_rows(x, padded), 0, -1) if batched else x, batched)
+            Operand(jnp.moveaxis(_pad_rows(x, padded), 0, -1) if batched else x, batched)
             for x, batched in leaves
         ]
         try:
@@ -83,8 +70,8 @@ def batch_last(fn: Callable[..., Any], in_axes: Sequence[int | None]) -> Callabl
             _warn_once(error)
             return jax.vmap(fn, in_axes=tuple(in_axes))(*args)
         outputs, tree = jax.tree.flatten(shapes)
-        spread = [_spread(x, out.shape, padded) for x, out in zip(results, outputs, strict=True)]
-        return jax.tree.unflatten(tree, [jnp.moveaxis(x, -1, 0)[:size] for x in spread])
+        rows = [spread(x, out.shape, padded) for x, out in zip(results, outputs, strict=True)]
+        return jax.tree.unflatten(tree, [jnp.moveaxis(x, -1, 0)[:size] for x in rows])
 
     return rows_of
 
@@ -105,13 +92,8 @@ def _warn_once(error: Exception) -> None:
 
 
 def _varies(x: jax.Array) -> bool:
-    """Whether ``jax.shard_map`` tracks that devices have different values of ``x``."""
+    """Return whether ``jax.shard_map`` tracks that devices have different values of ``x``."""
     return bool(getattr(getattr(jax.typeof(x), "manual_axis_type", None), "varying", ()))
-
-
-def _aval(atom: core.Var | core.Literal) -> Any:
-    """Shape and dtype of one row, which JAX types as anything abstract."""
-    return atom.aval
 
 
 def _row(x: jax.Array) -> jax.ShapeDtypeStruct:
@@ -119,21 +101,21 @@ def _row(x: jax.Array) -> jax.ShapeDtypeStruct:
 
 
 def _pad_rows(x: jax.Array, size: int) -> jax.Array:
-    """Rows, and the last one again until there are ``size``."""
+    """Return the rows, and the last one again until there are ``size``."""
     return x if len(x) == size else x[jnp.minimum(jnp.arange(size), len(x) - 1)]
 
 
-def _evaluate(closed: core.ClosedJaxpr, operands: Sequence[_Operand], size: int) -> list[_Operand]:
-    """Results of a program, equation by equation."""
-    known: dict[core.Var, _Operand] = {}
+def _evaluate(closed: core.ClosedJaxpr, operands: Sequence[Operand], size: int) -> list[Operand]:
+    """Return the results of a program, equation by equation."""
+    known: dict[core.Var, Operand] = {}
 
-    def read(atom: core.Var | core.Literal) -> _Operand:
+    def read(atom: core.Var | core.Literal) -> Operand:
         if isinstance(atom, core.Literal):
-            return _Operand(jnp.asarray(atom.val, _aval(atom).dtype), False)
+            return Operand(jnp.asarray(atom.val, row_aval(atom).dtype), False)
         return known[atom]
 
     jaxpr = closed.jaxpr
-    known.update(zip(jaxpr.constvars, (_Operand(x, False) for x in closed.consts), strict=True))
+    known.update(zip(jaxpr.constvars, (Operand(x, False) for x in closed.consts), strict=True))
     known.update(zip(jaxpr.invars, operands, strict=True))
     for eqn in jaxpr.eqns:
         inputs = [read(atom) for atom in eqn.invars]
@@ -142,218 +124,55 @@ def _evaluate(closed: core.ClosedJaxpr, operands: Sequence[_Operand], size: int)
     return [read(atom) for atom in jaxpr.outvars]
 
 
-def _apply(eqn: core.JaxprEqn, inputs: list[_Operand], size: int) -> list[_Operand]:
+def _apply(eqn: core.JaxprEqn, inputs: list[Operand], size: int) -> list[Operand]:
     name = eqn.primitive.name
-    values = [x.value for x in inputs]
-    flags = [x.batched for x in inputs]
-    if not any(flags):
-        return [_Operand(x, False) for x in _bind(eqn, *values)]
+    if not any(x.batched for x in inputs):
+        return [Operand(x, False) for x in bind(eqn, *(x.value for x in inputs))]
     if name in _CALLS:
         return _evaluate(eqn.params[_CALLS[name]], inputs, size)
     if name == "scan":
         return _scan(eqn, inputs, size)
-    if name in _ELEMENTWISE:
-        shape = _aval(eqn.outvars[0]).shape
-        outputs = _bind(eqn, *(_spread(x, shape, size) for x in inputs))
-    elif name in _NAMED_AXES:
-        outputs = _bind(eqn, *values)
-    elif name in _FIRST_BATCHED and flags == [True] + [False] * (len(flags) - 1):
-        outputs = [_FIRST_BATCHED[name](eqn, *values)]
-    elif name in ("concatenate", "stack"):
-        parts = [
-            _spread(x, _aval(atom).shape, size) for x, atom in zip(inputs, eqn.invars, strict=True)
-        ]
-        # A barrier: else XLA reads the parts in place of slices of the whole, and computes them
-        # anew in each kernel that reads one.
-        outputs = lax.optimization_barrier(_bind(eqn, *parts))
-    elif name == "dot_general" and _is_short(eqn):
-        outputs = [_dot(eqn, size, *inputs)]
-    elif name in _SCATTERS and not flags[1]:
-        outputs = [_scatter(eqn, size, *inputs)]
-    elif name == "cond":
-        outputs = _cond(eqn, size, inputs[0], inputs[1:])
-    else:
-        in_axes = [-1 if batched else None for batched in flags]
-        outputs = jax.vmap(lambda *row: _bind(eqn, *row), in_axes=in_axes, out_axes=-1)(*values)
+    outputs = RULES[name](eqn, inputs, size) if name in RULES else None
+    if outputs is None:
+        outputs = _by_vmap(eqn, inputs)
     for x, var in zip(outputs, eqn.outvars, strict=True):
-        if x.shape != (*_aval(var).shape, size):
-            raise ValueError(f"{name} gave {x.shape} for {_aval(var).shape} of {size} rows.")
-    return [_Operand(x, True) for x in outputs]
+        if x.shape != (*row_aval(var).shape, size):
+            raise ValueError(f"{name} gave {x.shape} for {row_aval(var).shape} of {size} rows.")
+    return [Operand(x, True) for x in outputs]
 
 
-def _bind(eqn: core.JaxprEqn, *values: Any, **changed: Any) -> list[Any]:
-    params = eqn.primitive.get_bind_params({**eqn.params, **changed})
-    # Other releases of JAX hand out functions apart.
-    functions, params = params if isinstance(params, tuple) else ((), params)
-    outputs = eqn.primitive.bind(*functions, *values, **params)
-    return list(outputs) if eqn.primitive.multiple_results else [outputs]
-
-
-def _spread(operand: _Operand, shape: tuple[int, ...], size: int) -> jax.Array:
-    """The operand as (*shape, size); its row has ``shape`` or is a scalar."""
-    rank = jnp.ndim(operand.value) - operand.batched
-    axes = tuple(range(rank)) + ((len(shape),) if operand.batched else ())
-    if operand.batched and rank == len(shape):
-        return operand.value
-    return lax.broadcast_in_dim(operand.value, (*shape, size), axes)
+def _by_vmap(eqn: core.JaxprEqn, inputs: list[Operand]) -> list[Any]:
+    """Compute what has no rule."""
+    in_axes = [-1 if x.batched else None for x in inputs]
+    rows = jax.vmap(lambda *row: bind(eqn, *row), in_axes=in_axes, out_axes=-1)
+    return list(rows(*(x.value for x in inputs)))
 
 
 _CALLS = {"jit": "jaxpr", "closed_call": "call_jaxpr"}
 """Primitives that are programs, which are written out in place, and the parameter that has it."""
 
-_ELEMENTWISE_NAMES = """
-abs acos add and asin atan atan2 cbrt ceil clamp convert_element_type copy copy_p cos cosh div eq
-erf exp exp2 expm1 floor ge gt integer_pow is_finite le log log1p logistic lt max min mul ne neg
-nextafter not or pow reduce_precision rem round rsqrt select_n shift_left shift_right_arithmetic
-shift_right_logical sign sin sinh sqrt square sub tan tanh xor
-"""
-_ELEMENTWISE = frozenset(_ELEMENTWISE_NAMES.split())
 
-_NAMED_AXES_NAMES = """
-argmax argmin cumlogsumexp cummax cummin cumprod cumsum reduce_and reduce_max reduce_min reduce_or
-reduce_prod reduce_sum rev split squeeze
-"""
-_NAMED_AXES = frozenset(_NAMED_AXES_NAMES.split())
-"""Primitives whose parameters name the axes they work on: one more at the end changes nothing."""
-
-
-def _broadcast(eqn: core.JaxprEqn, x: jax.Array) -> jax.Array:
-    shape = eqn.params["shape"]
-    axes = (*eqn.params["broadcast_dimensions"], len(shape))
-    return lax.broadcast_in_dim(x, (*shape, x.shape[-1]), axes)
-
-
-def _reshape(eqn: core.JaxprEqn, x: jax.Array) -> jax.Array:
-    order = eqn.params["dimensions"]
-    order = None if order is None else (*order, x.ndim - 1)
-    return lax.reshape(x, (*eqn.params["new_sizes"], x.shape[-1]), order)
-
-
-def _transpose(eqn: core.JaxprEqn, x: jax.Array) -> jax.Array:
-    return lax.transpose(x, (*eqn.params["permutation"], x.ndim - 1))
-
-
-def _tile(eqn: core.JaxprEqn, x: jax.Array) -> jax.Array:
-    return lax.tile(x, (*eqn.params["reps"], 1))
-
-
-def _slice(eqn: core.JaxprEqn, x: jax.Array) -> jax.Array:
-    strides = eqn.params["strides"] or (1,) * (x.ndim - 1)
-    start, limit = eqn.params["start_indices"], eqn.params["limit_indices"]
-    return lax.slice(x, (*start, 0), (*limit, x.shape[-1]), (*strides, 1))
-
-
-def _dynamic_slice(eqn: core.JaxprEqn, x: jax.Array, *start: jax.Array) -> jax.Array:
-    # Bound as it is: `lax.dynamic_slice` would take negative indices from the end once more.
-    zero = jnp.zeros((), start[0].dtype if start else jnp.int32)
-    sizes = (*eqn.params["slice_sizes"], x.shape[-1])
-    return _bind(eqn, x, *start, zero, slice_sizes=sizes)[0]
-
-
-def _pad(eqn: core.JaxprEqn, x: jax.Array, padding: jax.Array) -> jax.Array:
-    return lax.pad(x, padding, (*eqn.params["padding_config"], (0, 0, 0)))
-
-
-def _gather(eqn: core.JaxprEqn, x: jax.Array, indices: jax.Array) -> jax.Array:
-    numbers = eqn.params["dimension_numbers"]
-    numbers = numbers._replace(offset_dims=(*numbers.offset_dims, _aval(eqn.outvars[0]).ndim))
-    sizes = (*eqn.params["slice_sizes"], x.shape[-1])
-    return _bind(eqn, x, indices, dimension_numbers=numbers, slice_sizes=sizes)[0]
-
-
-_FIRST_BATCHED: dict[str, Callable[..., jax.Array]] = {
-    "broadcast_in_dim": _broadcast,
-    "dynamic_slice": _dynamic_slice,
-    "gather": _gather,
-    "pad": _pad,
-    "reshape": _reshape,
-    "slice": _slice,
-    "tile": _tile,
-    "transpose": _transpose,
-}
-"""Rules for a batched first operand and further ones that are the same for all rows."""
-
-
-_SCATTERS = frozenset(["scatter", "scatter-add", "scatter-mul", "scatter-min", "scatter-max"])
-
-
-def _scatter(
-    eqn: core.JaxprEqn, size: int, x: _Operand, indices: _Operand, updates: _Operand
-) -> jax.Array:
-    numbers = eqn.params["dimension_numbers"]
-    last = _aval(eqn.invars[2]).ndim
-    numbers = numbers._replace(update_window_dims=(*numbers.update_window_dims, last))
-    into = _spread(x, _aval(eqn.invars[0]).shape, size)
-    added = _spread(updates, _aval(eqn.invars[2]).shape, size)
-    return _bind(eqn, into, indices.value, added, dimension_numbers=numbers)[0]
-
-
-def _is_short(eqn: core.JaxprEqn) -> bool:
-    (contracted, _), _ = eqn.params["dimension_numbers"]
-    terms = 1
-    for axis in contracted:
-        terms *= _aval(eqn.invars[0]).shape[axis]
-    # Libraries add the products of short floats in longer ones.
-    dtype = _aval(eqn.outvars[0]).dtype
-    is_short_float = jnp.issubdtype(dtype, jnp.floating) and dtype.itemsize < 4
-    return 0 < terms <= _LONGEST_SUM and not is_short_float
-
-
-def _dot(eqn: core.JaxprEqn, size: int, left: _Operand, right: _Operand) -> jax.Array:
-    """A product of matrices as sums of products of entries: no call of a library."""
-    contracted, batch = eqn.params["dimension_numbers"]
-    out = _aval(eqn.outvars[0])
-
-    def arrange(side: int, operand: _Operand) -> tuple[jax.Array, int]:
-        """With axes contracted, batch, own, and the environments'; and how many are own."""
-        rank = _aval(eqn.invars[side]).ndim
-        own = [i for i in range(rank) if i not in contracted[side] and i not in batch[side]]
-        axes = (*contracted[side], *batch[side], *own, *([rank] if operand.batched else []))
-        return lax.transpose(operand.value.astype(out.dtype), axes), len(own)
-
-    (x, x_own), (y, _) = arrange(0, left), arrange(1, right)
-    lengths = x.shape[: len(contracted[0])]
-
-    def multiply(a: jax.Array, b: jax.Array, leading: tuple[int, ...]) -> jax.Array:
-        """Products of entries, (*leading, *out.shape, size).
-
-        Axes of ``a`` and ``b`` are leading, batch, own, and rows if batched.
-        """
-        shape = (*leading, *out.shape, size)
-        shared = tuple(range(len(leading) + len(batch[0])))
-        first, last = len(shared), len(shape) - 1
-        a_axes = (*shared, *range(first, first + x_own), *([last] if left.batched else []))
-        b_axes = (*shared, *range(first + x_own, last), *([last] if right.batched else []))
-        return lax.broadcast_in_dim(a, shape, a_axes) * lax.broadcast_in_dim(b, shape, b_axes)
-
-    if size <= _FEW:
-        return jnp.sum(multiply(x, y, lengths), tuple(range(len(lengths))), dtype=out.dtype)
-    # Additions run over many rows at a time, which a sum over an axis was seen not to.
-    terms = [multiply(x[index], y[index], ()) for index in itertools.product(*map(range, lengths))]
-    return sum(terms[1:], start=terms[0])
-
-
-def _cond(
-    eqn: core.JaxprEqn, size: int, index: _Operand, operands: list[_Operand]
-) -> list[jax.Array]:
+@rule("cond")
+def _cond(eqn: core.JaxprEqn, inputs: Sequence[Operand], size: int) -> list[Any]:
+    index, *operands = inputs
     flags = [x.batched for x in operands]
-    shapes = [_aval(var).shape for var in eqn.outvars]
+    shapes = [row_aval(var).shape for var in eqn.outvars]
 
     def branch(closed: core.ClosedJaxpr, *values: jax.Array) -> list[jax.Array]:
-        results = _evaluate(closed, list(map(_Operand, values, flags)), size)
-        return [_spread(x, shape, size) for x, shape in zip(results, shapes, strict=True)]
+        results = _evaluate(closed, list(map(Operand, values, flags)), size)
+        return [spread(x, shape, size) for x, shape in zip(results, shapes, strict=True)]
 
     branches = [partial(branch, closed) for closed in eqn.params["branches"]]
     values = [x.value for x in operands]
     if not index.batched:
         return list(lax.switch(index.value, branches, *values))
     # Rows differ in their branch: all are computed, as under `jax.vmap`.
-    chosen = _Operand(lax.clamp(0, index.value, len(branches) - 1), True)
+    chosen = Operand(lax.clamp(0, index.value, len(branches) - 1), True)
     cases = zip(shapes, *(take(*values) for take in branches), strict=True)
-    return [lax.select_n(_spread(chosen, shape, size), *case) for shape, *case in cases]
+    return [lax.select_n(spread(chosen, shape, size), *case) for shape, *case in cases]
 
 
-def _scan(eqn: core.JaxprEqn, inputs: list[_Operand], size: int) -> list[_Operand]:
+def _scan(eqn: core.JaxprEqn, inputs: list[Operand], size: int) -> list[Operand]:
     closed, params = eqn.params["jaxpr"], eqn.params
     num_consts, num_carry = _scan_sizes(params)
     consts, first = inputs[:num_consts], inputs[num_consts : num_consts + num_carry]
@@ -361,22 +180,22 @@ def _scan(eqn: core.JaxprEqn, inputs: list[_Operand], size: int) -> list[_Operan
     reached = _reach_scan(eqn, [x.batched for x in inputs])
     flags = reached[:num_carry]
 
-    def carry(operands: Sequence[_Operand]) -> list[Any]:
-        shapes = [_aval(var).shape for var in closed.jaxpr.outvars[:num_carry]]
+    def carry(operands: Sequence[Operand]) -> list[Any]:
+        shapes = [row_aval(var).shape for var in closed.jaxpr.outvars[:num_carry]]
         return [
-            _spread(x, shape, size) if flag else x.value
+            spread(x, shape, size) if flag else x.value
             for x, shape, flag in zip(operands, shapes, flags, strict=True)
         ]
 
     def turn(carried: list[Any], slices: list[Any]) -> tuple[list[Any], list[Any]]:
         x_flags = [x.batched for x in xs]
-        operands = [*consts, *map(_Operand, carried, flags), *map(_Operand, slices, x_flags)]
+        operands = [*consts, *map(Operand, carried, flags), *map(Operand, slices, x_flags)]
         results = _evaluate(closed, operands, size)
         return carry(results[:num_carry]), [y.value for y in results[num_carry:]]
 
     options = {name: params[name] for name in ("length", "reverse", "unroll")}
     last, ys = lax.scan(turn, carry(first), [x.value for x in xs], **options)
-    return list(map(_Operand, [*last, *ys], reached))
+    return list(map(Operand, [*last, *ys], reached))
 
 
 def _scan_sizes(params: Mapping[str, Any]) -> tuple[int, int]:
@@ -389,7 +208,7 @@ def _scan_sizes(params: Mapping[str, Any]) -> tuple[int, int]:
 
 
 def _reach_scan(eqn: core.JaxprEqn, flags: list[bool]) -> list[bool]:
-    """Which carries and results of a scan are batched."""
+    """Return which carries and results of a scan are batched."""
     start, num_carry = _scan_sizes(eqn.params)
     stop = start + num_carry
     # What reaches a carry in one turn reaches others in the next.
@@ -402,7 +221,7 @@ def _reach_scan(eqn: core.JaxprEqn, flags: list[bool]) -> list[bool]:
 
 
 def _reach(closed: core.ClosedJaxpr, flags: Sequence[bool]) -> list[bool]:
-    """Which results of a program are batched, as `_evaluate` finds."""
+    """Return which results of a program are batched, as `_evaluate` finds."""
     known = dict(zip(closed.jaxpr.invars, flags, strict=True))
 
     def read(atom: core.Var | core.Literal) -> bool:

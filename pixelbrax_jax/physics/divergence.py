@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+from functools import partial
 from typing import Any
 
 import jax
@@ -35,10 +36,14 @@ class GuardedPhysics(abc.ABC):
     def _watched(self, state: PhysicsState) -> Any:
         """Return a tree of what must be finite besides observation and reward."""
 
+    # Traced once for equal objects, however many programs they are part of.
+
+    @partial(jax.jit, static_argnums=0, inline=True)
     def reset(self, key: jax.Array) -> PhysicsState:
         """See ``Physics.reset``."""
         return self._guard_first(self._reset(key))
 
+    @partial(jax.jit, static_argnums=0, inline=True)
     def step(self, state: PhysicsState, action: jax.Array) -> PhysicsState:
         """See ``Physics.step``."""
         after = self._step(state, action)

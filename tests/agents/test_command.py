@@ -68,7 +68,7 @@ def test_errors_name_the_setting_and_the_cure(capsys):
     assert "no checkpoint" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("given", "told"), [("0", "at least 1"), ("2", "comes too late")])
+@pytest.mark.parametrize(("given", "told"), [("0", "positive integer"), ("2", "comes too late")])
 def test_devices_cannot_be_emulated_late(given, told, capsys):
     jax.devices()
     assert main(["train", "ppo", *TINY, "--cpu-devices", given]) == 1

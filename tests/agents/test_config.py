@@ -90,8 +90,9 @@ def test_a_bad_setting_is_named_with_its_value_and_what_is_allowed(settings, val
 
 def test_every_number_and_choice_is_checked():
     unchecked = {
-        # Checked by `make`, which knows the tasks.
-        "task", "backend", "reward_preset", "distractors", "clips",
+        # Options of the environment, checked with those of every other one.
+        "task", "backend", "reward_preset", "distractors", "clips", "camera", "look", "shadows",
+        "split", "obs_mode", "renderer", "physics_batching",
         # Truth values.
         "state_critic", "anneal", "normalize_reward", "clip_value", "decoupled",
     }  # fmt: skip
@@ -202,9 +203,9 @@ def test_the_environment_is_the_one_that_is_described():
         task="inverted_pendulum", height=20, width=24, frame_stack=2, action_repeat=3,
         episode_length=50, encoder="small", state_critic=True,
     )  # fmt: skip
-    env, _ = make_env(config)
+    env, params = make_env(config)
     assert env.obs_spec["pixels"].shape == (20, 24, 6)
-    assert (env.action_repeat, env.episode_length) == (3, 50)
+    assert (env.action_repeat, params.episode_length) == (3, 50)
     # Only a critic that sees it makes the state an observation.
     assert make_env(config, obs_mode="pixels")[0].obs_spec.shape == (20, 24, 6)
 

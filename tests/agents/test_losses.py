@@ -99,7 +99,7 @@ def test_samples_without_weight_teach_nothing(normalize_advantage):
         assert (np.asarray(gradient)[~masked] != 0).any()
     # Nor do they change what the others teach.
     other = batch(5)
-    fields = ("raw", "log_prob", "value", "advantage", "returns")
+    fields = ("unclipped_action", "log_prob", "value", "advantage", "returns")
     changed = {
         name: jnp.where(
             masked.reshape(-1, *(1,) * (getattr(samples, name).ndim - 1)),

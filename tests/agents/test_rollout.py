@@ -151,7 +151,7 @@ def test_chunks_of_the_buffer_are_the_rollouts(played):
     buffer = phasic.Buffer(
         *jax.tree.map(
             lambda *x: jnp.zeros((2, *x[0].shape), x[0].dtype),
-            (*(getattr(played.rollouts[0], name) for name in ("frames", "raw", "reward")),
+            (*(getattr(played.rollouts[0], name) for name in ("frames", "unclipped_action", "reward")),
              *(getattr(played.rollouts[0], name) for name in ("done", "valid"))),
         )
     )  # fmt: skip
@@ -164,7 +164,7 @@ def test_chunks_of_the_buffer_are_the_rollouts(played):
     size = T // parts
     assert chunk.num_steps == size
     for name, field in (
-        ("pixels", "value"), ("raw", "raw"), ("returns", "reward"), ("weight", "valid"),
+        ("pixels", "value"), ("unclipped_action", "unclipped_action"), ("returns", "reward"), ("weight", "valid"),
     ):  # fmt: skip
         actual = np.asarray(getattr(chunk, name))
         actual = actual.reshape(N, size, *actual.shape[1:])
@@ -178,16 +178,16 @@ def test_an_environment_does_not_depend_on_its_neighbours(played):
     physics = played.start.sim.physics
     elsewhere = FastBall._state(jnp.float32(0.9), jnp.float32(0), jnp.float32(0), jnp.bool_(False))
     moved = jax.tree.map(lambda rows, one: rows.at[0].set(one), physics, elsewhere)
-    _, changed = played.play(played.start.replace(physics=moved), jax.random.key(1))
+    _, changed = played.play(played.start.replace(sim=played.start.sim.replace(physics=moved)), jax.random.key(1))
     first = played.rollouts[0]
     assert not np.array_equal(changed.reward[:, 0], first.reward[:, 0])
-    for name in ("reward", "done", "valid", "raw", "value", "log_prob", "episode_return"):
+    for name in ("reward", "done", "valid", "unclipped_action", "value", "log_prob", "episode_return"):
         actual, expected = getattr(changed, name), getattr(first, name)
         np.testing.assert_array_equal(actual[:, 1:], expected[:, 1:])
 
 
 def test_every_step_draws_its_own_actions(played):
-    raw = of_both(played, "raw")
+    raw = of_both(played, "unclipped_action")
     assert len({step.tobytes() for step in raw}) == 2 * T
 
 

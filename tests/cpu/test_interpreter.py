@@ -6,13 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.extend import core
 from jax.sharding import AxisType
 from jax.sharding import PartitionSpec as P
 
-import pixelbrax_jax as pb
 from pixelbrax_jax._cpu import interpreter as module
 from pixelbrax_jax._cpu.interpreter import batch_last
+from tests.cpu.equations import equations
 
 TABLE = jnp.arange(12.0).reshape(4, 3)
 
@@ -165,11 +164,11 @@ def test_equations_keep_their_contexts():
     np.testing.assert_array_equal(actual, jax.vmap(draw)(jnp.zeros(2)))
 
 
-@pytest.mark.parametrize("function", ["_scan_sizes", "_bind", "_reshape_wrongly"])
+@pytest.mark.parametrize("function", ["_scan_sizes", "bind", "_reshape_wrongly"])
 def test_what_is_not_known_is_computed_by_vmap(monkeypatch, function):
     """As if a release of JAX had other parameters, or shapes that no rule foresaw."""
     if function == "_reshape_wrongly":
-        monkeypatch.setitem(module._FIRST_BATCHED, "reshape", lambda eqn, x: x)
+        monkeypatch.setitem(module.RULES, "reshape", lambda eqn, inputs, size: [inputs[0].value])
     else:
         monkeypatch.setattr(module, function, lambda *_: {}["num_carry"])
     monkeypatch.setattr(module, "_warned", [])
@@ -217,32 +216,3 @@ def test_products_of_few_rows_are_sums_over_an_axis(size):
     names = [eqn.primitive.name for eqn in equations(jaxpr.jaxpr)]
     assert "dot_general" not in names
     assert ("reduce_sum" in names) == (size == 4)
-
-
-def equations(jaxpr):
-    for eqn in jaxpr.eqns:
-        inner = list(core.jaxprs_in_params(eqn.params))
-        yield from [eqn] * (not inner)
-        for sub in inner:
-            yield from equations(sub)
-
-
-@pytest.mark.parametrize("task", ["ant", "walker2d", "inverted_pendulum", "swimmer"])
-def test_physics_keep_the_batch_last(task):
-    # A number of environments that is no other length; 48 is a multiple of the lanes.
-    num_envs = 48
-    env, params = pb.make(task)
-    state, _ = jax.eval_shape(pb.VectorPixelEnv(env, num_envs).reset, jax.random.key(0), params)
-    state = state.replace(frames=None)
-    action = jax.ShapeDtypeStruct((num_envs, env.action_size), jnp.float32)
-    closed = jax.make_jaxpr(batch_last(env.advance, (0, 0, None)))(state, action, params)
-    batched = [
-        (eqn.primitive.name, var.aval.shape)
-        for eqn in equations(closed.jaxpr)
-        for var in eqn.outvars
-        if num_envs in var.aval.shape
-    ]
-    first = [name for name, shape in batched if num_envs in shape[:-1]]
-    assert "dot_general" not in dict(batched)
-    assert set(first) <= {"transpose"}, "only the ends of the program may move the batch"
-    assert len(first) < len(batched) / 20

@@ -250,8 +250,8 @@ def break_davis(davis, how):
     [
         ("no split file", FileNotFoundError, r"train\.txt is missing.*ImageSets/2017"),
         ("absent clip", FileNotFoundError, "clip 'bear', listed in .*train.txt, has no folder"),
-        ("no frames", ValueError, "bear has no pictures"),
-        ("truncated picture", ValueError, r"00002\.jpg cannot be read as a picture"),
+        ("no frames", ValueError, "bear has no images"),
+        ("truncated picture", ValueError, r"00002\.jpg cannot be read as an image"),
         ("no 480p", FileNotFoundError, "480p is missing.*DAVIS-2017 at 480p unpacks into"),
     ],
 )
@@ -294,7 +294,7 @@ def test_other_mistakes(davis, tmp_path):
         load_clips(davis, "paper-train")
     empty = tmp_path / "empty"
     empty.mkdir()
-    with pytest.raises(ValueError, match=r"neither videos .* nor folders of pictures"):
+    with pytest.raises(ValueError, match=r"neither videos .* nor folders of images"):
         load_clips(empty, "all")
     with pytest.raises(
         MemoryError, match=r"8 frames of 84 x 84 .*max_bytes allows 0 MB.*num_clips"
@@ -302,9 +302,9 @@ def test_other_mistakes(davis, tmp_path):
         load_clips(davis, "train", max_bytes=1000)
     with pytest.raises(MemoryError, match="max_bytes"):
         load_clips("procedural", max_bytes=1000)
-    with pytest.raises(ValueError, match="num_clips must be a whole number"):
+    with pytest.raises(ValueError, match="num_clips must be a positive integer"):
         load_clips(davis, num_clips=0)
-    with pytest.raises(ValueError, match="height must be a whole number"):
+    with pytest.raises(ValueError, match="height must be a positive integer"):
         load_clips(davis, height=0)
 
 

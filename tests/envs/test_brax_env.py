@@ -146,7 +146,7 @@ def ends(timesteps) -> np.ndarray:
 @pytest.fixture(scope="module")
 def limit() -> int:
     """A time limit that one ball reaches just as it leaves, two before, and two by resting."""
-    terminated = np.asarray(pixel_rollout(make(obs_mode="state"), 30).terminated)
+    terminated = np.asarray(pixel_rollout(make(obs_mode="state"), 30, limited(1000)).terminated)
     lengths = np.argmax(terminated, axis=0)[:3] + 1
     assert sorted(lengths)[1] < max(lengths)
     return int(max(lengths))

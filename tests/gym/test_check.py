@@ -59,7 +59,7 @@ FAULTS = {
     "never resets": (SAME, "the observation at the end of an episode must be the next one's"),
     "resets all": (DISABLED, "return the observations of the other environments as they were"),
     "resets others secretly": (DISABLED, "must leave the other environments alone"),
-    "ignores mask": (DISABLED, "begin an episode in the masked environments"),
+    "ignores mask": (DISABLED, "reset the masked environments"),
     "writes mask": (DISABLED, "must not write to the mask"),
     "reward dtype": (NEXT, "rewards must be floats of shape (3,), are int64"),
     "reward shape": (NEXT, "rewards must be floats of shape (3,), are float64 of shape (3, 1)"),

@@ -40,30 +40,30 @@ def test_a_healthy_machine():
 
 
 @pytest.mark.parametrize(
-    ("changes", "level", "text", "cure"),
+    ("changes", "level", "text", "fix"),
     [
         (
             {"jax_platform": "cpu", "jax_device": "cpu:0", "torch_cuda": False},
-            "trouble",
+            "problem",
             "NVIDIA GPU, but JAX does not use it",
             ".[cuda12]",
         ),
         (
             {"jax_platform": "cpu", "has_nvidia": False},
-            "trouble",
+            "problem",
             "torch uses CUDA and JAX the CPU",
             ".[cuda12]",
         ),
-        ({"torch_cuda": False}, "trouble", "JAX uses the GPU and torch cannot", "torch built for"),
+        ({"torch_cuda": False}, "problem", "JAX uses the GPU and torch cannot", "torch built for"),
         (
             {"jax_error": "RuntimeError: no backend", "to_torch": None, "to_jax": None},
-            "trouble",
+            "problem",
             "JAX finds no device to compute on: RuntimeError: no backend",
             "JAX_PLATFORMS",
         ),
         (
             {"torch_cuda": "ImportError: libcudart", "to_torch": None, "to_jax": None},
-            "trouble",
+            "problem",
             "torch is installed and cannot be imported: ImportError: libcudart",
             "install it again",
         ),
@@ -79,8 +79,8 @@ def test_a_healthy_machine():
             "cannot share the memory of a tpu",
             "output='numpy'",
         ),
-        ({"to_torch": False}, "trouble", "copied on their way from JAX to torch", "constraints"),
-        ({"to_jax": "BufferError: x"}, "trouble", "from torch to JAX: BufferError: x", "numpy"),
+        ({"to_torch": False}, "problem", "copied on their way from JAX to torch", "constraints"),
+        ({"to_jax": "BufferError: x"}, "problem", "from torch to JAX: BufferError: x", "numpy"),
         ({"environ": {}}, "note", "75% of the GPU's memory", "XLA_CLIENT_MEM_FRACTION=0.4"),
         (
             {
@@ -89,7 +89,7 @@ def test_a_healthy_machine():
                     "XLA_PYTHON_CLIENT_MEM_FRACTION": "0.4",
                 }
             },
-            "trouble",
+            "problem",
             "are both set",
             "unset XLA_PYTHON_CLIENT_MEM_FRACTION",
         ),
@@ -102,11 +102,11 @@ def test_a_healthy_machine():
         ),
     ],
 )
-def test_each_trouble_has_a_cure(changes, level, text, cure):
+def test_each_problem_has_a_fix(changes, level, text, fix):
     (finding,) = not_ok(**changes)
     assert finding.level == level
     assert text in finding.text
-    assert cure in finding.cure
+    assert fix in finding.fix
 
 
 @pytest.mark.parametrize(
@@ -134,9 +134,9 @@ def test_a_cpu_alone_is_fine():
     assert not not_ok(**cpu, to_torch=None, to_jax=None)
 
 
-def test_troubles_are_counted():
+def test_problems_are_counted():
     text = doctor.report(doctor.diagnose(replace(HEALTHY, to_torch=False, to_jax=False)))
-    assert text.endswith("2 troubles found.")
+    assert text.endswith("2 problems found.")
     assert " -> use a current torch" in text
 
 
@@ -152,7 +152,7 @@ def test_command(monkeypatch, capsys, broken, status):
     machine = replace(HEALTHY, to_torch=not broken)
     monkeypatch.setattr(doctor, "inspect", lambda: machine)
     assert cli.main(["doctor"]) == status
-    assert ("1 trouble found." if broken else "All is well.") in capsys.readouterr().out
+    assert ("1 problem found." if broken else "All is well.") in capsys.readouterr().out
 
 
 def test_the_command_is_installed():

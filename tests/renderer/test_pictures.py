@@ -129,7 +129,7 @@ class TestGround:
         rng = np.random.default_rng(0)
         x, y = rng.uniform(-3, 3, (2, 20))
         width_x, width_y = rng.uniform(0.05, 3, (2, 20))
-        share = ground.second_color_share(pattern, x, y, width_x, width_y)
+        share = ground.second_color_fraction(pattern, x, y, width_x, width_y)
         steps = (np.arange(400) + 0.5) / 400 - 0.5
         for k in range(20):
             px = (x[k] + width_x[k] * steps)[:, None]

@@ -1,0 +1,94 @@
+"""The tables of the documentation are those of the code."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from dataclasses import fields
+from pathlib import Path
+
+import gymnasium
+
+import pixelbrax_gym
+import pixelbrax_jax as pb
+from pixelbrax_jax.config import EnvConfig
+from pixelbrax_jax.tasks import TASKS
+
+ROOT = Path(__file__).parents[1]
+
+
+def table(page: str, heading: str) -> list[list[str]]:
+    """Return the cells of the table below a heading row, row by row."""
+    lines = (ROOT / page).read_text("utf-8").split("\n")
+    start = next(i for i, line in enumerate(lines) if line.startswith(heading))
+    rows = []
+    for line in lines[start + 2 :]:
+        if not line.startswith("|"):
+            break
+        rows.append([cell.strip() for cell in line.strip("|").split("|")])
+    return rows
+
+
+def code(cell: str) -> list[str]:
+    return re.findall(r"`([^`]*)`", cell)
+
+
+def test_the_readme_lists_every_option_with_its_default():
+    listed = {}
+    for names, defaults, _ in table("README.md", "| option | default | meaning"):
+        listed |= dict(zip(code(names), code(defaults), strict=True))
+    options = {f.name: f.default for f in fields(EnvConfig) if f.name != "task"}
+    assert listed == {name: repr(value).replace("'", '"') for name, value in options.items()}
+
+
+def test_the_readme_lists_every_task():
+    expected = [
+        [
+            f"`{task.gymnasium_id}`",
+            f"`{name}`",
+            str(pb.make(name)[0].action_size),
+            task.default_backend,
+            task.summary,
+        ]
+        for name, task in TASKS.items()
+    ]
+    assert table("README.md", "| Gymnasium id |") == expected, "\n".join(
+        "| " + " | ".join(row) + " |" for row in expected
+    )
+
+    for name, task in TASKS.items():
+        assert gymnasium.spec(task.gymnasium_id).kwargs == {"task": name}
+
+
+def test_the_gallery_shows_every_task():
+    expected = [
+        [
+            f"`{task.gymnasium_id}`",
+            task.summary,
+            f"![{task.gymnasium_id.partition('/')[2].partition('-')[0]}](images/gallery/{name}.png)",
+        ]
+        for name, task in TASKS.items()
+    ]
+    shown = table("docs/gallery.md", "| task |")
+    assert shown == expected, "\n".join("| " + " | ".join(row) + " |" for row in expected)
+    for _, _, image in shown:
+        path = image.partition("(")[2].rstrip(")")
+        assert (ROOT / "docs" / path).is_file()
+
+
+def test_the_readme_lists_the_options_of_adapters():
+    adapters = [
+        pixelbrax_gym.PixelBraxEnv,
+        pixelbrax_gym.PixelBraxVectorEnv,
+        pixelbrax_gym.PixelBraxTorchRLEnv,
+        pixelbrax_gym.PixelBraxSB3VecEnv,
+    ]
+    taken = [
+        set(inspect.signature(adapter.__init__).parameters) - {"self", "task", "options"}
+        for adapter in adapters
+    ]
+    listed: list[set[str]] = [set() for _ in adapters]
+    for names, *cells, _ in table("README.md", "| option | Gymnasium `make` |"):
+        for options, cell in zip(listed, cells, strict=True):
+            options |= set(code(names)) if cell == "yes" else set()
+    assert listed == taken
