@@ -17,7 +17,7 @@ WORKERS := -n 2 --dist worksteal
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-slow test-newest test-oldest test-clients lint format bench docs docs-serve clean
+.PHONY: help demo test test-slow test-newest test-oldest test-clients lint format bench golden docs docs-serve clean
 
 help: ## show this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1|/' | \
@@ -63,6 +63,9 @@ format: $(VENV)/.installed-dev ## rewrite the code in the project's style
 
 bench: $(VENV)/.installed-dev ## measure throughput
 	$(RUN) -m tests.benchmarks.run $(ARGS)
+
+golden: $(VENV)/.installed-dev ## accept how tasks, looks and cameras are drawn now; ARGS="ant" for some
+	$(RUN) -m tests.golden.images $(ARGS)
 
 docs: $(VENV)/.installed-docs ## build the documentation into site/, every warning an error
 	NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs build --strict

@@ -15,8 +15,12 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1]
 os.environ.setdefault("JAX_COMPILATION_CACHE_MAX_SIZE", str(2**30))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
 # `make test-slow` compiles as users do.
-OPTIMIZE = os.environ.get("PIXELBRAX_TESTS_OPTIMIZE") == "1"
-os.environ["XLA_FLAGS"] = f"{xla_flags(OPTIMIZE)} {os.environ.get('XLA_FLAGS', '')}"
+os.environ["XLA_FLAGS"] = " ".join(
+    [
+        xla_flags(optimize=os.environ.get("PIXELBRAX_TESTS_OPTIMIZE") == "1"),
+        os.environ.get("XLA_FLAGS", ""),
+    ]
+)
 
 import jax
 

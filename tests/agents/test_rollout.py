@@ -13,6 +13,7 @@ from pixelbrax_jax import PixelEnv, VectorPixelEnv
 from pixelbrax_jax.agents.core import phasic
 from pixelbrax_jax.agents.core.config import TrainConfig
 from pixelbrax_jax.agents.core.distributions import Normal
+from pixelbrax_jax.agents.core.experience import Experience
 from pixelbrax_jax.agents.core.rollout import (
     Decision,
     collect,
@@ -148,24 +149,20 @@ def test_chunks_of_the_buffer_are_the_rollouts(played):
         height=10, width=12, frame_stack=played.stack, num_envs=N, num_steps=T, encoder="impala",
         random_shift=played.shift, num_minibatches=1,
     )  # fmt: skip
-    buffer = phasic.Buffer(
-        *jax.tree.map(
-            lambda *x: jnp.zeros((2, *x[0].shape), x[0].dtype),
-            (*(getattr(played.rollouts[0], name) for name in ("frames", "unclipped_action", "reward")),
-             *(getattr(played.rollouts[0], name) for name in ("done", "valid"))),
-        )
-    )  # fmt: skip
-    for slot, rollout in enumerate(played.rollouts):
-        buffer = phasic.remember(buffer, jnp.uint32(slot), rollout, rollout.reward)
+    experiences = [Experience(x, x.reward, x.reward) for x in played.rollouts]
+    buffer = jax.tree.map(
+        lambda x: jnp.zeros((2, *x.shape), x.dtype), phasic._entry(experiences[0])
+    )
+    for slot, experience in enumerate(experiences):
+        buffer = phasic.remember(buffer, jnp.uint32(slot), experience)
     parts, policy = 3, Normal(jnp.zeros(()), jnp.ones(()), False)
     # Of each environment another chunk: the second and third of each rollout.
     which = np.array([1, 5, 2, 4])
     chunk = phasic._chunk(config, buffer, jnp.asarray(which), parts, policy)
     size = T // parts
     assert chunk.num_steps == size
-    for name, field in (
-        ("pixels", "value"), ("unclipped_action", "unclipped_action"), ("returns", "reward"), ("weight", "valid"),
-    ):  # fmt: skip
+    fields = {"pixels": "value", "returns": "reward", "weight": "valid"}
+    for name, field in (fields | {"unclipped_action": "unclipped_action"}).items():
         actual = np.asarray(getattr(chunk, name))
         actual = actual.reshape(N, size, *actual.shape[1:])
         for i, number in enumerate(which):
@@ -178,10 +175,12 @@ def test_an_environment_does_not_depend_on_its_neighbours(played):
     physics = played.start.sim.physics
     elsewhere = FastBall._state(jnp.float32(0.9), jnp.float32(0), jnp.float32(0), jnp.bool_(False))
     moved = jax.tree.map(lambda rows, one: rows.at[0].set(one), physics, elsewhere)
-    _, changed = played.play(played.start.replace(sim=played.start.sim.replace(physics=moved)), jax.random.key(1))
+    start = played.start.replace(sim=played.start.sim.replace(physics=moved))
+    _, changed = played.play(start, jax.random.key(1))
     first = played.rollouts[0]
     assert not np.array_equal(changed.reward[:, 0], first.reward[:, 0])
-    for name in ("reward", "done", "valid", "unclipped_action", "value", "log_prob", "episode_return"):
+    names = ("reward", "done", "valid", "value", "log_prob", "episode_return", "unclipped_action")
+    for name in names:
         actual, expected = getattr(changed, name), getattr(first, name)
         np.testing.assert_array_equal(actual[:, 1:], expected[:, 1:])
 

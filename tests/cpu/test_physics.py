@@ -51,13 +51,8 @@ def test_primitives_without_a_rule_are_those_listed(task, backend, monkeypatch):
         for var in eqn.outvars
         if NUM_ENVS in var.aval.shape
     ]
-    print(
-        task,
-        backend,
-        sorted(found),
-        len(batched),
-        sum(NUM_ENVS in shape[:-1] for _, shape in batched),
-    )
+    first = [name for name, shape in batched if NUM_ENVS in shape[:-1] and name not in found]
+    assert len(first) < len(batched) / 20
 
 
 WITHOUT_RULE = {}

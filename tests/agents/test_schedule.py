@@ -1,0 +1,119 @@
+"""What follows an iteration, where the environments are in a training state, and equal runs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import pytest
+from flax import struct
+
+from pixelbrax_jax import PixelEnv, VectorPixelEnv
+from pixelbrax_jax.agents.algorithms.dcpg import DCPG, DCPGConfig
+from pixelbrax_jax.agents.algorithms.ppg import PPG, PPGConfig
+from pixelbrax_jax.agents.algorithms.ppo import PPO, PPOConfig
+from pixelbrax_jax.agents.core.env_axis import along_envs, as_declared, env_axes, without_envs
+from pixelbrax_jax.agents.runner import programs
+from pixelbrax_jax.agents.runner.evaluate import Evaluator
+from pixelbrax_jax.agents.runner.schedule import Schedule
+from pixelbrax_jax.agents.runner.seeds import Runs
+from tests.agents.small import OPTIONS, PARAMS, PHASIC, SMALL, ball_envs
+from tests.compilations import counted
+from tests.envs.toy import limited
+
+ENVS = ball_envs()
+SEVEN = VectorPixelEnv(ENVS.env, 7)
+SCHEDULE = Schedule(num_iterations=10, num_phases=4, log_every=3, num_evals=2)
+
+
+def test_jobs_come_in_their_order():
+    jobs = {number: SCHEDULE.jobs(number) for number in range(1, 11)}
+    every = ("log", "evaluate", "save")
+    assert {n: done for n, done in jobs.items() if done} == {
+        3: ("log",), 5: every, 6: ("log",), 9: ("log",), 10: every,
+    }  # fmt: skip
+    assert SCHEDULE.jobs(1, save=True) == ("log", "save")
+
+
+def test_a_run_that_is_asked_to_stop_saves_first():
+    assert SCHEDULE.jobs(1, stop=True) == ("log", "save", "report_stop")
+    assert SCHEDULE.jobs(5, stop=True) == ("log", "save", "report_stop", "evaluate")
+
+
+def test_phases_and_evaluations_are_spread_evenly():
+    numbers = range(1, 11)
+    assert [n for n in numbers if SCHEDULE.has_auxiliary_phase(n)] == [4, 8]
+    never = Schedule(10, 0, 1, 0)
+    assert not any(never.has_auxiliary_phase(n) or never.evaluates(n) for n in numbers)
+    often = Schedule(num_iterations=3, num_phases=0, log_every=1, num_evals=7)
+    assert all(often.evaluates(n) for n in range(1, 4))
+
+
+@pytest.mark.parametrize(
+    "algorithm",
+    [
+        PPO(PPOConfig(**SMALL), ENVS),
+        PPG(PPGConfig(**SMALL, **PHASIC), ENVS),
+        DCPG(DCPGConfig(**SMALL, **PHASIC, decoupled=True), ENVS),
+    ],
+    ids=lambda algorithm: algorithm.name,
+)
+def test_environments_are_where_the_fields_say(algorithm):
+    """An axis that is declared has the number of environments, and no other axis has."""
+    few, more = (
+        jax.eval_shape(Runs(kind).init, 0, PARAMS)
+        for kind in (algorithm, type(algorithm)(replace(algorithm.config, num_envs=7), SEVEN))
+    )
+    axes = env_axes(few)
+    assert jax.tree.structure(axes) == jax.tree.structure(few)
+    for axis, a, b in zip(*map(jax.tree.leaves, (axes, few, more)), strict=True):
+        expected = list(a.shape)
+        if axis >= 0:
+            assert a.shape[axis] == SMALL["num_envs"]
+            expected[axis] = 7
+        assert tuple(expected) == b.shape
+
+
+def test_a_field_that_declares_nothing_is_an_error():
+    class State(struct.PyTreeNode):
+        rewards: jax.Array = along_envs(1)
+        network: jax.Array = without_envs()
+
+    class Forgetful(struct.PyTreeNode):
+        state: State = as_declared(leading_axes=2)
+        new: jax.Array | None = None
+
+    state = State(jnp.zeros((3, 4)), jnp.zeros(5))
+    assert env_axes(state) == State(1, -1)
+    with pytest.raises(TypeError, match=r"Forgetful\.new does not say where its environments are"):
+        env_axes(Forgetful(state, jnp.zeros(2)))
+
+
+def make_ppo(**changes):
+    envs = VectorPixelEnv(PixelEnv(ENVS.env.physics, **OPTIONS), SMALL["num_envs"])
+    return PPO(PPOConfig(**SMALL | changes), envs)
+
+
+def test_equal_settings_are_equal_algorithms():
+    one, two = make_ppo(), make_ppo()
+    assert one == two
+    assert hash(one) == hash(two)
+    assert one != make_ppo(gamma=0.5)
+    assert one != PPG(PPGConfig(**SMALL, **PHASIC), ENVS)
+    # A physics object of one's own is equal to itself alone.
+    assert one != PPO(PPOConfig(**SMALL), ball_envs())
+
+
+def test_a_run_like_one_before_compiles_nothing():
+    def train(seed, params):
+        algorithm = make_ppo()
+        state = programs.init(Runs(algorithm), jnp.uint32(seed), params)
+        state, _ = programs.iterate(Runs(algorithm), state, params)
+        env = PixelEnv(ENVS.env.physics, **OPTIONS)
+        return Evaluator(algorithm, env, params, num_episodes=2)(state.networks)
+
+    train(0, PARAMS)
+    with counted() as events:
+        train(1, limited(3))
+    assert not events

@@ -1,0 +1,1 @@
+"""Images of every task, look and camera as they were last accepted."""
