@@ -1,4 +1,4 @@
-"""Pictures of every distractor at every level, for the documentation.
+"""Images of every distractor at every level, for the documentation.
 
     python examples/render_distractors.py --output-dir docs/images/distractors
 
@@ -41,7 +41,7 @@ TASKS = ("halfcheetah", "ant")
 EACH = 3  # environments of a task
 SIZE = 84  # pixels that agents get
 SHOWN = 8  # the frame in levels.png: by then what moves has moved
-SEED = 4  # agents of this one do not stretch beyond the picture
+SEED = 4  # agents of this one do not stretch beyond the image
 STAR = 2  # the environment in motion.gif: its viewpoint strays further with every level
 
 ZOOM, GAP, CAPTION = 2, 4, 20  # pixels in motion.gif
@@ -92,10 +92,10 @@ def levels(frames: dict[str, np.ndarray], path: Path) -> None:
     figure, grid = plt.subplots(
         len(frames), columns, figsize=(columns * 1.15 + 1.6, len(frames) * 1.15), squeeze=False
     )
-    for row, (name, pictures) in enumerate(frames.items()):
-        for column, picture in enumerate(pictures[min(SHOWN, num_frames - 1)]):
+    for row, (name, images) in enumerate(frames.items()):
+        for column, image in enumerate(images[min(SHOWN, num_frames - 1)]):
             panel = grid[row, column]
-            panel.imshow(picture, interpolation="nearest")
+            panel.imshow(image, interpolation="nearest")
             panel.set(xticks=[], yticks=[])
             for side in panel.spines.values():
                 side.set_visible(False)
@@ -116,25 +116,25 @@ def motion(frames: dict[str, np.ndarray], path: Path) -> None:
     """Presets side by side, each below its name, in time; a row for each task."""
     font = ImageFont.load_default(size=14)
     side = ZOOM * SIZE
-    films = {name: film[:, STAR::EACH] for name, film in frames.items()}
-    num_frames, rows = next(iter(films.values())).shape[:2]
-    width = len(films) * (side + GAP) - GAP
-    pictures = []
+    videos = {name: video[:, STAR::EACH] for name, video in frames.items()}
+    num_frames, rows = next(iter(videos.values())).shape[:2]
+    width = len(videos) * (side + GAP) - GAP
+    images = []
     for t in range(num_frames):
-        picture = Image.new("RGB", (width, CAPTION + rows * (side + GAP) - GAP), "white")
-        drawing = ImageDraw.Draw(picture)
-        for column, (name, film) in enumerate(films.items()):
+        image = Image.new("RGB", (width, CAPTION + rows * (side + GAP) - GAP), "white")
+        drawing = ImageDraw.Draw(image)
+        for column, (name, video) in enumerate(videos.items()):
             left = column * (side + GAP)
             drawing.text((left + side / 2, CAPTION / 2), name, "black", font, anchor="mm")
-            for row, pixels in enumerate(film[t]):
+            for row, pixels in enumerate(video[t]):
                 tile = pixels.repeat(ZOOM, axis=0).repeat(ZOOM, axis=1)
-                picture.paste(Image.fromarray(tile), (left, CAPTION + row * (side + GAP)))
-        pictures.append(picture.quantize(COLORS, kmeans=2))
-    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=80, loop=0)
+                image.paste(Image.fromarray(tile), (left, CAPTION + row * (side + GAP)))
+        images.append(image.quantize(COLORS, kmeans=2))
+    images[0].save(path, save_all=True, append_images=images[1:], duration=80, loop=0)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Writes both pictures."""
+    """Writes both images."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--output-dir", type=Path, default=Path("docs/images/distractors"))
     parser.add_argument("--num-frames", type=int, default=18)
@@ -148,7 +148,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for name in options.presets
     }
     levels(frames, options.output_dir / "levels.png")
-    moving = {name: film for name, film in frames.items() if name in MOVING}
+    moving = {name: video for name, video in frames.items() if name in MOVING}
     motion(moving or frames, options.output_dir / "motion.gif")
 
 

@@ -3,7 +3,7 @@
     python examples/render_gallery.py --output-dir docs/images/gallery
     python examples/render_gallery.py --output-dir runs/gallery --tasks ant reacher
 
-Each picture is the environment's after a few random actions; the strip shows, side by side, what
+Each image is the environment's after a few random actions; the strip shows, side by side, what
 the agent gets (84 x 84, enlarged), the default look with shadows, and the original look.
 """
 
@@ -24,7 +24,7 @@ GAP = 8
 
 
 def strip(task: str, num_steps: int) -> np.ndarray:
-    """The task's three pictures side by side, (SIZE, 3 SIZE + gaps, 3) uint8."""
+    """The task's three images side by side, (SIZE, 3 SIZE + gaps, 3) uint8."""
     env, params = pixelbrax_jax.make(task, obs_mode="state")
     key = jax.random.key(1)
     state, _ = env.reset(key, params)
@@ -32,7 +32,7 @@ def strip(task: str, num_steps: int) -> np.ndarray:
         shape = (env.action_size,)
         action = jax.random.uniform(jax.random.fold_in(key, t), shape, minval=-1.0)
         state, _ = env.step(state, action, params)
-    pictures = []
+    images = []
     for look, shadows, size in (
         ("default", False, 84),
         ("default", True, SIZE),
@@ -40,15 +40,15 @@ def strip(task: str, num_steps: int) -> np.ndarray:
     ):
         dressed = params.replace(look=pixelbrax_jax.make_look(look, shadows=shadows))
         pixels = np.asarray(env.image(state, dressed, size, size))
-        pictures.append(pixels.repeat(SIZE // size, axis=0).repeat(SIZE // size, axis=1))
+        images.append(pixels.repeat(SIZE // size, axis=0).repeat(SIZE // size, axis=1))
     gap = np.full((SIZE, GAP, 3), 255, np.uint8)
-    return np.concatenate([pictures[0], gap, pictures[1], gap, pictures[2]], axis=1)
+    return np.concatenate([images[0], gap, images[1], gap, images[2]], axis=1)
 
 
 def overview(strips: list[np.ndarray], columns: int = 6) -> np.ndarray:
-    """The middle pictures of all strips at half size, in rows of at most ``columns``."""
+    """The middle images of all strips at half size, in rows of at most ``columns``."""
     start, columns = SIZE + GAP, min(columns, len(strips))
-    tiles = [picture[::2, start : start + SIZE : 2] for picture in strips]
+    tiles = [image[::2, start : start + SIZE : 2] for image in strips]
     tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % columns)
     rows = [np.concatenate(tiles[k : k + columns], axis=1) for k in range(0, len(tiles), columns)]
     return np.concatenate(rows, axis=0)
@@ -65,8 +65,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     output = Path(options.output_dir)
     output.mkdir(parents=True, exist_ok=True)
     strips = {task: strip(task, options.num_steps) for task in options.tasks}
-    for task, picture in strips.items():
-        imageio.imwrite(output / f"{task}.png", picture)
+    for task, image in strips.items():
+        imageio.imwrite(output / f"{task}.png", image)
     imageio.imwrite(output / "overview.png", overview(list(strips.values())))
 
 

@@ -111,7 +111,7 @@ def _train(arguments: list[str]) -> int:
 
 
 def _lacks_train(command: str, error: ImportError) -> int:
-    """Say how to get the extra that agents need, and returns the exit status."""
+    """Say how to get the extra that agents need, and return the exit status."""
     sys.stderr.write(f"pixelbrax {command}: {error}; try: {install_extra('train')}\n")
     return 1
 

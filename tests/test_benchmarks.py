@@ -39,7 +39,7 @@ STEPS = {
     "bytes_on_a_device": 10**6,
     "control_dt": 0.05,
 }
-TURN = {"steps_per_second": 97.0, "ratio": 0.97, "interval": [0.96, 0.98], "turns": 5}
+TURN = {"steps_per_second": 97.0, "ratio": 0.97, "interval": [0.96, 0.98], "runs": 5}
 WALKERS = {"task": "walker2d", "num_envs": 2}
 ANSWERS = {
     "throughput.renderer": RENDERER,
@@ -47,9 +47,9 @@ ANSWERS = {
     "throughput.gymnasium": STEPS,
     "throughput.sharded": STEPS,
     "scaling.training": STEPS,
-    "turns.batches": [{"num_envs": 10, **TURN}],
-    "turns.doors": [{"door": "JAX loop", "autoreset_mode": "next_step", **TURN}],
-    "turns.distractors": [{"distractors": "camera", **TURN}],
+    "interleaved.batches": [{"num_envs": 10, **TURN}],
+    "interleaved.adapters": [{"adapter": "JAX loop", "autoreset_mode": "next_step", **TURN}],
+    "interleaved.distractors": [{"distractors": "camera", **TURN}],
     "bank.load": {"frames": 4200, "file_bytes": 2e8, "bank_bytes": 1e8, "seconds": {"read": 9.0}},
     "startup.first_frame": {"seconds": {"import": 1.0, "make": 2.0}},
     "scene.describe": {},
@@ -310,9 +310,9 @@ def test_a_real_case_runs_in_a_process_of_its_own():
     [
         ("throughput.gymnasium", WALKERS),
         ("throughput.scan", WALKERS),
-        ("turns.batches", {"task": "walker2d", "sizes": (2, 1), "seconds": 1.0}),
-        ("turns.doors", {**WALKERS, "seconds": 1.0}),
-        ("turns.distractors", {**WALKERS, "seconds": 1.0}),
+        ("interleaved.batches", {"task": "walker2d", "sizes": (2, 1), "seconds": 1.0}),
+        ("interleaved.adapters", {**WALKERS, "seconds": 1.0}),
+        ("interleaved.distractors", {**WALKERS, "seconds": 1.0}),
         ("bank.load", {"size": 16, "frames": 2}),
         (
             "scaling.training",
@@ -321,7 +321,7 @@ def test_a_real_case_runs_in_a_process_of_its_own():
     ],
 )
 def test_more_real_cases_run(measure, options):
-    outcome = run.measure(Case("doors", measure, options), 900.0)
+    outcome = run.measure(Case("adapters", measure, options), 900.0)
     assert outcome["status"] == "ok", outcome
 
 

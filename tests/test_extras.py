@@ -46,18 +46,18 @@ def test_extras_that_are_named_exist():
 
 
 @pytest.mark.parametrize(
-    ("absent", "door", "extra"),
+    ("absent", "adapter", "extra"),
     [
         ("torch", "pixelbrax_gym.interop.dlpack", "torch"),
         ("torchrl.envs", "pixelbrax_gym.torchrl.env", "torchrl"),
         ("stable_baselines3.common.vec_env", "pixelbrax_gym.sb3.vec_env", "sb3"),
     ],
 )
-def test_a_framework_that_is_missing(monkeypatch, absent, door, extra):
+def test_a_framework_that_is_missing(monkeypatch, absent, adapter, extra):
     monkeypatch.setitem(sys.modules, absent, None)
-    monkeypatch.delitem(sys.modules, door, raising=False)
+    monkeypatch.delitem(sys.modules, adapter, raising=False)
     with pytest.raises(ImportError, match=rf"is not installed; try: .*\[{extra}\]"):
-        importlib.import_module(door)
+        importlib.import_module(adapter)
 
 
 def test_a_reader_that_is_missing(monkeypatch, tmp_path):

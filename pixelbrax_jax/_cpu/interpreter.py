@@ -24,7 +24,7 @@ _LANES = 16
 
 
 def batch_last(fn: Callable[..., Any], in_axes: Sequence[int | None]) -> Callable[..., Any]:
-    """``jax.vmap(fn, in_axes)``, computed with the batch as last axis.
+    """Return ``jax.vmap(fn, in_axes)``, computed with the batch as last axis.
 
     Results differ from those of ``jax.vmap`` by rounding. What has no rule here, among it loops
     that end by themselves and functions with derivatives of their own, is computed by

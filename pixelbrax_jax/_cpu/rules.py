@@ -106,7 +106,7 @@ reduce_prod reduce_sum rev split squeeze
 
 @rule(*_NAMED_AXES_NAMES.split())
 def _named_axes(eqn: core.JaxprEqn, inputs: Sequence[Operand], size: int) -> list[Any]:
-    """Parameters name the axes these work on: one more at the end changes nothing."""
+    """Return bind as it is: parameters name the axes, and one more at the end changes nothing."""
     del size
     return bind(eqn, *(x.value for x in inputs))
 
@@ -195,7 +195,7 @@ def _dot(eqn: core.JaxprEqn, inputs: Sequence[Operand], size: int) -> list[Any] 
     out = row_aval(eqn.outvars[0])
 
     def arrange(side: int, operand: Operand) -> tuple[jax.Array, int]:
-        """With axes contracted, batch, own, and the environments'; and how many are own."""
+        """Return axes in the order contracted, batch, own, environments; and how many are own."""
         rank = row_aval(eqn.invars[side]).ndim
         own = [i for i in range(rank) if i not in contracted[side] and i not in batch[side]]
         axes = (*contracted[side], *batch[side], *own, *([rank] if operand.batched else []))
@@ -205,7 +205,7 @@ def _dot(eqn: core.JaxprEqn, inputs: Sequence[Operand], size: int) -> list[Any] 
     lengths = x.shape[: len(contracted[0])]
 
     def multiply(a: jax.Array, b: jax.Array, leading: tuple[int, ...]) -> jax.Array:
-        """Products of entries, (*leading, *out.shape, size).
+        """Return products of entries, (*leading, *out.shape, size).
 
         Axes of ``a`` and ``b`` are leading, batch, own, and rows if batched.
         """

@@ -12,7 +12,7 @@ from pixelbrax_jax.types import CameraRig, Geoms, Look, Scene
 
 
 def place(geoms: Geoms, rig: CameraRig, look: Look, xpos: jax.Array, xquat: jax.Array) -> Scene:
-    """Carry every geom along with its link and aims the camera.
+    """Carry every geom along with its link, and aim the camera.
 
     Args:
         geoms: shapes in their links' frames.

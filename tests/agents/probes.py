@@ -1,6 +1,6 @@
 """Tasks so simple that what an agent must find out is known, all in one environment.
 
-The ball lies in one of ten places, and each place is a situation of some small task. A picture
+The ball lies in one of ten places, and each place is a situation of some small task. An image
 tells the place, and the place tells the future. An episode begins in a random task.
 """
 

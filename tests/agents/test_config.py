@@ -120,7 +120,7 @@ def test_dcpg_needs_its_delayed_phase():
         (
             PPOConfig,
             {"encoder": "nature", "height": 40, "width": 35},
-            "encoder 'nature' needs pictures of at least 36 x 36 pixels, got 40 x 35",
+            "encoder 'nature' needs images of at least 36 x 36 pixels, got 40 x 35",
         ),
         (
             PPOConfig,

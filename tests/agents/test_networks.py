@@ -109,7 +109,7 @@ def test_convolution_and_its_gradient_are_jax_s(convolutions, case):
 
 
 def inputs_of_last_layer(name: str, size: int) -> int:
-    """Numbers that an encoder's dense layer gets of square pictures."""
+    """Numbers that an encoder's dense layer gets of square images."""
     pixels = jnp.zeros((1, size, size, 3))
     params = jax.eval_shape(ENCODERS[name]().init, jax.random.key(0), pixels)["params"]
     return params["Dense_0"]["kernel"].shape[0]
@@ -119,7 +119,7 @@ def inputs_of_last_layer(name: str, size: int) -> int:
 def test_an_encoder_s_smallest_size_is_the_smallest(name):
     assert inputs_of_last_layer(name, SMALLEST[name]) > 0
     if SMALLEST[name] > 1:
-        # A convolution that does not fit gives an empty picture: features would be constant.
+        # A convolution that does not fit gives an empty image: features would be constant.
         assert inputs_of_last_layer(name, SMALLEST[name] - 1) == 0
 
 

@@ -56,21 +56,21 @@ def envs():
 
 
 @pytest.fixture(scope="module")
-def pictures(envs):
+def images(envs):
     """What an agent sees in each place."""
 
     @jax.jit
     @jax.vmap
-    def picture(place):
+    def image(place):
         state = envs.env.reset_sim(jax.random.key(0), jnp.uint32(0), PARAMS)
         state = state.replace(physics=Probes.at(place))
         return envs.env.push_frame(envs.env.blank_frames(), state, PARAMS, jnp.bool_(True))
 
-    return picture(jnp.arange(len(NAMES)))
+    return image(jnp.arange(len(NAMES)))
 
 
 @pytest.fixture(scope="module", params=AGENTS)
-def learned(request, envs, pictures):
+def learned(request, envs, images):
     """Values and mean actions by place, of an agent that has learned."""
     make, config = AGENTS[request.param]
     algorithm = make(config, envs)
@@ -87,19 +87,19 @@ def learned(request, envs, pictures):
     for _ in range(config.num_iterations // number):
         state = phase(state)
     if "critic" in state.networks:
-        values = Critic("small").apply(state.networks["critic"], pictures)
+        values = Critic("small").apply(state.networks["critic"], images)
     else:
         actor = Actor("small", 1, config.policy, has_value=True)
-        values = actor.apply(state.networks["actor"], pictures).value
-    actions = algorithm.act(state.networks, pictures)[:, 0]
+        values = actor.apply(state.networks["actor"], images).value
+    actions = algorithm.act(state.networks, images)[:, 0]
     return SimpleNamespace(
         value=dict(zip(NAMES, np.asarray(values).tolist(), strict=True)),
         action=dict(zip(NAMES, np.asarray(actions).tolist(), strict=True)),
     )
 
 
-def test_places_can_be_told_apart(pictures):
-    assert len({np.asarray(picture).tobytes() for picture in pictures}) == len(NAMES)
+def test_places_can_be_told_apart(images):
+    assert len({np.asarray(image).tobytes() for image in images}) == len(NAMES)
 
 
 @pytest.mark.parametrize("place", true_values(GAMMA))

@@ -14,13 +14,13 @@ from PIL import Image
 from pixelbrax_jax import load_clips
 
 CLIPS, FRAMES, HEIGHT, WIDTH = 60, 70, 480, 854
-"""As many pictures as DAVIS-2017's training split has at most, and as large."""
+"""As many images as DAVIS-2017's training split has at most, and as large."""
 
 
 def load(size: int, frames: int = FRAMES) -> dict[str, Any]:
     """Seconds from a folder in DAVIS's layout: read, read from the cache, moved to the device.
 
-    The pictures have just been written, so that they come from memory and not from a disk.
+    The images have just been written, so that they come from memory and not from a disk.
 
     Args:
         size: pixels of an observation's side.
@@ -50,7 +50,7 @@ def load(size: int, frames: int = FRAMES) -> dict[str, Any]:
 
 
 def _write(davis: Path, frames: int) -> None:
-    """Rolling pictures, smooth with some noise as a camera's."""
+    """Rolling images, smooth with some noise as a camera's."""
     draw = np.random.default_rng(0)
     names = [f"clip{number:02}" for number in range(CLIPS)]
     for name in names:
@@ -58,11 +58,11 @@ def _write(davis: Path, frames: int) -> None:
         smooth = np.asarray(
             Image.fromarray(coarse).resize((WIDTH, HEIGHT), Image.Resampling.BICUBIC)
         )
-        picture = np.clip(smooth + draw.normal(0.0, 8.0, smooth.shape), 0, 255).astype(np.uint8)
-        pictures = davis / "JPEGImages" / "480p" / name
-        pictures.mkdir(parents=True)
+        image = np.clip(smooth + draw.normal(0.0, 8.0, smooth.shape), 0, 255).astype(np.uint8)
+        images = davis / "JPEGImages" / "480p" / name
+        images.mkdir(parents=True)
         for frame in range(frames):
-            Image.fromarray(np.roll(picture, 4 * frame, 1)).save(pictures / f"{frame:05}.jpg")
+            Image.fromarray(np.roll(image, 4 * frame, 1)).save(images / f"{frame:05}.jpg")
     lists = davis / "ImageSets" / "2017"
     lists.mkdir(parents=True)
     (lists / "train.txt").write_text("\n".join(names) + "\n")

@@ -78,7 +78,7 @@ class Case:
 
 
 def renderers() -> Iterator[Case]:
-    """The ray-caster alone: its looks, and the size of the picture."""
+    """The ray-caster alone: its looks, and the size of the image."""
     for options in (
         {},
         {"look": "original"},
@@ -100,9 +100,9 @@ def environments() -> Iterator[Case]:
 
 
 def batches() -> Iterator[Case]:
-    """Pixels over the number of environments, all taking turns."""
+    """Pixels over the number of environments, interleaved."""
     for task in TASKS:
-        yield Case("batches", "turns.batches", {"task": task, "sizes": (100, 10, 1000)})
+        yield Case("batches", "interleaved.batches", {"task": task, "sizes": (100, 10, 1000)})
 
 
 def sizes() -> Iterator[Case]:
@@ -121,20 +121,20 @@ def original() -> Iterator[Case]:
 
 
 def distractors() -> Iterator[Case]:
-    """Pixels with each distractor, all taking turns."""
+    """Pixels with each distractor, interleaved."""
     for task, num_envs in [("ant", 256), ("ant", 1024), *((task, 1000) for task in TASKS)]:
-        yield Case("distractors", "turns.distractors", {"task": task, "num_envs": num_envs})
+        yield Case("distractors", "interleaved.distractors", {"task": task, "num_envs": num_envs})
 
 
 def clips() -> Iterator[Case]:
-    """From a folder of pictures to the device."""
+    """From a folder of images to the device."""
     yield Case("clips", "bank.load", {"size": 84})
 
 
-def doors() -> Iterator[Case]:
-    """Every door, all taking turns."""
+def adapters() -> Iterator[Case]:
+    """Every adapter, interleaved."""
     for task, num_envs in [("ant", 256), ("ant", 1), *((task, 1000) for task in TASKS)]:
-        yield Case("doors", "turns.doors", {"task": task, "num_envs": num_envs})
+        yield Case("adapters", "interleaved.adapters", {"task": task, "num_envs": num_envs})
 
 
 def startup() -> Iterator[Case]:
@@ -172,7 +172,7 @@ def peers() -> Iterator[Case]:
 GROUPS = {
     "renderer": renderers,
     "startup": startup,
-    "doors": doors,
+    "adapters": adapters,
     "distractors": distractors,
     "clips": clips,
     "original": original,

@@ -65,7 +65,7 @@ def _version(name: str) -> str | None:
 def _vectors() -> str:
     """The widest vectors that the processor computes with, where the system tells.
 
-    Virtual machines name processors of several generations alike, and pictures depend on it.
+    Virtual machines name processors of several generations alike, and images depend on it.
     """
     flags = _from_cpuinfo("flags").split()
     known = {"avx512f": "AVX-512", "avx2": "AVX2"}

@@ -57,13 +57,13 @@ NOTES = {
     "renderer": "From link poses to packed pixels, without physics.",
     "startup": "16 environments behind Gymnasium; one sample each. `gymnasium` and PixelBrax are "
     "imported first, JAX and Brax when the environment is made.",
-    "doors": "The ratio is that to the JAX loop with the same autoreset mode, which waits for each "
-    "step: medians over rounds, in which all take a turn of 8 to 100 steps in one process, with "
+    "adapters": "The ratio is that to the JAX loop with the same autoreset mode, which waits for "
+    "each step: medians over rounds, in which all take a turn of 8 to 100 steps in one process, with "
     "bootstrap intervals of 95 %.",
     "distractors": "With a bank of 60 clips of 70 frames. Ratios are to the speed without: medians "
     "over rounds, in which all take a turn of 1 to 100 steps in one process, with bootstrap "
     "intervals of 95 %.",
-    "clips": "Pictures of 854 x 480, as many as the training split of DAVIS-2017 has at most, just "
+    "clips": "Images of 854 x 480, as many as the training split of DAVIS-2017 has at most, just "
     "written and so still in memory; one sample each.",
     "original": "A compiled loop of ours in the settings in which the speed of the original is "
     "known; that was measured apart, on two cores of an AMD EPYC whose vectors were not noted.",
@@ -239,8 +239,8 @@ def _original(rows: list[Row]) -> str:
     return _table(("task", "environments", "steps/s", "original", "ratio"), lines)
 
 
-def _turns(*columns: str) -> Callable[[list[Row]], str]:
-    """A table of a comparison in turns.
+def _interleaved(*columns: str) -> Callable[[list[Row]], str]:
+    """A table of a comparison of interleaved runs.
 
     Args:
         columns: what tells its lines apart, by their names in the case's arguments or values.
@@ -254,7 +254,7 @@ def _turns(*columns: str) -> Callable[[list[Row]], str]:
                 number(value["steps_per_second"]),
                 f"{value['ratio']:.2f}",
                 " to ".join(f"{bound:.2f}" for bound in value["interval"]),
-                value["turns"],
+                value["runs"],
             ]
             for row in _ok(rows)
             for value in row["values"]
@@ -399,13 +399,13 @@ def _peer_versions(rows: list[Row]) -> str:
 TABLES: dict[str, Callable[[list[Row]], str]] = {
     "renderer": _renderer,
     "startup": _startup,
-    "doors": _turns("num_envs", "autoreset_mode", "door"),
-    "distractors": _turns("num_envs", "distractors"),
+    "adapters": _interleaved("num_envs", "autoreset_mode", "adapter"),
+    "distractors": _interleaved("num_envs", "distractors"),
     "clips": _clips,
     "original": _original,
     "peers": _peers,
     "devices": _devices,
-    "batches": _turns("num_envs"),
+    "batches": _interleaved("num_envs"),
     "sizes": _sizes,
     "environments": _environments,
 }

@@ -74,7 +74,7 @@ class Agent(nn.Module):
 
     def __init__(self, envs: gym.vector.VectorEnv) -> None:
         super().__init__()
-        # Pictures are square: what differs from the two others is the channels.
+        # Images are square: what differs from the two others is the channels.
         first, second, _ = envs.single_observation_space.shape
         self.channels_last = first == second
         shape = self.as_images(torch.zeros(1, *envs.single_observation_space.shape)).shape

@@ -164,14 +164,14 @@ def shows_what_render_draws(wrapper):
 
     bare, env = make(**UNSEEN, **PICTURES), wrapped()
     pairs = [(bare.reset(seed=0)[0], env.reset(seed=0)[0])]
-    pictures = [bare.render()]
+    images = [bare.render()]
     for action in ACTIONS[:6]:
         pairs.append((bare.step(action)[0], env.step(action)[0]))
-        pictures.append(bare.render())
-    for (state, obs), picture in zip(pairs, pictures, strict=True):
+        images.append(bare.render())
+    for (state, obs), image in zip(pairs, images, strict=True):
         assert_array_equal(obs["state"], state)
-        assert_array_equal(obs["pixels"], picture)
-    assert (pictures[0] != pictures[1]).any(), "the ball moves"
+        assert_array_equal(obs["pixels"], image)
+    assert (images[0] != images[1]).any(), "the ball moves"
 
 
 @case("ResizeObservation")
@@ -377,11 +377,11 @@ def filmed(env):
     play(env, ACTIONS[:LIMIT])
     bare = make(**PICTURES)
     bare.reset(seed=0)
-    pictures = [bare.render()]
+    images = [bare.render()]
     for action in ACTIONS[:LIMIT]:
         bare.step(action)
-        pictures.append(bare.render())
-    return pictures
+        images.append(bare.render())
+    return images
 
 
 @case("HumanRendering")

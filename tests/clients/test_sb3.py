@@ -1,4 +1,4 @@
-"""Every algorithm of Stable-Baselines3 and sb3-contrib learns from our pictures."""
+"""Every algorithm of Stable-Baselines3 and sb3-contrib learns from our images."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from pixelbrax_gym import PixelBraxSB3VecEnv
 from tests.clients.ball import ACTIONS, ID, SIZE, TASK, make
 
 NUM_ENVS = 2
-# The smallest picture that the CNN of Stable-Baselines3 takes.
+# The smallest image that the CNN of Stable-Baselines3 takes.
 OPTIONS = SIZE | {"height": 36, "width": 36}
 
 # Of networks that fit into a test.
@@ -121,7 +121,7 @@ class Rollouts(BaseCallback):
 
 
 def as_stored(part):
-    """Pictures are kept channels first."""
+    """Images are kept channels first."""
     return part.transpose(0, 3, 1, 2) if part.ndim == 4 else part
 
 

@@ -58,7 +58,7 @@ class Witness:
     """Keeps what the wrapped environment hands to the trainer."""
 
     def __init__(self, env):
-        self.obs, self.rewards, self.pictures = [], [], []
+        self.obs, self.rewards, self.images = [], [], []
         reset, step, render = env.reset, env.step, env.render
 
         def witness_reset():
@@ -74,7 +74,7 @@ class Witness:
             return answer
 
         def witness_render():
-            self.pictures.append(render())
+            self.images.append(render())
 
         env.reset, env.step, env.render = witness_reset, witness_step, witness_render
 
@@ -115,7 +115,7 @@ def test_the_default_trainer_learns_from_our_frames(kind, output, tmp_path):
     assert_array_equal(stored, torch.stack(witness.obs[:STEPS]))
     # PPO's advantages are shaped in place, the rewards are not.
     assert_array_equal(agent.memory.get_tensor_by_name("rewards"), torch.stack(witness.rewards))
-    assert np.shape(witness.pictures) == (STEPS, NUM_ENVS, 8, 8, 3)
+    assert np.shape(witness.images) == (STEPS, NUM_ENVS, 8, 8, 3)
 
     after = list(agent.models["policy"].parameters())
     assert all(p.isfinite().all() for p in after)

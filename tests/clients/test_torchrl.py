@@ -1,4 +1,4 @@
-"""TorchRL's own doors to Gymnasium, and its collectors, on our environments."""
+"""TorchRL's own adapters to Gymnasium, and its collectors, on our environments."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def test_gym_wrapper_takes_a_vector_environment(mode, resets):
     env.set_seed(3)
     batch = rollout(env, np.stack([ACTIONS, ACTIONS], axis=1))
     for i in range(2):
-        # It calls a batch of pictures an observation.
+        # It calls a batch of images an observation.
         agree(batch[i], two_episodes(3 + i, ACTIONS, resets), "observation")
 
 

@@ -155,7 +155,7 @@ def test_the_agent_stays_in_view_at_the_easy_level(task):
     moving = np.array([g for g, link in enumerate(geoms.link) if link >= 0])
 
     def centers_in_view(state_of_camera):
-        """Which geom centers lie in the picture."""
+        """Which geom centers lie in the image."""
         rig = camera.change_params(state_of_camera, params).rig
         scene = place(geoms, rig, params.look, state.sim.physics.xpos, state.sim.physics.xquat)
         seen = (scene.pos[moving] - scene.camera.pos) @ scene.camera.xmat

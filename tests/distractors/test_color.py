@@ -79,7 +79,7 @@ def test_paper_color_is_one_offset_for_each_frame():
             ((frame.r, clean.r), (frame.g, clean.g), (frame.b, clean.b))
         ):
             np.testing.assert_allclose(plane, np.clip(bare + offset[c], 0, 1), atol=1e-6)
-        # The uint8 path rounds the same picture.
+        # The uint8 path rounds the same image.
         levels = np.floor(np.stack([frame.r, frame.g, frame.b], -1) * 255 + 0.5)
         np.testing.assert_allclose(timestep.obs[..., -3:], levels, atol=1)
         assert (np.asarray(timestep.obs[..., -3:]) != levels).mean() < 1e-3

@@ -1,4 +1,4 @@
-"""The video distractor: which frame is shown, and where in the picture."""
+"""The video distractor: which frame is shown, and where in the image."""
 
 from __future__ import annotations
 

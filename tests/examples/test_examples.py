@@ -25,7 +25,7 @@ def load(name):
 
 
 def pictures_in(path):
-    """All pictures of a file, (num_frames, height, width, 3) uint8."""
+    """All images of a file, (num_frames, height, width, 3) uint8."""
     with Image.open(path) as opened:
         frames = [np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(opened)]
     return np.stack(frames)
@@ -93,8 +93,8 @@ def test_render_gallery(tmp_path):
     # What the agent sees is enlarged four times, the others are drawn at their size.
     np.testing.assert_array_equal(small, small[::4, ::4].repeat(4, axis=0).repeat(4, axis=1))
     assert (shaded != shaded[::4, ::4].repeat(4, axis=0).repeat(4, axis=1)).any()
-    for picture in (small, shaded, original):
-        assert picture.std() > 10
+    for image in (small, shaded, original):
+        assert image.std() > 10
     assert np.abs(shaded.astype(int) - original).mean() > 10, "two looks"
     (overview,) = pictures_in(tmp_path / "overview.png")
     np.testing.assert_array_equal(overview, shaded[::2, ::2])

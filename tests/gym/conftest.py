@@ -1,4 +1,4 @@
-"""A toy task for both Gymnasium doors; real tasks are slow to compile."""
+"""A toy task for both Gymnasium adapters; real tasks are slow to compile."""
 
 from __future__ import annotations
 

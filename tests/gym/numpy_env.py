@@ -136,12 +136,12 @@ class CountingVectorEnv(VectorEnv):
         return obs, reward, ended.copy(), truncated, infos
 
     def render(self):
-        pictures = tuple(np.zeros((4, 5, 3), np.uint8) for _ in range(self.num_envs))
-        if self.fault == "picture array":
-            return np.stack(pictures)
-        if self.fault == "picture dtype":
-            return tuple(picture.astype(float) for picture in pictures)
-        return pictures
+        images = tuple(np.zeros((4, 5, 3), np.uint8) for _ in range(self.num_envs))
+        if self.fault == "image array":
+            return np.stack(images)
+        if self.fault == "image dtype":
+            return tuple(image.astype(float) for image in images)
+        return images
 
     def close(self):
         if self.fault == "closes once" and self.closed:

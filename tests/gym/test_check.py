@@ -66,8 +66,8 @@ FAULTS = {
     "reward nan": (NEXT, "rewards must be finite"),
     "flag dtype": (NEXT, "truncated must be bools of shape (3,), is int64"),
     "four results": (NEXT, "step() must return observations, rewards, terminated, truncated"),
-    "picture array": (NEXT, "render() must return a tuple of 3, returned ndarray"),
-    "picture dtype": (NEXT, "render() must return uint8 NumPy arrays"),
+    "image array": (NEXT, "render() must return a tuple of 3, returned ndarray"),
+    "image dtype": (NEXT, "render() must return uint8 NumPy arrays"),
     "closes once": (NEXT, "close() must work twice, but raised RuntimeError"),
     "stays open": (NEXT, "the attribute closed must be True after close()"),
 }

@@ -1,4 +1,4 @@
-"""Distractors through the doors to PyTorch."""
+"""Distractors through the adapters to PyTorch."""
 
 from __future__ import annotations
 

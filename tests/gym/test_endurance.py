@@ -48,12 +48,12 @@ def test_equal_options_share_programs(make_vector):
 
 @pytest.fixture
 def make_stepper(make_vector, make_torchrl, make_sb3):
-    """A function that steps two environments once, through the door of that name."""
+    """A function that steps two environments once, through the adapter of that name."""
     action = np.full((2, 1), -0.1, np.float32)
 
-    def make(door):
+    def make(adapter):
         options = {"num_envs": 2, "height": 8, "width": 8, "episode_length": 6}
-        if door == "torchrl":
+        if adapter == "torchrl":
             env = make_torchrl(**options)
             carry = [env.reset()]
 
@@ -62,10 +62,10 @@ def make_stepper(make_vector, make_torchrl, make_sb3):
                 carry[0] = env.step_and_maybe_reset(td)[1]
 
             return step
-        if door == "sb3":
+        if adapter == "sb3":
             env = make_sb3(**options)
         else:
-            env = make_vector(**options, output=door, autoreset_mode="same_step")
+            env = make_vector(**options, output=adapter, autoreset_mode="same_step")
         env.reset()
         return lambda: env.step(action)
 
@@ -79,13 +79,13 @@ def run(step, num_steps: int) -> tuple[int, float]:
     return len(jax.live_arrays()), resident_mib()
 
 
-@pytest.mark.parametrize("door", ["numpy", "torch", "torchrl", "sb3"])
+@pytest.mark.parametrize("adapter", ["numpy", "torch", "torchrl", "sb3"])
 @pytest.mark.parametrize("num_steps", [1_000, pytest.param(50_000, marks=pytest.mark.slow)])
-def test_nothing_leaks(make_stepper, num_steps, door):
-    step = make_stepper(door)
+def test_nothing_leaks(make_stepper, num_steps, adapter):
+    step = make_stepper(adapter)
     arrays, memory = run(step, 500)
     arrays_later, memory_later = run(step, num_steps)
-    # TorchRL's door holds a few more where a step has ended an episode.
+    # TorchRL's adapter holds a few more where a step has ended an episode.
     assert abs(arrays_later - arrays) < 10
     # A single leaked observation a step would be 0.4 kB, its Python object about as much.
     assert memory_later - memory < 4 + num_steps * 0.2e-3

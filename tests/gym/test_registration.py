@@ -104,13 +104,13 @@ def steps_until_truncated(env) -> int:
         ({"max_episode_steps": 4, "action_repeat": 2}, 4),
     ],
 )
-@pytest.mark.parametrize("door", ["make", "vector", "sync"])
-def test_time_limits_mean_the_same_at_every_door(door, options, expected):
+@pytest.mark.parametrize("adapter", ["make", "vector", "sync"])
+def test_time_limits_mean_the_same_at_every_door(adapter, options, expected):
     options = {"obs_mode": "state"} | options
-    if door == "make":
+    if adapter == "make":
         env = gymnasium.make(ID, **options)
     else:
-        mode = "sync" if door == "sync" else None
+        mode = "sync" if adapter == "sync" else None
         env = gymnasium.make_vec(ID, num_envs=2, vectorization_mode=mode, **options)
     assert steps_until_truncated(env) == expected
 

@@ -1,4 +1,4 @@
-"""The same seed and actions give the same frames through every door, from first to true last."""
+"""The same seed and actions give the same frames through every adapter, from first to true last."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The Stable-Baselines3 door: its contract, its wrappers, its algorithms."""
+"""The Stable-Baselines3 adapter: its contract, its wrappers, its algorithms."""
 
 from __future__ import annotations
 
@@ -167,9 +167,9 @@ def test_members(make_sb3):
     assert not env.has_attr("difficulty")
     with pytest.raises(AttributeError):
         env.get_attr("difficulty")
-    pictures = env.env_method("render", indices=[0, 2])
-    assert [picture.shape for picture in pictures] == [(8, 8, 3)] * 2
-    np.testing.assert_array_equal(pictures[1], env.get_images()[2])
+    images = env.env_method("render", indices=[0, 2])
+    assert [image.shape for image in images] == [(8, 8, 3)] * 2
+    np.testing.assert_array_equal(images[1], env.get_images()[2])
     assert env.env_method("get_wrapper_attr", "index", indices=1) == [1]
     assert env.env_is_wrapped(Monitor) == [False] * 3
     assert env.get_attr("unwrapped")[0].action_space == env.action_space

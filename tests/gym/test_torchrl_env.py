@@ -1,4 +1,4 @@
-"""The TorchRL door: its contract, true transitions, partial resets, clear errors."""
+"""The TorchRL adapter: its contract, true transitions, partial resets, clear errors."""
 
 from __future__ import annotations
 
@@ -361,19 +361,19 @@ def test_replay_buffer(make_torchrl):
 def test_render(make_torchrl):
     env = make_torchrl(render_height=10, render_width=14)
     env.reset()
-    pictures = env.render()
-    assert pictures.shape == (3, 10, 14, 3)
-    assert pictures.dtype == torch.uint8
+    images = env.render()
+    assert images.shape == (3, 10, 14, 3)
+    assert images.dtype == torch.uint8
 
 
 def test_recording(make_torchrl, tmp_path):
-    """Pictures of `render` end up in a video of TorchRL's recorder."""
+    """Images of `render` end up in a video of TorchRL's recorder."""
     logger = CSVLogger("run", str(tmp_path), video_format="pt")
     env = TransformedEnv(
         make_torchrl(render_height=16, render_width=24),
         Compose(
-            PixelRenderTransform(out_keys=["pictures"]),
-            VideoRecorder(logger, tag="film", in_keys=["pictures"], skip=1),
+            PixelRenderTransform(out_keys=["images"]),
+            VideoRecorder(logger, tag="film", in_keys=["images"], skip=1),
         ),
     )
     env.rollout(5, policy)

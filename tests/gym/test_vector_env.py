@@ -320,9 +320,9 @@ def test_number_of_environments_does_not_matter(make_vector):
 def test_render_is_a_tuple(make_vector):
     env = make_vector(render_mode="rgb_array", render_height=10, render_width=11)
     env.reset(seed=0)
-    pictures = env.render()
-    assert isinstance(pictures, tuple)
-    assert [picture.shape for picture in pictures] == [(10, 11, 3)] * 3
+    images = env.render()
+    assert isinstance(images, tuple)
+    assert [image.shape for image in images] == [(10, 11, 3)] * 3
     assert make_vector().render() is None
 
 

@@ -54,7 +54,7 @@ def test_constant_reward_is_withheld_too(program):
 
 @pytest.mark.parametrize("speed", [1e9, 1e12, np.inf, np.nan])
 def test_speeds_beyond_reason(speed, program):
-    """A finite number so large that a picture's arithmetic would overflow also diverged."""
+    """A finite number so large that an image's arithmetic would overflow also diverged."""
     compiled = program("inverted_pendulum")
     pipeline = compiled.reset(jax.random.key(1))
     carry = pipeline.engine

@@ -18,7 +18,7 @@ backends = pytest.mark.parametrize("backend", TASKS[TASK].backends)
 
 
 def tip_of(physics, state, geom_pose):
-    """Center of the far end cap of the upper pole, as a picture shows it."""
+    """Center of the far end cap of the upper pole, as an image shows it."""
     index = physics.geoms.name.index("cpole2")
     pos, mat = geom_pose(physics.geoms, state, index)
     half = float(physics.geoms.size[index, 1])

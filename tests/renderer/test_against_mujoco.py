@@ -1,4 +1,4 @@
-"""The picture's geometry against MuJoCo's ray caster, which shares no code with ours."""
+"""The image's geometry against MuJoCo's ray caster, which shares no code with ours."""
 
 from __future__ import annotations
 

@@ -165,7 +165,7 @@ class TestGround:
     def test_pattern_is_anchored_to_the_world(self, draw):
         scene = scenes.one_geom(GeomKind.PLANE, (0, 0, 1), (0.0, -2.0, 1.0), target=(0, 0, 0))
         period = 2 * float(scene.look.ground_pitch)
-        pictures = [
+        images = [
             rgb(
                 draw(
                     scene.replace(
@@ -180,9 +180,9 @@ class TestGround:
             )
             for shift in (0.0, period / 2, period, 100 * period)
         ]
-        np.testing.assert_allclose(pictures[2], pictures[0], atol=2 / 255)
-        np.testing.assert_allclose(pictures[3], pictures[0], atol=4 / 255)
-        assert np.abs(pictures[1] - pictures[0]).max() > 0.1
+        np.testing.assert_allclose(images[2], images[0], atol=2 / 255)
+        np.testing.assert_allclose(images[3], images[0], atol=4 / 255)
+        assert np.abs(images[1] - images[0]).max() > 0.1
 
 
 def test_bad_sizes_and_names():

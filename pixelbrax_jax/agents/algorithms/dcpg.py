@@ -64,7 +64,7 @@ class DCPGConfig(TrainConfig):
     """tau of the averaged actor whose value is kept in the decoupled variant."""
 
     def __post_init__(self) -> None:
-        """Checks the settings.
+        """Check the settings.
 
         Raises:
             ValueError: a setting is out of range; the message says what is allowed.
@@ -229,7 +229,7 @@ def dynamics_loss(
     chunk: phasic.Chunk,
     key: jax.Array,
 ) -> jax.Array:
-    """DDCPG's loss: what leads to what, true ones told from wrong ones.
+    """Return DDCPG's loss: true transitions are told from wrong ones.
 
     With features z, action a and features z' one step later, and a logistic loss l:
     ``l(f(z, a, z'), 1) + l(f(z, a~, z'), 0) / 2 + l(f(z, a, z~'), 0)``, with the weights of the

@@ -54,7 +54,7 @@ class PPGConfig(TrainConfig):
     """Weight of the separate critic's loss in the auxiliary phase."""
 
     def __post_init__(self) -> None:
-        """Checks the settings.
+        """Check the settings.
 
         Raises:
             ValueError: a setting is out of range; the message says what is allowed.

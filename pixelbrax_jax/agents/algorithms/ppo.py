@@ -45,7 +45,7 @@ class PPOConfig(TrainConfig):
     """Approximate KL divergence beyond which an update stops early."""
 
     def __post_init__(self) -> None:
-        """Checks the settings.
+        """Check the settings.
 
         Raises:
             ValueError: a setting is out of range; the message says what is allowed.

@@ -39,7 +39,7 @@ class TrainConfig(EnvConfig):
     state_critic: bool = False
     """Whether a separate critic sees the simulator's state in place of pixels."""
     random_shift: int = 0
-    """Pixels by which pictures are shifted at most, one random shift for each rollout."""
+    """Pixels by which images are shifted at most, one random shift for each rollout."""
 
     gamma: float = 0.99
     """Discount of rewards, for each action."""
@@ -67,7 +67,7 @@ class TrainConfig(EnvConfig):
     """Bytes, in 10^9, that stored frames may take; none asks the device."""
 
     def __post_init__(self) -> None:
-        """Checks the settings.
+        """Check the settings.
 
         Raises:
             ValueError: a setting is out of range; the message says what is allowed.
@@ -109,7 +109,7 @@ class TrainConfig(EnvConfig):
         smallest = SMALLEST[self.encoder]
         if min(self.height, self.width) < smallest:
             raise ValueError(
-                f"encoder {self.encoder!r} needs pictures of at least {smallest} x {smallest} "
+                f"encoder {self.encoder!r} needs images of at least {smallest} x {smallest} "
                 f"pixels, got {self.height} x {self.width}; another encoder takes smaller ones."
             )
         check_divides("num_steps", self.num_steps, "num_minibatches", self.num_minibatches)
@@ -137,13 +137,13 @@ def make_env(config: TrainConfig, **changes: Any) -> tuple[PixelEnv, EnvParams]:
 
 
 def describe(config: TrainConfig) -> dict[str, Any]:
-    """All settings by name, as JSON has them."""
+    """Return all settings by name, as JSON has them."""
     values = {field.name: getattr(config, field.name) for field in fields(config)}
     return {name: list(v) if isinstance(v, tuple) else v for name, v in values.items()}
 
 
 def check_positive(name: str, value: object, or_zero: bool = False) -> None:
-    """Rejects what is not a positive, finite number.
+    """Reject what is not a positive, finite number.
 
     Raises:
         ValueError: otherwise, naming the setting.
@@ -155,7 +155,7 @@ def check_positive(name: str, value: object, or_zero: bool = False) -> None:
 
 
 def check_count(name: str, value: object) -> None:
-    """Rejects what is not a whole number of at least 0.
+    """Reject what is not a whole number of at least 0.
 
     Raises:
         ValueError: otherwise, naming the setting.
@@ -165,7 +165,7 @@ def check_count(name: str, value: object) -> None:
 
 
 def check_divides(whole: str, size: int, part: str, count: int) -> None:
-    """Rejects a number of parts into which a whole cannot be cut.
+    """Reject a number of parts into which a whole cannot be cut.
 
     Raises:
         ValueError: with the next counts that would do.

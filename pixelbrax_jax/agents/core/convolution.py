@@ -15,7 +15,7 @@ Pads = tuple[tuple[int, int], tuple[int, int]]
 
 
 class Conv(nn.Module):
-    """A convolution with a bias, of channels-last pictures; as ``flax.linen.Conv``.
+    """A convolution with a bias, of channels-last images; as ``flax.linen.Conv``.
 
     Attributes:
         features: channels of the result.
@@ -31,7 +31,7 @@ class Conv(nn.Module):
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
-        """(B, H, W, C) float32 -> (B, H', W', features)."""
+        """Map (B, H, W, C) float32 to (B, H', W', features)."""
         shape = (self.size, self.size, x.shape[-1], self.features)
         kernel = self.param("kernel", nn.initializers.lecun_normal(), shape)
         bias = self.param("bias", nn.initializers.zeros, (self.features,))
@@ -43,7 +43,7 @@ class Conv(nn.Module):
 
 @partial(jax.custom_vjp, nondiff_argnums=(2, 3))
 def convolve(x: jax.Array, kernel: jax.Array, stride: int, pads: Pads) -> jax.Array:
-    """Cross-correlation of (B, H, W, C) with (h, w, C, D), padded by zeros.
+    """Return cross-correlation of (B, H, W, C) with (h, w, C, D), padded by zeros.
 
     The derivatives of a convolution are convolutions of tensors whose axes play other roles. XLA
     brings them into the form that its fast kernels for CPUs take, but only outside of loops:
@@ -84,7 +84,7 @@ def _backward(
 def _slope_of_x(
     x: jax.Array, kernel: jax.Array, slope: jax.Array, stride: int, pads: Pads
 ) -> jax.Array:
-    """The slope, with zeros between its pixels, convolved with the kernel turned round."""
+    """Return the slope, with zeros between its pixels, convolved with the kernel turned round."""
     before = [size - 1 - pad[0] for size, pad in zip(kernel.shape, pads, strict=False)]
     after = [
         # What is missing to the size of x.
@@ -104,7 +104,7 @@ def _slope_of_x(
 def _slope_of_kernel(
     x: jax.Array, kernel: jax.Array, slope: jax.Array, stride: int, pads: Pads
 ) -> jax.Array:
-    """Channels of x as pictures, convolved with the slope as a kernel; sums over the batch."""
+    """Return channels of x as images, convolved with the slope as a kernel; sums over the batch."""
     after = [
         # Negative where the kernel never reached the last pixels.
         kernel.shape[i] - 1 + (slope.shape[1 + i] - 1) * stride + 1 - x.shape[1 + i] - pads[i][0]

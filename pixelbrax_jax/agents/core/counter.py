@@ -30,7 +30,7 @@ class StepCounter(struct.PyTreeNode):
 
     @classmethod
     def of(cls, value: int) -> StepCounter:
-        """The counter that stands at ``value``.
+        """Return the counter that stands at ``value``.
 
         Raises:
             TypeError: the value is no whole number.
@@ -44,7 +44,7 @@ class StepCounter(struct.PyTreeNode):
         return cls(high=jnp.uint32(high), low=jnp.uint32(low))
 
     def __add__(self, other: StepCounter | int | jax.Array) -> StepCounter:
-        """The sum, also inside ``jit``.
+        """Return the sum, also inside ``jit``.
 
         Args:
             other: a counter, a whole number in [0, 2^64), or a () uint32 array.
@@ -61,11 +61,11 @@ class StepCounter(struct.PyTreeNode):
     __radd__ = __add__
 
     def __int__(self) -> int:
-        """The number; outside ``jit``, and of a single counter."""
+        """Return the number; outside ``jit``, and of a single counter."""
         return int(np.asarray(self.high)) * _WORD + int(np.asarray(self.low))
 
     def as_float(self) -> jax.Array:
-        """The number as () float32, exact up to 2^24 and to 1 part in 10^7 beyond."""
+        """Return the number as () float32, exact up to 2^24 and to 1 part in 10^7 beyond."""
         return self.high.astype(jnp.float32) * float(_WORD) + self.low.astype(jnp.float32)
 
 

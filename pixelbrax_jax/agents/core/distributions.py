@@ -27,15 +27,15 @@ class Normal(struct.PyTreeNode):
     squash: bool = struct.field(pytree_node=False)
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """A unclipped action, (..., A)."""
+        """Sample an unclipped action, (..., A)."""
         return self.mean + self.std * jax.random.normal(key, self.mean.shape)
 
     def action(self, unclipped: jax.Array) -> jax.Array:
-        """What the environment gets for a unclipped action."""
+        """Return what the environment gets for an unclipped action."""
         return jnp.tanh(unclipped) if self.squash else unclipped
 
     def log_prob(self, unclipped: jax.Array) -> jax.Array:
-        """(...) logarithm of the density of ``action(unclipped)``.
+        """Return (...) logarithm of the density of ``action(unclipped)``.
 
         With a = tanh(u), ``log p(a) = log N(u) - sum 2 (log 2 - u - softplus(-2 u))``, the
         stable form of ``log(1 - tanh^2 u)`` (Haarnoja et al., arXiv 1801.01290, appendix C).
@@ -47,7 +47,7 @@ class Normal(struct.PyTreeNode):
         return log_prob.sum(-1)
 
     def entropy(self, key: jax.Array) -> jax.Array:
-        """(...) differential entropy of the action, in nats.
+        """Return (...) differential entropy of the action, in nats.
 
         Exact without squashing; with it the mean of ``log(1 - tanh^2 u)`` is estimated from one
         draw.
@@ -61,7 +61,7 @@ class Normal(struct.PyTreeNode):
         return entropy
 
     def kl_to(self, new: Normal) -> jax.Array:
-        """(...) Kullback-Leibler divergence KL(self || new), in nats.
+        """Return (...) Kullback-Leibler divergence KL(self || new), in nats.
 
         ``sum [log(s_n / s_o) + (s_o^2 + (m_o - m_n)^2) / (2 s_n^2) - 1/2]``. A squashing that
         both share does not change it.
@@ -71,5 +71,5 @@ class Normal(struct.PyTreeNode):
 
 
 def _log_slope(unclipped: jax.Array) -> jax.Array:
-    """``log(1 - tanh^2 u)``, each coordinate."""
+    """Return ``log(1 - tanh^2 u)``, each coordinate."""
     return 2.0 * (jnp.log(2.0) - unclipped - jax.nn.softplus(-2.0 * unclipped))

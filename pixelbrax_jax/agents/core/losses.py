@@ -43,7 +43,7 @@ def batch_at(
     returns: jax.Array,
     times: jax.Array,
 ) -> Batch:
-    """The samples of some times, (B, N) int32."""
+    """Return the samples of some times, (B, N) int32."""
     frames = rollout.frames
     return Batch(
         pixels=observations(frames, times, config.random_shift),
@@ -58,12 +58,12 @@ def batch_at(
 
 
 def mean(x: jax.Array, weight: jax.Array) -> jax.Array:
-    """() weighted mean; 0 where nothing has weight."""
+    """Return () weighted mean; 0 where nothing has weight."""
     return jnp.sum(x * weight) / jnp.maximum(jnp.sum(weight), 1.0)
 
 
 def normalized(x: jax.Array, weight: jax.Array) -> jax.Array:
-    """``x`` with weighted mean 0 and standard deviation 1."""
+    """Return ``x`` with weighted mean 0 and standard deviation 1."""
     center = x - mean(x, weight)
     return center / (jnp.sqrt(mean(center**2, weight)) + 1e-8)
 
@@ -71,7 +71,7 @@ def normalized(x: jax.Array, weight: jax.Array) -> jax.Array:
 def policy_loss(
     policy: Normal, batch: Batch, config: TrainConfig, key: jax.Array
 ) -> tuple[jax.Array, Metrics]:
-    """PPO's clipped objective and the entropy bonus (Schulman et al., arXiv 1707.06347).
+    """Return PPO's clipped objective and the entropy bonus (Schulman et al., arXiv 1707.06347).
 
     ``- mean min(rho A, clip(rho, 1 - eps, 1 + eps) A) - c_H H`` with the ratio
     ``rho = exp(log pi(a) - log pi_old(a))``.
@@ -101,12 +101,12 @@ def policy_loss(
 
 
 def value_loss(value: jax.Array, target: jax.Array, weight: jax.Array) -> jax.Array:
-    """() half the mean squared error."""
+    """Return () half the mean squared error."""
     return 0.5 * mean((value - target) ** 2, weight)
 
 
 def clipped_value_loss(value: jax.Array, batch: Batch, clip_coef: float) -> jax.Array:
-    """() the larger of the errors of the value and of the value kept near what it was."""
+    """Return () the larger of the errors of the value and of the value kept near what it was."""
     near = batch.value + jnp.clip(value - batch.value, -clip_coef, clip_coef)
     error = jnp.maximum((value - batch.returns) ** 2, (near - batch.returns) ** 2)
     return 0.5 * mean(error, batch.weight)

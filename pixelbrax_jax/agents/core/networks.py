@@ -21,7 +21,7 @@ _ROOT_2 = math.sqrt(2.0)
 
 
 def max_pool(x: jax.Array) -> jax.Array:
-    """The maximum over windows of 3 x 3 with stride 2, padded as ``SAME``.
+    """Return the maximum over windows of 3 x 3 with stride 2, padded as ``SAME``.
 
     The windows are nine strided slices. ``nn.max_pool`` gives the same numbers, but its gradient
     is XLA's select-and-scatter, which is slow and on a GPU not deterministic.
@@ -52,7 +52,7 @@ class Impala(nn.Module):
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
-        """(B, H, W, C) float32 -> (B, 256) features."""
+        """Map (B, H, W, C) float32 to (B, 256) features."""
         for channels in (16, 32, 32):
             x = max_pool(Conv(channels, 3, padding="SAME")(x))
             for _ in range(2):
@@ -68,7 +68,7 @@ class Nature(nn.Module):
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
-        """(B, H, W, C) float32 -> (B, 512) features."""
+        """Map (B, H, W, C) float32 to (B, 512) features."""
         for channels, size, stride in ((32, 8, 4), (64, 4, 2), (64, 3, 1)):
             x = nn.relu(Conv(channels, size, stride)(x))
         return nn.relu(_dense(512)(_flat(x)))
@@ -79,18 +79,18 @@ class DrQ(nn.Module):
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
-        """(B, H, W, C) float32 -> (B, 50) features."""
+        """Map (B, H, W, C) float32 to (B, 50) features."""
         for stride in (2, 1, 1, 1):
             x = nn.relu(Conv(32, 3, stride)(x))
         return jnp.tanh(nn.LayerNorm()(_dense(50)(_flat(x))))
 
 
 class Small(nn.Module):
-    """Three convolutions for small pictures and slow processors."""
+    """Three convolutions for small images and slow processors."""
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
-        """(B, H, W, C) float32 -> (B, 128) features."""
+        """Map (B, H, W, C) float32 to (B, 128) features."""
         for channels, size, stride in ((16, 4, 2), (32, 4, 2), (32, 3, 1)):
             x = nn.relu(Conv(channels, size, stride)(x))
         return nn.relu(_dense(128)(_flat(x)))
@@ -150,7 +150,7 @@ class Actor(nn.Module):
 
     @nn.compact
     def __call__(self, pixels: jax.Array, detach_value: bool = False) -> ActorOutput:
-        """The policy, and the value.
+        """Return the policy, and the value.
 
         Args:
             pixels: (B, H, W, C) uint8.
@@ -187,7 +187,7 @@ class Critic(nn.Module):
 
     @nn.compact
     def __call__(self, pixels: jax.Array, state: jax.Array | None = None) -> jax.Array:
-        """The value.
+        """Return the value.
 
         Args:
             pixels: (B, H, W, C) uint8.
@@ -210,7 +210,7 @@ class Dynamics(nn.Module):
 
     @nn.compact
     def __call__(self, features: jax.Array, action: jax.Array, following: jax.Array) -> jax.Array:
-        """(B,) logits of (B, F) features, (B, A) unclipped actions and (B, F) features."""
+        """Return (B,) logits of (B, F) features, (B, A) unclipped actions and (B, F) features."""
         x = jnp.concatenate([features, action, following], axis=-1)
         for _ in range(2):
             x = nn.relu(_dense(256)(x))
@@ -230,7 +230,7 @@ def _dense(size: int, gain: float = _ROOT_2, name: str | None = None) -> nn.Dens
 
 
 def _orthogonal(gain: float) -> Callable[..., jax.Array]:
-    """Flax's orthogonal matrices, which may be drawn under ``jax.vmap`` too.
+    """Return Flax's orthogonal matrices, which may be sampled under ``jax.vmap`` too.
 
     They are Q of a QR decomposition. On a CPU that of a batch waits for threads which others of
     its kind may hold while they wait as well: where cores are few, jaxlib 0.10 then stands still

@@ -18,7 +18,7 @@ class Optimizer:
     """Steps along the gradients of several networks."""
 
     def __init__(self, config: TrainConfig) -> None:
-        """Takes its settings from ``config``."""
+        """Take its settings from ``config``."""
         self._config = config
         self._adam = optax.scale_by_adam(eps=config.adam_eps)
 
@@ -27,7 +27,7 @@ class Optimizer:
         return {name: self._adam.init(params) for name, params in networks.items()}
 
     def learning_rate(self, iteration: jax.Array) -> jax.Array:
-        """() float32, the step size in an iteration, a () uint32."""
+        """Return () float32, the step size in an iteration, a () uint32."""
         rate = jnp.float32(self._config.learning_rate)
         if self._config.anneal:
             rate *= jnp.maximum(0.0, 1.0 - iteration / self._config.num_iterations)

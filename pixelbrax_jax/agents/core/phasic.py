@@ -79,7 +79,7 @@ Loss = Callable[[Networks, Chunk, jax.Array], tuple[jax.Array, Metrics]]
 def check_phases(
     config: TrainConfig, num_policy_phases: int, aux_epochs: int, aux_minibatches: int
 ) -> None:
-    """Rejects settings with which the auxiliary phase cannot be.
+    """Reject settings with which the auxiliary phase cannot be.
 
     Raises:
         ValueError: the message says what is allowed.
@@ -148,7 +148,7 @@ def auxiliary_phase(
     num_minibatches: int,
     after_step: Callable[[Networks], Networks] = lambda networks: networks,
 ) -> tuple[TrainState, Metrics]:
-    """Passes over the buffer with an optimiser of their own.
+    """Pass over the buffer with an optimiser of its own.
 
     Args:
         config: settings.
@@ -210,7 +210,7 @@ def _entry(experience: Experience) -> Buffer:
 
 
 def _of_each(chunks: jax.Array, which: jax.Array) -> jax.Array:
-    """(Q, N, C, ...) and (N,) -> (N C, ...), of each environment another chunk."""
+    """Map (Q, N, C, ...) and (N,) to (N C, ...), of each environment another chunk."""
     picked = jax.vmap(lambda x, i: x[i], in_axes=(1, 0))(chunks, which)
     return picked.reshape(-1, *picked.shape[2:])
 
@@ -218,12 +218,12 @@ def _of_each(chunks: jax.Array, which: jax.Array) -> jax.Array:
 def _chunk(
     config: TrainConfig, buffer: Buffer, which: jax.Array, parts: int, policy: Normal | None
 ) -> Chunk:
-    """Chunk ``which``, (N,) int32 in [0, P parts), of each environment."""
+    """Return chunk ``which``, (N,) int32 in [0, P parts), of each environment."""
     num_steps = config.num_steps // parts
     rollout, first = which // parts, which % parts * num_steps
 
     def cut(rows: jax.Array, more: int = 0) -> jax.Array:
-        """(P, T, N, ...) -> (C + more, N, ...)."""
+        """Map (P, T, N, ...) to (C + more, N, ...)."""
 
         def of_env(rows: jax.Array, rollout: jax.Array, first: jax.Array) -> jax.Array:
             return jax.lax.dynamic_slice_in_dim(rows[rollout], first, num_steps + more)

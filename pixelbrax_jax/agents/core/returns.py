@@ -21,7 +21,7 @@ def gae(
     gamma: float,
     gae_lambda: float,
 ) -> tuple[jax.Array, jax.Array]:
-    """Generalised advantage estimates (Schulman et al., arXiv 1506.02438).
+    """Return generalised advantage estimates (Schulman et al., arXiv 1506.02438).
 
     ``delta_t = r_t + gamma (1 - d_t) V(o_{t+1}) - V(o_t)`` and
     ``A_t = delta_t + gamma lambda (1 - d_t) (1 - u_t) A_{t+1}``, where d is termination and u is
@@ -75,7 +75,7 @@ class RewardScaler(struct.PyTreeNode):
 
     @classmethod
     def start(cls, num_envs: int) -> RewardScaler:
-        """Nothing seen yet."""
+        """Return a scaler that has seen nothing."""
         return cls(
             discounted=jnp.zeros(num_envs),
             count=StepCounter.of(0),
@@ -91,7 +91,7 @@ class RewardScaler(struct.PyTreeNode):
     def __call__(
         self, reward: jax.Array, done: jax.Array, valid: jax.Array, gamma: float
     ) -> tuple[RewardScaler, jax.Array]:
-        """Learns from a rollout, then scales it.
+        """Learn from a rollout, then scale it.
 
         Args:
             reward: (T, N) float32.

@@ -114,7 +114,7 @@ def collect(
     num_steps: int,
     random_shift: int,
 ) -> tuple[EnvState, Rollout]:
-    """Plays ``num_steps`` steps.
+    """Play ``num_steps`` steps.
 
     Args:
         envs: the environments.
@@ -175,7 +175,7 @@ def collect(
 
 
 def observations(frames: Frames, times: jax.Array, random_shift: int = 0) -> jax.Array:
-    """The pixels that the agent saw at some times, as it saw them.
+    """Return the pixels that the agent saw at some times, as it saw them.
 
     Args:
         frames: of T steps of N environments.
@@ -199,7 +199,7 @@ def observations(frames: Frames, times: jax.Array, random_shift: int = 0) -> jax
 
 
 def at_times(rows: jax.Array, times: jax.Array) -> jax.Array:
-    """Rows of some times.
+    """Return rows of some times.
 
     Args:
         rows: (T, N, ...).
@@ -214,7 +214,7 @@ def at_times(rows: jax.Array, times: jax.Array) -> jax.Array:
 
 
 def minibatch_times(key: jax.Array, num_steps: int, num_envs: int, parts: int) -> jax.Array:
-    """A random partition of a rollout into minibatches.
+    """Return a random partition of a rollout into minibatches.
 
     Every minibatch has equally many steps of each environment. So a minibatch is cut along the
     environments alike, on however many devices they live.
@@ -234,14 +234,14 @@ def minibatch_times(key: jax.Array, num_steps: int, num_envs: int, parts: int) -
 
 
 def split_obs(obs: Any) -> tuple[jax.Array, jax.Array | None]:
-    """Pixels and state of an observation; None for a state that is not there."""
+    """Return pixels and state of an observation; None for a state that is not there."""
     if isinstance(obs, dict):
         return obs["pixels"], obs["state"]
     return obs, None
 
 
 def shifted(pixels: jax.Array, shift: jax.Array, at_most: int) -> jax.Array:
-    """Pictures shifted, their edges repeated (Yarats et al., arXiv 2004.13649).
+    """Shift images, and repeat their edges (Yarats et al., arXiv 2004.13649).
 
     Args:
         pixels: (N, H, W, C).
@@ -259,4 +259,4 @@ def shifted(pixels: jax.Array, shift: jax.Array, at_most: int) -> jax.Array:
         jnp.clip(rows, 0, pixels.shape[1] - 1),
         jnp.clip(columns, 0, pixels.shape[2] - 1),
     )
-    return jax.vmap(lambda picture, r, c: picture[r][:, c])(pixels, rows, columns)
+    return jax.vmap(lambda image, r, c: image[r][:, c])(pixels, rows, columns)

@@ -54,7 +54,7 @@ class Checkpoints:
     def __init__(
         self, folder: str | Path, settings: dict[str, Any], algorithm: str, *, keep: int = 3
     ) -> None:
-        """Opens the folder, which is made if need be.
+        """Open the folder, which is made if need be.
 
         Args:
             folder: where the checkpoints are.
@@ -89,15 +89,15 @@ class Checkpoints:
         logging.getLogger("absl").addFilter(_not_a_traceback)
 
     def steps(self) -> list[int]:
-        """Control steps of all checkpoints, ascending."""
+        """Return control steps of all checkpoints, ascending."""
         return sorted(self._manager.all_steps())
 
     def best(self) -> int | None:
-        """Control steps of the checkpoint with the highest score; None if none has a score."""
+        """Return the steps of the checkpoint with the highest score; None if none has one."""
         return best_steps(self.folder)
 
     def save(self, state: Any, steps: int, score: float | None) -> None:
-        """Begins to write a checkpoint; training may go on meanwhile.
+        """Begin to write a checkpoint; training may go on meanwhile.
 
         Args:
             state: any pytree of arrays.
@@ -144,7 +144,7 @@ class Checkpoints:
         return not self._writing
 
     def wait(self) -> None:
-        """Returns when everything is written.
+        """Return when everything is written.
 
         Raises:
             CheckpointError: it could not be.
@@ -169,7 +169,7 @@ class Checkpoints:
         return CheckpointError(f"cannot write a checkpoint to {self.folder}: {reason}.")
 
     def restore(self, template: Tree, steps: int | None = None) -> Tree:
-        """The state of a checkpoint.
+        """Return the state of a checkpoint.
 
         Args:
             template: a state of the same shapes, or its ``jax.eval_shape``.
@@ -194,7 +194,7 @@ class Checkpoints:
         return _typed(template, leaves)
 
     def other_versions(self, steps: int | None = None) -> list[str]:
-        """Packages whose versions, and devices whose kind or number, were others then.
+        """Return packages whose versions, and devices whose kind or number, were others then.
 
         Args:
             steps: of which checkpoint; None takes the latest.
@@ -208,7 +208,7 @@ class Checkpoints:
         ]
 
     def close(self) -> None:
-        """Waits for what is being written, and lets go of the folder."""
+        """Wait for what is being written, and let go of the folder."""
         try:
             self.wait()
         finally:
@@ -252,7 +252,7 @@ class Checkpoints:
 
 
 def best_steps(folder: str | Path) -> int | None:
-    """Control steps of the checkpoint with the highest score; None if none has a score.
+    """Return control steps of the checkpoint with the highest score; None if none has a score.
 
     Of equal scores the later one is taken.
 
@@ -270,7 +270,7 @@ def latest_steps(folder: str | Path) -> int | None:
 
 
 def read_about(folder: str | Path, steps: int | None = None) -> dict[str, Any]:
-    """What is stored beside a checkpoint's arrays: algorithm, config, steps, score.
+    """Return what is stored beside a checkpoint's arrays: algorithm, config, steps, score.
 
     Args:
         folder: of the checkpoints.
@@ -298,7 +298,7 @@ def read_about(folder: str | Path, steps: int | None = None) -> dict[str, Any]:
 
 
 def read_networks(folder: str | Path, template: Tree, steps: int | None = None) -> Tree:
-    """Parameters alone, of a checkpoint of any settings with equal networks.
+    """Return parameters alone, of a checkpoint of any settings with equal networks.
 
     Args:
         folder: of the checkpoints.
@@ -328,7 +328,7 @@ def read_networks(folder: str | Path, template: Tree, steps: int | None = None) 
 
 
 def check_writable(folder: Path) -> None:
-    """Rejects a folder that cannot be made or written to.
+    """Reject a folder that cannot be made or written to.
 
     Raises:
         CheckpointError: naming the folder and the reason.
@@ -345,7 +345,7 @@ def check_writable(folder: Path) -> None:
 
 
 def _plain(tree: Any) -> dict[str, Any]:
-    """Leaves by their place, keys as numbers; without empty arrays, which tell nothing."""
+    """Return leaves by their place, keys as numbers; without empty arrays, which tell nothing."""
     leaves = {}
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
         if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
@@ -360,7 +360,7 @@ def _plain(tree: Any) -> dict[str, Any]:
 
 
 def _typed(template: Tree, leaves: dict[str, Any]) -> Tree:
-    """The tree that `_plain` took apart."""
+    """Return the tree that `_plain` took apart."""
 
     def leaf(path: Any, like: Any) -> Any:
         if not like.size:
@@ -389,7 +389,7 @@ def _not_a_traceback(record: logging.LogRecord) -> bool:
 
 @contextlib.contextmanager
 def _without_warnings() -> Iterator[None]:
-    """Orbax's warnings are not shown."""
+    """Silence Orbax's warnings."""
     logger = logging.getLogger("absl")
     level = logger.level
     logger.setLevel(logging.ERROR)
@@ -400,7 +400,7 @@ def _without_warnings() -> Iterator[None]:
 
 
 def _versions() -> dict[str, str]:
-    """Of packages, and number and kind of devices."""
+    """Return versions of packages, and number and kind of devices."""
     kind = jax.devices()[0].device_kind
     found = {"devices": f"{jax.device_count()} x {kind}"}
     for name in _PACKAGES:
@@ -421,5 +421,5 @@ def _bytes(number: float) -> str:
 
 
 def nbytes(tree: Any) -> int:
-    """Bytes of all arrays of a tree, or of its ``jax.eval_shape``."""
+    """Return bytes of all arrays of a tree, or of its ``jax.eval_shape``."""
     return sum(int(np.prod(leaf.shape)) * leaf.dtype.itemsize for leaf in _plain(tree).values())

@@ -48,7 +48,7 @@ class Result:
 
 
 def make_splits(config: TrainConfig) -> dict[str, tuple[PixelEnv, EnvParams]]:
-    """Environments to evaluate in, by name of the split.
+    """Return environments to evaluate in, by name of the split.
 
     ``clean`` has no distractors, ``train`` those of the training, and ``test`` the same with
     clips that training never shows. Without distractors there is only ``clean``.
@@ -57,12 +57,12 @@ def make_splits(config: TrainConfig) -> dict[str, tuple[PixelEnv, EnvParams]]:
 
 
 def splits_of(config: TrainConfig) -> tuple[str, ...]:
-    """Names of the splits that there are."""
+    """Return names of the splits that there are."""
     return SPLITS if config.distractors else SPLITS[:1]
 
 
 def make_split(config: TrainConfig, name: str) -> tuple[PixelEnv, EnvParams]:
-    """One of the environments of `make_splits`.
+    """Return one of the environments of `make_splits`.
 
     Raises:
         ValueError: there is no such split.
@@ -163,7 +163,7 @@ class Interval:
 
 
 def interquartile_mean(scores: np.ndarray, *, confidence: float = 0.95, seed: int = 0) -> Interval:
-    """Mean of the middle half of scores, with a bootstrap interval over runs.
+    """Return mean of the middle half of scores, with a bootstrap interval over runs.
 
     Recommended for a handful of runs by Agarwal et al., arXiv 2108.13264.
 

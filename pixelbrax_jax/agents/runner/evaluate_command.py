@@ -13,7 +13,7 @@ from pixelbrax_jax.validation import check_positive_int
 
 
 def evaluate(options: argparse.Namespace) -> int:
-    """Runs the command; see ``pixelbrax evaluate --help``.
+    """Run the command; see ``pixelbrax evaluate --help``.
 
     Returns:
         The exit status.

@@ -14,7 +14,7 @@ PLATFORMS = ("cpu", "cuda", "tpu")
 
 
 def save_policy(algorithm: Algorithm, networks: Networks, path: str | Path) -> Path:
-    """Writes a policy's mean action as a compiled function of JAX's export format.
+    """Write a policy's mean action as a compiled function of JAX's export format.
 
     The file holds program and parameters, runs on CPU, CUDA and TPU for any number of
     observations, and needs nothing but JAX: ``jax.export.deserialize(bytes).call(pixels)``.

@@ -14,7 +14,7 @@ from pixelbrax_jax.agents.runner.sharding import any_process, mesh_of
 
 
 def check_memory(algorithm: Algorithm, template: TrainState, report: Callable[[str], None]) -> None:
-    """Tells what will be stored, and rejects what would not fit.
+    """Report what will be stored, and reject what would not fit.
 
     Args:
         algorithm: with its settings.
@@ -42,12 +42,12 @@ def check_memory(algorithm: Algorithm, template: TrainState, report: Callable[[s
         raise MemoryError(
             f"rollout and state take {stored / 1e9:.2f} GB{where}, of {limit / 1e9:.2f} GB that "
             f"may be used. Lower num_envs, num_steps{', num_policy_phases' if buffer else ''} or "
-            "the size of the pictures, or raise memory_budget_gb."
+            "the size of the images, or raise memory_budget_gb."
         )
 
 
 def _memories(algorithm: Algorithm) -> int:
-    """Memories over which environments are spread; devices of a CPU share one."""
+    """Return memories over which environments are spread; devices of a CPU share one."""
     mesh = mesh_of(algorithm)
     if mesh is None:
         return 1
@@ -55,7 +55,7 @@ def _memories(algorithm: Algorithm) -> int:
 
 
 def _device_memory() -> float:
-    """Bytes that JAX may use on its first device; no bound where nobody tells."""
+    """Return bytes that JAX may use on its first device; no bound where nobody tells."""
     statistics = jax.local_devices()[0].memory_stats() or {}
     if "bytes_limit" in statistics:
         return float(statistics["bytes_limit"])

@@ -199,7 +199,7 @@ class MetricsWriter:
         wandb_project: str | None = None,
         report: Callable[[str], None],
     ) -> None:
-        """Opens the files.
+        """Open the files.
 
         Args:
             folder: where they are.
@@ -229,7 +229,7 @@ class MetricsWriter:
             self._outputs.append(_Output("Weights & Biases", wandb, retries=False, last=first_step))
 
     def write(self, steps: int, record: Mapping[str, float]) -> None:
-        """One record.
+        """Write one record.
 
         Args:
             steps: control steps so far, any size.
@@ -281,18 +281,18 @@ class NoWriter:
     """What processes other than the first write: nothing."""
 
     def write(self, steps: int, record: Mapping[str, float]) -> None:
-        """Nothing."""
+        """Do nothing."""
 
     def close(self) -> None:
-        """Nothing."""
+        """Do nothing."""
 
     def missing(self) -> list[str]:
-        """Nothing."""
+        """Do nothing."""
         return []
 
 
 def read_metrics(path: str | Path) -> list[dict[str, float]]:
-    """All records of a ``metrics.jsonl``; a last line that was cut off is left out."""
+    """Return all records of a ``metrics.jsonl``; a last line that was cut off is left out."""
     records = []
     for line in Path(path).read_text("utf-8").splitlines():
         try:
@@ -303,7 +303,7 @@ def read_metrics(path: str | Path) -> list[dict[str, float]]:
 
 
 def _keep_until(path: Path, first_step: int) -> float:
-    """Drops records beyond a step; the seconds that the kept ones took."""
+    """Drop records beyond a step, and return the seconds that the kept ones took."""
     if not path.exists():
         return 0.0
     kept = [r for r in read_metrics(path) if first_step and r["steps"] <= first_step]

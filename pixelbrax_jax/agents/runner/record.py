@@ -22,7 +22,7 @@ from pixelbrax_jax.validation import check_choice, check_positive_int
 
 
 def record(options: argparse.Namespace) -> int:
-    """Runs the command; see ``pixelbrax record --help``.
+    """Run the command; see ``pixelbrax record --help``.
 
     Returns:
         The exit status.
@@ -60,7 +60,7 @@ def film(
     seed: int = 0,
     run: int = 0,
 ) -> Path:
-    """Writes an MP4 of ``grid`` x ``grid`` episodes, side by side.
+    """Write an MP4 of ``grid`` x ``grid`` episodes, side by side.
 
     Args:
         folder: output folder of a training run.
@@ -109,7 +109,7 @@ def film(
         # Python warns of a fork beside JAX's threads; the child becomes ffmpeg at once.
         warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)
         for _ in range(num_frames):
-            state, pictures = step(state, params)
-            tiles = np.asarray(pictures).reshape(grid, grid, size, size, 3)
+            state, images = step(state, params)
+            tiles = np.asarray(images).reshape(grid, grid, size, size, 3)
             writer.append_data(np.concatenate(np.concatenate(tiles, axis=1), axis=1))
     return path

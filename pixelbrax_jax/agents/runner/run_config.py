@@ -43,7 +43,7 @@ class RunConfig:
     """Whether a progress bar is shown."""
 
     def __post_init__(self) -> None:
-        """Checks the settings.
+        """Check the settings.
 
         Raises:
             ValueError: a setting is out of range; the message says what is allowed.

@@ -30,7 +30,7 @@ INTERRUPTED = 130
 
 
 def train(arguments: list[str]) -> int:
-    """Runs the command.
+    """Run the command.
 
     Args:
         arguments: those behind ``pixelbrax train``.
@@ -98,13 +98,13 @@ def _train(arguments: list[str]) -> int:
 
 
 def _write(line: str) -> None:
-    """Writes a line above the bar, if anybody is left to read it."""
+    """Write a line above the bar, if anybody is left to read it."""
     with contextlib.suppress(OSError, ValueError):
         tqdm.write(line, file=sys.stderr)
 
 
 def _flush(stream: Any) -> None:
-    """Empties a stream, or gives up its text: Python would exit with 120 on account of it."""
+    """Empty a stream, or give up its text: Python would exit with 120 on account of it."""
     try:
         stream.flush()
     except ValueError:  # It is closed.
@@ -115,7 +115,7 @@ def _flush(stream: Any) -> None:
 
 
 def _emulate(cpu_devices: int) -> None:
-    """Has JAX show the CPU as several devices, each of which computes in threads of its own.
+    """Let JAX show the CPU as several devices, each of which computes in threads of its own.
 
     Raises:
         ValueError: the number is below 1, or JAX is at work already.
@@ -130,7 +130,7 @@ def _emulate(cpu_devices: int) -> None:
 
 
 def parse(algorithm: str, name: str, arguments: list[str]) -> tuple[TrainConfig, RunConfig]:
-    """Settings of an algorithm and of the run, from options over a preset.
+    """Return settings of an algorithm and of the run, from options over a preset.
 
     Args:
         algorithm: its name.

@@ -40,7 +40,7 @@ class Trained:
 def load_trained(
     folder: str | Path, *, steps: int | None = None, best: bool = False, run: int = 0
 ) -> Trained:
-    """Reads the networks of a checkpoint.
+    """Read the networks of a checkpoint.
 
     Args:
         folder: output folder of a training run.
@@ -78,7 +78,7 @@ def load_trained(
 
 
 def load_config(about: dict[str, Any]) -> TrainConfig:
-    """The settings that are stored with a checkpoint.
+    """Return the settings that are stored with a checkpoint.
 
     Raises:
         CheckpointError: it is of an algorithm that is not known here.

@@ -46,7 +46,7 @@ def known_warnings_silenced() -> Iterator[None]:
 
 @contextlib.contextmanager
 def import_silenced() -> Iterator[None]:
-    """Hide the known noise of importing Brax; prints anything else afterwards."""
+    """Hide the known noise of importing Brax; print anything else afterwards."""
     printed = io.StringIO()
     with known_warnings_silenced(), contextlib.redirect_stdout(printed):
         yield

@@ -1,1 +1,1 @@
-"""Other simulators that draw pictures, each measured in an environment of its own."""
+"""Other simulators that draw images, each measured in an environment of its own."""

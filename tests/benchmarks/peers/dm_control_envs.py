@@ -2,7 +2,7 @@
 
     python dm_control_envs.py '{"domain": "cheetah", "processes": 8, "cores": 8}'
 
-Each environment step is one control step with one picture; under SubprocVecEnv the last three are
+Each environment step is one control step with one image; under SubprocVecEnv the last three are
 stacked. Exits with 3 where no OpenGL works.
 """
 
@@ -89,8 +89,8 @@ def vectorised(domain: str, processes: int) -> Callable[[], int]:
 
         def step(self, action: np.ndarray) -> Any:
             step = self.env.step(action)
-            picture = self.env.physics.render(SIZE, SIZE, camera_id=0)
-            return picture, float(step.reward or 0.0), False, bool(step.last()), {}
+            image = self.env.physics.render(SIZE, SIZE, camera_id=0)
+            return image, float(step.reward or 0.0), False, bool(step.last()), {}
 
     makers = [lambda seed=seed: Env(seed) for seed in range(processes)]
     envs = VecFrameStack(SubprocVecEnv(makers), 3, channels_order="last")

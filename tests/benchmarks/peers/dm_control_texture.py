@@ -28,7 +28,7 @@ SIZE = 84
 
 
 def steps_per_second(domain: str, task: str, *, upload: bool) -> float:
-    """Median over repetitions, one environment, one picture a step."""
+    """Median over repetitions, one environment, one image a step."""
     env = suite.load(domain, task, task_kwargs={"random": 0})
     env.reset()
     physics, spec = env.physics, env.action_spec()

@@ -19,7 +19,7 @@ SECONDS, SIZE = 3.0, 84
 
 
 def make(name: str) -> Any:
-    """An environment whose observations are its pictures."""
+    """An environment whose observations are its images."""
     import gymnasium
 
     env = gymnasium.make(name, render_mode="rgb_array", width=SIZE, height=SIZE)

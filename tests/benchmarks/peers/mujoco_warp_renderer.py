@@ -3,7 +3,7 @@
     python mujoco_warp_renderer.py '{"num_envs": 256, "size": 84, "cores": 2, "scene": {...}}'
 
 ``scene`` comes from ``tests.benchmarks.scene``. A frame costs the refit of the bounding volumes
-and the picture; there are no textures and no shadows. Warp runs its kernels in one thread on a
+and the image; there are no textures and no shadows. Warp runs its kernels in one thread on a
 CPU, so there is a process for each core, with ``num_envs`` worlds each, and their rates are summed.
 """
 
@@ -24,7 +24,7 @@ PATIENCE = 300.0
 
 
 def prepare(scene: dict[str, Any], num_envs: int, size: int) -> Any:
-    """A function that draws all worlds once, and the context that holds their pictures."""
+    """A function that draws all worlds once, and the context that holds their images."""
     try:
         import mujoco
         import mujoco_warp as mjw

@@ -1,4 +1,4 @@
-"""Comparisons within one process, where all take turns.
+"""Comparisons within one process, interleaved.
 
 A change of the machine's mood then strikes everyone alike, so that ratios hold where speeds do
 not. Turns are short and their order is drawn anew in each round; a ratio is the median over the
@@ -24,13 +24,13 @@ from pixelbrax_jax.distractors import Camera, ClipBank, Color, Video
 from tests.benchmarks.cases import TASKS
 
 SECONDS = 90.0
-"""About how long the turns of a comparison take altogether."""
+"""About how long the runs of a comparison take altogether."""
 
 
-def take_turns(
+def take_interleaved(
     runners: Mapping[Hashable, Callable[[], Any]], seconds: float = SECONDS
 ) -> dict[Any, list[float]]:
-    """Seconds of each runner's turns, one in each round: at least five rounds, at most 300."""
+    """Seconds of each runner's runs, one in each round: at least five rounds, at most 300."""
     for run in runners.values():
         run()
     order = list(runners)
@@ -71,23 +71,23 @@ def batches(task: str, sizes: Sequence[int], seconds: float = SECONDS) -> list[d
         shape = (steps // num_envs, num_envs, action_size)
         actions = np.random.default_rng(0).uniform(-1, 1, shape).astype(np.float32)
         runners[num_envs] = _jax_scan(task, num_envs, "next_step", actions)
-    times = take_turns(runners, seconds)
+    times = take_interleaved(runners, seconds)
     return [
         {
             "num_envs": num_envs,
-            "steps_per_second": steps / float(np.median(turns)),
-            **speed_ratio(turns, times[sizes[0]]),
-            "turns": len(turns),
+            "steps_per_second": steps / float(np.median(runs)),
+            **speed_ratio(runs, times[sizes[0]]),
+            "runs": len(runs),
         }
-        for num_envs, turns in times.items()
+        for num_envs, runs in times.items()
     ]
 
 
-def doors(task: str, num_envs: int, seconds: float = SECONDS) -> list[dict[str, Any]]:
-    """Steps per second of every door to PyTorch, and of the functional environment in Python.
+def adapters(task: str, num_envs: int, seconds: float = SECONDS) -> list[dict[str, Any]]:
+    """Steps per second of every adapter to PyTorch, and of the functional environment in Python.
 
     ``ratio`` is to the functional loop with the same autoreset mode that waits for each step as the
-    door does. All see the same actions and the same episodes.
+    adapter does. All see the same actions and the same episodes.
     """
     # So many that a loop that never waits can be told from one that does.
     calls = max(8, min(100, 512 // num_envs))
@@ -108,16 +108,16 @@ def doors(task: str, num_envs: int, seconds: float = SECONDS) -> list[dict[str, 
         task, num_envs, actions, whole=True
     )
     runners["Stable-Baselines3", "same_step"] = _sb3(task, num_envs, actions)
-    times = take_turns(runners, seconds)
+    times = take_interleaved(runners, seconds)
     return [
         {
-            "door": name,
+            "adapter": name,
             "autoreset_mode": mode,
-            "steps_per_second": num_envs * calls / float(np.median(turns)),
-            **speed_ratio(turns, times["JAX loop", mode]),
-            "turns": len(turns),
+            "steps_per_second": num_envs * calls / float(np.median(runs)),
+            **speed_ratio(runs, times["JAX loop", mode]),
+            "runs": len(runs),
         }
-        for (name, mode), turns in times.items()
+        for (name, mode), runs in times.items()
     ]
 
 
@@ -261,16 +261,16 @@ def distractors(task: str, num_envs: int, seconds: float = SECONDS) -> list[dict
         plays = any(isinstance(link, Video) for link in links)
         env, params = pb.make(task, distractors=links, clips=bank if plays else None)
         runners[name] = _stepper(env, jax.device_put(params), num_envs, calls)
-    times = take_turns(runners, seconds)
+    times = take_interleaved(runners, seconds)
     clean = times["none"]
     return [
         {
             "distractors": name,
-            "steps_per_second": num_envs * calls / float(np.median(turns)),
-            **speed_ratio(turns, clean),
-            "turns": len(turns),
+            "steps_per_second": num_envs * calls / float(np.median(runs)),
+            **speed_ratio(runs, clean),
+            "runs": len(runs),
         }
-        for name, turns in times.items()
+        for name, runs in times.items()
     ]
 
 
