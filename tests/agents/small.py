@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pixelbrax_jax import PixelEnv, VectorPixelEnv
+from pixelbrax_jax import EnvParams, PixelEnv, VectorPixelEnv
 from pixelbrax_jax.agents.core.algorithm import Algorithm
 from pixelbrax_jax.agents.core.train_state import TrainState
 from tests.envs.toy import Ball, limited
@@ -36,14 +38,28 @@ def ball_envs() -> VectorPixelEnv:
     return VectorPixelEnv(PixelEnv(Ball(), **OPTIONS), SMALL["num_envs"])
 
 
+@partial(jax.jit, static_argnums=0)
+def _iterate(algorithm: Algorithm, state: TrainState) -> Any:
+    return algorithm.iterate(state, PARAMS)
+
+
+@partial(jax.jit, static_argnums=0)
+def _auxiliary(algorithm: Algorithm, state: TrainState) -> Any:
+    return algorithm.auxiliary(state)
+
+
 class Agent:
-    """An algorithm whose parts are compiled once."""
+    """An algorithm, the parts of which are compiled once for equal ones."""
 
     def __init__(self, algorithm: Algorithm) -> None:
         self.algorithm = algorithm
         self.config = algorithm.config
-        self.iterate = jax.jit(lambda state: algorithm.iterate(state, PARAMS))
-        self.auxiliary = jax.jit(algorithm.auxiliary) if algorithm.num_phases else None
+
+    def iterate(self, state: TrainState) -> tuple[TrainState, dict[str, Any]]:
+        return _iterate(self.algorithm, state)
+
+    def auxiliary(self, state: TrainState) -> tuple[TrainState, dict[str, Any]]:
+        return _auxiliary(self.algorithm, state)
 
     def init(self, seed: int = 0) -> TrainState:
         return self.algorithm.init(jax.random.key(seed), PARAMS)
@@ -62,6 +78,18 @@ class Agent:
     def without_steps(self, state: TrainState) -> TrainState:
         """``state`` after the last iteration: annealed, the step size is 0 from there on."""
         return state.replace(iteration=jnp.uint32(self.config.num_iterations))
+
+
+def with_iterate(
+    algorithm: Algorithm, iterate: Callable[[TrainState, EnvParams], Any]
+) -> Algorithm:
+    """Return the algorithm with another ``iterate``; it is equal to itself alone."""
+
+    class Changed(type(algorithm)):
+        def iterate(self, state, env_params):
+            return iterate(state, env_params)
+
+    return Changed(algorithm.config, algorithm.envs)
 
 
 def arrays(tree: Any) -> list[np.ndarray]:

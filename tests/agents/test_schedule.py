@@ -20,7 +20,7 @@ from pixelbrax_jax.agents.runner.schedule import Schedule
 from pixelbrax_jax.agents.runner.seeds import Runs
 from tests.agents.small import OPTIONS, PARAMS, PHASIC, SMALL, ball_envs
 from tests.compilations import counted
-from tests.envs.toy import limited
+from tests.envs.toy import Ball, limited
 
 ENVS = ball_envs()
 SEVEN = VectorPixelEnv(ENVS.env, 7)
@@ -90,6 +90,10 @@ def test_a_field_that_declares_nothing_is_an_error():
         env_axes(Forgetful(state, jnp.zeros(2)))
 
 
+class Heavy(Ball):
+    """Other physics, so other environments."""
+
+
 def make_ppo(**changes):
     envs = VectorPixelEnv(PixelEnv(ENVS.env.physics, **OPTIONS), SMALL["num_envs"])
     return PPO(PPOConfig(**SMALL | changes), envs)
@@ -101,8 +105,7 @@ def test_equal_settings_are_equal_algorithms():
     assert hash(one) == hash(two)
     assert one != make_ppo(gamma=0.5)
     assert one != PPG(PPGConfig(**SMALL, **PHASIC), ENVS)
-    # A physics object of one's own is equal to itself alone.
-    assert one != PPO(PPOConfig(**SMALL), ball_envs())
+    assert one != PPO(PPOConfig(**SMALL), VectorPixelEnv(PixelEnv(Heavy(), **OPTIONS), 4))
 
 
 def test_a_run_like_one_before_compiles_nothing():

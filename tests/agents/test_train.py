@@ -30,7 +30,7 @@ from pixelbrax_jax.agents.runner.export import save_policy
 from pixelbrax_jax.agents.runner.metrics import read_metrics, summarize
 from pixelbrax_jax.agents.runner.train import RunConfig, TrainingDivergedError, run
 from pixelbrax_jax.policy import load_policy
-from tests.agents.small import OPTIONS, PARAMS, SMALL, ball_envs, same
+from tests.agents.small import OPTIONS, PARAMS, SMALL, ball_envs, same, with_iterate
 from tests.envs.toy import Ball
 
 PHASES = {"num_policy_phases": 3, "aux_minibatches": 3, "aux_epochs": 1}
@@ -137,6 +137,13 @@ def test_another_configuration_is_refused_by_name(whole):
     about.write_text(json.dumps(json.loads(text) | {"format": 0}))
     with pytest.raises(CheckpointError, match="format 0"):
         run(ppg(9), PARAMS, options(whole[1], resume="latest"))
+    # Of the format before, the networks can still be read.
+    about.write_text(json.dumps(json.loads(text) | {"format": 2}))
+    with pytest.raises(CheckpointError, match="reads the networks alone: evaluate or record"):
+        run(ppg(9), PARAMS, options(whole[1], resume="latest"))
+    steps = int(about.parents[1].name)
+    networks = read_networks(whole[1] / "checkpoints", whole[0].state.networks, steps)
+    assert jax.tree.structure(networks) == jax.tree.structure(whole[0].state.networks)
     about.write_text(text)
 
 
@@ -224,7 +231,7 @@ def test_losses_that_are_not_finite_stop_the_run(tmp_path):
         bad = jnp.where(state.iteration > 4, jnp.nan, 0.0)
         return state, metrics | {"loss/value": metrics["loss/value"] + bad}
 
-    broken = replace(algorithm, iterate=iterate)
+    broken = with_iterate(algorithm, iterate)
     with pytest.raises(TrainingDivergedError, match=rf"loss/value.*{4 * PER_ITERATION} steps is"):
         run(broken, PARAMS, options(tmp_path, checkpoint_every=PER_ITERATION))
     names = [int(p.name) for p in (tmp_path / "checkpoints").iterdir() if p.name.isdigit()]
@@ -246,7 +253,7 @@ def test_ctrl_c_writes_a_checkpoint_and_the_run_goes_on(whole, tmp_path):
 
     lines = []
     begun = options(tmp_path, resume="latest")
-    stopped = run(replace(algorithm, iterate=iterate), PARAMS, begun, report=lines.append)
+    stopped = run(with_iterate(algorithm, iterate), PARAMS, begun, report=lines.append)
     assert stopped.interrupted
     assert any("a new run begins" in line for line in lines)
     assert any("stopping within two iterations" in line for line in lines)
@@ -265,15 +272,15 @@ def test_training_stays_one_iteration_ahead_of_the_device(tmp_path, monkeypatch)
         heavy = jax.lax.fori_loop(0, 10, lambda _, x: x @ x / 800.0, jnp.ones((800, 800)))
         return state, metrics | {"heavy": heavy[0, 0]}
 
-    one, ahead = train._Run._one, []
+    one, ahead = train._Run._iterate, []
 
     def watched(self, state, number):
         state = one(self, state, number)
         ahead.append(sum(not record["heavy"].is_ready() for record in self._pending))
         return state
 
-    monkeypatch.setattr(train._Run, "_one", watched)
-    run(replace(algorithm, iterate=iterate), PARAMS, options(tmp_path, log_every=12))
+    monkeypatch.setattr(train._Run, "_iterate", watched)
+    run(with_iterate(algorithm, iterate), PARAMS, options(tmp_path, log_every=12))
     assert len(ahead) == 12
     assert max(ahead) == 1
 
@@ -291,7 +298,7 @@ def test_asked_to_stop_in_its_last_iteration_a_run_is_whole(whole, tmp_path):
         signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
 
     lines = []
-    late = replace(algorithm, iterate=iterate)
+    late = with_iterate(algorithm, iterate)
     ended = run(late, PARAMS, options(tmp_path), report=lines.append)
     assert not ended.interrupted
     assert not any("--resume" in line for line in lines)

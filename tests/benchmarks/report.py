@@ -58,7 +58,7 @@ NOTES = {
     "startup": "16 environments behind Gymnasium; one sample each. `gymnasium` and PixelBrax are "
     "imported first, JAX and Brax when the environment is made.",
     "adapters": "The ratio is that to the JAX loop with the same autoreset mode, which waits for "
-    "each step: medians over rounds, in which all take a turn of 8 to 100 steps in one process, with "
+    "each step: medians over rounds, in which each runs 8 to 100 steps in one process, with "
     "bootstrap intervals of 95 %.",
     "distractors": "With a bank of 60 clips of 70 frames. Ratios are to the speed without: medians "
     "over rounds, in which all take a turn of 1 to 100 steps in one process, with bootstrap "

@@ -210,9 +210,15 @@ class TestMake:
             assert other != first
 
     def test_physics_of_ones_own_are_compared_by_the_object(self):
-        ball = Ball()
+        class Own(Ball):
+            """Physics as most users write them: equal to itself alone."""
+
+            __eq__ = object.__eq__
+            __hash__ = object.__hash__
+
+        ball = Own()
         assert PixelEnv(ball) == PixelEnv(ball)
-        assert PixelEnv(ball) != PixelEnv(Ball())
+        assert PixelEnv(ball) != PixelEnv(Own())
 
     @pytest.mark.parametrize("value", [jnp.int32(16), np.zeros(2), [16]])
     def test_arrays_are_no_options(self, value):

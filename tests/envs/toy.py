@@ -41,6 +41,14 @@ class Ball:
     backend = "toy"
     link_names = ("ball",)
 
+    # Environments over equal balls share programs.
+
+    def __eq__(self, other: object) -> bool:
+        return type(self) is type(other) and vars(self) == vars(other)
+
+    def __hash__(self) -> int:
+        return hash(type(self))
+
     def reset(self, key: jax.Array) -> PhysicsState:
         x = jax.random.uniform(key, minval=-0.5, maxval=0.0)
         return self._state(x, jnp.float32(0.0), jnp.float32(0.0), jnp.bool_(False))

@@ -18,8 +18,11 @@ import orbax.checkpoint as ocp
 
 from pixelbrax_jax.agents.runner.sharding import any_process
 
-FORMAT = 2
+FORMAT = 3
 """Number of the format; raised when what is stored changes its meaning."""
+
+_NETWORKS_ALONE = (2,)
+"""Former formats whose networks can be read: their runs can be evaluated, and not gone on with."""
 
 _FREE = ("total_steps", "memory_budget_gb")
 """Settings that a run may go on with although they differ."""
@@ -230,6 +233,12 @@ class Checkpoints:
 
     def _check(self, steps: int) -> None:
         about = read_about(self.folder, steps)
+        if about["format"] != FORMAT:
+            raise CheckpointError(
+                f"{self.folder} has format {about['format']!r}, of which this version reads the "
+                "networks alone: evaluate or record the run, and train anew in another "
+                "--output-dir."
+            )
         if about["algorithm"] != self._about["algorithm"]:
             raise CheckpointError(
                 f"{self.folder} is a run of {about['algorithm']}, not of "
@@ -290,7 +299,7 @@ def read_about(folder: str | Path, steps: int | None = None) -> dict[str, Any]:
             f"{', '.join(map(str, known))} steps."
         )
     about: dict[str, Any] = json.loads(path.read_text("utf-8"))
-    if about.get("format") != FORMAT:
+    if about.get("format") not in (*_NETWORKS_ALONE, FORMAT):
         raise CheckpointError(
             f"{path.parents[1]} has format {about.get('format')!r}, this version reads {FORMAT}."
         )
