@@ -202,6 +202,12 @@ class Clips(struct.PyTreeNode):
     first: jax.Array
     length: jax.Array
 
+    @property
+    def words(self) -> jax.Array:
+        """The former name of ``packed``, which goes with the next release."""
+        warnings.warn("Clips.words is Clips.packed now.", DeprecationWarning, stacklevel=2)
+        return self.packed
+
 
 class EnvParams(struct.PyTreeNode):
     """The part of an environment that may be randomised; always a jit argument.
