@@ -74,8 +74,10 @@ def test_every_mode_goes_through_the_episodes_of_the_single_environment(make_vec
         assert len(actual[row]) >= 2
         for mine, other in zip(actual[row], expected, strict=False):
             for step, (left, right) in enumerate(zip(mine, other, strict=False)):
-                np.testing.assert_array_equal(left[0], right[0], err_msg=f"{row}, {step}")
-                assert left[1:] == right[1:]
+                # Two programs, whose sums may be rounded in another order.
+                np.testing.assert_allclose(left[0], right[0], atol=1, err_msg=f"{row}, {step}")
+                assert left[1] == pytest.approx(right[1], rel=1e-6, abs=1e-6)
+                assert left[2:] == right[2:]
 
 
 @pytest.mark.parametrize("output", ["numpy", "torch", "jax"])
