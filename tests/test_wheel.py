@@ -100,6 +100,7 @@ def test_the_metadata_says_what_a_user_needs(wheel):
     assert not [line for line in core if line.startswith(("torch", "pygame", "matplotlib"))]
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_the_wheel_works_in_an_empty_environment(wheel, tmp_path):
     venv.create(tmp_path / "env", with_pip=True)

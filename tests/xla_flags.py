@@ -5,6 +5,7 @@ from __future__ import annotations
 import mmap
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 
 def xla_flags(optimize: bool) -> str:
@@ -18,12 +19,23 @@ def xla_flags(optimize: bool) -> str:
     Args:
         optimize: whether programs are optimised as those of users are.
     """
-    flags = ["--xla_cpu_prefer_vector_width=512"]
+    flags = {"xla_cpu_prefer_vector_width": 512}
     if not optimize:
-        flags.append("--xla_backend_optimization_level=0")
-        if is_known("xla_cpu_use_fusion_emitters"):
-            flags.append("--xla_cpu_use_fusion_emitters=false")
-    return " ".join(flags)
+        flags |= {name: off for name, (off, _) in _optimizations().items()}
+    return " ".join(f"--{name}={str(value).lower()}" for name, value in flags.items())
+
+
+def optimized() -> dict[str, Any]:
+    """Return options of ``jax.jit`` that optimise a program: one that runs for long."""
+    return {name: on for name, (_, on) in _optimizations().items()}
+
+
+def _optimizations() -> dict[str, tuple[Any, Any]]:
+    """Return flags by name, with the value that turns optimisation off, and the one of users."""
+    known = {"xla_backend_optimization_level": (0, 3)}
+    if is_known("xla_cpu_use_fusion_emitters"):
+        known["xla_cpu_use_fusion_emitters"] = (False, True)
+    return known
 
 
 def is_known(flag: str) -> bool:

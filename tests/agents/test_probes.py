@@ -6,6 +6,7 @@ discount, a credit that goes astray, a time limit taken for an end, a gradient o
 
 from __future__ import annotations
 
+from functools import partial
 from types import SimpleNamespace
 
 import jax
@@ -20,6 +21,7 @@ from pixelbrax_jax.agents.algorithms.ppo import PPO, PPOConfig
 from pixelbrax_jax.agents.core.networks import Actor, Critic
 from tests.agents.probes import NAMES, TARGETS, TIME_LIMIT, Probes, true_values
 from tests.envs.toy import limited
+from tests.xla_flags import optimized
 
 GAMMA = 0.7
 PARAMS = limited(TIME_LIMIT)
@@ -76,7 +78,7 @@ def learned(request, envs, images):
     algorithm = make(config, envs)
     number = algorithm.num_phases or 2
 
-    @jax.jit
+    @partial(jax.jit, compiler_options=optimized())
     def phase(state):
         state, _ = jax.lax.scan(
             lambda state, _: algorithm.iterate(state, PARAMS), state, length=number

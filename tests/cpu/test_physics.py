@@ -15,8 +15,13 @@ from tests.cpu.equations import equations
 NUM_ENVS = 48
 """No other length in any task, and a multiple of the lanes."""
 
+FAST = ("ant", "inverted_pendulum", "swimmer", "walker2d")
 CASES = [
-    pytest.param(name, backend, marks=() if backend == task.backends[0] else pytest.mark.slow)
+    pytest.param(
+        name,
+        backend,
+        marks=() if name in FAST and backend == task.default_backend else pytest.mark.slow,
+    )
     for name, task in TASKS.items()
     for backend in task.backends
 ]
@@ -43,7 +48,7 @@ def test_primitives_without_a_rule_are_those_listed(task, backend, monkeypatch):
 
     monkeypatch.setattr(interpreter, "_by_vmap", record)
     closed = trace(task, backend)
-    assert found <= WITHOUT_RULE.get((task, backend), WITHOUT_RULE[backend])
+    assert found <= set(WITHOUT_RULE[task, backend].split())
     # What has rules keeps the batch last: only the ends of the program may move it.
     batched = [
         (eqn.primitive.name, var.aval.shape)
@@ -52,7 +57,53 @@ def test_primitives_without_a_rule_are_those_listed(task, backend, monkeypatch):
         if NUM_ENVS in var.aval.shape
     ]
     first = [name for name, shape in batched if NUM_ENVS in shape[:-1] and name not in found]
-    assert len(first) < len(batched) / 20
+    # What is in a loop that ends by itself has the batch first, as `jax.vmap` puts it.
+    assert "while" in found or len(first) < len(batched) / 20
 
 
-WITHOUT_RULE = {}
+WITHOUT_RULE = {
+    ("ant", "generalized"): "custom_jvp_call dot_general random_fold_in",
+    ("ant", "mjx"): "cholesky dot_general dynamic_slice random_fold_in triangular_solve",
+    ("ant", "spring"): "custom_jvp_call random_fold_in",
+    ("halfcheetah", "generalized"): "custom_jvp_call dot_general random_fold_in",
+    ("halfcheetah", "mjx"): "cholesky dot_general random_fold_in triangular_solve while",
+    ("halfcheetah", "positional"): "custom_jvp_call random_fold_in",
+    ("halfcheetah", "spring"): "custom_jvp_call random_fold_in",
+    ("hopper", "generalized"): "custom_jvp_call random_fold_in",
+    ("hopper", "mjx"): "cholesky dot_general random_fold_in triangular_solve while",
+    ("hopper", "positional"): "custom_jvp_call random_fold_in",
+    ("hopper", "spring"): "custom_jvp_call random_fold_in",
+    ("humanoid", "generalized"): "custom_jvp_call dot_general random_fold_in",
+    ("humanoid", "mjx"): "cholesky dot_general dynamic_slice random_fold_in triangular_solve",
+    ("humanoid", "positional"): "custom_jvp_call random_fold_in",
+    ("humanoid", "spring"): "custom_jvp_call random_fold_in",
+    ("humanoidstandup", "generalized"): "custom_jvp_call dot_general random_fold_in",
+    ("humanoidstandup", "mjx"): "cholesky dot_general random_fold_in triangular_solve while",
+    ("humanoidstandup", "positional"): "custom_jvp_call random_fold_in",
+    ("humanoidstandup", "spring"): "custom_jvp_call random_fold_in",
+    ("inverted_double_pendulum", "generalized"): "custom_jvp_call random_fold_in",
+    (
+        "inverted_double_pendulum",
+        "mjx",
+    ): "cholesky dot_general random_fold_in triangular_solve while",
+    ("inverted_double_pendulum", "positional"): "custom_jvp_call random_fold_in",
+    ("inverted_double_pendulum", "spring"): "custom_jvp_call random_fold_in",
+    ("inverted_pendulum", "generalized"): "custom_jvp_call random_fold_in",
+    ("inverted_pendulum", "mjx"): "cholesky dot_general random_fold_in triangular_solve while",
+    ("inverted_pendulum", "positional"): "custom_jvp_call random_fold_in",
+    ("inverted_pendulum", "spring"): "custom_jvp_call random_fold_in",
+    ("pusher", "generalized"): "custom_jvp_call dot_general random_fold_in",
+    ("pusher", "mjx"): "cholesky dot_general random_fold_in triangular_solve while",
+    ("pusher", "positional"): "custom_jvp_call random_fold_in",
+    ("pusher", "spring"): "custom_jvp_call random_fold_in",
+    ("reacher", "generalized"): "custom_jvp_call random_fold_in",
+    ("reacher", "mjx"): "cholesky dot_general random_fold_in triangular_solve while",
+    ("reacher", "positional"): "custom_jvp_call random_fold_in",
+    ("reacher", "spring"): "custom_jvp_call random_fold_in",
+    ("swimmer", "generalized"): "custom_jvp_call random_fold_in",
+    ("walker2d", "generalized"): "custom_jvp_call dot_general random_fold_in",
+    ("walker2d", "mjx"): "cholesky dot_general random_fold_in triangular_solve while",
+    ("walker2d", "positional"): "custom_jvp_call random_fold_in",
+    ("walker2d", "spring"): "custom_jvp_call random_fold_in",
+}
+"""What each task leaves to ``jax.vmap``. It must not grow: add a rule to `rules`, or slow down."""

@@ -52,7 +52,7 @@ def test_constant_reward_is_withheld_too(program):
     assert_diverged(compiled.step(first, np.full(1, np.nan, np.float32)), first)
 
 
-@pytest.mark.parametrize("speed", [1e9, 1e12, np.inf, np.nan])
+@pytest.mark.parametrize("speed", [1e6, 1e12, np.inf, np.nan])
 def test_speeds_beyond_reason(speed, program):
     """A finite number so large that an image's arithmetic would overflow also diverged."""
     compiled = program("inverted_pendulum")
@@ -63,7 +63,7 @@ def test_speeds_beyond_reason(speed, program):
     assert_finite(state)
     assert np.abs(state.xpos).max() < 1e10
     assert state.terminated
-    assert bool(state.non_finite) == (speed != 1e9)
+    assert bool(state.non_finite) == (speed != 1e6)
 
 
 def test_only_the_diverged_member_of_a_batch_is_affected(program):

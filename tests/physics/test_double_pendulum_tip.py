@@ -14,7 +14,13 @@ TIPS = [
     ((0, 0.3, -0.3), (0.1773, 1.1732)),
     ((0.2, 0.5, 0.7), (1.0469, 0.7440)),
 ]
-backends = pytest.mark.parametrize("backend", TASKS[TASK].backends)
+backends = pytest.mark.parametrize(
+    "backend",
+    [
+        pytest.param(name, marks=() if name == TASKS[TASK].default_backend else pytest.mark.slow)
+        for name in TASKS[TASK].backends
+    ],
+)
 
 
 def tip_of(physics, state, geom_pose):

@@ -1,0 +1,74 @@
+"""Rows that are computed in chunks are those that are computed together, and by ``jax.vmap``."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import pixelbrax_jax as pb
+from pixelbrax_jax._cpu import chunks
+from pixelbrax_jax._cpu.chunks import chunk_size, step_rows
+from tests.envs.toy import PARAMS, Ball
+
+
+@pytest.mark.parametrize(
+    ("num_rows", "size"),
+    [(1, 1), (100, 100), (128, 128), (130, 65), (256, 128), (257, 257), (1000, 125), (8192, 128)],
+)
+def test_a_chunk_is_the_largest_divisor_within_bounds(num_rows, size):
+    assert chunk_size(num_rows) == size
+
+
+def step(state, row, shared):
+    """Rows of two arrays, one of them empty, as some engines carry."""
+    x = jnp.tanh(state["x"] @ shared + row)
+    return {"x": x, "empty": state["empty"]}, x.sum()
+
+
+@pytest.mark.parametrize("num_rows", [1, 6, 7])
+def test_chunks_give_what_the_whole_gives(num_rows, monkeypatch):
+    keys = jax.random.split(jax.random.key(num_rows), 3)
+    state = {"x": jax.random.normal(keys[0], (num_rows, 3)), "empty": jnp.zeros((num_rows, 0))}
+    row, shared = jax.random.normal(keys[1], (num_rows, 3)), jax.random.normal(keys[2], (3, 3))
+    expected = jax.jit(jax.vmap(step, in_axes=(0, 0, None)))(state, row, shared)
+    for largest in (128, 4, 3, 1):
+        monkeypatch.setattr(chunks, "_CHUNK", largest)
+        actual = jax.jit(lambda *args: step_rows(step, *args))(state, row, shared)
+        for a, b in zip(jax.tree.leaves(actual), jax.tree.leaves(expected), strict=True):
+            assert a.shape == b.shape
+            np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)
+
+
+def test_physics_may_be_batched_by_vmap():
+    """The switch decides how physics are computed, and not what they are."""
+    results = {}
+    for batching in ("auto", "vmap"):
+        env = pb.PixelEnv(Ball(), height=4, width=4, physics_batching=batching)
+        envs = pb.VectorPixelEnv(env, 5)
+        state, _ = envs.reset(jax.random.key(0), PARAMS)
+        _, results[batching] = envs.step(state, jnp.full((5, 1), 0.3), PARAMS)
+    close = partial(np.testing.assert_allclose, rtol=1e-6, atol=1e-6)
+    jax.tree.map(close, results["auto"], results["vmap"])
+
+
+@pytest.mark.parametrize(
+    ("backend", "batching"), [("cpu", "vmap"), ("gpu", "auto"), ("tpu", "auto")]
+)
+def test_a_program_for_an_accelerator_never_traces_what_is_for_cpus(backend, batching, monkeypatch):
+    def fail(*args, **kwargs):
+        raise AssertionError("this is for CPUs")
+
+    env = pb.PixelEnv(Ball(), obs_mode="state", physics_batching=batching, frame_stack=7)
+    envs = pb.VectorPixelEnv(env, 3)
+    state, _ = jax.eval_shape(envs.reset, jax.random.key(0), PARAMS)
+    monkeypatch.setattr("pixelbrax_jax.envs.vector.step_rows", fail)
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    jax.eval_shape(envs.step, state, jnp.zeros((3, 1)), PARAMS)
+    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
+    other = pb.VectorPixelEnv(pb.PixelEnv(Ball(), obs_mode="state", frame_stack=8), 3)
+    with pytest.raises(AssertionError, match="for CPUs"):
+        jax.eval_shape(other.step, state, jnp.zeros((3, 1)), PARAMS)
