@@ -23,7 +23,7 @@ from pixelbrax_jax.memory import check_fits
 from pixelbrax_jax.types import EnvParams, EnvState
 from pixelbrax_jax.validation import check_positive_int
 
-_made: deque[EnvConfig] = deque(maxlen=64)
+_made: deque[tuple[EnvConfig, PixelEnv, EnvParams]] = deque(maxlen=64)
 """Options of the latest environments, so that forks of this process can name them."""
 
 
@@ -286,19 +286,23 @@ def _limited(config: EnvConfig, max_episode_steps: Any, is_limited: bool) -> Env
 
 
 def _make(config: EnvConfig) -> tuple[PixelEnv, EnvParams]:
-    if is_forked() and not _is_made(config):
+    if is_forked():
+        # What exists can be named in a fork without starting JAX. The worker then fails in
+        # reset(), where Gymnasium's AsyncVectorEnv passes errors on; from here it would only see
+        # a lost pipe.
+        for made, env, params in _made:
+            if _is_equal(made, config):
+                return env, params
         check_not_forked()
-    # What exists can be named in a fork without starting JAX. The worker then fails in reset(),
-    # where Gymnasium's AsyncVectorEnv passes errors on; from here it would only see a lost pipe.
     env, params = make(config)
     # Clips would be put on the device, which starts JAX.
-    if params.clips is None and not _is_made(config):
-        _made.append(config)
+    if params.clips is None and not any(_is_equal(made, config) for made, _, _ in _made):
+        _made.append((config, env, params))
     return env, params
 
 
-def _is_made(config: EnvConfig) -> bool:
+def _is_equal(one: EnvConfig, other: EnvConfig) -> bool:
     try:
-        return config in _made
+        return one == other
     except ValueError:  # Arrays of a camera or look, which have no truth value.
         return False

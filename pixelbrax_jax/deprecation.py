@@ -48,10 +48,13 @@ MOVED = {
 RENAMED = {
     f"{_AGENTS}.ppo.make_ppo": f"{_AGENTS}.algorithms.ppo.PPO",
     f"{_AGENTS}.ppo.ActorCritic": f"{_AGENTS}.core.actor_critic.ActorCritic",
-    f"{_AGENTS}.ppo.epochs": f"{_AGENTS}.core.update.update",
     f"{_AGENTS}.ppg.make_ppg": f"{_AGENTS}.algorithms.ppg.PPG",
     f"{_AGENTS}.dcpg.make_dcpg": f"{_AGENTS}.algorithms.dcpg.DCPG",
-    f"{_AGENTS}.algorithm.TrainState": f"{_AGENTS}.core.train_state.TrainState",
+    **{
+        f"{_AGENTS}.algorithm.{name}": f"{_AGENTS}.core.train_state.{name}"
+        for name in ("TrainState", "auxiliary_key", "update_key")
+    },
+    f"{_AGENTS}.algorithm.policy_metrics": f"{_AGENTS}.core.losses.policy_metrics",
     **{
         f"{_AGENTS}.{name}.make_train": f"{_AGENTS}.algorithms.registry.make_train"
         for name in ("dcpg", "ppg", "ppo")

@@ -141,6 +141,3 @@ def check_fraction(what: str, value: object) -> float:
     if isinstance(value, Real) and not isinstance(value, bool) and 0.0 <= float(value) <= 1.0:
         return float(value)
     raise ValueError(f"{what} must lie in [0, 1], got {value!r}.")
-
-
-check_positive_int, check_fraction = check_positive_int, check_fraction

@@ -13,6 +13,7 @@ import pytest
 import pixelbrax_gym  # noqa: F401, it makes former names known
 from pixelbrax_jax import Clips, EnvState, PixelEnv, SimState
 from pixelbrax_jax.deprecation import MOVED, RENAMED
+from pixelbrax_jax.distractors import Color
 from pixelbrax_jax.distractors.base import Distractor
 from tests.envs.toy import Ball
 
@@ -56,6 +57,9 @@ def test_a_state_has_the_fields_of_its_simulation(name):
         DeprecationWarning, match=f"EnvState.{name} is EnvState.sim.{FORMER_FIELDS[name]}"
     ):
         assert getattr(state, name) is getattr(sim, FORMER_FIELDS[name])
+    with pytest.warns(DeprecationWarning, match=f"replace.*{name}"):
+        changed = state.replace(**{name: 7}, key=8)
+    assert (getattr(changed.sim, FORMER_FIELDS[name]), changed.key) == (7, 8)
     with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
         _ = state.nothing
 
@@ -68,12 +72,21 @@ def test_a_picture_is_an_image(monkeypatch):
 
 
 def test_a_distractor_may_still_begin():
-    class Old(Distractor):
-        def begin(self, key, params):
-            return key, params
+    for base in (Distractor, Color):
+        with pytest.warns(DeprecationWarning, match="Old.begin is called reset now"):
 
-    with pytest.warns(DeprecationWarning, match="Old.begin is called reset now"):
+            class Old(base):
+                def begin(self, key, params):
+                    return key, params
+
         assert Old().reset(1, 2) == (1, 2)
+
+    class New(Distractor):
+        def reset(self, key, params):
+            return params, key
+
+    with pytest.warns(DeprecationWarning, match="Distractor.begin is Distractor.reset now"):
+        assert New().begin(1, 2) == (2, 1)
 
 
 def test_words_of_clips_are_packed_pixels():

@@ -106,7 +106,7 @@ reduce_prod reduce_sum rev split squeeze
 
 @rule(*_NAMED_AXES_NAMES.split())
 def _named_axes(eqn: core.JaxprEqn, inputs: Sequence[Operand], size: int) -> list[Any]:
-    """Return bind as it is: parameters name the axes, and one more at the end changes nothing."""
+    """Bind as it is: parameters name the axes, and one more at the end changes nothing."""
     del size
     return bind(eqn, *(x.value for x in inputs))
 

@@ -36,14 +36,22 @@ class Distractor:
             key: a key of this episode and this distractor alone.
             params: of the environment.
         """
-        if begin := getattr(self, "begin", None):
+        raise NotImplementedError
+
+    def begin(self, key: jax.Array, params: EnvParams) -> Any:
+        """Sample a state; the former name of ``reset``, which goes with the next release."""
+        warnings.warn("Distractor.begin is Distractor.reset now.", DeprecationWarning, stacklevel=2)
+        return self.reset(key, params)
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        if "begin" in vars(cls) and "reset" not in vars(cls):
             warnings.warn(
-                f"{type(self).__name__}.begin is called reset now; rename it.",
+                f"{cls.__name__}.begin is called reset now; rename it.",
                 DeprecationWarning,
                 stacklevel=2,
             )
-            return begin(key, params)
-        raise NotImplementedError
+            cls.reset = vars(cls)["begin"]  # type: ignore[method-assign]
 
     def advance(self, state: Any, key: jax.Array, frame: jax.Array, params: EnvParams) -> Any:
         """Return the state at the next frame.

@@ -58,7 +58,13 @@ class PixelEnv(ProgramConfig):
     def __post_init__(self) -> None:
         """Check the fields."""
         super().__post_init__()
-        self._static("physics")
+        try:
+            hash(self.physics)
+        except TypeError as error:
+            raise TypeError(
+                f"physics must be hashable, got a {type(self.physics).__name__}: make it a frozen "
+                "dataclass, or leave its __eq__ alone."
+            ) from error
         chain = Chain(as_tuple(self.distractors) if self.obs_mode != "state" else ())
         self._store("distractors", chain.links)
         self.check_memory(1)

@@ -43,7 +43,8 @@ class ShardedVectorEnv:
         autoreset_mode: as of ``VectorPixelEnv``.
 
     Raises:
-        ValueError: the environments cannot be spread evenly.
+        ValueError: a field is out of range, or the environments cannot be spread evenly.
+        MemoryError: observations would not fit into this machine's memory.
     """
 
     env: PixelEnv
@@ -57,6 +58,7 @@ class ShardedVectorEnv:
         if num_envs % size:
             raise ValueError(f"num_envs={num_envs} must be a multiple of the {size} devices.")
         object.__setattr__(self, "num_envs", num_envs)
+        _ = self._local  # It checks the other fields.
 
     @partial(jax.jit, static_argnums=0)
     def reset(self, key: jax.Array, params: EnvParams) -> tuple[EnvState, Timestep]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -176,6 +177,12 @@ class VectorPixelEnv:
         """
         check_key(key)
         return jax.vmap(partial(jax.random.fold_in, key))(jnp.arange(num_envs))
+
+    @staticmethod
+    def keys_of(key: jax.Array, num_envs: int) -> jax.Array:
+        """Return keys; the former name of ``env_keys``, which goes with the next release."""
+        warnings.warn("VectorPixelEnv.keys_of is env_keys now.", DeprecationWarning, stacklevel=2)
+        return VectorPixelEnv.env_keys(key, num_envs)
 
     def _advance(
         self, sim: SimState, keys: jax.Array, action: jax.Array, params: EnvParams

@@ -106,14 +106,11 @@ class PPG(Algorithm):
     def init(self, key: jax.Array, env_params: EnvParams) -> TrainState:
         """As ``Algorithm.init``, with an empty buffer."""
         state = super().init(key, env_params)
-        return phasic.with_buffer(
-            self.config,
-            self.envs,
-            state,
-            env_params,
-            self.agent.decide(state.networks),
-            self.config.num_policy_phases,
+        decide = self.agent.decide(state.networks)
+        state = phasic.with_buffer(
+            self.config, self.envs, state, env_params, decide, self.config.num_policy_phases
         )
+        return state.replace(aux_opt_state=Optimizer(self.config).init(state.networks))
 
     def iterate(self, state: TrainState, env_params: EnvParams) -> tuple[TrainState, Metrics]:
         """Learn as PPO does (the policy phase), and remember the rollout."""

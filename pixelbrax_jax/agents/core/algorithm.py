@@ -143,7 +143,15 @@ def check_environments(config: TrainConfig, envs: Environments) -> None:
 
     Raises:
         ValueError: naming the setting and both values.
+        TypeError: they cannot be hashed, which programs are shared by.
     """
+    try:
+        hash(envs)
+    except TypeError as error:
+        raise TypeError(
+            f"environments must be hashable, got a {type(envs).__name__}: make it a frozen "
+            "dataclass, or leave its __eq__ alone."
+        ) from error
     if envs.autoreset_mode != "next_step":
         raise ValueError(
             f"autoreset_mode of the environments must be 'next_step', got {envs.autoreset_mode!r}."

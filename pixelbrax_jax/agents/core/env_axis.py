@@ -6,7 +6,7 @@ everything else is the same on every device.
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from typing import Any
 
 import jax
@@ -46,7 +46,7 @@ def env_axes(tree: Any) -> Any:
         The same tree; in place of a leaf its axis of environments, or -1 if it has none.
 
     Raises:
-        TypeError: a field is not declared.
+        TypeError: a field is not declared, or is none of the class that shall declare it.
     """
     found = {}
     for field in fields(tree):
@@ -57,6 +57,11 @@ def env_axes(tree: Any) -> Any:
                 "declare it with along_envs, without_envs or as_declared."
             )
         if isinstance(declared, tuple) and value is not None:
+            if not is_dataclass(value):
+                raise TypeError(
+                    f"{type(tree).__name__}.{field.name} must be a dataclass that declares its "
+                    f"fields, got a {type(value).__name__}."
+                )
             leading_axes = declared[1]
             found[field.name] = jax.tree.map(
                 lambda axis, more=leading_axes: axis + more if axis >= 0 else axis, env_axes(value)

@@ -113,7 +113,7 @@ def with_buffer(
     decide: Callable[..., Decision],
     num_policy_phases: int,
 ) -> TrainState:
-    """Return ``state`` with an empty buffer and a second optimiser."""
+    """Return ``state`` with an empty buffer."""
 
     def one() -> Buffer:
         return _entry(gather(config, envs, state, env_params, decide)[1])
@@ -121,7 +121,7 @@ def with_buffer(
     buffer = jax.tree.map(
         lambda x: jnp.zeros((num_policy_phases, *x.shape), x.dtype), jax.eval_shape(one)
     )
-    return state.replace(buffer=buffer, aux_opt_state=Optimizer(config).init(state.networks))
+    return state.replace(buffer=buffer)
 
 
 def remember(buffer: Buffer, slot: jax.Array, experience: Experience) -> Buffer:

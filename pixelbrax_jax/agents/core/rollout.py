@@ -17,7 +17,7 @@ from pixelbrax_jax.types import EnvParams, EnvState, Timestep
 
 
 class Environments(Protocol):
-    """What agents need: N environments in mode ``"next_step"``."""
+    """What agents need: N environments in mode ``"next_step"``, hashable; equal ones are alike."""
 
     @property
     def env(self) -> Any:

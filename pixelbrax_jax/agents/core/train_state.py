@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import jax
@@ -41,6 +42,12 @@ class TrainState(struct.PyTreeNode):
     key: jax.Array = without_envs()
     iteration: jax.Array = without_envs()
     steps: StepCounter = without_envs()
+
+    @property
+    def moments(self) -> Networks:
+        """The former name of ``opt_state``, which goes with the next release."""
+        warnings.warn("TrainState.moments is opt_state now.", DeprecationWarning, stacklevel=2)
+        return self.opt_state
 
 
 def env_key(key: jax.Array) -> jax.Array:

@@ -21,6 +21,9 @@ from pixelbrax_jax.validation import check_choice
 
 SPLITS = ("clean", "train", "test")
 
+WITHOUT_DISTRACTORS: dict[str, Any] = {"distractors": (), "clips": None, "split": "train"}
+"""Options of an environment that shows none, whatever its other options are."""
+
 
 @dataclass(frozen=True)
 class Result:
@@ -51,7 +54,8 @@ def make_splits(config: TrainConfig) -> dict[str, tuple[PixelEnv, EnvParams]]:
     """Return environments to evaluate in, by name of the split.
 
     ``clean`` has no distractors, ``train`` those of the training, and ``test`` the same with
-    clips that training never shows. Without distractors there is only ``clean``.
+    clips that training never shows: of the split ``test`` or, if ``train`` is within the name of
+    the training's, that with ``test`` in its place. Without distractors there is only ``clean``.
     """
     return {name: make_split(config, name) for name in splits_of(config)}
 
@@ -72,8 +76,12 @@ def make_split(config: TrainConfig, name: str) -> tuple[PixelEnv, EnvParams]:
         raise ValueError(
             f"split {name!r} is for distractors, and the run had none; there is only 'clean'."
         )
-    clean = {"distractors": (), "clips": None}
-    changes = clean if name == "clean" else {"split": name}
+    changes = {
+        "clean": WITHOUT_DISTRACTORS,
+        # That of the training, whatever it is called.
+        "train": {},
+        "test": {"split": config.split.replace("train", "test")},
+    }[name]
     # What training sees of the state, evaluation need not.
     return make_env(config, obs_mode="pixels", **changes)
 
@@ -163,7 +171,7 @@ class Interval:
 
 
 def interquartile_mean(scores: np.ndarray, *, confidence: float = 0.95, seed: int = 0) -> Interval:
-    """Return mean of the middle half of scores, with a bootstrap interval over runs.
+    """Return the mean of the middle half of scores, with a bootstrap interval over runs.
 
     Recommended for a handful of runs by Agarwal et al., arXiv 2108.13264.
 

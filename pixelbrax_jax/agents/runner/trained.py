@@ -18,6 +18,7 @@ from pixelbrax_jax.agents.runner.checkpoint import (
     read_about,
     read_networks,
 )
+from pixelbrax_jax.agents.runner.evaluate import WITHOUT_DISTRACTORS
 from pixelbrax_jax.agents.runner.seeds import Runs
 from pixelbrax_jax.envs.vector import VectorPixelEnv
 
@@ -69,7 +70,7 @@ def load_trained(
     if not 0 <= run < num_seeds:
         raise ValueError(f"run must be from 0 to {num_seeds - 1}, got {run}.")
     # The networks are those of training, whose environments may show more than pixels.
-    env, params = make_env(config, distractors=(), clips=None)
+    env, params = make_env(config, **WITHOUT_DISTRACTORS)
     algorithm = ALGORITHMS[about["algorithm"]](config, VectorPixelEnv(env, config.num_envs))
     runs = Runs(algorithm, num_seeds)
     template = jax.eval_shape(runs.init, 0, params).networks

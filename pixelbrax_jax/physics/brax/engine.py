@@ -118,7 +118,7 @@ class BraxPhysics(GuardedPhysics):
         self._check_shapes()
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, BraxPhysics) and self._identity == other._identity
+        return type(self) is type(other) and self._identity == getattr(other, "_identity", None)
 
     def __hash__(self) -> int:
         return hash(self._identity)
