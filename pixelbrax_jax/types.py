@@ -12,7 +12,6 @@ batched or randomised.
 
 from __future__ import annotations
 
-import dataclasses
 import warnings
 from enum import IntEnum
 from typing import Any
@@ -251,9 +250,6 @@ class SimState(struct.PyTreeNode):
     distractor_state: Any = ()
 
 
-_FORMER_FIELDS = {"head_start": "time_limit_offset", "distraction": "distractor_state"}
-
-
 class EnvState(struct.PyTreeNode):
     """State of one pixel environment.
 
@@ -274,7 +270,7 @@ class EnvState(struct.PyTreeNode):
 
     def __getattr__(self, name: str) -> Any:
         """Look up a field of ``sim`` under the place and name that it had."""
-        new = _FORMER_FIELDS.get(name, name)
+        new = {"head_start": "time_limit_offset", "distraction": "distractor_state"}.get(name, name)
         if new not in SimState.__dataclass_fields__:
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
         warnings.warn(
@@ -283,26 +279,6 @@ class EnvState(struct.PyTreeNode):
             stacklevel=2,
         )
         return getattr(self.sim, new)
-
-    def replace(self, **changes: Any) -> EnvState:
-        """Return the state with other fields; those of ``sim`` under the names that they had too.
-
-        Args:
-            **changes: by name of the field.
-        """
-        names = {name: _FORMER_FIELDS.get(name, name) for name in changes}
-        former = {old: new for old, new in names.items() if new in SimState.__dataclass_fields__}
-        if former:
-            warnings.warn(
-                f"EnvState.replace takes {', '.join(former)} until the next release; use "
-                "state.replace(sim=state.sim.replace(...)).",
-                DeprecationWarning,
-                stacklevel=2,
-            )
-            sim = changes.get("sim", self.sim)
-            sim = sim.replace(**{new: changes.pop(old) for old, new in former.items()})
-            changes["sim"] = sim
-        return dataclasses.replace(self, **changes)
 
 
 class Timestep(struct.PyTreeNode):

@@ -57,9 +57,6 @@ def test_a_state_has_the_fields_of_its_simulation(name):
         DeprecationWarning, match=f"EnvState.{name} is EnvState.sim.{FORMER_FIELDS[name]}"
     ):
         assert getattr(state, name) is getattr(sim, FORMER_FIELDS[name])
-    with pytest.warns(DeprecationWarning, match=f"replace.*{name}"):
-        changed = state.replace(**{name: 7}, key=8)
-    assert (getattr(changed.sim, FORMER_FIELDS[name]), changed.key) == (7, 8)
     with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
         _ = state.nothing
 
