@@ -184,16 +184,10 @@ class DCPG(Algorithm):
         def loss(
             networks: Networks, chunk: phasic.Chunk, key: jax.Array
         ) -> tuple[jax.Array, Metrics]:
-            output = agent.actor(networks["actor"], chunk.pixels)
-            error = value_loss(output.value, chunk.returns, chunk.weight)
-            kl = mean(chunk.policy.kl_to(output.policy), chunk.weight)
-            loss = error + config.beta_clone * kl
-            metrics = {"auxiliary/value_loss": error, "auxiliary/kl": kl}
-            if config.decoupled:
-                value = agent.critic(networks["critic"], chunk.pixels, chunk.state)
-                critic_error = value_loss(value, chunk.returns, chunk.weight)
-                loss += config.vf_coef * critic_error
-                metrics["auxiliary/critic_loss"] = critic_error
+            critic_coef = config.vf_coef if config.decoupled else None
+            output, loss, metrics = phasic.value_loss_with_kept_policy(
+                agent, networks, chunk, config.beta_clone, critic_coef
+            )
             if config.dynamics_coef:
                 wrong = dynamics_loss(dynamics, networks["dynamics"], output.features, chunk, key)
                 loss += config.dynamics_coef * wrong

@@ -16,7 +16,6 @@ from pixelbrax_jax.agents.core.experience import gather
 from pixelbrax_jax.agents.core.losses import (
     Batch,
     Metrics,
-    mean,
     policy_loss,
     policy_metrics,
     value_loss,
@@ -177,16 +176,10 @@ class PPG(Algorithm):
             networks: Networks, chunk: phasic.Chunk, key: jax.Array
         ) -> tuple[jax.Array, Metrics]:
             del key
-            output = agent.actor(networks["actor"], chunk.pixels)
-            error = value_loss(output.value, chunk.returns, chunk.weight)
-            kl = mean(chunk.policy.kl_to(output.policy), chunk.weight)
-            loss = error + config.beta_clone * kl
-            metrics = {"auxiliary/value_loss": error, "auxiliary/kl": kl}
-            if config.layout == "dual":
-                value = agent.critic(networks["critic"], chunk.pixels, chunk.state)
-                critic_error = value_loss(value, chunk.returns, chunk.weight)
-                loss += config.aux_value_coef * critic_error
-                metrics["auxiliary/critic_loss"] = critic_error
+            critic_coef = config.aux_value_coef if config.layout == "dual" else None
+            _, loss, metrics = phasic.value_loss_with_kept_policy(
+                agent, networks, chunk, config.beta_clone, critic_coef
+            )
             return loss, metrics
 
         return phasic.auxiliary_phase(

@@ -13,11 +13,13 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from pixelbrax_jax.agents.core.actor_critic import ActorCritic
 from pixelbrax_jax.agents.core.config import TrainConfig, check_divides
 from pixelbrax_jax.agents.core.distributions import Normal
 from pixelbrax_jax.agents.core.env_axis import along_envs, as_declared
 from pixelbrax_jax.agents.core.experience import Experience, gather
-from pixelbrax_jax.agents.core.losses import Metrics
+from pixelbrax_jax.agents.core.losses import Metrics, mean, value_loss
+from pixelbrax_jax.agents.core.networks import ActorOutput
 from pixelbrax_jax.agents.core.optimizer import Networks, Optimizer
 from pixelbrax_jax.agents.core.rollout import (
     Decision,
@@ -200,6 +202,38 @@ def auxiliary_phase(
     (networks, opt_state), metrics = jax.lax.scan(epoch, carry, jax.random.split(key, number))
     state = state.replace(networks=networks, aux_opt_state=opt_state)
     return state, jax.tree.map(jnp.mean, metrics)
+
+
+def value_loss_with_kept_policy(
+    agent: ActorCritic,
+    networks: Networks,
+    chunk: Chunk,
+    beta_clone: float,
+    critic_coef: float | None,
+) -> tuple[ActorOutput, jax.Array, Metrics]:
+    """Return the loss by which values learn from the buffer while the policy stays.
+
+    Args:
+        agent: an actor with a value head.
+        networks: parameters.
+        chunk: samples of the buffer.
+        beta_clone: weight of KL(old policy || policy).
+        critic_coef: weight of the separate critic's loss; None where there is no such critic.
+
+    Returns:
+        The actor's output, () float32, and metrics.
+    """
+    output = agent.actor(networks["actor"], chunk.pixels)
+    error = value_loss(output.value, chunk.returns, chunk.weight)
+    kl = mean(chunk.policy.kl_to(output.policy), chunk.weight)
+    loss = error + beta_clone * kl
+    metrics = {"auxiliary/value_loss": error, "auxiliary/kl": kl}
+    if critic_coef is not None:
+        value = agent.critic(networks["critic"], chunk.pixels, chunk.state)
+        critic_error = value_loss(value, chunk.returns, chunk.weight)
+        loss += critic_coef * critic_error
+        metrics["auxiliary/critic_loss"] = critic_error
+    return output, loss, metrics
 
 
 def _entry(experience: Experience) -> Buffer:
