@@ -48,42 +48,32 @@ if TYPE_CHECKING:
     from pixelbrax_jax.types import Timestep as Timestep
 
 # Loaded when they are first asked for: who wants the list of tasks need not wait for JAX.
+_PUBLIC = {
+    "compilation": "compiler_options",
+    "config": "EnvConfig",
+    "distractors": "load_clips",
+    "envs.autoreset": "AUTORESET_MODES",
+    "envs.brax_env": "BraxPixelEnv wrap_fresh_episodes",
+    "envs.check": "check_env",
+    "envs.pixel_env": "PixelEnv",
+    "envs.sharded": "ShardedVectorEnv",
+    "envs.vector": "VectorPixelEnv",
+    "physics.base": "Physics",
+    "physics.brax.engine": "BraxPhysics",
+    "physics.brax.mjcf": "mjcf_physics",
+    "policy": "load_policy",
+    "registry": "list_envs make register",
+    "renderer.base": "render",
+    "scene.cameras": "named_rigs rig",
+    "scene.look": "make_look",
+    "scene.place": "place",
+    "types": (
+        "Camera CameraRig Clips EnvParams EnvState Frame GeomKind Geoms Look PhysicsState Scene "
+        "SimState Timestep"
+    ),
+}
 _LAZY = {
-    "AUTORESET_MODES": "pixelbrax_jax.envs.autoreset",
-    "BraxPhysics": "pixelbrax_jax.physics.brax.engine",
-    "BraxPixelEnv": "pixelbrax_jax.envs.brax_env",
-    "Camera": "pixelbrax_jax.types",
-    "CameraRig": "pixelbrax_jax.types",
-    "Clips": "pixelbrax_jax.types",
-    "EnvConfig": "pixelbrax_jax.config",
-    "EnvParams": "pixelbrax_jax.types",
-    "EnvState": "pixelbrax_jax.types",
-    "Frame": "pixelbrax_jax.types",
-    "GeomKind": "pixelbrax_jax.types",
-    "Geoms": "pixelbrax_jax.types",
-    "Look": "pixelbrax_jax.types",
-    "Physics": "pixelbrax_jax.physics.base",
-    "PhysicsState": "pixelbrax_jax.types",
-    "PixelEnv": "pixelbrax_jax.envs.pixel_env",
-    "Scene": "pixelbrax_jax.types",
-    "ShardedVectorEnv": "pixelbrax_jax.envs.sharded",
-    "SimState": "pixelbrax_jax.types",
-    "Timestep": "pixelbrax_jax.types",
-    "VectorPixelEnv": "pixelbrax_jax.envs.vector",
-    "check_env": "pixelbrax_jax.envs.check",
-    "compiler_options": "pixelbrax_jax.compilation",
-    "list_envs": "pixelbrax_jax.registry",
-    "load_clips": "pixelbrax_jax.distractors",
-    "load_policy": "pixelbrax_jax.policy",
-    "make": "pixelbrax_jax.registry",
-    "make_look": "pixelbrax_jax.scene.look",
-    "mjcf_physics": "pixelbrax_jax.physics.brax.mjcf",
-    "named_rigs": "pixelbrax_jax.scene.cameras",
-    "place": "pixelbrax_jax.scene.place",
-    "register": "pixelbrax_jax.registry",
-    "render": "pixelbrax_jax.renderer.base",
-    "rig": "pixelbrax_jax.scene.cameras",
-    "wrap_fresh_episodes": "pixelbrax_jax.envs.brax_env",
+    name: f"pixelbrax_jax.{module}" for module, names in _PUBLIC.items() for name in names.split()
 }
 
 __all__ = [*_LAZY, "distractors"]

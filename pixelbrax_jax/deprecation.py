@@ -29,7 +29,6 @@ MOVED = {
         for name in (
             "algorithm",
             "config",
-            "counter",
             "distributions",
             "losses",
             "networks",

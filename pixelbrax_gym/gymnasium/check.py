@@ -24,7 +24,7 @@ class VectorEnvWarning(UserWarning):
 
 
 def check_vector_env(env: VectorEnv, *, seed: int = 0, num_steps: int = 200) -> None:
-    """Return drive a vector environment with random actions, and check what others rely on.
+    """Drive a vector environment with random actions, and check what others rely on.
 
     Checked are, in this order:
 

@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax.agents.core.config import TrainConfig, make_env
-from pixelbrax_jax.agents.core.counter import StepCounter
 from pixelbrax_jax.agents.core.losses import Metrics
 from pixelbrax_jax.agents.core.optimizer import Networks, Optimizer
 from pixelbrax_jax.agents.core.returns import RewardScaler
@@ -88,7 +87,6 @@ class Algorithm(ABC):
             buffer=None,
             key=key,
             iteration=jnp.uint32(0),
-            steps=StepCounter.of(0),
         )
 
     @abstractmethod

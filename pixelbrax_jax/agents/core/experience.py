@@ -47,7 +47,7 @@ def gather(
         decide: of ``ActorCritic.decide``.
 
     Returns:
-        The state after it, with counters moved on; the experience; and its metrics.
+        The state after it, one iteration further; the experience; and its metrics.
     """
     env_state, rollout = collect(
         envs,
@@ -79,7 +79,6 @@ def gather(
         env_state=env_state,
         scaler=scaler,
         iteration=state.iteration + 1,
-        steps=state.steps + config.steps_per_iteration,
     )
     return state, Experience(rollout, advantage, returns), metrics
 

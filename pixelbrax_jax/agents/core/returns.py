@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from pixelbrax_jax.agents.core.counter import StepCounter
 from pixelbrax_jax.agents.core.env_axis import along_envs, without_envs
 
 
@@ -59,17 +58,17 @@ class RewardScaler(struct.PyTreeNode):
 
     ``G_t = gamma G_{t-1} + r_t``, from 0 in every episode; rewards become
     ``clip(r / sqrt(var(G) + 1e-8), -10, 10)``, as in OpenAI's baselines and PPG
-    (arXiv 2009.04416). The number of returns is exact for any length of run.
+    (arXiv 2009.04416).
 
     Attributes:
         discounted: (N,) float32, G of each environment.
-        count: number of returns seen.
+        count: () float32, number of returns seen; to 24 bits.
         mean: () float32.
         square: () float32, mean squared deviation from the mean.
     """
 
     discounted: jax.Array = along_envs(0)
-    count: StepCounter = without_envs()
+    count: jax.Array = without_envs()
     mean: jax.Array = without_envs()
     square: jax.Array = without_envs()
 
@@ -78,7 +77,7 @@ class RewardScaler(struct.PyTreeNode):
         """Return a scaler that has seen nothing."""
         return cls(
             discounted=jnp.zeros(num_envs),
-            count=StepCounter.of(0),
+            count=jnp.float32(0.0),
             mean=jnp.float32(0.0),
             square=jnp.float32(0.0),
         )
@@ -109,13 +108,13 @@ class RewardScaler(struct.PyTreeNode):
             return jnp.where(done, 0.0, discounted), discounted
 
         after, seen = jax.lax.scan(forwards, self.discounted, (reward, done))
-        number = jnp.sum(valid, dtype=jnp.uint32)
+        number = jnp.sum(valid, dtype=jnp.float32)
         weight = valid / jnp.maximum(number, 1)
         mean = jnp.sum(weight * seen)
         square = jnp.sum(weight * (seen - mean) ** 2)
         # Chan et al.'s union of two samples, in fractions of their sizes.
         count = self.count + number
-        fraction = number.astype(jnp.float32) / jnp.maximum(count.as_float(), 1.0)
+        fraction = number / jnp.maximum(count, 1.0)
         shift = mean - self.mean
         scaler = RewardScaler(
             discounted=after,

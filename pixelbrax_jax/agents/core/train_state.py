@@ -8,7 +8,6 @@ from typing import Any
 import jax
 from flax import struct
 
-from pixelbrax_jax.agents.core.counter import StepCounter
 from pixelbrax_jax.agents.core.env_axis import along_envs, as_declared, without_envs
 from pixelbrax_jax.agents.core.optimizer import Networks
 from pixelbrax_jax.agents.core.returns import RewardScaler
@@ -29,8 +28,7 @@ class TrainState(struct.PyTreeNode):
         scaler: statistics of rewards.
         buffer: what the auxiliary phase will learn from; None where there is none.
         key: typed PRNG key of the run; never changes.
-        iteration: () uint32, rollouts so far.
-        steps: control steps so far, over all environments.
+        iteration: () uint32, rollouts so far, of ``config.steps_per_iteration`` control steps each.
     """
 
     networks: Networks = without_envs()
@@ -41,7 +39,6 @@ class TrainState(struct.PyTreeNode):
     buffer: Any = as_declared()
     key: jax.Array = without_envs()
     iteration: jax.Array = without_envs()
-    steps: StepCounter = without_envs()
 
     @property
     def moments(self) -> Networks:

@@ -18,10 +18,10 @@ import orbax.checkpoint as ocp
 
 from pixelbrax_jax.agents.runner.sharding import any_process
 
-FORMAT = 3
+FORMAT = 4
 """Number of the format; raised when what is stored changes its meaning."""
 
-_NETWORKS_ALONE = (2,)
+_NETWORKS_ALONE = (2, 3)
 """Former formats whose networks can be read: their runs can be evaluated, and not gone on with."""
 
 _FREE = ("total_steps", "memory_budget_gb")
