@@ -23,9 +23,20 @@ os.environ["XLA_FLAGS"] = " ".join(
 )
 
 import jax
+import pytest
 
-MAX_MAPS = 25_000
+MAX_MAPS = 45_000
 """Memory maps of this process beyond which compiled programs are forgotten."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Run tests of one task one after the other: a process then traces its programs once."""
+
+    def task(item: pytest.Item) -> str:
+        parameters = getattr(item, "callspec", None)
+        return str(parameters.params.get("task", "")) if parameters else ""
+
+    items.sort(key=task)
 
 
 def pytest_runtest_teardown() -> None:

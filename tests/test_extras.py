@@ -66,7 +66,7 @@ def test_a_reader_that_is_missing(monkeypatch, tmp_path):
         clips.pillow()
     monkeypatch.setitem(sys.modules, "imageio", None)
     monkeypatch.setitem(sys.modules, "imageio.v3", None)
-    (tmp_path / "film.mp4").write_bytes(b"")
+    (tmp_path / "video.mp4").write_bytes(b"")
     with pytest.raises(ImportError, match=r"videos needs imageio; try: .*\[clips\]"):
         load_clips(tmp_path, "all", cache_dir=tmp_path, progress=False)
 
@@ -77,7 +77,7 @@ def test_a_window_without_pygame(monkeypatch):
         window.Window("Ant", 20)
 
 
-def test_a_film_needs_an_extra(monkeypatch, capsys):
+def test_a_video_needs_an_extra(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "imageio.v2", None)
     monkeypatch.delitem(sys.modules, "pixelbrax_jax.agents.runner.record", raising=False)
     assert cli.main(["record", "nowhere"]) == 1

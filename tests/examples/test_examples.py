@@ -128,10 +128,10 @@ def test_render_distractors(tmp_path):
     assert names[:, :2].min() == 255, "not cut"
 
     # Only what changes from frame to frame is shown in motion.
-    film = pictures_in(tmp_path / "motion.gif")
-    assert film.shape == (3, 20 + 168, 168 + 4 + 168, 3)
-    assert film[:, :20].min() < 100, "names"
-    assert film[:, 20:, :168].std() > 10
-    assert film[:, 20:, -168:].std() > 10
-    steps = np.abs(np.diff(film.astype(int), axis=0)).mean((1, 2, 3))
+    animation = pictures_in(tmp_path / "motion.gif")
+    assert animation.shape == (3, 20 + 168, 168 + 4 + 168, 3)
+    assert animation[:, :20].min() < 100, "names"
+    assert animation[:, 20:, :168].std() > 10
+    assert animation[:, 20:, -168:].std() > 10
+    steps = np.abs(np.diff(animation.astype(int), axis=0)).mean((1, 2, 3))
     assert (steps > 1).all()

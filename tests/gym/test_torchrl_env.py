@@ -373,13 +373,13 @@ def test_recording(make_torchrl, tmp_path):
         make_torchrl(render_height=16, render_width=24),
         Compose(
             PixelRenderTransform(out_keys=["images"]),
-            VideoRecorder(logger, tag="film", in_keys=["images"], skip=1),
+            VideoRecorder(logger, tag="video", in_keys=["images"], skip=1),
         ),
     )
     env.rollout(5, policy)
     env.transform[-1].dump()
-    (film,) = tmp_path.rglob("*.pt")
-    frames = torch.load(film)
+    (video,) = tmp_path.rglob("*.pt")
+    frames = torch.load(video)
     # A first frame and five more, of all environments in a grid of two by two.
     assert frames.shape == (1, 6, 3, 2 * 16, 2 * 24)
     assert frames.dtype == torch.uint8
