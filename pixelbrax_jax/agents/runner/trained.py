@@ -87,7 +87,8 @@ def load_config(about: dict[str, Any]) -> TrainConfig:
     if about["algorithm"] not in ALGORITHMS:
         raise CheckpointError(
             f"the checkpoint is of {about['algorithm']!r}, which is none of "
-            f"{', '.join(ALGORITHMS)}; load one of your own with read_networks."
+            f"{', '.join(ALGORITHMS)}; read one of your own with "
+            "pixelbrax_jax.agents.runner.checkpoint.read_networks."
         )
     kind = ALGORITHMS[about["algorithm"]].config_class
     names = {field.name for field in fields(kind)}
