@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from pixelbrax_jax.physics.base import Physics as Physics
     from pixelbrax_jax.physics.brax.engine import BraxPhysics as BraxPhysics
     from pixelbrax_jax.physics.brax.mjcf import mjcf_physics as mjcf_physics
+    from pixelbrax_jax.policy import list_pretrained as list_pretrained
     from pixelbrax_jax.policy import load_policy as load_policy
     from pixelbrax_jax.registry import list_envs as list_envs
     from pixelbrax_jax.registry import make as make
@@ -61,7 +62,7 @@ _PUBLIC = {
     "physics.base": "Physics",
     "physics.brax.engine": "BraxPhysics",
     "physics.brax.mjcf": "mjcf_physics",
-    "policy": "load_policy",
+    "policy": "list_pretrained load_policy",
     "registry": "list_envs make register",
     "renderer.base": "render",
     "scene.cameras": "named_rigs rig",

@@ -118,7 +118,12 @@ def _lacks_train(command: str, error: ImportError) -> int:
 
 def _add_trained(command: argparse.ArgumentParser) -> None:
     """Add the options that choose a trained agent."""
-    command.add_argument("folder", help="output folder of a training run")
+    command.add_argument("folder", nargs="?", help="output folder of a training run")
+    command.add_argument(
+        "--pretrained",
+        metavar="NAME",
+        help="in its place a policy that comes with the package, as halfcheetah",
+    )
     command.add_argument("--steps", type=int, help="of which checkpoint (default: the latest)")
     command.add_argument("--best", action="store_true", help="take the best checkpoint")
     command.add_argument(
@@ -163,7 +168,9 @@ def _add_record(commands: Any) -> None:
         description="Plays several episodes of a checkpoint side by side and writes an MP4.",
     )
     _add_trained(command)
-    command.add_argument("--output", help="default: videos/<steps>_<split>.mp4 in the folder")
+    command.add_argument(
+        "--output", help="an .mp4 or .gif (default: videos/<steps>_<split>.mp4 in the folder)"
+    )
     command.add_argument(
         "--split", help="clean, train or test (default: train, or clean without distractors)"
     )

@@ -29,7 +29,7 @@ ALLOWED: dict[str, set[str]] = {
     **{f"pixelbrax_jax.{name}": set() for name in FOUNDATIONS},
     "pixelbrax_jax.spatial": {"pixelbrax_jax.types"},
     "pixelbrax_jax.deprecation": set(),
-    "pixelbrax_jax.policy": {"pixelbrax_jax.extras"},
+    "pixelbrax_jax.policy": {"pixelbrax_jax.extras", "pixelbrax_jax.validation"},
     **{f"pixelbrax_jax.{name}": _below() for name in LAYERS},
     "pixelbrax_jax.config": _below("scene", "renderer", "distractors"),
     # How a CPU runs a batch: it knows nothing of PixelBrax, and only `envs` knows of it.

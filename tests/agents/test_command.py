@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import imageio.v3 as imageio
 import jax
 import pytest
 
-from pixelbrax_jax.agents.algorithms.presets import PRESETS, preset
+from pixelbrax_jax.agents.algorithms.presets import PRESETS, TASK_SETTINGS, preset
 from pixelbrax_jax.agents.algorithms.registry import ALGORITHMS
 from pixelbrax_jax.agents.core.config import describe
 from pixelbrax_jax.agents.runner import train_command as command
@@ -31,6 +32,24 @@ def test_every_preset_is_valid_and_comes_back_from_json(algorithm, name):
     config = preset(algorithm, name)
     stored = {"algorithm": algorithm, "config": describe(config) | {"seed": 3}}
     assert load_config(stored) == config
+
+
+@pytest.mark.parametrize("task", TASK_SETTINGS["cpu"])
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_a_preset_may_have_settings_of_a_task(algorithm, task):
+    config, _ = parse(algorithm, "cpu", ["--task", task, "--num-steps", "64"])
+    assert config == replace(preset(algorithm, "cpu", task), num_steps=64)  # type: ignore[arg-type]
+    wanted = TASK_SETTINGS["cpu"][task] | {"task": task}
+    assert {name: getattr(config, name) for name in wanted} == wanted
+
+
+def test_a_preset_without_settings_of_the_task_is_told(capsys):
+    assert main(["train", "ppo", "--preset", "cpu", "--task", "pusher"]) == 1
+    told = capsys.readouterr().err
+    assert "unknown task of the preset 'cpu': 'pusher'; allowed: ant, halfcheetah, " in told
+    with pytest.raises(SystemExit):
+        main(["train", "ppo", "--preset", "gpu"])
+    assert "'cpu'" in capsys.readouterr().err
 
 
 def test_options_change_a_preset():

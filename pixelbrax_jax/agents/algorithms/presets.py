@@ -46,6 +46,18 @@ _CI = {
     "ent_coef": 0.0,
 }
 
+_CPU = {
+    "height": 48,
+    "width": 48,
+    "frame_stack": 2,
+    "encoder": "patch",
+    "num_envs": 64,
+    "num_steps": 32,
+    "initial_std": 0.5,
+    "learning_rate": 7e-4,
+    "ent_coef": 0.0,
+}
+
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     # As each class says.
     "default": {},
@@ -83,20 +95,53 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
         "dcpg": _CI
         | {"num_policy_phases": 2, "aux_minibatches": 8, "aux_epochs": 2, "update_epochs": 2},
     },
+    # Fifteen minutes on two CPU cores; see docs/results.md.
+    "cpu": {
+        "ppo": _CPU | {"layout": "shared", "update_epochs": 3},
+        "ppg": _CPU
+        | {
+            "layout": "detach",
+            "policy_epochs": 3,
+            "value_epochs": 3,
+            "num_policy_phases": 8,
+            "aux_minibatches": 8,
+            "aux_epochs": 1,
+        },
+        "dcpg": _CPU
+        | {"num_policy_phases": 2, "aux_minibatches": 8, "aux_epochs": 2, "update_epochs": 2},
+    },
 }
 """Changes of the defaults, by name of the preset and of the algorithm."""
 
+TASK_SETTINGS: dict[str, dict[str, dict[str, Any]]] = {
+    "cpu": {
+        "halfcheetah": {"backend": "spring", "action_repeat": 2, "gamma": 0.97},
+        "walker2d": {"backend": "spring", "action_repeat": 4, "gamma": 0.98},
+        "ant": {"backend": "spring", "action_repeat": 2, "gamma": 0.97},
+        "humanoid": {"backend": "spring", "action_repeat": 3, "gamma": 0.97},
+    },
+}
+"""Further changes, by name of the preset and of the task; such a preset has no other tasks."""
 
-def preset(algorithm: str, name: str = "default") -> TrainConfig:
+
+def preset(algorithm: str, name: str = "default", task: str | None = None) -> TrainConfig:
     """Return the settings of a preset.
 
     Args:
         algorithm: ``"ppo"``, ``"ppg"`` or ``"dcpg"``.
-        name: ``"default"``, ``"deacrep"``, ``"procgen"`` or ``"ci"``.
+        name: ``"default"``, ``"deacrep"``, ``"procgen"``, ``"ci"`` or ``"cpu"``.
+        task: name of the task; None means the preset's own.
 
     Raises:
-        ValueError: one of them is unknown.
+        ValueError: one of them is unknown, or the preset has no settings for the task.
     """
     check_choice("algorithm", algorithm, ALGORITHMS)
     check_choice("preset", name, [n for n in PRESETS if n == "default" or algorithm in PRESETS[n]])
-    return ALGORITHMS[algorithm].config_class(**PRESETS[name].get(algorithm, {}))
+    kind, settings = ALGORITHMS[algorithm].config_class, PRESETS[name].get(algorithm, {})
+    if task is not None:
+        settings = settings | {"task": task}
+    if of_tasks := TASK_SETTINGS.get(name):
+        task = settings.get("task", kind.task)
+        check_choice(f"task of the preset {name!r}", task, of_tasks)
+        settings = settings | of_tasks[task]
+    return kind(**settings)

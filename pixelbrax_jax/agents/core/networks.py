@@ -96,14 +96,29 @@ class Small(nn.Module):
         return nn.relu(_dense(128)(_flat(x)))
 
 
+class Patch(nn.Module):
+    """Three convolutions, the first over patches that do not overlap: little work for each pixel.
+
+    Vision transformers begin with such a layer (Dosovitskiy et al., arXiv 2010.11929).
+    """
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """Map (B, H, W, C) float32 to (B, 256) features."""
+        for channels, size, stride in ((32, 4, 4), (32, 2, 2), (32, 3, 1)):
+            x = nn.relu(Conv(channels, size, stride)(x))
+        return nn.relu(_dense(256)(_flat(x)))
+
+
 ENCODERS: dict[str, Callable[[], nn.Module]] = {
     "impala": Impala,
     "nature": Nature,
     "drq": DrQ,
     "small": Small,
+    "patch": Patch,
 }
 
-SMALLEST = {"impala": 1, "nature": 36, "drq": 15, "small": 18}
+SMALLEST = {"impala": 1, "nature": 36, "drq": 15, "small": 18, "patch": 24}
 """Height and width, in pixels, that an encoder needs at least."""
 
 POLICIES = ("gaussian", "tanh_gaussian", "deacrep")

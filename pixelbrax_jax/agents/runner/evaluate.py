@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pixelbrax_jax.agents.core.algorithm import Algorithm
 from pixelbrax_jax.agents.core.config import TrainConfig, make_env
 from pixelbrax_jax.agents.core.optimizer import Networks
 from pixelbrax_jax.compilation import jit
@@ -23,6 +22,17 @@ SPLITS = ("clean", "train", "test")
 
 WITHOUT_DISTRACTORS: dict[str, Any] = {"distractors": (), "clips": None, "split": "train"}
 """Options of an environment that shows none, whatever its other options are."""
+
+
+class Player(Protocol):
+    """What chooses actions; hashable. Every ``Algorithm`` does."""
+
+    @property
+    def config(self) -> TrainConfig:
+        """Settings of its training."""
+
+    def act(self, networks: Networks, pixels: jax.Array, key: jax.Array | None = None) -> jax.Array:
+        """As ``Algorithm.act``."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +105,7 @@ class Evaluator:
 
     def __init__(
         self,
-        algorithm: Algorithm,
+        algorithm: Player,
         env: Any,
         env_params: EnvParams,
         *,
@@ -127,7 +137,7 @@ class Evaluator:
 
 @jit(static_argnums=(0, 1, 2))
 def _play(
-    algorithm: Algorithm,
+    algorithm: Player,
     envs: VectorPixelEnv,
     deterministic: bool,
     networks: Networks,

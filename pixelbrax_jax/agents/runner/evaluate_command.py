@@ -8,7 +8,7 @@ import sys
 
 from pixelbrax_jax.agents.runner.checkpoint import CheckpointError
 from pixelbrax_jax.agents.runner.evaluate import Evaluator, make_split, splits_of
-from pixelbrax_jax.agents.runner.trained import load_trained
+from pixelbrax_jax.agents.runner.trained import load_chosen
 from pixelbrax_jax.validation import check_positive_int
 
 
@@ -20,9 +20,7 @@ def evaluate(options: argparse.Namespace) -> int:
     """
     try:
         check_positive_int("episodes", options.episodes)
-        agent = load_trained(
-            options.folder, steps=options.steps, best=options.best, run=options.run_index
-        )
+        agent = load_chosen(options)
         config = agent.algorithm.config
         for name in options.split or splits_of(config):
             env, params = make_split(config, name)

@@ -15,7 +15,7 @@ import numpy as np
 
 from pixelbrax_jax.agents.runner.checkpoint import CheckpointError
 from pixelbrax_jax.agents.runner.evaluate import SPLITS, make_split
-from pixelbrax_jax.agents.runner.trained import load_trained
+from pixelbrax_jax.agents.runner.trained import Trained, load_chosen
 from pixelbrax_jax.compilation import compiler_options
 from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.validation import check_choice, check_positive_int
@@ -28,17 +28,18 @@ def record(options: argparse.Namespace) -> int:
         The exit status.
     """
     try:
+        agent = load_chosen(options)
+        split = options.split or ("train" if agent.algorithm.config.distractors else "clean")
+        run = [f"run{options.run_index}"] if options.run_index else []
+        name = "_".join([options.pretrained or str(agent.steps), split, *run])
         path = film(
-            options.folder,
-            output=options.output,
-            steps=options.steps,
-            best=options.best,
-            split=options.split,
+            agent,
+            options.output or Path(options.folder or "") / "videos" / f"{name}.mp4",
+            split=split,
             grid=options.grid,
             size=options.size,
             num_frames=options.num_frames,
             seed=options.seed,
-            run=options.run_index,
         )
     except (CheckpointError, ValueError, OSError, ImportError) as error:
         sys.stderr.write(f"pixelbrax record: {error}\n")
@@ -48,47 +49,37 @@ def record(options: argparse.Namespace) -> int:
 
 
 def film(
-    folder: str | Path,
+    agent: Trained,
+    path: str | Path,
     *,
-    output: str | Path | None = None,
-    steps: int | None = None,
-    best: bool = False,
-    split: str | None = None,
+    split: str = "clean",
     grid: int = 3,
     size: int = 168,
     num_frames: int = 300,
     seed: int = 0,
-    run: int = 0,
 ) -> Path:
-    """Write an MP4 of ``grid`` x ``grid`` episodes, side by side.
+    """Write an MP4, or an animated GIF, of ``grid`` x ``grid`` episodes, side by side.
 
     Args:
-        folder: output folder of a training run.
-        output: of the film; None puts it into the run's folder.
-        steps: of which checkpoint; None takes the latest.
-        best: whether instead the best checkpoint is taken.
-        split: ``"clean"``, ``"train"`` or ``"test"``; None takes that of the training.
+        agent: who plays, with mean actions.
+        path: of the film; its suffix decides the format.
+        split: ``"clean"``, ``"train"`` or ``"test"``.
         grid: episodes a side.
         size: pixels of one episode, square.
         num_frames: at most.
         seed: of the episodes.
-        run: which of several runs that were trained together, from 0.
 
     Returns:
         The film's path.
 
     Raises:
-        CheckpointError: there is no such checkpoint.
         ValueError: an option is out of range.
     """
     check_positive_int("grid", grid)
     check_positive_int("size", size)
     check_positive_int("num_frames", num_frames)
-    if split is not None:
-        check_choice("split", split, SPLITS)
-    agent = load_trained(folder, steps=steps, best=best, run=run)
+    check_choice("split", split, SPLITS)
     algorithm, networks = agent.algorithm, agent.networks
-    split = split or ("train" if algorithm.config.distractors else "clean")
     env, params = make_split(algorithm.config, split)
     envs = VectorPixelEnv(env, grid * grid)
 
@@ -99,12 +90,13 @@ def film(
         draw = jax.vmap(lambda state: env.image(state, params, size, size))
         return state, draw(state)
 
-    name = "_".join([str(agent.steps), split, *([f"run{run}"] if run else [])])
-    path = Path(output) if output else Path(folder) / "videos" / f"{name}.mp4"
+    path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     state, _ = envs.reset(jax.random.key(seed), params)
-    fps = max(1, round(1.0 / env.dt))
-    writer: Any = imageio.get_writer(path, fps=min(fps, 60), macro_block_size=1)
+    fps = min(max(1, round(1.0 / env.dt)), 60)
+    moving = {"duration": 1000.0 / fps, "loop": 0}
+    options = moving if path.suffix == ".gif" else {"fps": fps, "macro_block_size": 1}
+    writer: Any = imageio.get_writer(path, **options)
     with writer, warnings.catch_warnings():
         # Python warns of a fork beside JAX's threads; the child becomes ffmpeg at once.
         warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)

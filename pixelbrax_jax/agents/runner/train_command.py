@@ -141,7 +141,10 @@ def parse(algorithm: str, name: str, arguments: list[str]) -> tuple[TrainConfig,
         ValueError: a setting is out of range.
         SystemExit: an option is unknown.
     """
-    defaults = preset(algorithm, name)
+    # A preset's settings may be those of a task.
+    task = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    task.add_argument("--task")
+    defaults = preset(algorithm, name, task.parse_known_args(arguments)[0].task)
     options = RunConfig(output_dir=f"runs/{algorithm}")
     # One flat list of options for both.
     parts: dict[str, Any] = {"config": defaults, "options": options}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,6 @@ from typing import Any
 import jax
 
 from pixelbrax_jax.agents.algorithms.registry import ALGORITHMS
-from pixelbrax_jax.agents.core.algorithm import Algorithm
 from pixelbrax_jax.agents.core.config import TrainConfig, make_env
 from pixelbrax_jax.agents.core.optimizer import Networks
 from pixelbrax_jax.agents.runner.checkpoint import (
@@ -18,14 +18,34 @@ from pixelbrax_jax.agents.runner.checkpoint import (
     read_about,
     read_networks,
 )
-from pixelbrax_jax.agents.runner.evaluate import WITHOUT_DISTRACTORS
+from pixelbrax_jax.agents.runner.evaluate import WITHOUT_DISTRACTORS, Player
 from pixelbrax_jax.agents.runner.seeds import Runs
 from pixelbrax_jax.envs.vector import VectorPixelEnv
+from pixelbrax_jax.policy import Policy, load_policy, read_pretrained
+
+
+@dataclass(frozen=True, eq=False)
+class Pretrained:
+    """A policy with its parameters within."""
+
+    config: TrainConfig
+    policy: Policy
+
+    def act(self, networks: Networks, pixels: jax.Array, key: jax.Array | None = None) -> jax.Array:
+        """Return mean actions, (N, A), of (N, H, W, 3 K) pixels.
+
+        Raises:
+            ValueError: there is a key: the policy has no other actions.
+        """
+        del networks
+        if key is not None:
+            raise ValueError("a pretrained policy has mean actions alone, got a key.")
+        return self.policy(pixels)
 
 
 @dataclass(frozen=True)
 class Trained:
-    """One run's networks at one checkpoint.
+    """One run's networks at one checkpoint, or a policy that comes with the package.
 
     Attributes:
         algorithm: with the run's settings; its ``act`` plays.
@@ -33,9 +53,41 @@ class Trained:
         steps: control steps of the checkpoint.
     """
 
-    algorithm: Algorithm
+    algorithm: Player
     networks: Networks
     steps: int
+
+
+def load_pretrained(name: str) -> Trained:
+    """Return a policy that comes with the package.
+
+    Args:
+        name: one of ``pixelbrax_jax.policy.list_pretrained()``.
+
+    Raises:
+        ValueError: there is none of that name, or it was made by another version.
+    """
+    about = read_pretrained(name)
+    player = Pretrained(load_config(about), load_policy(name))
+    return Trained(player, {"actor": {}}, about["steps"])
+
+
+def load_chosen(options: argparse.Namespace) -> Trained:
+    """Return what the options of a command choose: a run's checkpoint, or a pretrained policy.
+
+    Raises:
+        CheckpointError: there is no such checkpoint.
+        ValueError: options do not go together, or are out of range.
+    """
+    if (options.folder is None) == (options.pretrained is None):
+        raise ValueError("give the folder of a run, or --pretrained and a name: one of the two.")
+    if options.pretrained is None:
+        return load_trained(
+            options.folder, steps=options.steps, best=options.best, run=options.run_index
+        )
+    if options.steps is not None or options.best or options.run_index:
+        raise ValueError("--steps, --best and --run choose of a run's folder, not of --pretrained.")
+    return load_pretrained(options.pretrained)
 
 
 def load_trained(

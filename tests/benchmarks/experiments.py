@@ -1,0 +1,179 @@
+"""Trains the agents of docs/results.md, one run after the other, at the lowest priority.
+
+    python -m tests.benchmarks.experiments                         what is missing; half a day
+    python -m tests.benchmarks.experiments --only ppo-walker2d     those with this in their names
+    python -m tests.benchmarks.experiments --minutes 90            stops in time
+    python -m tests.benchmarks.experiments --list                  the commands
+
+A run that was cut short, by Ctrl-C or by --minutes, goes on from its checkpoint at the next call.
+Of a finished one docs/results/runs/<name>.json is kept; `tests.benchmarks.results` draws all of
+them. A run's minutes are those on its own clock: nothing else should compute meanwhile. The best
+policy of each task goes into the package, for --pretrained.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import platform
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from importlib.metadata import version
+from pathlib import Path
+
+import pixelbrax_jax
+from pixelbrax_jax.agents.algorithms.presets import preset
+from pixelbrax_jax.agents.algorithms.registry import ALGORITHMS
+from pixelbrax_jax.agents.runner.checkpoint import read_about
+from pixelbrax_jax.agents.runner.metrics import read_metrics
+
+KEPT = Path(__file__).parents[2] / "docs" / "results" / "runs"
+PRETRAINED = Path(pixelbrax_jax.__file__).parent / "pretrained"
+EPISODES = 32
+TASKS = ("halfcheetah", "walker2d", "ant", "humanoid")
+DISTRACTED = ("halfcheetah", "walker2d")
+DISTRACTORS = {
+    "video": ("--distractors", "paper-video", "--clips", "procedural"),
+    "color": ("--distractors", "paper-color"),
+}
+
+
+def experiments() -> dict[str, list[str]]:
+    """Arguments of ``pixelbrax`` for each run, by name, in the order in which they are made."""
+    runs = {}
+
+    def add(algorithm: str, task: str, seed: int, *more: str, name: str = "") -> None:
+        name = "-".join([algorithm, task, *([name] if name else []), str(seed)])
+        command = ["train", algorithm, "--preset", "cpu", "--task", task, "--seed", str(seed)]
+        runs[name] = [*command, "--eval-episodes", str(EPISODES), *more]
+
+    for seed in range(3):
+        for task in TASKS:
+            for algorithm in ALGORITHMS:
+                add(algorithm, task, seed, "--num-evals", "3")
+    for seed in range(2):
+        for task in DISTRACTED:
+            for name, options in DISTRACTORS.items():
+                for algorithm in ALGORITHMS:
+                    add(algorithm, task, seed, *options, "--num-evals", "1", name=name)
+    # An hour, and for one task several.
+    for task in TASKS:
+        times = 16 if task == "halfcheetah" else 4
+        steps = times * preset("ppo", "cpu", task).total_steps
+        more = ("--total-steps", str(steps), "--num-evals", str(3 * times))
+        add("ppo", task, 0, *more, name="long")
+    return runs
+
+
+def record(folder: Path, arguments: list[str]) -> dict:
+    """What is kept of a finished run: settings, returns over steps and time, evaluations."""
+    about = read_about(folder / "checkpoints")
+    records = read_metrics(folder / "metrics.jsonl")
+    training = [r for r in records if "episode/return" in r]
+    evaluations = [
+        {"steps": r["steps"], "seconds": r["seconds"]}
+        | {name.removeprefix("eval/"): x for name, x in r.items() if name.startswith("eval/")}
+        for r in records
+        if "eval/clean/return" in r
+    ]
+    packages = ("jax", "jaxlib", "brax", "pixelbrax")
+    return {
+        "command": shlex.join(["pixelbrax", *arguments]),
+        "algorithm": about["algorithm"],
+        "config": about["config"],
+        "machine": {"cores": os.cpu_count(), "architecture": platform.machine()},
+        "versions": {name: version(name) for name in packages},
+        "seconds_of_first_iteration": records[0]["seconds"],
+        "steps": [r["steps"] for r in training],
+        "seconds": [round(r["seconds"], 1) for r in training],
+        "episodes": [int(r["episode/count"]) for r in training],
+        "return": [round(r["episode/return"], 2) for r in training],
+        "evaluations": evaluations,
+    }
+
+
+def offer(task: str, folder: Path, kept: dict) -> None:
+    """Put a finished run's policy into the package if it is the best of its task so far."""
+    about = PRETRAINED / f"{task}.json"
+    last, before = kept["evaluations"][-1], -math.inf
+    if about.exists():
+        before = json.loads(about.read_text())["return"]
+    if last["clean/return"] <= before:
+        return
+    PRETRAINED.mkdir(exist_ok=True)
+    shutil.copyfile(folder / "policy.jax", PRETRAINED / f"{task}.jax")
+    names = ("task", "backend", "reward_preset", "height", "width", "frame_stack", "action_repeat")
+    written = {
+        "return": last["clean/return"],
+        "standard_error": last["clean/standard_error"],
+        "episodes": EPISODES,
+        "steps": last["steps"],
+        "env_options": {name: kept["config"][name] for name in names},
+    }
+    written |= {name: kept[name] for name in ("algorithm", "command", "versions", "config")}
+    about.write_text(json.dumps(written, indent=1) + "\n")
+
+
+def run(arguments: list[str], folder: Path, until: float) -> int:
+    """Make a run, or go on with it; its exit status, above 128 if it was stopped."""
+    command = [sys.executable, "-m", "pixelbrax_jax.cli", *arguments]
+    command += ["--resume", "latest", "--output-dir", str(folder)]
+    with subprocess.Popen(["nice", "-n", "19", *command], start_new_session=True) as process:
+        stop = lambda *_: process.terminate()  # noqa: E731
+        previous = {s: signal.signal(s, stop) for s in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            # None would be no limit, and infinity is an error.
+            return process.wait(min(1e6, max(0.0, until - time.monotonic())))
+        except subprocess.TimeoutExpired:
+            process.terminate()
+            return process.wait() or 128 + signal.SIGTERM
+        finally:
+            for number, handler in previous.items():
+                signal.signal(number, handler)
+
+
+def main() -> int:
+    """Run the command; the exit status is 1 if a run failed."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--only", default="", help="part of the names of runs")
+    parser.add_argument("--minutes", type=float, default=float("inf"), help="then stop")
+    parser.add_argument("--output-dir", type=Path, default=Path("runs/results"))
+    parser.add_argument("--list", action="store_true", help="only write the commands")
+    options = parser.parse_args()
+    chosen = {name: line for name, line in experiments().items() if options.only in name}
+    if not chosen:
+        parser.error(f"no run has {options.only!r} in its name; --list shows all")
+    KEPT.mkdir(parents=True, exist_ok=True)
+    until, failed = time.monotonic() + 60.0 * options.minutes, []
+    for name, arguments in chosen.items():
+        path = KEPT / f"{name}.json"
+        if options.list:
+            print(f"{name:24s} {'done' if path.exists() else '    '} {shlex.join(arguments)}")
+        if options.list or path.exists():
+            continue
+        status = run(arguments, options.output_dir / name, until)
+        if status > 128 or status < 0:
+            print(f"stopped in {name}; the same command goes on", file=sys.stderr)
+            break
+        if status:
+            failed.append(name)
+            continue
+        kept = record(options.output_dir / name, arguments)
+        path.write_text(json.dumps(kept) + "\n")
+        if not kept["config"]["distractors"]:
+            offer(kept["config"]["task"], options.output_dir / name, kept)
+    if failed:
+        print(f"failed: {', '.join(failed)}", file=sys.stderr)
+    return bool(failed)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,77 @@
+"""What Brax's own PPO learns from the state in the environments of docs/results.md.
+
+    python -m tests.benchmarks.from_state                     every task of the preset cpu
+    python -m tests.benchmarks.from_state --tasks humanoid
+
+It tells a hard task from an agent that does not see: same physics, rewards, action repeat,
+discount, environments, rollouts and number of steps, Brax's networks and Adam's usual step size.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+
+from brax.training.agents.ppo import train as ppo
+
+from pixelbrax_jax import BraxPixelEnv, make, wrap_fresh_episodes
+from pixelbrax_jax.agents.algorithms.presets import TASK_SETTINGS, preset
+from pixelbrax_jax.agents.core.config import TrainConfig
+
+OUTPUT = Path(__file__).parents[2] / "docs" / "results" / "from_state.json"
+
+
+def curve(config: TrainConfig, times: int, evaluations: int) -> dict:
+    """Mean returns of 128 episodes with the mean action, over control steps and seconds."""
+    env = BraxPixelEnv(*make(config, obs_mode="state"))
+    found: dict = {"steps": [], "seconds": [], "return": [], "length": []}
+    began = time.monotonic()
+
+    def progress(calls: int, metrics: dict) -> None:
+        found["steps"].append(calls * config.action_repeat)
+        found["seconds"].append(round(time.monotonic() - began, 1))
+        found["return"].append(round(float(metrics["eval/episode_reward"]), 1))
+        found["length"].append(float(metrics["eval/avg_episode_length"]) * config.action_repeat)
+        print(config.task, found["steps"][-1], found["return"][-1], flush=True)
+
+    ppo.train(
+        env,
+        num_timesteps=times * config.total_steps // config.action_repeat,
+        episode_length=env.episode_length,
+        wrap_env_fn=wrap_fresh_episodes,
+        num_envs=config.num_envs,
+        unroll_length=config.num_steps,
+        num_minibatches=config.num_minibatches,
+        batch_size=config.num_envs // config.num_minibatches,
+        num_updates_per_batch=4,
+        learning_rate=3e-4,
+        entropy_cost=1e-3,
+        discounting=config.gamma,
+        gae_lambda=config.gae_lambda,
+        normalize_observations=True,
+        num_evals=evaluations,
+        deterministic_eval=True,
+        progress_fn=progress,
+    )
+    return found
+
+
+def main() -> None:
+    """Run the command."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    tasks = list(TASK_SETTINGS["cpu"])
+    parser.add_argument("--tasks", nargs="+", choices=tasks, default=tasks)
+    parser.add_argument("--times", type=int, default=1, help="the preset's number of steps")
+    options = parser.parse_args()
+    for task in options.tasks:
+        found = curve(preset("ppo", "cpu", task), options.times, 10)
+        known = json.loads(OUTPUT.read_text()) if OUTPUT.exists() else {}
+        OUTPUT.write_text(json.dumps(known | {f"{task} x {options.times}": found}) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,218 @@
+"""Draws docs/results.md's tables and plots from the runs that `tests.benchmarks.experiments` kept.
+
+    python -m tests.benchmarks.results
+
+What drawn actions, and none, earn in the same tasks is played once and kept beside them.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from pixelbrax_jax import VectorPixelEnv, make
+from pixelbrax_jax.agents.runner.evaluate import interquartile_mean
+
+FOLDER = Path(__file__).parents[2] / "docs" / "results"
+PAGE = FOLDER.with_suffix(".md")
+MINUTES = (5, 15, 60)
+WINDOW = 60.0
+"""Seconds whose training episodes make one point."""
+
+_TASK = ("task", "backend", "reward_preset", "action_repeat", "episode_length")
+"""Settings that decide what a return means."""
+
+
+def untrained(settings: dict, episodes: int = 256) -> dict:
+    """Returns of whole episodes under actions drawn uniformly from [-1, 1], and under none (0)."""
+    env, params = make(obs_mode="state", **settings)
+    envs = VectorPixelEnv(env, episodes, "disabled")
+
+    @jax.jit
+    def play(key, params, scale):
+        def step(state, key):
+            action = scale * jax.random.uniform(key, (episodes, env.action_size), minval=-1.0)
+            state, _ = envs.step(state, action, params)
+            return state, (state.episode_return, state.done)
+
+        first, rest = jax.random.split(key)
+        state, _ = envs.reset(first, params)
+        steps = -(-env.episode_length // env.action_repeat)
+        _, (returns, over) = jax.lax.scan(step, state, jax.random.split(rest, steps))
+        return returns[over.argmax(0), np.arange(episodes)]
+
+    result = {"settings": settings, "episodes": episodes}
+    for name, scale in (("drawn", 1.0), ("none", 0.0)):
+        returns = np.asarray(play(jax.random.key(0), params, scale))
+        error = float(returns.std(ddof=1) / np.sqrt(episodes))
+        result[name] = {"return": float(returns.mean()), "standard_error": error}
+    return result
+
+
+def baselines(runs: dict[str, dict]) -> dict[str, dict]:
+    """What is earned without learning, by task; played where it is not known yet."""
+    path = FOLDER / "untrained.json"
+    known = json.loads(path.read_text()) if path.exists() else {}
+    for run in runs.values():
+        settings = {name: run["config"][name] for name in _TASK}
+        if known.get(settings["task"], {}).get("settings") != settings:
+            known[settings["task"]] = untrained(settings)
+    path.write_text(json.dumps(known, indent=1) + "\n")
+    return known
+
+
+def return_at(run: dict, seconds: float) -> float:
+    """Mean return of the episodes that ended within a minute before; NaN beyond the run."""
+    times = np.array(run["seconds"])
+    if times[-1] < 0.97 * seconds:
+        return float("nan")
+    seconds = min(seconds, times[-1])
+    # All episodes may end in one iteration: the latest of them then.
+    last = times[times <= seconds].max(initial=times[0])
+    chosen = (times > min(seconds - WINDOW, last - 1e-3)) & (times <= max(seconds, last))
+    count = np.array(run["episodes"])[chosen]
+    return float(np.average(np.array(run["return"])[chosen], weights=count))
+
+
+def groups(runs: dict[str, dict]) -> dict[str, list[dict]]:
+    """Runs that differ in their seeds alone, by their common name."""
+    found: dict[str, list[dict]] = {}
+    for name in sorted(runs):
+        found.setdefault(re.sub(r"-\d+$", "", name), []).append(runs[name])
+    return found
+
+
+def middle(scores: list[float], digits: int = 0) -> str:
+    """An interquartile mean with its interval; of one score that alone."""
+    scores = [score for score in scores if np.isfinite(score)]
+    if len(scores) < 2:
+        return f"{scores[0]:,.{digits}f}" if scores else ""
+    found = interquartile_mean(np.array(scores))
+    return f"{found.value:,.0f} ({found.low:,.0f} to {found.high:,.0f})"
+
+
+def final(run: dict, split: str = "clean") -> dict:
+    """Return, standard error and length of the last evaluation."""
+    last = run["evaluations"][-1]
+    names = ("return", "standard_error", "length")
+    return {name: last[f"{split}/{name}"] for name in names}
+
+
+def distance(run: dict, untrained: dict) -> float:
+    """Standard errors by which the last evaluation is above drawn actions."""
+    reached, drawn = final(run), untrained["drawn"]
+    error = np.hypot(reached["standard_error"], drawn["standard_error"])
+    return (reached["return"] - drawn["return"]) / error
+
+
+def table(runs: dict[str, list[dict]], untrained: dict[str, dict]) -> str:
+    """Return over time, clean, in Markdown."""
+    lines = [
+        "| task | agent | seeds | " + " | ".join(f"{m} min" for m in MINUTES) + " | mean action, "
+        "at the end | above drawn actions |",
+        "|" + "---|" * (5 + len(MINUTES)),
+    ]
+    for task, without in untrained.items():
+        for name, text in (("drawn", "drawn actions"), ("none", "no action")):
+            value, error = without[name]["return"], without[name]["standard_error"]
+            blank = " | " * len(MINUTES)
+            lines.append(f"| {task} | {text} | {blank} | {value:,.0f} ± {error:,.0f} | |")
+        for name, seeds in runs.items():
+            algorithm, of_task, *variant = name.split("-")
+            if of_task != task or variant not in ([], ["long"]):
+                continue
+            times = " | ".join(middle([return_at(r, 60.0 * m) for r in seeds]) for m in MINUTES)
+            ends = middle([final(run)["return"] for run in seeds])
+            above = min(distance(run, without) for run in seeds)
+            minutes = np.median([run["seconds"][-1] for run in seeds]) / 60.0
+            lines.append(
+                f"| {task} | {algorithm.upper()}, {minutes:.0f} min | {len(seeds)} | {times} | "
+                f"{ends} | {above:.0f} s.e. |"
+            )
+    return "\n".join(lines) + "\n"
+
+
+def distracted_table(runs: dict[str, list[dict]]) -> str:
+    """Mean actions with distractors: clean, in training's clips and in held-out ones."""
+    lines = [
+        "| task | distractors | agent | seeds | clean | training | held out | "
+        "held out / training |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for name, seeds in sorted(runs.items(), key=lambda item: item[0].split("-")[1:]):
+        algorithm, task, *variant = name.split("-")
+        if variant in ([], ["long"]):
+            continue
+        splits = [[final(r, s)["return"] for r in seeds] for s in ("clean", "train", "test")]
+        share = np.mean(splits[2]) / np.mean(splits[1])
+        cells = " | ".join(middle(scores) for scores in splits)
+        lines.append(
+            f"| {task} | `paper-{variant[0]}` | {algorithm.upper()} | {len(seeds)} | {cells} | "
+            f"{share:.2f} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def plot(runs: dict[str, list[dict]], untrained: dict[str, dict], path: Path) -> None:
+    """Return over minutes: a thin line for each seed, a thick one and a band for their middle."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    shown = {name: seeds for name, seeds in runs.items() if name.count("-") == 1}
+    tasks = [task for task in untrained if any(name.endswith(task) for name in shown)]
+    figure, panels = plt.subplots(
+        1, len(tasks), figsize=(4 * len(tasks), 3.4), layout="constrained", squeeze=False
+    )
+    colors = {"ppo": "C0", "ppg": "C1", "dcpg": "C2"}
+    for task, axes in zip(tasks, panels[0], strict=True):
+        for name in (f"{algorithm}-{task}" for algorithm in colors):
+            if name not in shown:
+                continue
+            color, seeds = colors[name.split("-")[0]], shown[name]
+            grid = np.arange(60.0, min(r["seconds"][-1] for r in seeds) + 1.0, 30.0)
+            lines = np.array([[return_at(run, t) for t in grid] for run in seeds])
+            for line in lines:
+                axes.plot(grid / 60, line, color=color, alpha=0.3, linewidth=0.7)
+            label = name.split("-")[0].upper()
+            if len(seeds) > 1:
+                found = [interquartile_mean(column) for column in lines.T]
+                low, high = [f.low for f in found], [f.high for f in found]
+                axes.fill_between(grid / 60, low, high, color=color, alpha=0.2, linewidth=0)
+                lines = np.array([[f.value for f in found]])
+            axes.plot(grid / 60, lines[0], color=color, linewidth=1.8, label=label)
+        for kind, style in (("drawn", ":"), ("none", "--")):
+            label = {"drawn": "drawn actions", "none": "no action"}[kind]
+            axes.axhline(
+                untrained[task][kind]["return"], color="gray", linestyle=style, label=label
+            )
+        axes.set(xlabel="minutes on two CPU cores", title=task)
+        axes.grid(alpha=0.3)
+    panels[0][0].set_ylabel("return of training episodes")
+    panels[0][0].legend(fontsize=8)
+    figure.savefig(path, dpi=130)
+
+
+def main() -> None:
+    """Draw everything."""
+    runs = {path.stem: json.loads(path.read_text()) for path in (FOLDER / "runs").glob("*.json")}
+    if not runs:
+        raise SystemExit("no run is kept yet: python -m tests.benchmarks.experiments makes them")
+    without, grouped = baselines(runs), groups(runs)
+    tables = {"clean": table(grouped, without), "distracted": distracted_table(grouped)}
+    page = PAGE.read_text("utf-8")
+    for name, text in tables.items():
+        between = re.compile(f"(<!-- {name} -->\n).*?(<!-- end -->)", re.DOTALL)
+        page = between.sub(lambda found, text=text: found[1] + text + found[2], page)
+    PAGE.write_text(page, "utf-8")
+    plot(grouped, without, FOLDER / "clean.png")
+    print(*tables.values(), sep="\n")
+
+
+if __name__ == "__main__":
+    main()
