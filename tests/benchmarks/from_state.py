@@ -63,7 +63,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    tasks = list(TASK_SETTINGS["cpu"])
+    tasks = list(TASK_SETTINGS["cpu"]["ppo"])
     parser.add_argument("--tasks", nargs="+", choices=tasks, default=tasks)
     parser.add_argument("--times", type=int, default=1, help="the preset's number of steps")
     options = parser.parse_args()

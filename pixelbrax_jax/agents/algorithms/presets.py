@@ -53,8 +53,9 @@ _CPU = {
     "encoder": "patch",
     "num_envs": 64,
     "num_steps": 32,
+    "num_minibatches": 16,
     "initial_std": 0.5,
-    "learning_rate": 7e-4,
+    "learning_rate": 1e-3,
     "ent_coef": 0.0,
 }
 
@@ -95,33 +96,45 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
         "dcpg": _CI
         | {"num_policy_phases": 2, "aux_minibatches": 8, "aux_epochs": 2, "update_epochs": 2},
     },
-    # Fifteen minutes on two CPU cores; see docs/results.md.
+    # A quarter of an hour on two CPU cores; see docs/results.md.
     "cpu": {
-        "ppo": _CPU | {"layout": "shared", "update_epochs": 3},
+        "ppo": _CPU | {"layout": "shared", "update_epochs": 2},
         "ppg": _CPU
         | {
             "layout": "detach",
-            "policy_epochs": 3,
-            "value_epochs": 3,
+            "policy_epochs": 2,
+            "value_epochs": 2,
             "num_policy_phases": 8,
-            "aux_minibatches": 8,
+            "aux_minibatches": 64,
             "aux_epochs": 1,
         },
         "dcpg": _CPU
-        | {"num_policy_phases": 2, "aux_minibatches": 8, "aux_epochs": 2, "update_epochs": 2},
+        | {"num_policy_phases": 2, "aux_minibatches": 16, "aux_epochs": 2, "update_epochs": 2},
     },
 }
 """Changes of the defaults, by name of the preset and of the algorithm."""
 
-TASK_SETTINGS: dict[str, dict[str, dict[str, Any]]] = {
+_CPU_TASKS = {
+    "halfcheetah": {"action_repeat": 2, "gamma": 0.97, "total_steps": 3_100_000},
+    "walker2d": {"action_repeat": 4, "gamma": 0.99, "total_steps": 6_800_000},
+    "ant": {"action_repeat": 2, "gamma": 0.97, "total_steps": 3_400_000},
+    "humanoid": {"action_repeat": 3, "gamma": 0.98, "total_steps": 3_500_000},
+}
+_CPU_SHARES = {"ppo": 1.0, "ppg": 0.7, "dcpg": 0.6}
+"""Steps that an algorithm makes in the time in which PPO makes one."""
+
+TASK_SETTINGS: dict[str, dict[str, dict[str, dict[str, Any]]]] = {
     "cpu": {
-        "halfcheetah": {"backend": "spring", "action_repeat": 2, "gamma": 0.97},
-        "walker2d": {"backend": "spring", "action_repeat": 4, "gamma": 0.98},
-        "ant": {"backend": "spring", "action_repeat": 2, "gamma": 0.97},
-        "humanoid": {"backend": "spring", "action_repeat": 3, "gamma": 0.97},
+        algorithm: {
+            task: settings
+            | {"backend": "spring", "total_steps": int(share * settings["total_steps"])}
+            for task, settings in _CPU_TASKS.items()
+        }
+        for algorithm, share in _CPU_SHARES.items()
     },
 }
-"""Further changes, by name of the preset and of the task; such a preset has no other tasks."""
+"""Further changes, by name of the preset, of the algorithm and of the task; such a preset has no
+other tasks."""
 
 
 def preset(algorithm: str, name: str = "default", task: str | None = None) -> TrainConfig:
@@ -140,7 +153,7 @@ def preset(algorithm: str, name: str = "default", task: str | None = None) -> Tr
     kind, settings = ALGORITHMS[algorithm].config_class, PRESETS[name].get(algorithm, {})
     if task is not None:
         settings = settings | {"task": task}
-    if of_tasks := TASK_SETTINGS.get(name):
+    if of_tasks := TASK_SETTINGS.get(name, {}).get(algorithm):
         task = settings.get("task", kind.task)
         check_choice(f"task of the preset {name!r}", task, of_tasks)
         settings = settings | of_tasks[task]
