@@ -38,7 +38,10 @@ ALLOWED: dict[str, set[str]] = {
     "pixelbrax_jax.registry": _below("config", "envs", *LAYERS),
     # The package itself, which names what is public.
     "pixelbrax_jax": _below("config", "deprecation", "envs", "registry", "policy", *LAYERS),
-    "pixelbrax_jax.agents": {"pixelbrax_jax", *_below("config", "envs", "registry", "distractors")},
+    "pixelbrax_jax.agents": {
+        "pixelbrax_jax",
+        *_below("config", "envs", "policy", "registry", "distractors"),
+    },
     "pixelbrax_gym": {"pixelbrax_jax", *_below("config", "registry", "policy")},
 }
 """Package -> the packages that it may import besides itself."""

@@ -15,12 +15,11 @@ import platform
 from importlib.metadata import version
 from pathlib import Path
 
-import jax
 import numpy as np
 
-from pixelbrax_jax import VectorPixelEnv, make
 from pixelbrax_jax.agents.runner.checkpoint import read_about
 from pixelbrax_jax.agents.runner.metrics import read_metrics
+from tests.benchmarks.results import TASK_SETTINGS, untrained
 
 
 def curve_of(folder: Path) -> dict:
@@ -40,39 +39,6 @@ def curve_of(folder: Path) -> dict:
         "seconds": last["seconds"],
         "steps_per_second": round(speed),
         "evaluation": evaluation,
-    }
-
-
-_TASK = ("task", "backend", "reward_preset", "action_repeat", "episode_length")
-"""Settings that decide what a return means."""
-
-
-def drawn_actions(curve: dict, episodes: int = 100) -> dict:
-    """Returns of whole episodes of a run's task under actions drawn uniformly from [-1, 1]."""
-    settings = {name: curve["config"][name] for name in _TASK}
-    env, params = make(settings["task"], obs_mode="state", **dict(list(settings.items())[1:]))
-    envs = VectorPixelEnv(env, episodes, "disabled")
-
-    @jax.jit
-    def play(key, params):
-        def step(state, key):
-            action = jax.random.uniform(key, (episodes, env.action_size), minval=-1.0)
-            state, _ = envs.step(state, action, params)
-            over = state.done
-            return state, (state.episode_return, over)
-
-        first, rest = jax.random.split(key)
-        state, _ = envs.reset(jax.random.split(first, episodes), params)
-        steps = -(-env.episode_length // env.action_repeat)
-        _, (returns, over) = jax.lax.scan(step, state, jax.random.split(rest, steps))
-        return returns[over.argmax(0), np.arange(episodes)]
-
-    returns = np.asarray(play(jax.random.key(0), params))
-    return {
-        "settings": settings,
-        "episodes": episodes,
-        "mean": float(returns.mean()),
-        "standard_error": float(returns.std(ddof=1) / np.sqrt(episodes)),
     }
 
 
@@ -109,7 +75,7 @@ def plot(curves: list[dict], drawn: dict[str, dict], path: Path) -> None:
             mean = np.mean([np.interp(common, run["steps"], run["return"]) for run in runs], axis=0)
             count = f"{len(runs)} seeds" if len(runs) > 1 else "1 seed"
             axes.plot(common / 1e6, mean, color=f"C{number}", label=f"{name}, {count}")
-        axes.axhline(drawn[task]["mean"], color="gray", linestyle=":", label="drawn actions")
+        axes.axhline(drawn[task]["return"], color="gray", linestyle=":", label="drawn actions")
         axes.set(xlabel="million control steps", ylabel="return of training episodes", title=task)
         axes.grid(alpha=0.3)
         axes.legend(fontsize=8)
@@ -127,10 +93,12 @@ def main() -> None:
     parser.add_argument("--output", type=Path, required=True, help="without .json or .png")
     options = parser.parse_args()
     curves = [curve for path in options.runs for curve in runs_of(path)]
-    tasks = {tuple(curve["config"][name] for name in _TASK): curve for curve in curves}
-    drawn = {curve["config"]["task"]: drawn_actions(curve) for curve in tasks.values()}
+    kinds = {tuple(curve["config"][name] for name in TASK_SETTINGS) for curve in curves}
+    tasks = [dict(zip(TASK_SETTINGS, kind, strict=True)) for kind in kinds]
+    drawn = {settings["task"]: untrained(settings)["drawn"] for settings in tasks}
     if len(drawn) < len(tasks):
-        raise SystemExit(f"runs of one task differ in {', '.join(_TASK[1:])}; plot them apart")
+        names = ", ".join(TASK_SETTINGS[1:])
+        raise SystemExit(f"runs of one task differ in {names}; plot them apart")
     about = {"jax": version("jax"), "brax": version("brax"), "machine": platform.machine()}
     options.output.with_suffix(".json").write_text(
         json.dumps({"about": about, "drawn_actions": drawn, "runs": curves})

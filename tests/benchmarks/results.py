@@ -23,7 +23,7 @@ MINUTES = (5, 15, 60)
 WINDOW = 60.0
 """Seconds whose training episodes make one point."""
 
-_TASK = ("task", "backend", "reward_preset", "action_repeat", "episode_length")
+TASK_SETTINGS = ("task", "backend", "reward_preset", "action_repeat", "episode_length")
 """Settings that decide what a return means."""
 
 
@@ -31,17 +31,18 @@ def untrained(settings: dict, episodes: int = 256) -> dict:
     """Returns of whole episodes under actions drawn uniformly from [-1, 1], and under none (0)."""
     env, params = make(obs_mode="state", **settings)
     envs = VectorPixelEnv(env, episodes, "disabled")
+    steps = -(-settings["episode_length"] // env.action_repeat)
 
     @jax.jit
     def play(key, params, scale):
         def step(state, key):
             action = scale * jax.random.uniform(key, (episodes, env.action_size), minval=-1.0)
-            state, _ = envs.step(state, action, params)
-            return state, (state.episode_return, state.done)
+            state, timestep = envs.step(state, action, params)
+            over = timestep.terminated | timestep.truncated
+            return state, (timestep.info["episode_return"], over)
 
         first, rest = jax.random.split(key)
         state, _ = envs.reset(first, params)
-        steps = -(-env.episode_length // env.action_repeat)
         _, (returns, over) = jax.lax.scan(step, state, jax.random.split(rest, steps))
         return returns[over.argmax(0), np.arange(episodes)]
 
@@ -58,7 +59,7 @@ def baselines(runs: dict[str, dict]) -> dict[str, dict]:
     path = FOLDER / "untrained.json"
     known = json.loads(path.read_text()) if path.exists() else {}
     for run in runs.values():
-        settings = {name: run["config"][name] for name in _TASK}
+        settings = {name: run["config"][name] for name in TASK_SETTINGS}
         if known.get(settings["task"], {}).get("settings") != settings:
             known[settings["task"]] = untrained(settings)
     path.write_text(json.dumps(known, indent=1) + "\n")
@@ -66,9 +67,12 @@ def baselines(runs: dict[str, dict]) -> dict[str, dict]:
 
 
 def return_at(run: dict, seconds: float) -> float:
-    """Mean return of the episodes that ended within a minute before; NaN beyond the run."""
+    """Mean return of the episodes that ended within a minute before; NaN beyond the run.
+
+    A run that ended in the last tenth of that time counts with its end.
+    """
     times = np.array(run["seconds"])
-    if times[-1] < 0.97 * seconds:
+    if times[-1] < 0.9 * seconds:
         return float("nan")
     seconds = min(seconds, times[-1])
     # All episodes may end in one iteration: the latest of them then.
