@@ -75,7 +75,7 @@ def plot(curves: list[dict], drawn: dict[str, dict], path: Path) -> None:
             mean = np.mean([np.interp(common, run["steps"], run["return"]) for run in runs], axis=0)
             count = f"{len(runs)} seeds" if len(runs) > 1 else "1 seed"
             axes.plot(common / 1e6, mean, color=f"C{number}", label=f"{name}, {count}")
-        axes.axhline(drawn[task]["return"], color="gray", linestyle=":", label="drawn actions")
+        axes.axhline(drawn[task]["return"], color="gray", linestyle=":", label="random policy")
         axes.set(xlabel="million control steps", ylabel="return of training episodes", title=task)
         axes.grid(alpha=0.3)
         axes.legend(fontsize=8)

@@ -2,7 +2,7 @@
 
     python -m tests.benchmarks.results
 
-What drawn actions, and none, earn in the same tasks is played once and kept beside them.
+What a random policy, and no action, earn in the same tasks is played once and kept beside them.
 """
 
 from __future__ import annotations
@@ -90,24 +90,23 @@ def groups(runs: dict[str, dict]) -> dict[str, list[dict]]:
     return found
 
 
-def middle(scores: list[float], digits: int = 0) -> str:
+def middle(scores: list[float]) -> str:
     """An interquartile mean with its interval; of one score that alone."""
     scores = [score for score in scores if np.isfinite(score)]
     if len(scores) < 2:
-        return f"{scores[0]:,.{digits}f}" if scores else ""
+        return f"{scores[0]:,.0f}" if scores else ""
     found = interquartile_mean(np.array(scores))
     return f"{found.value:,.0f} ({found.low:,.0f} to {found.high:,.0f})"
 
 
 def final(run: dict, split: str = "clean") -> dict:
-    """Return, standard error and length of the last evaluation."""
+    """Return and standard error of the last evaluation."""
     last = run["evaluations"][-1]
-    names = ("return", "standard_error", "length")
-    return {name: last[f"{split}/{name}"] for name in names}
+    return {name: last[f"{split}/{name}"] for name in ("return", "standard_error")}
 
 
 def distance(run: dict, untrained: dict) -> float:
-    """Standard errors by which the last evaluation is above drawn actions."""
+    """Standard errors by which the last evaluation is above the random policy."""
     reached, drawn = final(run), untrained["drawn"]
     error = np.hypot(reached["standard_error"], drawn["standard_error"])
     return (reached["return"] - drawn["return"]) / error
@@ -117,11 +116,11 @@ def table(runs: dict[str, list[dict]], untrained: dict[str, dict]) -> str:
     """Return over time, clean, in Markdown."""
     lines = [
         "| task | agent | seeds | " + " | ".join(f"{m} min" for m in MINUTES) + " | mean action, "
-        "at the end | above drawn actions |",
+        "at the end | above the random policy |",
         "|" + "---|" * (5 + len(MINUTES)),
     ]
     for task, without in untrained.items():
-        for name, text in (("drawn", "drawn actions"), ("none", "no action")):
+        for name, text in (("drawn", "random policy"), ("none", "no action")):
             value, error = without[name]["return"], without[name]["standard_error"]
             blank = " | " * len(MINUTES)
             lines.append(f"| {task} | {text} | {blank} | {value:,.0f} ± {error:,.0f} | |")
@@ -158,7 +157,7 @@ def distracted_table(runs: dict[str, list[dict]]) -> str:
             f"| {task} | `paper-{variant[0]}` | {algorithm.upper()} | {len(seeds)} | {cells} | "
             f"{share:.2f} |"
         )
-    return "\n".join(lines) + "\n"
+    return "\n".join(lines) + "\n" if len(lines) > 2 else "Not run yet.\n"
 
 
 def plot(runs: dict[str, list[dict]], untrained: dict[str, dict], path: Path) -> None:
@@ -191,7 +190,7 @@ def plot(runs: dict[str, list[dict]], untrained: dict[str, dict], path: Path) ->
                 lines = np.array([[f.value for f in found]])
             axes.plot(grid / 60, lines[0], color=color, linewidth=1.8, label=label)
         for kind, style in (("drawn", ":"), ("none", "--")):
-            label = {"drawn": "drawn actions", "none": "no action"}[kind]
+            label = {"drawn": "random policy", "none": "no action"}[kind]
             axes.axhline(
                 untrained[task][kind]["return"], color="gray", linestyle=style, label=label
             )

@@ -62,7 +62,7 @@ def film(
 
     Args:
         agent: who plays, with mean actions.
-        path: of the film; its suffix decides the format.
+        path: of the video; its suffix decides the format.
         split: ``"clean"``, ``"train"`` or ``"test"``.
         grid: episodes a side.
         size: pixels of one episode, square.
@@ -70,7 +70,7 @@ def film(
         seed: of the episodes.
 
     Returns:
-        The film's path.
+        The video's path.
 
     Raises:
         ValueError: an option is out of range.
