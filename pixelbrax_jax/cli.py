@@ -164,7 +164,7 @@ def _evaluate(options: argparse.Namespace) -> int:
 def _add_record(commands: Any) -> None:
     command = commands.add_parser(
         "record",
-        help="film a trained agent",
+        help="make a video of a trained agent",
         description="Plays several episodes of a checkpoint side by side and writes an MP4.",
     )
     _add_trained(command)

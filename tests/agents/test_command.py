@@ -17,7 +17,7 @@ from pixelbrax_jax.agents.runner import train_command as command
 from pixelbrax_jax.agents.runner.train_command import parse
 from pixelbrax_jax.agents.runner.trained import load_config
 from pixelbrax_jax.cli import main
-from tests.gpu.learning import commands
+from tests.benchmarks.experiments import experiments, gpu_experiments
 
 TINY = (
     *("--task", "inverted_pendulum", "--height", "18", "--width", "18", "--frame-stack", "1"),
@@ -63,12 +63,14 @@ def test_options_change_a_preset():
     assert options.output_dir == "runs/ppg"
 
 
-@pytest.mark.parametrize("name", commands(1, Path("runs"), "procedural"))
-def test_the_runs_for_a_gpu_are_valid(name):
-    _, algorithm, *line = commands(1, Path("runs"), "procedural")[name]
-    config, options = parse(algorithm, "default", line)
-    assert config.total_steps >= 25_000_000
-    assert options.output_dir == f"runs/{name}"
+@pytest.mark.parametrize("name", experiments() | gpu_experiments())
+def test_the_runs_of_the_results_are_valid(name):
+    _, algorithm, *line = (experiments() | gpu_experiments())[name]
+    name_of_preset = "default"
+    if "--preset" in line:
+        _, name_of_preset, *line = line
+    config, _ = parse(algorithm, name_of_preset, line)
+    assert name.startswith(f"{algorithm}-{config.task}-")
     # The largest buffer, that of PPG and DCPG, in bytes.
     frames = config.num_envs * (config.num_steps + 2) * config.height * config.width * 3
     assert frames * getattr(config, "num_policy_phases", 0) < 25e9

@@ -4,6 +4,7 @@
     python -m tests.benchmarks.experiments --only ppo-walker2d     those with this in their names
     python -m tests.benchmarks.experiments --minutes 90            stops in time
     python -m tests.benchmarks.experiments --list                  the commands
+    python -m tests.benchmarks.experiments --gpu                   those for a GPU in place of them
 
 A run that was cut short, by Ctrl-C or by --minutes, goes on from its checkpoint at the next call.
 Of a finished one docs/results/runs/<name>.json is kept; `tests.benchmarks.results` draws all of
@@ -16,8 +17,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import os
-import platform
 import shlex
 import shutil
 import signal
@@ -32,6 +31,7 @@ from pixelbrax_jax.agents.algorithms.presets import preset
 from pixelbrax_jax.agents.algorithms.registry import ALGORITHMS
 from pixelbrax_jax.agents.runner.checkpoint import read_about
 from pixelbrax_jax.agents.runner.metrics import read_metrics
+from tests.benchmarks.machine import describe_cpu
 
 KEPT = Path(__file__).parents[2] / "docs" / "results" / "runs"
 PRETRAINED = Path(pixelbrax_jax.__file__).parent / "pretrained"
@@ -42,6 +42,12 @@ DISTRACTORS = {
     "video": ("--distractors", "paper-video", "--clips", "procedural"),
     "color": ("--distractors", "paper-color"),
 }
+GPU_STEPS = {
+    "halfcheetah": 25_000_000,
+    "walker2d": 25_000_000,
+    "ant": 25_000_000,
+    "humanoid": 50_000_000,
+}
 
 
 def experiments() -> dict[str, list[str]]:
@@ -49,26 +55,50 @@ def experiments() -> dict[str, list[str]]:
     runs = {}
 
     def add(algorithm: str, task: str, seed: int, *more: str, name: str = "") -> None:
-        name = "-".join([algorithm, task, *([name] if name else []), str(seed)])
-        command = ["train", algorithm, "--preset", "cpu", "--task", task, "--seed", str(seed)]
-        runs[name] = [*command, "--eval-episodes", str(EPISODES), *more]
+        full = "-".join([algorithm, task, *([name] if name else []), str(seed)])
+        given = "ci" if task == "inverted_pendulum" else "cpu"
+        command = ["train", algorithm, "--preset", given, "--task", task, "--seed", str(seed)]
+        runs[full] = [*command, "--eval-episodes", str(EPISODES), *more]
+
+    def longer(task: str, times: int, name: str) -> None:
+        steps = times * preset("ppo", "cpu", task).total_steps
+        more = ("--total-steps", str(steps), "--num-evals", str(3 * times))
+        add("ppo", task, 0, *more, name=name)
 
     for seed in range(3):
         for task in TASKS:
             for algorithm in ALGORITHMS:
                 add(algorithm, task, seed, "--num-evals", "3")
+    for task in TASKS:
+        longer(task, 4, "long")
+    longer("halfcheetah", 16, "hour")
     for seed in range(2):
         for task in DISTRACTED:
             for name, options in DISTRACTORS.items():
                 for algorithm in ALGORITHMS:
                     add(algorithm, task, seed, *options, "--num-evals", "1", name=name)
-    # An hour, and for one task several.
-    for task in TASKS:
-        times = 16 if task == "halfcheetah" else 4
-        steps = times * preset("ppo", "cpu", task).total_steps
-        more = ("--total-steps", str(steps), "--num-evals", str(3 * times))
-        add("ppo", task, 0, *more, name="long")
+    for algorithm in ALGORITHMS:
+        add(algorithm, "inverted_pendulum", 0, "--num-evals", "3")
     return runs
+
+
+def gpu_experiments() -> dict[str, list[str]]:
+    """The same for a GPU: the paper's tasks and numbers of steps, with a video as background.
+
+    Many environments keep a GPU busy; a rollout's frames take 1.4 GB, PPG's buffer 23 GB. PPG and
+    DCPG leave about 50 GB of checkpoints each, for their buffer belongs to a checkpoint.
+    """
+    size = "--num-envs 1024 --num-steps 64 --num-minibatches 16 --num-evals 10 --eval-episodes 64"
+    return {
+        f"{algorithm}-{task}-gpu-{seed}": [
+            *("train", algorithm, "--task", task, "--total-steps", str(steps), *size.split()),
+            *("--distractors", "video", "--clips", "procedural", "--seed", str(seed)),
+            *("--checkpoint-every", str(steps // 10), "--keep-checkpoints", "1"),
+        ]
+        for seed in range(5)
+        for task, steps in GPU_STEPS.items()
+        for algorithm in ALGORITHMS
+    }
 
 
 def record(folder: Path, arguments: list[str]) -> dict:
@@ -87,7 +117,7 @@ def record(folder: Path, arguments: list[str]) -> dict:
         "command": shlex.join(["pixelbrax", *arguments]),
         "algorithm": about["algorithm"],
         "config": about["config"],
-        "machine": {"cores": os.cpu_count(), "architecture": platform.machine()},
+        "machine": describe_cpu(),
         "versions": {name: version(name) for name in packages},
         "seconds_of_first_iteration": records[0]["seconds"],
         "steps": [r["steps"] for r in training],
@@ -146,9 +176,11 @@ def main() -> int:
     parser.add_argument("--only", default="", help="part of the names of runs")
     parser.add_argument("--minutes", type=float, default=float("inf"), help="then stop")
     parser.add_argument("--output-dir", type=Path, default=Path("runs/results"))
+    parser.add_argument("--gpu", action="store_true", help="runs of the paper's size")
     parser.add_argument("--list", action="store_true", help="only write the commands")
     options = parser.parse_args()
-    chosen = {name: line for name, line in experiments().items() if options.only in name}
+    runs = gpu_experiments() if options.gpu else experiments()
+    chosen = {name: line for name, line in runs.items() if options.only in name}
     if not chosen:
         parser.error(f"no run has {options.only!r} in its name; --list shows all")
     KEPT.mkdir(parents=True, exist_ok=True)
@@ -168,7 +200,7 @@ def main() -> int:
             continue
         kept = record(options.output_dir / name, arguments)
         path.write_text(json.dumps(kept) + "\n")
-        if not kept["config"]["distractors"]:
+        if kept["config"]["task"] in TASKS and not kept["config"]["distractors"]:
             offer(kept["config"]["task"], options.output_dir / name, kept)
     if failed:
         print(f"failed: {', '.join(failed)}", file=sys.stderr)

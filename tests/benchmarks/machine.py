@@ -29,6 +29,21 @@ def num_cores() -> int:
     return os.cpu_count() or 1
 
 
+def describe_cpu() -> dict[str, Any]:
+    """The processor, without a device of JAX being made.
+
+    Virtual machines name several generations alike; family and model tell them apart.
+    """
+    return {
+        "processor": _from_cpuinfo("model name") or platform.processor() or platform.machine(),
+        "family": _from_cpuinfo("cpu family"),
+        "model": _from_cpuinfo("model"),
+        "vectors": _vectors(),
+        "cores": num_cores(),
+        "system": f"{platform.system()} {platform.machine()}",
+    }
+
+
 def describe() -> dict[str, Any]:
     """Device, processor and versions."""
     import jax
@@ -39,10 +54,7 @@ def describe() -> dict[str, Any]:
         "device": device.device_kind,
         "devices": jax.device_count(),
         "runtime": device.client.platform_version,
-        "processor": _from_cpuinfo("model name") or platform.processor() or platform.machine(),
-        "vectors": _vectors(),
-        "cores": num_cores(),
-        "system": f"{platform.system()} {platform.machine()}",
+        **describe_cpu(),
         "python": platform.python_version(),
         "versions": {name: _version(name) for name in PACKAGES},
         "xla_flags": os.environ.get("XLA_FLAGS", ""),

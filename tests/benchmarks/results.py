@@ -19,7 +19,7 @@ from pixelbrax_jax.agents.runner.evaluate import interquartile_mean
 
 FOLDER = Path(__file__).parents[2] / "docs" / "results"
 PAGE = FOLDER.with_suffix(".md")
-MINUTES = (5, 15, 60)
+MINUTES = (1, 3, 5, 15, 60)
 WINDOW = 60.0
 """Seconds whose training episodes make one point."""
 
@@ -28,7 +28,7 @@ TASK_SETTINGS = ("task", "backend", "reward_preset", "action_repeat", "episode_l
 
 
 def untrained(settings: dict, episodes: int = 256) -> dict:
-    """Returns of whole episodes under actions drawn uniformly from [-1, 1], and under none (0)."""
+    """Returns of whole episodes under uniform actions in [-1, 1], and under none (0)."""
     env, params = make(obs_mode="state", **settings)
     envs = VectorPixelEnv(env, episodes, "disabled")
     steps = -(-settings["episode_length"] // env.action_repeat)
@@ -47,7 +47,7 @@ def untrained(settings: dict, episodes: int = 256) -> dict:
         return returns[over.argmax(0), np.arange(episodes)]
 
     result = {"settings": settings, "episodes": episodes}
-    for name, scale in (("drawn", 1.0), ("none", 0.0)):
+    for name, scale in (("random", 1.0), ("none", 0.0)):
         returns = np.asarray(play(jax.random.key(0), params, scale))
         error = float(returns.std(ddof=1) / np.sqrt(episodes))
         result[name] = {"return": float(returns.mean()), "standard_error": error}
@@ -107,9 +107,9 @@ def final(run: dict, split: str = "clean") -> dict:
 
 def distance(run: dict, untrained: dict) -> float:
     """Standard errors by which the last evaluation is above the random policy."""
-    reached, drawn = final(run), untrained["drawn"]
-    error = np.hypot(reached["standard_error"], drawn["standard_error"])
-    return (reached["return"] - drawn["return"]) / error
+    reached, random = final(run), untrained["random"]
+    error = np.hypot(reached["standard_error"], random["standard_error"])
+    return (reached["return"] - random["return"]) / error
 
 
 def table(runs: dict[str, list[dict]], untrained: dict[str, dict]) -> str:
@@ -120,7 +120,7 @@ def table(runs: dict[str, list[dict]], untrained: dict[str, dict]) -> str:
         "|" + "---|" * (5 + len(MINUTES)),
     ]
     for task, without in untrained.items():
-        for name, text in (("drawn", "random policy"), ("none", "no action")):
+        for name, text in (("random", "random policy"), ("none", "no action")):
             value, error = without[name]["return"], without[name]["standard_error"]
             blank = " | " * len(MINUTES)
             lines.append(f"| {task} | {text} | {blank} | {value:,.0f} ± {error:,.0f} | |")
@@ -189,8 +189,8 @@ def plot(runs: dict[str, list[dict]], untrained: dict[str, dict], path: Path) ->
                 axes.fill_between(grid / 60, low, high, color=color, alpha=0.2, linewidth=0)
                 lines = np.array([[f.value for f in found]])
             axes.plot(grid / 60, lines[0], color=color, linewidth=1.8, label=label)
-        for kind, style in (("drawn", ":"), ("none", "--")):
-            label = {"drawn": "random policy", "none": "no action"}[kind]
+        for kind, style in (("random", ":"), ("none", "--")):
+            label = {"random": "random policy", "none": "no action"}[kind]
             axes.axhline(
                 untrained[task][kind]["return"], color="gray", linestyle=style, label=label
             )

@@ -56,6 +56,7 @@ _CPU = {
     "num_minibatches": 16,
     "initial_std": 0.5,
     "learning_rate": 1e-3,
+    "anneal": True,
     "ent_coef": 0.0,
 }
 
@@ -104,8 +105,8 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
             "layout": "detach",
             "policy_epochs": 2,
             "value_epochs": 2,
-            "num_policy_phases": 8,
-            "aux_minibatches": 64,
+            "num_policy_phases": 2,
+            "aux_minibatches": 16,
             "aux_epochs": 1,
         },
         "dcpg": _CPU

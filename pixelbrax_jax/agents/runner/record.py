@@ -1,4 +1,4 @@
-"""``pixelbrax record``: a trained agent on film."""
+"""``pixelbrax record``: a video of a trained agent."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def record(options: argparse.Namespace) -> int:
         split = options.split or ("train" if agent.algorithm.config.distractors else "clean")
         run = [f"run{options.run_index}"] if options.run_index else []
         name = "_".join([options.pretrained or str(agent.steps), split, *run])
-        path = film(
+        path = write_video(
             agent,
             options.output or Path(options.folder or "") / "videos" / f"{name}.mp4",
             split=split,
@@ -48,7 +48,7 @@ def record(options: argparse.Namespace) -> int:
     return 0
 
 
-def film(
+def write_video(
     agent: Trained,
     path: str | Path,
     *,
