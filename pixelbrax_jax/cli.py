@@ -38,6 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "is.",
     )
     command.set_defaults(run=_doctor)
+    _add_play(commands)
     _add_clips(commands)
     # Its options are the fields of the settings' classes, which tyro reads by itself.
     commands.add_parser("train", help="train an agent: train ppo --help", add_help=False)
@@ -52,6 +53,45 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _bench(arguments[1:])
     options = parser.parse_args(arguments)
     return int(options.run(options))
+
+
+def _add_play(commands: Any) -> None:
+    command = commands.add_parser(
+        "play",
+        help="see a task as an agent sees it",
+        description="Plays a task in a window, or, with --gif or where there is no display, into "
+        "an animated image.",
+    )
+    command.add_argument("task", help="as ant; 'pixelbrax play x' lists them")
+    command.add_argument(
+        "--policy",
+        choices=("random", "zero", "pretrained"),
+        default="random",
+        help="who acts; pretrained comes with the package for some tasks (default: random)",
+    )
+    command.add_argument("--backend", help="of the physics")
+    command.add_argument("--camera", help="default, side, front, top or original")
+    command.add_argument("--look", help="default or original")
+    command.add_argument("--shadows", action="store_true", default=None)
+    command.add_argument("--distractors", nargs="+", help="such as dcs-easy, or paper-color")
+    command.add_argument("--clips", help="of videos: procedural, or a folder")
+    command.add_argument("--split", help="of the clips: train, test, ...")
+    command.add_argument(
+        "--observation", action="store_true", help="show the observation's own pixels, enlarged"
+    )
+    command.add_argument("--size", type=int, default=336, help="pixels, square (default: 336)")
+    command.add_argument("--seed", type=int, default=0, help="of the episodes (default: 0)")
+    command.add_argument("--gif", metavar="FILE", help="write a .gif or an .mp4, and no window")
+    command.add_argument("--num-frames", type=int, default=200, help="of the file (default: 200)")
+    command.set_defaults(run=_play)
+
+
+def _play(options: argparse.Namespace) -> int:
+    try:
+        from pixelbrax_gym.play import play
+    except KeyboardInterrupt:
+        return 128 + signal.SIGINT
+    return play(options)
 
 
 def _add_clips(commands: Any) -> None:

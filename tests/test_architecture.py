@@ -16,7 +16,16 @@ from packaging.requirements import Requirement
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("pixelbrax_jax", "pixelbrax_gym")
 
-FOUNDATIONS = {"types", "spatial", "validation", "extras", "compilation", "memory", "tasks"}
+FOUNDATIONS = {
+    "types",
+    "spatial",
+    "validation",
+    "extras",
+    "compilation",
+    "memory",
+    "tasks",
+    "video",
+}
 LAYERS = {"physics", "scene", "renderer", "distractors"}
 """They never import each other; `envs` joins them."""
 
@@ -28,6 +37,7 @@ def _below(*names: str) -> set[str]:
 ALLOWED: dict[str, set[str]] = {
     **{f"pixelbrax_jax.{name}": set() for name in FOUNDATIONS},
     "pixelbrax_jax.spatial": {"pixelbrax_jax.types"},
+    "pixelbrax_jax.video": {"pixelbrax_jax.extras"},
     "pixelbrax_jax.deprecation": set(),
     "pixelbrax_jax.policy": {"pixelbrax_jax.extras", "pixelbrax_jax.validation"},
     **{f"pixelbrax_jax.{name}": _below() for name in LAYERS},

@@ -33,15 +33,15 @@ def code(cell: str) -> list[str]:
     return re.findall(r"`([^`]*)`", cell)
 
 
-def test_the_readme_lists_every_option_with_its_default():
+def test_every_option_is_listed_with_its_default():
     listed = {}
-    for names, defaults, _ in table("README.md", "| option | default | meaning"):
+    for names, defaults, _ in table("docs/options.md", "| option | default | meaning"):
         listed |= dict(zip(code(names), code(defaults), strict=True))
     options = {f.name: f.default for f in fields(EnvConfig) if f.name != "task"}
     assert listed == {name: repr(value).replace("'", '"') for name, value in options.items()}
 
 
-def test_the_readme_lists_every_task():
+def test_every_task_is_listed():
     expected = [
         [
             f"`{task.gymnasium_id}`",
@@ -52,7 +52,7 @@ def test_the_readme_lists_every_task():
         ]
         for name, task in TASKS.items()
     ]
-    assert table("README.md", "| Gymnasium id |") == expected, "\n".join(
+    assert table("docs/tasks.md", "| Gymnasium id |") == expected, "\n".join(
         "| " + " | ".join(row) + " |" for row in expected
     )
 
@@ -60,7 +60,7 @@ def test_the_readme_lists_every_task():
         assert gymnasium.spec(task.gymnasium_id).kwargs == {"task": name}
 
 
-def test_the_gallery_shows_every_task():
+def test_every_task_has_its_images():
     expected = [
         [
             f"`{task.gymnasium_id}`",
@@ -69,14 +69,14 @@ def test_the_gallery_shows_every_task():
         ]
         for name, task in TASKS.items()
     ]
-    shown = table("docs/gallery.md", "| task |")
+    shown = table("docs/tasks.md", "| task |")
     assert shown == expected, "\n".join("| " + " | ".join(row) + " |" for row in expected)
     for _, _, image in shown:
         path = image.partition("(")[2].rstrip(")")
         assert (ROOT / "docs" / path).is_file()
 
 
-def test_the_readme_lists_the_options_of_adapters():
+def test_the_options_of_adapters_are_listed():
     adapters = [
         pixelbrax_gym.PixelBraxEnv,
         pixelbrax_gym.PixelBraxVectorEnv,
@@ -88,7 +88,7 @@ def test_the_readme_lists_the_options_of_adapters():
         for adapter in adapters
     ]
     listed: list[set[str]] = [set() for _ in adapters]
-    for names, *cells, _ in table("README.md", "| option | Gymnasium `make` |"):
+    for names, *cells, _ in table("docs/options.md", "| option | Gymnasium `make` |"):
         for options, cell in zip(listed, cells, strict=True):
             options |= set(code(names)) if cell == "yes" else set()
     assert listed == taken

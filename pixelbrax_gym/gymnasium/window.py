@@ -31,6 +31,8 @@ class Window:
         self._pygame, self._title, self._fps = pygame, title, fps
         self._screen: Any = None
         self._clock: Any = None
+        self.closed = False
+        """Whether the user has asked to close it."""
 
     def show(self, image: np.ndarray) -> None:
         """Show an image.
@@ -47,6 +49,8 @@ class Window:
         # pygame counts columns first.
         pygame.surfarray.blit_array(self._screen, image.swapaxes(0, 1))
         pygame.event.pump()
+        # Looked at, not taken: events are whose program this is.
+        self.closed = self.closed or bool(pygame.event.peek(pygame.QUIT))
         pygame.display.flip()
         self._clock.tick(self._fps)
 

@@ -46,13 +46,13 @@ def test_a_healthy_machine():
             {"jax_platform": "cpu", "jax_device": "cpu:0", "torch_cuda": False},
             "problem",
             "NVIDIA GPU, but JAX does not use it",
-            ".[cuda12]",
+            "pixelbrax[cuda12]",
         ),
         (
             {"jax_platform": "cpu", "has_nvidia": False},
             "problem",
             "torch uses CUDA and JAX the CPU",
-            ".[cuda12]",
+            "pixelbrax[cuda12]",
         ),
         ({"torch_cuda": False}, "problem", "JAX uses the GPU and torch cannot", "torch built for"),
         (
@@ -98,7 +98,7 @@ def test_a_healthy_machine():
             {"versions": HEALTHY.versions | {"torchrl": None}},
             "note",
             "torchrl is not installed",
-            ".[torchrl]",
+            "pixelbrax[torchrl]",
         ),
     ],
 )

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import argparse
 import sys
-import warnings
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import imageio.v2 as imageio
 import jax
 import numpy as np
 
@@ -19,6 +18,7 @@ from pixelbrax_jax.agents.runner.trained import Trained, load_chosen
 from pixelbrax_jax.compilation import compiler_options
 from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.validation import check_choice, check_positive_int
+from pixelbrax_jax.video import write_frames
 
 
 def record(options: argparse.Namespace) -> int:
@@ -74,6 +74,7 @@ def write_video(
 
     Raises:
         ValueError: an option is out of range.
+        ImportError: imageio is not installed, with the fix.
     """
     check_positive_int("grid", grid)
     check_positive_int("size", size)
@@ -90,18 +91,12 @@ def write_video(
         draw = jax.vmap(lambda state: env.image(state, params, size, size))
         return state, draw(state)
 
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    state, _ = envs.reset(jax.random.key(seed), params)
-    fps = min(max(1, round(1.0 / env.dt)), 60)
-    moving = {"duration": 1000.0 / fps, "loop": 0}
-    options = moving if path.suffix == ".gif" else {"fps": fps, "macro_block_size": 1}
-    writer: Any = imageio.get_writer(path, **options)
-    with writer, warnings.catch_warnings():
-        # Python warns of a fork beside JAX's threads; the child becomes ffmpeg at once.
-        warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)
+    def frames() -> Iterator[np.ndarray]:
+        state, _ = envs.reset(jax.random.key(seed), params)
         for _ in range(num_frames):
             state, images = step(state, params)
             tiles = np.asarray(images).reshape(grid, grid, size, size, 3)
-            writer.append_data(np.concatenate(np.concatenate(tiles, axis=1), axis=1))
-    return path
+            yield np.concatenate(np.concatenate(tiles, axis=1), axis=1)
+
+    fps = min(max(1, round(1.0 / env.dt)), 60)
+    return write_frames(path, frames(), fps)

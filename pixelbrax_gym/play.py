@@ -1,0 +1,126 @@
+"""``pixelbrax play``: a task on the screen, or in an animated image."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Callable, Iterator
+from importlib.util import find_spec
+from itertools import islice
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from pixelbrax_gym.gymnasium.single_env import PixelBraxEnv
+from pixelbrax_gym.gymnasium.window import Window
+from pixelbrax_jax.extras import install_extra
+from pixelbrax_jax.policy import load_policy
+from pixelbrax_jax.validation import check_positive_int
+from pixelbrax_jax.video import write_frames
+
+POLICIES = ("random", "zero", "pretrained")
+
+ENV_OPTIONS = ("backend", "camera", "look", "shadows", "distractors", "clips", "split")
+"""Options of an environment that the command takes; one that is not given stays as it is."""
+
+Act = Callable[[np.ndarray], np.ndarray]
+
+
+def play(options: argparse.Namespace) -> int:
+    """Run the command; see ``pixelbrax play --help``.
+
+    Returns:
+        The exit status: 130 after Ctrl-C, which leaves a whole file.
+    """
+    written = options.gif
+    if written is None and (lacking := _no_window()):
+        written = f"{options.task}.gif"
+        sys.stderr.write(f"pixelbrax play: {lacking}; it becomes {written}\n")
+    try:
+        check_positive_int("size", options.size)
+        check_positive_int("num_frames", options.num_frames)
+        env, act = _make(options)
+        shown = images(env, act, options.seed, options.size if options.observation else None)
+        if written is None:
+            _show(shown, env.metadata["render_fps"], f"PixelBrax {options.task}")
+        else:
+            frames = islice(shown, options.num_frames)
+            path = write_frames(written, frames, env.metadata["render_fps"])
+            sys.stdout.write(f"{path.resolve()}\n")
+    except KeyboardInterrupt:
+        return 130
+    except (ValueError, TypeError, OSError, ImportError) as error:
+        sys.stderr.write(f"pixelbrax play: {error}\n")
+        return 1
+    return 0
+
+
+def images(env: PixelBraxEnv, act: Act, seed: int, observed: int | None) -> Iterator[np.ndarray]:
+    """Play for ever, episode after episode.
+
+    Args:
+        env: with ``render_mode="rgb_array"``.
+        act: gives an (A,) float32 action for an (H, W, 3 K) uint8 observation.
+        seed: of the first episode.
+        observed: None yields what ``render`` draws; a number the newest frame of the observation,
+            enlarged by a whole factor to about so many pixels.
+
+    Yields:
+        (H, W, 3) uint8 images.
+    """
+    obs, _ = env.reset(seed=seed)
+    while True:
+        if observed is None:
+            yield np.asarray(env.render())
+        else:
+            factor = max(1, round(observed / max(obs.shape[:2])))
+            yield obs[..., -3:].repeat(factor, axis=0).repeat(factor, axis=1)
+        obs, _, terminated, truncated, _ = env.step(act(obs))
+        if terminated or truncated:
+            obs, _ = env.reset()
+
+
+def _make(options: argparse.Namespace) -> tuple[PixelBraxEnv, Act]:
+    given = {name: getattr(options, name) for name in ENV_OPTIONS}
+    given = {name: value for name, value in given.items() if value is not None}
+    policy = None
+    if options.policy == "pretrained":
+        policy = load_policy(options.task)
+        given = (policy.env_options or {}) | given
+    task: Any = given.pop("task", options.task)
+    env = PixelBraxEnv(
+        task,
+        render_mode="rgb_array",
+        render_height=options.size,
+        render_width=options.size,
+        **given,
+    )
+    if policy is not None:
+        return env, lambda obs: np.asarray(policy(jnp.asarray(obs)[None]))[0]
+    if options.policy == "zero":
+        return env, lambda _: np.zeros(env.action_space.shape or (), np.float32)
+    env.action_space.seed(options.seed)
+    return env, lambda _: env.action_space.sample()
+
+
+def _show(shown: Iterator[np.ndarray], fps: int, title: str) -> None:
+    window = Window(title, fps)
+    try:
+        for image in shown:
+            window.show(image)
+            if window.closed:
+                return
+    finally:
+        window.close()
+
+
+def _no_window() -> str:
+    """Why no window can be opened; empty if one can."""
+    if find_spec("pygame") is None:
+        return f"a window needs pygame; try: {install_extra('human')}"
+    known = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
+    if sys.platform == "linux" and not any(map(os.environ.get, known)):
+        return "there is no display for a window"
+    return ""
