@@ -3,8 +3,8 @@
     python examples/train_inverted_pendulum.py --output-dir runs/demo
 
 The frames stay where JAX put them: ``make_vec(..., output="torch")`` hands them over by DLPack
-without a copy. Written into the output folder: ``learning_curve.png``, ``trained_agent.mp4``
-and ``figures.json``.
+without a copy. Training ends when an evaluation shows the task solved. Written into the output
+folder: ``learning_curve.png``, ``trained_agent.mp4`` and ``figures.json``.
 
 The algorithm is proximal policy optimisation (Schulman et al., arXiv 1707.06347) with
 generalised advantage estimation (arXiv 1506.02438), a Gaussian policy, and a shared CNN.
@@ -52,7 +52,9 @@ class Config:
     frame_stack: int = 2  # two frames show velocities
     num_envs: int = 128
     num_steps: int = 32  # per environment and iteration
-    total_steps: int = 1_400_000
+    total_steps: int = 1_400_000  # at most
+    eval_every: int = 100_000  # steps
+    solved_return: float = 995.0  # mean of an evaluation at which training stops
     learning_rate: float = 1e-3  # annealed to 0
     gamma: float = 0.99
     gae_lambda: float = 0.95
@@ -208,10 +210,31 @@ def update(
             optimizer.step()
 
 
+class Evaluation:
+    """Whole episodes under the policy's mean action, the same ones every time."""
+
+    def __init__(self, config: Config, device: torch.device):
+        self.config, self.device = config, device
+        self.envs = make_envs(config, config.eval_episodes)
+
+    @torch.no_grad()
+    def play(self, agent: Agent) -> list[float]:
+        """Returns, one per environment."""
+        obs, _ = self.envs.reset(seed=self.config.seed + 1_000_000)
+        returns = torch.zeros(self.config.eval_episodes)
+        running = torch.ones(self.config.eval_episodes, dtype=torch.bool)
+        while running.any():
+            policy, _ = agent(obs.to(self.device))
+            obs, reward, terminated, truncated, _ = self.envs.step(policy.mean.to(obs.device))
+            returns += reward.cpu() * running
+            running &= ~(terminated | truncated).cpu()
+        return returns.tolist()
+
+
 def train(config: Config, device: torch.device) -> tuple[Agent, dict]:
     """Trains an agent; returns it with the figures and the learning curve of the run."""
     started = time.perf_counter()
-    rollouts = Rollouts(config, device)
+    rollouts, evaluation = Rollouts(config, device), Evaluation(config, device)
     channels, action_size = rollouts.obs.shape[-1], rollouts.envs.single_action_space.shape[0]
     agent = Agent(config.image_size, channels, action_size, config.initial_std).to(device)
     optimizer = torch.optim.Adam(agent.parameters(), lr=config.learning_rate, eps=1e-5)
@@ -222,6 +245,7 @@ def train(config: Config, device: torch.device) -> tuple[Agent, dict]:
     batch_size = config.num_envs * config.num_steps
     num_iterations = -(-config.total_steps // batch_size)
     curve: dict[str, list[float]] = {"steps": [], "return": []}
+    evaluations: list[dict] = []
     started = time.perf_counter()
     with tqdm(total=num_iterations * batch_size, unit="step", unit_scale=True) as bar:
         for iteration in range(num_iterations):
@@ -229,41 +253,33 @@ def train(config: Config, device: torch.device) -> tuple[Agent, dict]:
                 group["lr"] = config.learning_rate * (1 - iteration / num_iterations)
             update(agent, optimizer, rollouts.collect(agent), config)
             bar.update(batch_size)
-            if rollouts.returns:
-                curve["steps"].append((iteration + 1) * batch_size)
-                curve["return"].append(float(np.mean(rollouts.returns[-config.num_envs :])))
+            steps = (iteration + 1) * batch_size
+            if recent := rollouts.returns[-config.num_envs :]:
+                curve["steps"].append(steps)
+                curve["return"].append(float(np.mean(recent)))
                 bar.set_postfix({"return": f"{curve['return'][-1]:.0f}"})
+            last = iteration + 1 == num_iterations
+            if last or steps // config.eval_every > (steps - batch_size) // config.eval_every:
+                evaluations.append({"steps": steps, "returns": evaluation.play(agent)})
+                if np.mean(evaluations[-1]["returns"]) >= config.solved_return:
+                    break
     seconds = time.perf_counter() - started
     rollouts.envs.close()
+    evaluation.envs.close()
     return agent, {
         "setup_seconds": setup_seconds,
         "train_seconds": seconds,
-        "train_steps": num_iterations * batch_size,
-        "train_steps_per_second": num_iterations * batch_size / seconds,
+        "train_steps": steps,
+        "train_steps_per_second": steps / seconds,
         "train_episodes": len(rollouts.returns),
         "curve": curve,
+        "evaluations": evaluations,
     }
 
 
 @torch.no_grad()
-def evaluate(agent: Agent, config: Config, device: torch.device) -> list[float]:
-    """Returns of whole episodes under the policy's mean action, one per environment."""
-    envs = make_envs(config, config.eval_episodes)
-    obs, _ = envs.reset(seed=config.seed + 1_000_000)
-    returns = torch.zeros(config.eval_episodes)
-    running = torch.ones(config.eval_episodes, dtype=torch.bool)
-    while running.any():
-        policy, _ = agent(obs.to(device))
-        obs, reward, terminated, truncated, _ = envs.step(policy.mean.to(obs.device))
-        returns += reward.cpu() * running
-        running &= ~(terminated | truncated).cpu()
-    envs.close()
-    return returns.tolist()
-
-
-@torch.no_grad()
 def record(agent: Agent, config: Config, device: torch.device, path: Path) -> None:
-    """Films the trained agent at 480 x 480 pixels, in the task's own time."""
+    """Makes a video of the trained agent at 480 x 480 pixels, in the task's own time."""
     env = gymnasium.make(
         config.env_id,
         disable_env_checker=True,  # Gymnasium's checker knows NumPy arrays alone
@@ -288,16 +304,16 @@ def record(agent: Agent, config: Config, device: torch.device, path: Path) -> No
     env.close()
 
 
-def plot(curve: dict[str, list[float]], evaluation: list[float], path: Path) -> None:
-    """Training returns over steps, with the evaluation's mean."""
+def plot(curve: dict[str, list[float]], evaluations: list[dict], path: Path) -> None:
+    """Training returns over steps, with the evaluations' means."""
     figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")
     axes.plot(curve["steps"], curve["return"], label="training, mean of recent episodes")
-    mean = np.mean(evaluation)
-    axes.axhline(
-        mean,
+    axes.plot(
+        [one["steps"] for one in evaluations],
+        [np.mean(one["returns"]) for one in evaluations],
+        "o",
         color="tab:orange",
-        ls="--",
-        label=f"evaluation, {len(evaluation)} episodes: {mean:.0f}",
+        label=f"evaluation, mean of {len(evaluations[-1]['returns'])} episodes",
     )
     axes.set(xlabel="environment steps", ylabel="return", title="Inverted pendulum from pixels")
     axes.set_ylim(bottom=0)
@@ -318,7 +334,7 @@ def parse(arguments: list[str] | None = None) -> Config:
 
 
 def main(arguments: list[str] | None = None) -> dict:
-    """Trains, evaluates, films; returns what ``figures.json`` holds."""
+    """Trains, evaluates, makes a video; returns what ``figures.json`` holds."""
     config = parse(arguments)
     output = Path(config.output_dir)
     output.mkdir(parents=True, exist_ok=True)
@@ -330,11 +346,10 @@ def main(arguments: list[str] | None = None) -> dict:
     torch.manual_seed(config.seed)
     print(f"Training on {device} with {config.num_envs} environments; the first step compiles.")
     agent, figures = train(config, device)
-    returns = evaluate(agent, config, device)
+    returns = figures["evaluations"][-1]["returns"]
     figures |= {
         "eval_return_mean": float(np.mean(returns)),
         "eval_return_std": float(np.std(returns)),
-        "eval_returns": returns,
         "config": asdict(config),
         "torch_device": str(device),
         "processor": platform.processor() or platform.machine(),
@@ -345,7 +360,7 @@ def main(arguments: list[str] | None = None) -> dict:
             "pixelbrax": version("pixelbrax"),
         },
     }
-    plot(figures["curve"], returns, output / "learning_curve.png")
+    plot(figures["curve"], figures["evaluations"], output / "learning_curve.png")
     record(agent, config, device, output / "trained_agent.mp4")
     (output / "figures.json").write_text(json.dumps(figures, indent=2) + "\n")
     print(

@@ -9,7 +9,10 @@ import pytest
 from pixelbrax_jax.video import write_frames
 
 # imageio's pipes to ffmpeg are closed by the garbage collector.
-pytestmark = pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),
+    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
+]
 
 
 def flashes(count: int):

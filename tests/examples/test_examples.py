@@ -32,15 +32,18 @@ def pictures_in(path):
 
 
 @pytest.mark.slow  # `make demo` runs it in full
-def test_train_inverted_pendulum(tmp_path):
+@pytest.mark.parametrize(("solved", "steps"), [("995", 512), ("1", 256)])
+def test_train_inverted_pendulum(tmp_path, solved, steps):
     figures = load("train_inverted_pendulum").main(
         [
             *("--output-dir", str(tmp_path), "--num-envs", "8", "--num-steps", "16"),
-            *("--total-steps", "256", "--eval-episodes", "2", "--video-steps", "10"),
+            *("--total-steps", "512", "--eval-every", "200", "--solved-return", solved),
+            *("--eval-episodes", "2", "--video-steps", "10"),
         ]
     )
-    assert figures["train_steps"] == 256
-    assert len(figures["eval_returns"]) == 2
+    assert figures["train_steps"] == steps, "it stops when the task is solved"
+    assert [one["steps"] for one in figures["evaluations"]] == [256, 512][: steps // 256]
+    assert len(figures["evaluations"][-1]["returns"]) == 2
     assert json.loads((tmp_path / "figures.json").read_text()) == figures
     for name in ("learning_curve.png", "trained_agent.mp4"):
         assert (tmp_path / name).stat().st_size > 1000
@@ -70,6 +73,14 @@ def test_sb3_ppo(tmp_path):
     assert figures["train_steps"] == 256
     assert SHORTEST <= figures["eval_return_mean"] <= 1000
     assert (tmp_path / "agent.zip").exists()
+
+
+def test_render_wall(tmp_path):
+    path = tmp_path / "wall.gif"
+    load("render_wall").main(["--output", str(path), "--num-frames", "3", "--only", "reacher"])
+    frames = pictures_in(path)
+    assert frames.shape == (3, 120, 120, 3)
+    assert (frames[0] != frames[2]).any()
 
 
 def test_skrl_ppo(tmp_path):
