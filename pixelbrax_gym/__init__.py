@@ -7,6 +7,7 @@ the first environment is made, and torch only if tensors are wanted.
 from __future__ import annotations
 
 import importlib
+from importlib import metadata
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -73,6 +74,8 @@ def _register(task: str, name: str) -> None:
 
 
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        return metadata.version("pixelbrax")
     if name not in _LAZY:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(importlib.import_module(_LAZY[name]), name)

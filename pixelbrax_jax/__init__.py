@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from importlib import import_module
+from importlib import import_module, metadata
 from typing import TYPE_CHECKING, Any
 
 from pixelbrax_jax.deprecation import find_former_names
@@ -81,6 +81,8 @@ __all__ = [*_LAZY, "distractors"]
 
 
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        return metadata.version("pixelbrax")
     if name == "distractors":
         return import_module("pixelbrax_jax.distractors")
     if name not in _LAZY:
