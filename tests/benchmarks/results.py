@@ -19,7 +19,7 @@ from pixelbrax_jax.agents.runner.evaluate import interquartile_mean
 
 FOLDER = Path(__file__).parents[2] / "docs" / "results"
 PAGE = FOLDER.with_suffix(".md")
-MINUTES = (1, 3, 5, 15, 60)
+MINUTES = (1, 3, 5, 10, 60)
 WINDOW = 60.0
 """Seconds whose training episodes make one point."""
 
@@ -178,7 +178,7 @@ def plot(runs: dict[str, list[dict]], untrained: dict[str, dict], path: Path) ->
             if name not in shown:
                 continue
             color, seeds = colors[name.split("-")[0]], shown[name]
-            grid = np.arange(60.0, min(r["seconds"][-1] for r in seeds) + 1.0, 30.0)
+            grid = np.arange(40.0, min(r["seconds"][-1] for r in seeds) + 1.0, 10.0)
             lines = np.array([[return_at(run, t) for t in grid] for run in seeds])
             for line in lines:
                 axes.plot(grid / 60, line, color=color, alpha=0.3, linewidth=0.7)

@@ -97,7 +97,7 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
         "dcpg": _CI
         | {"num_policy_phases": 2, "aux_minibatches": 8, "aux_epochs": 2, "update_epochs": 2},
     },
-    # A quarter of an hour on two CPU cores; see docs/results.md.
+    # 4 to 15 minutes on two CPU cores; see docs/results.md.
     "cpu": {
         "ppo": _CPU | {"layout": "shared", "update_epochs": 2},
         "ppg": _CPU
