@@ -133,5 +133,5 @@ def test_missing_torch_names_the_cure(monkeypatch):
 
     monkeypatch.setattr(builtins, "__import__", without_torch)
     monkeypatch.delitem(sys.modules, "pixelbrax_gym.interop.dlpack", raising=False)
-    with pytest.raises(ImportError, match=r'pip install -c constraints\.txt -e "\.\[torch\]"'):
+    with pytest.raises(ImportError, match=r'pip install "pixelbrax\[torch\]"'):
         importlib.import_module("pixelbrax_gym.interop.dlpack")

@@ -586,5 +586,5 @@ def test_missing_torchrl_names_the_cure(monkeypatch, package):
 
     monkeypatch.setattr(builtins, "__import__", without)
     monkeypatch.delitem(sys.modules, "pixelbrax_gym.torchrl.env", raising=False)
-    with pytest.raises(ImportError, match=r'pip install -c constraints\.txt -e "\.\[torch(rl)?\]"'):
+    with pytest.raises(ImportError, match=r'pip install "pixelbrax\[torch(rl)?\]"'):
         importlib.import_module("pixelbrax_gym.torchrl.env")
