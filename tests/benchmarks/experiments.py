@@ -1,6 +1,6 @@
 """Trains the agents of docs/results.md, one run after the other, at the lowest priority.
 
-    python -m tests.benchmarks.experiments                         what is missing; half a day
+    python -m tests.benchmarks.experiments                         what is missing; hours
     python -m tests.benchmarks.experiments --only ppo-walker2d     those with this in their names
     python -m tests.benchmarks.experiments --minutes 90            stops in time
     python -m tests.benchmarks.experiments --list                  the commands
