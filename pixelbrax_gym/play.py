@@ -20,8 +20,6 @@ from pixelbrax_jax.policy import load_policy
 from pixelbrax_jax.validation import check_positive_int
 from pixelbrax_jax.video import write_frames
 
-POLICIES = ("random", "zero", "pretrained")
-
 ENV_OPTIONS = ("backend", "camera", "look", "shadows", "distractors", "clips", "split")
 """Options of an environment that the command takes; one that is not given stays as it is."""
 

@@ -12,7 +12,7 @@ import pytest
 
 from pixelbrax_gym import doctor
 from pixelbrax_gym.gymnasium import window
-from pixelbrax_jax import load_clips
+from pixelbrax_jax import cli, load_clips
 from pixelbrax_jax.distractors import clips
 from pixelbrax_jax.extras import install_extra
 from pixelbrax_jax.video import write_frames
@@ -78,3 +78,10 @@ def test_a_video_needs_an_extra(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "imageio.v2", None)
     with pytest.raises(ImportError, match=r"needs imageio; try: .*\[video\]"):
         write_frames(tmp_path / "a.gif", [], 20)
+
+
+@pytest.mark.parametrize("command", ["record", "evaluate_command"])
+def test_trained_agents_need_an_extra(monkeypatch, capsys, command):
+    monkeypatch.setitem(sys.modules, f"pixelbrax_jax.agents.runner.{command}", None)
+    assert cli.main([command.partition("_")[0], "nowhere"]) == 1
+    assert '"pixelbrax[train]"' in capsys.readouterr().err

@@ -63,14 +63,19 @@ def test_options_change_a_preset():
     assert options.output_dir == "runs/ppg"
 
 
-@pytest.mark.parametrize("name", experiments() | gpu_experiments())
+RUNS = experiments() | gpu_experiments()
+
+
+@pytest.mark.parametrize("name", RUNS)
 def test_the_runs_of_the_results_are_valid(name):
-    _, algorithm, *line = (experiments() | gpu_experiments())[name]
+    _, algorithm, *line = RUNS[name]
     name_of_preset = "default"
     if "--preset" in line:
         _, name_of_preset, *line = line
     config, _ = parse(algorithm, name_of_preset, line)
     assert name.startswith(f"{algorithm}-{config.task}-")
+    if name in gpu_experiments():
+        assert config.total_steps >= 25_000_000
     # The largest buffer, that of PPG and DCPG, in bytes.
     frames = config.num_envs * (config.num_steps + 2) * config.height * config.width * 3
     assert frames * getattr(config, "num_policy_phases", 0) < 25e9
