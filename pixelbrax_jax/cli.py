@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import os
 import signal
-import subprocess
 import sys
 from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
-from importlib.util import find_spec
-from pathlib import Path
 from typing import Any
 
 from pixelbrax_jax.extras import install_extra
@@ -44,8 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     commands.add_parser("train", help="train an agent: train ppo --help", add_help=False)
     _add_evaluate(commands)
     _add_record(commands)
-    # Its options are those of the benchmark, which is not part of the package.
-    commands.add_parser("bench", help="measure throughput: bench --help", add_help=False)
+    commands.add_parser("bench", help="measure this machine: bench --help", add_help=False)
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     if arguments[:1] == ["train"]:
         return _train(arguments[1:])
@@ -230,22 +225,9 @@ def _record(options: argparse.Namespace) -> int:
 
 
 def _bench(arguments: list[str]) -> int:
-    root = Path(__file__).parents[1]
-    if not (root / "tests" / "benchmarks" / "run.py").exists():
-        sys.stderr.write(
-            "pixelbrax bench: the benchmark comes with the repository, not with the package; clone "
-            "it and run: make bench\n"
-        )
-        return 1
-    if not all(map(find_spec, ("matplotlib", "tqdm", "stable_baselines3", "torchrl"))):
-        sys.stderr.write(f"pixelbrax bench: it needs more packages; try: {install_extra('all')}\n")
-        return 1
-    path = os.pathsep.join(filter(None, (str(root), os.environ.get("PYTHONPATH"))))
-    command = [sys.executable, "-m", "tests.benchmarks.run", *arguments]
-    with subprocess.Popen(command, env=os.environ | {"PYTHONPATH": path}) as process:
-        # Left behind, it would go on and disturb, and overwrite, the next one's measurements.
-        signal.signal(signal.SIGTERM, lambda *_: process.terminate())
-        return process.wait()
+    from pixelbrax_gym.bench.command import main as bench
+
+    return bench(arguments)
 
 
 def _version() -> str:

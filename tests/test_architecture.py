@@ -63,6 +63,7 @@ HOMES: dict[str, tuple[str, ...]] = {
         "pixelbrax_gym/doctor.py",
         "pixelbrax_gym/policy.py",
         "pixelbrax_gym/torchrl/",
+        "pixelbrax_gym/bench/adapters.py",
     ),
     "torchrl": ("pixelbrax_gym/torchrl/",),
     "tensordict": ("pixelbrax_gym/torchrl/",),

@@ -2,17 +2,24 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import psutil
 import pytest
 
-from tests.benchmarks import cases, run
-from tests.benchmarks.cases import GROUPS, Case
+from pixelbrax_gym.bench import adapters, cases, command, report, runner
+from pixelbrax_gym.bench.case import AbsentError, Case
+from tests.benchmarks import cases as all_cases
+from tests.benchmarks import run
+from tests.benchmarks.cases import GROUPS
 from tests.benchmarks.peers import install
+
+ROOT = Path(__file__).parents[1]
 
 MACHINE = {
     "platform": "cpu",
@@ -45,11 +52,11 @@ ANSWERS = {
     "throughput.renderer": RENDERER,
     "throughput.scan": STEPS,
     "throughput.gymnasium": STEPS,
-    "throughput.sharded": STEPS,
+    "scaling.stepping": STEPS,
     "scaling.training": STEPS,
-    "interleaved.batches": [{"num_envs": 10, **TURN}],
-    "interleaved.adapters": [{"adapter": "JAX loop", "autoreset_mode": "next_step", **TURN}],
-    "interleaved.distractors": [{"distractors": "camera", **TURN}],
+    "batches.compare": [{"num_envs": 10, **TURN}],
+    "adapters.compare": [{"adapter": "JAX loop", "autoreset_mode": "next_step", **TURN}],
+    "distractors.compare": [{"distractors": "camera", **TURN}],
     "bank.load": {"frames": 4200, "file_bytes": 2e8, "bank_bytes": 1e8, "seconds": {"read": 9.0}},
     "startup.first_frame": {"seconds": {"import": 1.0, "make": 2.0}},
     "scene.describe": {},
@@ -64,21 +71,26 @@ ANSWERS = {
 }
 
 
+MODULES = re.compile(r"^(pixelbrax_gym\.bench|tests\.benchmarks)\.")
+
+
 @pytest.fixture
 def workers(monkeypatch):
     """Stands in for processes: records what is asked of them, answers or raises."""
     asked, answers = [], {}
 
-    def worker(measure, arguments, python, timeout):
+    def process(asked_for, environ, timeout):
+        *_, what, arguments = asked_for
+        measure = f"peers.{Path(what).stem}" if what.endswith(".py") else MODULES.sub("", what)
         if measure == "machine.describe":
             return {"values": MACHINE}
-        asked.append((measure, arguments, python))
+        asked.append((measure, arguments, asked_for[0]))
         answer = answers.get(measure, ANSWERS[measure])
         if isinstance(answer, Exception):
             raise answer
         return {"values": answer, "peak_bytes": {"host": 10**9, "device": None}}
 
-    monkeypatch.setattr(run, "worker", worker)
+    monkeypatch.setattr(runner, "process", process)
     return asked, answers
 
 
@@ -87,22 +99,27 @@ def outcomes(folder):
     return [case["status"] for case in results.values()]
 
 
+def page_of(folder):
+    """The page, with tables' padding taken away."""
+    return re.sub(" +", " ", (folder / "cpu.md").read_text())
+
+
 def test_what_has_been_measured_is_not_measured_again(workers, tmp_path):
     asked, _ = workers
     command = ["--only", "renderer", "--output-dir", str(tmp_path)]
     assert run.main(command) == 0
     count = len(asked)
-    assert count == len(list(GROUPS["renderer"]()))
+    assert count == len(list(GROUPS["renderer"].cases()))
     assert run.main(command) == 0
     assert len(asked) == count
     assert run.main([*command, "--again"]) == 0
     assert len(asked) == 2 * count
-    assert "| default | 256 |" in (tmp_path / "cpu.md").read_text()
+    assert "| default | 256 |" in page_of(tmp_path)
 
 
-def test_a_run_that_is_killed_goes_on_where_it_stopped(workers, tmp_path, monkeypatch):
+def test_a_run_that_is_stopped_goes_on_where_it_was(workers, tmp_path, monkeypatch, capsys):
     asked, _ = workers
-    measure = run.measure
+    measure = runner.measure
 
     def killed_at_the_third(case, timeout):
         if len(asked) == 2:
@@ -110,14 +127,14 @@ def test_a_run_that_is_killed_goes_on_where_it_stopped(workers, tmp_path, monkey
         return measure(case, timeout)
 
     command = ["--only", "renderer", "--output-dir", str(tmp_path)]
-    monkeypatch.setattr(run, "measure", killed_at_the_third)
-    with pytest.raises(KeyboardInterrupt):
-        run.main(command)
+    monkeypatch.setattr(runner, "measure", killed_at_the_third)
+    assert run.main(command) == 130
+    assert "goes on from here" in capsys.readouterr().err
     assert outcomes(tmp_path) == ["ok", "ok"]
-    monkeypatch.setattr(run, "measure", measure)
+    monkeypatch.setattr(runner, "measure", measure)
     assert run.main(command) == 0
-    assert len(asked) == len(list(GROUPS["renderer"]()))
-    assert len({json.dumps(arguments) for _, arguments, _ in asked}) == len(asked)
+    assert len(asked) == len(list(GROUPS["renderer"].cases()))
+    assert len({arguments for _, arguments, _ in asked}) == len(asked)
 
 
 def test_another_machine_s_figures_are_not_taken_for_this_one_s(workers, tmp_path, monkeypatch):
@@ -150,7 +167,7 @@ def test_processors_of_one_name_but_other_vectors_have_files_of_their_own(
         "cpu.json",
     }
     assert "a processor with AVX-512," in (tmp_path / "cpu-avx512.md").read_text()
-    assert "a processor, 2 cores" in (tmp_path / "cpu.md").read_text()
+    assert "a processor, 2 cores" in page_of(tmp_path)
 
 
 def test_vectors_of_a_gpu_s_host_do_not_matter(workers, tmp_path, monkeypatch):
@@ -169,13 +186,13 @@ def test_results_from_before_vectors_were_noted_are_shown(workers, tmp_path, mon
     (tmp_path / "cpu.json").write_text(json.dumps(kept))
     monkeypatch.setitem(MACHINE, "processor", "another processor")
     assert run.main([*command, "--only", "devices"]) == 0
-    assert "a processor, 2 cores" in (tmp_path / "cpu.md").read_text()
+    assert "a processor, 2 cores" in page_of(tmp_path)
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals are those of POSIX")
 def test_a_benchmark_that_is_stopped_leaves_no_process_behind(tmp_path):
     command = [sys.executable, "-m", "pixelbrax_jax.cli", "bench", "--output-dir", str(tmp_path)]
-    stopped = subprocess.Popen(command, cwd=run.ROOT)
+    stopped = subprocess.Popen(command, cwd=ROOT)
     parent = psutil.Process(stopped.pid)
     while not (left := parent.children(recursive=True)):
         assert stopped.poll() is None
@@ -187,10 +204,10 @@ def test_a_benchmark_that_is_stopped_leaves_no_process_behind(tmp_path):
     assert not psutil.wait_procs(left, timeout=30.0)[1]
 
 
-def test_a_file_of_another_kind_is_not_touched(workers, tmp_path):
+def test_a_file_of_another_kind_is_not_touched(workers, tmp_path, capsys):
     (tmp_path / "cpu.json").write_text('{"environment": []}')
-    with pytest.raises(ValueError, match="not a result of this benchmark"):
-        run.main(["--only", "renderer", "--output-dir", str(tmp_path)])
+    assert run.main(["--only", "renderer", "--output-dir", str(tmp_path)]) == 1
+    assert "not a result of this benchmark" in capsys.readouterr().err
     assert (tmp_path / "cpu.json").read_text() == '{"environment": []}'
 
 
@@ -201,14 +218,14 @@ def test_a_misspelt_task_is_refused(workers, capsys):
 
 
 def test_the_page_has_every_table_and_right_ratios(workers, tmp_path, monkeypatch):
-    monkeypatch.setattr(run, "peer_python", lambda peer: "python")
+    monkeypatch.setattr(all_cases, "peer_python", lambda peer: "python")
     assert run.main(["--peers", "--output-dir", str(tmp_path)]) == 0
-    page = (tmp_path / "cpu.md").read_text()
+    page = page_of(tmp_path)
     for group in GROUPS:
         assert f"## {group.capitalize()}\n" in page, group
     assert "## Not measured" not in page
     # 500 steps/s of ours over 4 of DM Control's, 12.6 of the original, 800 frames/s over 100.
-    assert "| DM Control quadruped, alone | 2 |  | 4.00 | 125 | a software one |" in page
+    assert "| DM Control quadruped, alone | 2 | | 4.00 | 125 | a software one |" in page
     assert "| HalfCheetah | 4 | 500 | 12.6 | 39.7 |" in page
     assert "| 84 | 256 | 800 | 100 | 8.00 |" in page
     assert "gymnasium 3, mujoco 1, mujoco 2." in page
@@ -223,7 +240,7 @@ def test_too_little_memory_is_recorded_and_the_rest_goes_on(workers, tmp_path):
     assert run.main(["--only", "renderer", "--output-dir", str(tmp_path)]) == 0
     assert set(outcomes(tmp_path)) == {"out of memory"}
     assert len(outcomes(tmp_path)) == len(asked) > 1
-    assert "RESOURCE_EXHAUSTED: 9 GB" in (tmp_path / "cpu.md").read_text()
+    assert "RESOURCE_EXHAUSTED: 9 GB" in page_of(tmp_path)
 
 
 def test_a_failure_is_recorded_and_told(workers, tmp_path):
@@ -241,11 +258,8 @@ def test_a_peer_that_cannot_be_installed_is_absent_and_not_zero(workers, tmp_pat
     statuses = outcomes(tmp_path)
     install._install.cache_clear()
     assert {"ok", "absent"} == set(statuses)
-    assert (
-        "| DM Control quadruped, alone | 1 |  | absent | - |  |"
-        in (tmp_path / "cpu.md").read_text()
-    )
-    page = (tmp_path / "cpu.md").read_text()
+    assert "| DM Control quadruped, alone | 1 | | absent | - | |" in page_of(tmp_path)
+    page = page_of(tmp_path)
     assert "absent" in page
     assert "cannot be installed" in page
     assert "| 0 |" not in page
@@ -264,20 +278,17 @@ jax.jit(f)(1.0)
     [
         ("raise MemoryError('no room')", MemoryError, "no room"),
         (JAX_ERROR, MemoryError, "no room for 9 GB"),
-        ("import os, signal; os.kill(os.getpid(), signal.SIGKILL)", run.KilledError, "killed"),
+        ("import os, signal; os.kill(os.getpid(), signal.SIGKILL)", runner.KilledError, "killed"),
         ("raise ValueError('wrong')", RuntimeError, "ValueError: wrong"),
-        ("import sys; sys.stderr.write('no OpenGL'); sys.exit(3)", run.AbsentError, "no OpenGL"),
+        ("import sys; sys.stderr.write('no OpenGL'); sys.exit(3)", AbsentError, "no OpenGL"),
         ("print('no result')", RuntimeError, "no result"),
     ],
     ids=["memory", "JAX's memory", "killed", "error", "absent", "no result"],
 )
 def test_how_a_process_ends_is_understood(tmp_path, script, error, why):
     (tmp_path / "script.py").write_text(script)
-    python = tmp_path / "python"
-    python.write_text(f"#!/bin/sh\nexec {sys.executable} {tmp_path}/script.py\n")
-    python.chmod(0o755)
     with pytest.raises(error, match=why):
-        run.worker("throughput.scan", {}, str(python), 60.0)
+        runner.process([sys.executable, str(tmp_path / "script.py")], {}, 60.0)
 
 
 def test_what_takes_too_long_leaves_no_process(tmp_path):
@@ -285,7 +296,7 @@ def test_what_takes_too_long_leaves_no_process(tmp_path):
     python.write_text(f"#!/bin/sh\nsleep 300 & echo $! > {tmp_path}/child\nwait\n")
     python.chmod(0o755)
     with pytest.raises(subprocess.TimeoutExpired):
-        run.worker("throughput.scan", {}, str(python), 1.0)
+        runner.process([str(python)], {}, 1.0)
     child = int((tmp_path / "child").read_text())
     for _ in range(100):
         state = Path(f"/proc/{child}/stat")
@@ -297,7 +308,7 @@ def test_what_takes_too_long_leaves_no_process(tmp_path):
 
 def test_a_real_case_runs_in_a_process_of_its_own():
     arguments = {"task": "inverted_pendulum", "num_envs": 2, "size": 16}
-    outcome = run.measure(Case("renderer", "throughput.renderer", arguments), 300.0)
+    outcome = runner.measure(Case("renderer", "throughput.renderer", arguments), 300.0)
     assert outcome["status"] == "ok", outcome
     assert outcome["values"]["frames_per_second"] > 0
     assert outcome["peak_bytes"]["host"] > 1e8
@@ -310,9 +321,9 @@ def test_a_real_case_runs_in_a_process_of_its_own():
     [
         ("throughput.gymnasium", WALKERS),
         ("throughput.scan", WALKERS),
-        ("interleaved.batches", {"task": "walker2d", "sizes": (2, 1), "seconds": 1.0}),
-        ("interleaved.adapters", {**WALKERS, "seconds": 1.0}),
-        ("interleaved.distractors", {**WALKERS, "seconds": 1.0}),
+        ("batches.compare", {"task": "walker2d", "sizes": (2, 1), "seconds": 1.0}),
+        ("adapters.compare", {**WALKERS, "seconds": 1.0}),
+        ("distractors.compare", {**WALKERS, "seconds": 1.0}),
         ("bank.load", {"size": 16, "frames": 2}),
         (
             "scaling.training",
@@ -321,12 +332,14 @@ def test_a_real_case_runs_in_a_process_of_its_own():
     ],
 )
 def test_more_real_cases_run(measure, options):
-    outcome = run.measure(Case("adapters", measure, options), 900.0)
+    ours = measure.split(".")[0] in ("throughput", "adapters", "distractors")
+    package = "pixelbrax_gym.bench" if ours else "tests.benchmarks"
+    outcome = runner.measure(Case("adapters", measure, options, package), 900.0)
     assert outcome["status"] == "ok", outcome
 
 
 def test_cases_have_names_of_their_own():
-    keys = [case.key for group in GROUPS.values() for case in group()]
+    keys = [case.key for group in GROUPS.values() for case in group.cases()]
     assert len(set(keys)) == len(keys)
     asked = {
         (case.arguments["task"], case.arguments["num_envs"])
@@ -334,3 +347,55 @@ def test_cases_have_names_of_their_own():
         if case.arguments.get("obs_mode") == "pixels"
     }
     assert asked == {(task, n) for task in cases.TASKS for n in (1, 10, 100, 1000, 4096, 8192)}
+
+
+def test_the_command_measures_this_machine_and_shows_the_page(workers, tmp_path, capsys):
+    asked, _ = workers
+    assert command.main(["--output-dir", str(tmp_path)]) == 0
+    assert {measure.split(".")[0] for measure, _, _ in asked} == {"throughput", "adapters"}
+    shown = capsys.readouterr().out
+    assert (tmp_path / "cpu.md").read_text() in shown
+    assert str(tmp_path / "cpu.png") in shown
+    count = len(asked)
+    assert command.main(["--output-dir", str(tmp_path)]) == 0
+    assert len(asked) == count
+    assert command.main(["--full", "--only", "distractors", "--output-dir", str(tmp_path)]) == 0
+    assert len(asked) == count + len(list(cases.distractors()))
+
+
+def test_without_matplotlib_the_command_says_how_to_get_a_plot(
+    workers, tmp_path, capsys, monkeypatch
+):
+    for module in (command, report):
+        monkeypatch.setattr(module, "find_spec", lambda name: None)
+    assert command.main(["--output-dir", str(tmp_path)]) == 0
+    assert 'pip install "pixelbrax[demo]"' in capsys.readouterr().out
+    assert not (tmp_path / "cpu.png").exists()
+
+
+def test_a_part_that_only_the_full_benchmark_has_is_named(workers, capsys):
+    with pytest.raises(SystemExit):
+        command.main(["--only", "distractors"])
+    assert "--full" in capsys.readouterr().err
+
+
+def test_options_that_leave_nothing_are_told(workers, capsys):
+    assert command.main(["--task", "walker2d"]) == 1
+    assert "no case fits" in capsys.readouterr().err
+
+
+def test_adapters_that_are_not_installed_are_left_out(monkeypatch):
+    made = []
+    monkeypatch.setattr(adapters, "find_spec", lambda name: None)
+    monkeypatch.setattr(adapters.pb, "make", lambda task: [SimpleNamespace(action_size=1)])
+    for name in ("scan", "_gymnasium"):
+        monkeypatch.setattr(adapters, name, lambda *given: made.append(given) or (lambda: None))
+    loops = {("JAX loop", "next_step"): lambda: None}
+    monkeypatch.setattr(adapters, "_jax_loops", lambda *given: loops)
+    found = adapters.compare("ant", 64, seconds=0.0)
+    assert [row["adapter"] for row in found] == [
+        "JAX scan",
+        "JAX loop",
+        "Gymnasium, jax",
+        "Gymnasium, numpy",
+    ]

@@ -1,108 +1,49 @@
-"""What is measured: cases as data."""
+"""What is measured besides ``pixelbrax bench --full``: others, several devices, start-up."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
 
-TASKS = {
-    "halfcheetah": "HalfCheetah",
-    "walker2d": "Walker2d",
-    "ant": "Ant",
-    "humanoid": "Humanoid",
-}
-"""Task -> its name in Gymnasium."""
+from pixelbrax_gym.bench import runner
+from pixelbrax_gym.bench.case import Case, Group
+from pixelbrax_gym.bench.cases import FULL, TASKS
+from pixelbrax_gym.bench.machine import num_cores
+from pixelbrax_gym.bench.plot import DM_CONTROL
+from pixelbrax_gym.bench.tables import interleaved
+from tests.benchmarks import tables
+from tests.benchmarks.original import ORIGINAL
+from tests.benchmarks.peers.install import peer_python
 
-DM_CONTROL = {
-    "halfcheetah": "cheetah",
-    "walker2d": "walker",
-    "ant": "quadruped",
-    "humanoid": "humanoid",
-}
-"""Task -> DM Control's domain of the same class."""
-
-BATCHES = (1, 10, 100, 1000, 4096, 8192)
-
-ORIGINAL = (
-    ("halfcheetah", 4, 12.6),
-    ("halfcheetah", 32, 8.7),
-    ("ant", 4, 4.3),
-    ("humanoid", 4, 4.4),
-    ("walker2d", 4, 13.5),
-)
-"""Task, environments and steps per second of the original (the code of arXiv 2502.00021)
-on two cores of an AMD EPYC machine whose vectors were not noted; measured once, apart."""
-
-PEERS: dict[str, tuple[str, ...]] = {
-    "dm_control": (
-        "dm_control==1.0.50",
-        "mujoco==3.17.0",
-        "gymnasium==1.4.0",
-        "stable-baselines3==2.9.2",
-        "torch==2.13.0",
-    ),
-    "mujoco_warp": ("mujoco-warp==4.0.0", "warp-lang==1.19.0", "mujoco==4.0.0"),
-    "gymnasium": ("gymnasium[mujoco]==1.4.0", "mujoco==3.17.0", "pyopengl"),
-    "envpool": ("envpool==1.2.5",),
-}
-"""Peer -> what is installed for it, into an environment of its own."""
-
-
-ABSENT = 3
-"""Exit status of a worker that lacks what it is to measure."""
+HERE = "tests.benchmarks"
 
 
 @dataclass(frozen=True)
-class Case:
-    """One measurement, made in a process of its own.
+class PeerCase(Case):
+    """A script that measures another simulator, in an environment of that one's own.
 
     Attributes:
-        group: the part of the benchmark that it belongs to; see ``GROUPS``.
-        measure: ``module.function`` of this package, or ``peers.<name>`` for a script.
-        arguments: of that function.
-        peer: the peer in whose environment it runs; empty for ours.
+        peer: its name in ``peers.install.PEERS``.
     """
 
-    group: str
-    measure: str
-    arguments: Mapping[str, Any] = field(default_factory=dict)
     peer: str = ""
 
-    @property
-    def key(self) -> str:
-        """Names the case in the results."""
-        arguments = json.dumps(dict(self.arguments), sort_keys=True)
-        return f"{self.group} {self.measure} {arguments}"
-
-
-def renderers() -> Iterator[Case]:
-    """The ray-caster alone: its looks, and the size of the image."""
-    for options in (
-        {},
-        {"look": "original"},
-        {"shadows": True},
-        {"size": 64},
-        {"renderer": "reference", "num_envs": 8},
-    ):
-        yield Case("renderer", "throughput.renderer", {"task": "ant", "num_envs": 256, **options})
-
-
-def environments() -> Iterator[Case]:
-    """State only, rendering only and pixels, over the number of environments."""
-    for task in TASKS:
-        for num_envs in BATCHES:
-            where = {"task": task, "num_envs": num_envs}
-            yield Case("environments", "throughput.scan", {**where, "obs_mode": "state"})
-            yield Case("environments", "throughput.renderer", where)
-            yield Case("environments", "throughput.scan", {**where, "obs_mode": "pixels"})
+    def command(self) -> list[str]:
+        python = peer_python(self.peer)
+        arguments = {**self.arguments, "cores": num_cores()}
+        if self.peer == "mujoco_warp":
+            describe = Case("scene", "scene.describe", {"task": arguments["task"]}, HERE)
+            arguments["scene"] = runner.process(describe.command(), {}, 300.0)["values"]
+        script = Path(__file__).parent / f"{self.measure.replace('.', '/')}.py"
+        return [python, str(script), json.dumps(arguments)]
 
 
 def batches() -> Iterator[Case]:
     """Pixels over the number of environments, interleaved."""
     for task in TASKS:
-        yield Case("batches", "interleaved.batches", {"task": task, "sizes": (100, 10, 1000)})
+        yield Case("batches", "batches.compare", {"task": task, "sizes": (100, 10, 1000)}, HERE)
 
 
 def sizes() -> Iterator[Case]:
@@ -120,37 +61,25 @@ def original() -> Iterator[Case]:
         yield Case("original", "throughput.scan", {"task": task, "num_envs": num_envs})
 
 
-def distractors() -> Iterator[Case]:
-    """Pixels with each distractor, interleaved."""
-    for task, num_envs in [("ant", 256), ("ant", 1024), *((task, 1000) for task in TASKS)]:
-        yield Case("distractors", "interleaved.distractors", {"task": task, "num_envs": num_envs})
-
-
 def clips() -> Iterator[Case]:
     """From a folder of images to the device."""
-    yield Case("clips", "bank.load", {"size": 84})
-
-
-def adapters() -> Iterator[Case]:
-    """Every adapter, interleaved."""
-    for task, num_envs in [("ant", 256), ("ant", 1), *((task, 1000) for task in TASKS)]:
-        yield Case("adapters", "interleaved.adapters", {"task": task, "num_envs": num_envs})
+    yield Case("clips", "bank.load", {"size": 84}, HERE)
 
 
 def startup() -> Iterator[Case]:
     """From the import to the first frames."""
     for cache in ("none", "cold", "warm"):
-        yield Case("startup", "startup.first_frame", {"task": "ant", "cache": cache})
+        yield Case("startup", "startup.first_frame", {"task": "ant", "cache": cache}, HERE)
 
 
 def devices() -> Iterator[Case]:
     """One device and eight, with as many environments in all, and with as many on each."""
     for num_devices, num_envs in ((1, 64), (8, 64), (8, 512)):
         where = {"task": "ant", "num_devices": num_devices, "num_envs": num_envs}
-        yield Case("devices", "throughput.sharded", where)
+        yield Case("devices", "scaling.stepping", where, HERE)
     for num_devices, cores, num_envs in ((1, 1, 64), (2, 2, 128), (1, 2, 128), (4, 2, 128)):
         where = {"num_devices": num_devices, "cores": cores, "num_envs": num_envs}
-        yield Case("devices", "scaling.training", {"task": "inverted_pendulum", **where})
+        yield Case("devices", "scaling.training", {"task": "inverted_pendulum", **where}, HERE)
 
 
 def peers() -> Iterator[Case]:
@@ -160,26 +89,60 @@ def peers() -> Iterator[Case]:
             yield Case("peers", "throughput.gymnasium", {"task": task, "num_envs": num_envs})
         for processes in (0, "cores", 32):
             where = {"task": task, "domain": DM_CONTROL[task], "processes": processes}
-            yield Case("peers", "peers.dm_control_envs", where, "dm_control")
-        yield Case("peers", "peers.gymnasium_envs", {"task": task}, "gymnasium")
-        yield Case("peers", "peers.envpool_envs", {"task": task}, "envpool")
+            yield PeerCase("peers", "peers.dm_control_envs", where, peer="dm_control")
+        yield PeerCase("peers", "peers.gymnasium_envs", {"task": task}, peer="gymnasium")
+        yield PeerCase("peers", "peers.envpool_envs", {"task": task}, peer="envpool")
     for size, num_envs in ((84, 256), (84, 1024), (64, 1024), (64, 8192)):
         where = {"task": "ant", "num_envs": num_envs, "size": size}
         yield Case("peers", "throughput.renderer", where)
-        yield Case("peers", "peers.mujoco_warp_renderer", where, "mujoco_warp")
+        yield PeerCase("peers", "peers.mujoco_warp_renderer", where, peer="mujoco_warp")
 
 
 GROUPS = {
-    "renderer": renderers,
-    "startup": startup,
-    "adapters": adapters,
-    "distractors": distractors,
-    "clips": clips,
-    "original": original,
-    "peers": peers,
-    "devices": devices,
-    "batches": batches,
-    "sizes": sizes,
-    "environments": environments,
+    "renderer": FULL["renderer"],
+    "startup": Group(
+        startup,
+        tables.startup,
+        "16 environments behind Gymnasium; one sample each. `gymnasium` and PixelBrax are imported "
+        "first, JAX and Brax when the environment is made.",
+    ),
+    "adapters": FULL["adapters"],
+    "distractors": FULL["distractors"],
+    "clips": Group(
+        clips,
+        tables.clips,
+        "Images of 854 x 480, as many as the training split of DAVIS-2017 has at most, just "
+        "written and so still in memory; one sample each.",
+    ),
+    "original": Group(
+        original,
+        tables.original,
+        "A compiled loop of ours in the settings in which the speed of the original is known; "
+        "that was measured apart, on two cores of an AMD EPYC whose vectors were not noted.",
+    ),
+    "peers": Group(
+        peers,
+        tables.peers,
+        "All hand NumPy arrays to Python. Tasks are of the same class, not the same: bodies, "
+        "control steps and simulators differ. OpenGL peers draw textures and shadows, which we do "
+        "not, and would be faster with a GPU; this compares what a machine without one can do. "
+        "MuJoCo Warp draws the same model in the same pose from our camera, without textures and "
+        "shadows.",
+    ),
+    "devices": Group(
+        devices,
+        tables.devices,
+        "Emulated devices share the cores of the machine: the first table shows what is where, "
+        "and no speed. Ideal is the speed of one device on one core times the number of cores.",
+    ),
+    "batches": Group(
+        batches,
+        interleaved("num_envs"),
+        "A compiled loop over steps. Ratios are to the first line of a task: medians over rounds, "
+        "in which all take a turn of 16,000 environment steps in one process, with bootstrap "
+        "intervals of 95 %.",
+    ),
+    "sizes": Group(sizes, tables.sizes, "Observations of 64 x 64."),
+    "environments": FULL["environments"],
 }
-"""Parts of the benchmark, in the order in which they are measured."""
+"""Parts of the whole benchmark, in the order in which they are measured."""

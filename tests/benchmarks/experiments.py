@@ -27,11 +27,11 @@ from importlib.metadata import version
 from pathlib import Path
 
 import pixelbrax_jax
+from pixelbrax_gym.bench.machine import describe_cpu
 from pixelbrax_jax.agents.algorithms.presets import preset
 from pixelbrax_jax.agents.algorithms.registry import ALGORITHMS
 from pixelbrax_jax.agents.runner.checkpoint import read_about
 from pixelbrax_jax.agents.runner.metrics import read_metrics
-from tests.benchmarks.machine import describe_cpu
 
 KEPT = Path(__file__).parents[2] / "docs" / "results" / "runs"
 PRETRAINED = Path(pixelbrax_jax.__file__).parent / "pretrained"

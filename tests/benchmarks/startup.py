@@ -10,6 +10,8 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from pixelbrax_jax.tasks import TASKS
+
 SCRIPT = """
 import json, time
 marks = {}
@@ -23,13 +25,13 @@ def mark(name):
 import gymnasium
 import pixelbrax_gym
 mark("import")
-envs = gymnasium.make_vec("PixelBrax/TASK-v0", num_envs=16)
+envs = gymnasium.make_vec("TASK", num_envs=16)
 mark("make")
 envs.reset(seed=0)
 mark("first reset")
 envs.step(envs.action_space.sample())
 mark("first step")
-again = gymnasium.make_vec("PixelBrax/TASK-v0", num_envs=16)
+again = gymnasium.make_vec("TASK", num_envs=16)
 again.reset(seed=0)
 again.step(again.action_space.sample())
 mark("make, reset and step once more")
@@ -48,8 +50,6 @@ def first_frame(task: str, cache: str) -> dict[str, Any]:
         cache: JAX's persistent compilation cache: ``"none"``, ``"cold"`` (empty at the start)
             or ``"warm"`` (filled by an earlier process).
     """
-    from tests.benchmarks.cases import TASKS
-
     with tempfile.TemporaryDirectory() as folder:
         ours = ("JAX_COMPILATION", "JAX_ENABLE_COMPILATION")
         environ = {k: v for k, v in os.environ.items() if not k.startswith(ours)}
@@ -58,7 +58,7 @@ def first_frame(task: str, cache: str) -> dict[str, Any]:
             environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.3"
         for _ in range(2 if cache == "warm" else 1):
             done = subprocess.run(
-                [sys.executable, "-c", SCRIPT.replace("TASK", TASKS[task])],
+                [sys.executable, "-c", SCRIPT.replace("TASK", TASKS[task].gymnasium_id)],
                 env=environ,
                 capture_output=True,
                 text=True,

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import pytest
 
 import pixelbrax_jax as pb
-from tests.benchmarks.throughput import operations
+from pixelbrax_gym.bench.throughput import operations
 
 NUM_ENVS, SIZE = 64, 84
 PIXELS = NUM_ENVS * SIZE * SIZE

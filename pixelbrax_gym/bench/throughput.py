@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-import time
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -12,51 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import pixelbrax_jax as pb
-from tests.benchmarks.cases import ABSENT, TASKS
-
-REPETITIONS = 5
-SECONDS = 0.5
-"""Least duration of a repetition."""
-
-
-def compiled(function: Callable, *arguments: Any, **jit_options: Any) -> tuple[Any, float]:
-    """The compiled program and the seconds it took to trace and compile."""
-    started = time.perf_counter()
-    options = pb.compiler_options()
-    program = jax.jit(function, compiler_options=options, **jit_options).lower(*arguments).compile()
-    return program, time.perf_counter() - started
-
-
-def rate(run: Callable[[int], Any], least_calls: int = 1) -> dict[str, float]:
-    """Calls per second.
-
-    Args:
-        run: does so many calls and returns something to wait for.
-        least_calls: of a repetition.
-
-    Returns:
-        Median, slowest and fastest repetition, and the calls of each.
-    """
-    calls = least_calls
-    jax.block_until_ready(run(calls))
-    while True:
-        started = time.perf_counter()
-        jax.block_until_ready(run(calls))
-        seconds = time.perf_counter() - started
-        if seconds >= SECONDS:
-            break
-        calls = max(calls + 1, int(calls * min(10.0, 1.1 * SECONDS / max(seconds, 1e-6))))
-    rates = []
-    for _ in range(REPETITIONS):
-        started = time.perf_counter()
-        jax.block_until_ready(run(calls))
-        rates.append(calls / (time.perf_counter() - started))
-    return {
-        "median": float(np.median(rates)),
-        "slowest": min(rates),
-        "fastest": max(rates),
-        "calls": calls,
-    }
+from pixelbrax_gym.bench.timing import compiled, rate
+from pixelbrax_jax.tasks import TASKS
 
 
 def renderer(
@@ -163,12 +117,10 @@ def gymnasium(task: str, num_envs: int) -> dict[str, Any]:
     """Steps per second of Gymnasium's vector environment with NumPy output, as peers have it."""
     from gymnasium import make_vec
 
-    import pixelbrax_gym  # noqa: F401  # registers the ids
-
-    envs = make_vec(f"PixelBrax/{TASKS[task]}-v0", num_envs=num_envs, output="numpy")
+    envs = make_vec(TASKS[task].gymnasium_id, num_envs=num_envs, output="numpy")
     envs.reset(seed=0)
     draw = np.random.default_rng(0)
-    shape = (num_envs, *envs.single_action_space.shape)
+    shape = envs.action_space.shape
 
     def run(calls: int) -> Any:
         for _ in range(calls):
@@ -180,36 +132,4 @@ def gymnasium(task: str, num_envs: int) -> dict[str, Any]:
         "steps_per_second": num_envs * speed["median"],
         "speed": speed,
         "control_dt": pb.make(task)[0].dt,
-    }
-
-
-def sharded(task: str, num_devices: int, num_envs: int) -> dict[str, Any]:
-    """Environments spread over devices; on a CPU these are emulated and share its cores."""
-    from pixelbrax_jax.envs.sharded import ShardedVectorEnv, make_env_mesh
-
-    if jax.device_count() < num_devices:
-        sys.stderr.write(f"there are {jax.device_count()} devices, not {num_devices}\n")
-        sys.exit(ABSENT)
-    env, params = pb.make(task)
-    venv = ShardedVectorEnv(env, num_envs, make_env_mesh(num_devices))
-    step = jax.jit(venv.step, donate_argnums=0, compiler_options=pb.compiler_options())
-    state, timestep = venv.reset(jax.random.key(0), params)
-    shape = (num_envs, env.action_size)
-    action = jax.random.uniform(jax.random.key(1), shape, minval=-1.0, maxval=1.0)
-    on_each = sum(
-        leaf.addressable_shards[0].data.nbytes for leaf in jax.tree.leaves((state, timestep))
-    )
-    carry = {"state": state}
-    del state, timestep
-
-    def run(calls: int) -> Any:
-        for _ in range(calls):
-            carry["state"], timestep = step(carry["state"], action, params)
-        return timestep
-
-    speed = rate(run)
-    return {
-        "steps_per_second": num_envs * speed["median"],
-        "speed": speed,
-        "bytes_on_a_device": on_each,
     }

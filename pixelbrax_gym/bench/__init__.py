@@ -1,0 +1,1 @@
+"""``pixelbrax bench``: how fast PixelBrax is on the user's machine."""

@@ -1,0 +1,67 @@
+"""What is measured, as data."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+ABSENT = 3
+"""Exit status of a process that lacks what it is to measure."""
+
+Row = dict[str, Any]
+"""A case's outcome as it is kept: ``group``, ``measure``, ``arguments``, ``status``, ``values``."""
+
+
+class AbsentError(Exception):
+    """What is to be measured is not here, with the reason."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One measurement, made in a process of its own.
+
+    Attributes:
+        group: the part of the benchmark that it belongs to.
+        measure: ``module.function`` of a package.
+        arguments: of that function.
+        package: the package.
+    """
+
+    group: str
+    measure: str
+    arguments: Mapping[str, Any] = field(default_factory=dict)
+    package: str = "pixelbrax_gym.bench"
+
+    @property
+    def key(self) -> str:
+        """Names the case in the results."""
+        arguments = json.dumps(dict(self.arguments), sort_keys=True)
+        return f"{self.group} {self.measure} {arguments}"
+
+    def command(self) -> list[str]:
+        """The process that measures it; its last line is the result, as JSON.
+
+        Raises:
+            AbsentError: it cannot run here.
+        """
+        function = f"{self.package}.{self.measure}"
+        arguments = json.dumps(dict(self.arguments))
+        return [sys.executable, "-m", "pixelbrax_gym.bench.worker", function, arguments]
+
+
+@dataclass(frozen=True)
+class Group:
+    """A part of the benchmark.
+
+    Attributes:
+        cases: what is measured.
+        table: the outcomes in Markdown.
+        note: what it shows and what it does not.
+    """
+
+    cases: Callable[[], Iterator[Case]]
+    table: Callable[[list[Row]], str]
+    note: str = ""

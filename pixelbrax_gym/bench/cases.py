@@ -1,0 +1,101 @@
+"""What ``pixelbrax bench`` measures: in two minutes, or in full."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from pixelbrax_gym.bench import tables
+from pixelbrax_gym.bench.case import Case, Group
+
+TASKS = ("halfcheetah", "walker2d", "ant", "humanoid")
+BATCHES = (1, 10, 100, 1000, 4096, 8192)
+
+
+def renderer() -> Iterator[Case]:
+    """The ray-caster alone, as it is used."""
+    yield Case("renderer", "throughput.renderer", {"task": "ant", "num_envs": 256})
+
+
+def renderers() -> Iterator[Case]:
+    """The ray-caster alone: its looks, and the size of the image."""
+    yield from renderer()
+    for options in (
+        {"look": "original"},
+        {"shadows": True},
+        {"size": 64},
+        {"renderer": "reference", "num_envs": 8},
+    ):
+        yield Case("renderer", "throughput.renderer", {"task": "ant", "num_envs": 256, **options})
+
+
+def few_environments() -> Iterator[Case]:
+    """One Ant and a hundred."""
+    for num_envs in (1, 100):
+        yield from _environments("ant", num_envs)
+
+
+def environments() -> Iterator[Case]:
+    """State only, rendering only and pixels, over the number of environments."""
+    for task in TASKS:
+        for num_envs in BATCHES:
+            yield from _environments(task, num_envs)
+            where = {"task": task, "num_envs": num_envs}
+            yield Case("environments", "throughput.renderer", where)
+
+
+def _environments(task: str, num_envs: int) -> Iterator[Case]:
+    for obs_mode in ("state", "pixels"):
+        where = {"task": task, "num_envs": num_envs, "obs_mode": obs_mode}
+        yield Case("environments", "throughput.scan", where)
+
+
+def adapter() -> Iterator[Case]:
+    """Every adapter that is installed, in seconds."""
+    where = {"task": "ant", "num_envs": 100, "seconds": 10.0}
+    yield Case("adapters", "adapters.compare", where)
+
+
+def adapters() -> Iterator[Case]:
+    """Every adapter that is installed."""
+    for task, num_envs in (("ant", 256), ("ant", 1), *((task, 1000) for task in TASKS)):
+        where = {"task": task, "num_envs": num_envs}
+        yield Case("adapters", "adapters.compare", where)
+
+
+def distractors() -> Iterator[Case]:
+    """Pixels with each distractor."""
+    for task, num_envs in (("ant", 256), ("ant", 1024), *((task, 1000) for task in TASKS)):
+        where = {"task": task, "num_envs": num_envs}
+        yield Case("distractors", "distractors.compare", where)
+
+
+RENDERER_NOTE = "From link poses to packed pixels, without physics."
+ADAPTERS_NOTE = (
+    "The ratio is that to the JAX loop with the same autoreset mode, which waits for each step: "
+    "medians over rounds, in which each runs 8 to 100 steps in one process, with bootstrap "
+    "intervals of 95 %."
+)
+ENVIRONMENTS_NOTE = "A compiled loop over steps; nothing leaves it."
+
+QUICK = {
+    "renderer": Group(renderer, tables.renderer, RENDERER_NOTE),
+    "environments": Group(few_environments, tables.environments, ENVIRONMENTS_NOTE),
+    "adapters": Group(adapter, tables.interleaved("adapter"), ADAPTERS_NOTE),
+}
+"""What takes two minutes on a fast machine, in the order in which it is measured."""
+
+FULL = {
+    "renderer": Group(renderers, tables.renderer, RENDERER_NOTE),
+    "adapters": Group(
+        adapters, tables.interleaved("num_envs", "autoreset_mode", "adapter"), ADAPTERS_NOTE
+    ),
+    "distractors": Group(
+        distractors,
+        tables.interleaved("num_envs", "distractors"),
+        "With a bank of 60 clips of 70 frames. Ratios are to the speed without: medians over "
+        "rounds, in which all take a turn of 1 to 100 steps in one process, with bootstrap "
+        "intervals of 95 %.",
+    ),
+    "environments": Group(environments, tables.environments, ENVIRONMENTS_NOTE),
+}
+"""What ``--full`` measures; it takes hours on a CPU."""

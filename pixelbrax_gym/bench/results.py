@@ -1,0 +1,57 @@
+"""Outcomes that outlive a run."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from pixelbrax_gym.bench.case import Case
+
+
+class Results:
+    """What has been measured, in a JSON file that is written after every case.
+
+    Args:
+        file: where it is kept; what is there stays.
+        machine: of this process, as ``machine.describe`` has it.
+
+    Raises:
+        ValueError: the file is of another kind.
+    """
+
+    def __init__(self, file: Path, machine: dict[str, Any]) -> None:
+        self.file = file
+        self.machine = hashlib.sha256(json.dumps(machine).encode()).hexdigest()[:8]
+        self.kept: dict[str, Any] = {"machines": {}, "cases": {}}
+        if file.exists():
+            kept = json.loads(file.read_text())
+            if not {"machines", "cases"} <= kept.keys():
+                raise ValueError(f"{file} is not a result of this benchmark: move it away.")
+            self.kept = kept
+        self.kept["machines"][self.machine] = machine
+
+    def has(self, case: Case) -> bool:
+        """Whether there is nothing more to learn of the case on this machine."""
+        known = self.kept["cases"].get(case.key, {})
+        learned = known.get("status") in ("ok", "out of memory")
+        return learned and known["machine"] == self.machine
+
+    def add(self, case: Case, outcome: dict[str, Any]) -> None:
+        """Keep an outcome. The file is never half written."""
+        self.kept["cases"][case.key] = {
+            "group": case.group,
+            "measure": case.measure,
+            "arguments": dict(case.arguments),
+            "machine": self.machine,
+            "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M"),
+            **outcome,
+        }
+        used = {known["machine"] for known in self.kept["cases"].values()}
+        self.kept["machines"] = {k: v for k, v in self.kept["machines"].items() if k in used}
+        self.file.parent.mkdir(parents=True, exist_ok=True)
+        part = self.file.with_suffix(".part")
+        part.write_text(json.dumps(self.kept, indent=1) + "\n")
+        part.replace(self.file)

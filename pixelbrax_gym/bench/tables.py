@@ -1,0 +1,165 @@
+"""Outcomes as tables in Markdown."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from pixelbrax_gym.bench.case import Row
+from pixelbrax_jax.tasks import TASKS
+
+
+def table(heads: Iterable[str], lines: Iterable[Iterable[Any]]) -> str:
+    """Heads and lines, in columns that are as wide as what is in them."""
+    rows = [[str(cell) for cell in row] for row in (list(heads), *lines)]
+    widths = [max(3, *map(len, column)) for column in zip(*rows, strict=True)]
+    rows.insert(1, ["-" * width for width in widths])
+    padded = (map(str.ljust, row, widths) for row in rows)
+    return "\n".join(f"| {' | '.join(row)} |" for row in padded)
+
+
+def number(value: float | None) -> str:
+    """Three significant digits, thousands apart; a hyphen for what is not known."""
+    if value is None or not math.isfinite(value):
+        return "-"
+    if value == 0:
+        return "0"
+    digits = 2 - math.floor(math.log10(abs(value)))
+    rounded = round(value, digits)
+    return f"{rounded:,.{max(0, digits)}f}"
+
+
+def title(task: str) -> str:
+    """A task's name as in its Gymnasium id."""
+    return TASKS[task].gymnasium_id.removeprefix("PixelBrax/").removesuffix("-v0")
+
+
+def succeeded(rows: list[Row]) -> list[Row]:
+    """Those that have values."""
+    return [row for row in rows if row["status"] == "ok"]
+
+
+def find(rows: list[Row], measure: str, **arguments: Any) -> Row | None:
+    """The first outcome of a measure with these arguments, and maybe others."""
+    for row in rows:
+        if row["measure"] == measure and arguments.items() <= row["arguments"].items():
+            return row
+    return None
+
+
+def value(row: Row | None, name: str) -> float | None:
+    """A value of an outcome; None if there is none."""
+    return row["values"][name] if row is not None and row["status"] == "ok" else None
+
+
+def cell(row: Row | None, name: str) -> str:
+    """A value of an outcome, or why there is none."""
+    if row is None:
+        return "not yet"
+    return number(row["values"][name]) if row["status"] == "ok" else str(row["status"])
+
+
+def ratio(above: float | None, below: float | None) -> str:
+    """A quotient; a hyphen if one of both is not known."""
+    return number(above / below) if above and below else "-"
+
+
+def renderer(rows: list[Row]) -> str:
+    """Frames per second of the ray-caster."""
+
+    def line(row: Row) -> list[str]:
+        values, options = row["values"], dict(row["arguments"])
+        num_envs = options.pop("num_envs")
+        options.pop("task")
+        return [
+            ", ".join(f"{k}={v}" for k, v in options.items()) or "default",
+            str(num_envs),
+            number(values["frames_per_second"]),
+            number(values["compile_seconds"]),
+            number(values["temporary_bytes"] / values["output_bytes"]),
+            number(values["operations_per_frame"] / 1e6),
+        ]
+
+    heads = (
+        "Ant",
+        "environments",
+        "frames/s",
+        "compilation, s",
+        "temporaries / output",
+        "million operations / frame",
+    )
+    return table(heads, map(line, succeeded(rows)))
+
+
+def environments(rows: list[Row]) -> str:
+    """Steps per second with pixels and without, over the number of environments."""
+    lines = []
+    names = {row["arguments"]["task"]: None for row in rows}
+    for task in names:
+        of_task = [row for row in rows if row["arguments"]["task"] == task]
+        for num_envs in sorted({row["arguments"]["num_envs"] for row in of_task}):
+            where = {"num_envs": num_envs}
+            state = find(of_task, "throughput.scan", **where, obs_mode="state")
+            pixels = find(of_task, "throughput.scan", **where, obs_mode="pixels")
+            frames = find(of_task, "throughput.renderer", **where)
+            speed, held = value(pixels, "steps_per_second"), value(pixels, "bytes_per_env")
+            lines.append(
+                [
+                    title(task),
+                    num_envs,
+                    cell(pixels, "steps_per_second"),
+                    cell(state, "steps_per_second"),
+                    ratio(speed, value(state, "steps_per_second")),
+                    cell(frames, "frames_per_second") if frames else "-",
+                    cell(pixels, "compile_seconds"),
+                    number(held / 1e3 if held else None),
+                    _gigabytes(pixels),
+                ]
+            )
+    heads = (
+        "task",
+        "environments",
+        "pixels, steps/s",
+        "state only",
+        "pixels / state",
+        "renderer, frames/s",
+        "compilation, s",
+        "kB / environment",
+        "peak memory, GB",
+    )
+    return table(heads, lines)
+
+
+def interleaved(*columns: str) -> Callable[[list[Row]], str]:
+    """A table of a comparison of interleaved runs.
+
+    Args:
+        columns: what tells its lines apart, by their names in the case's arguments or values.
+    """
+
+    def draw(rows: list[Row]) -> str:
+        lines = [
+            [
+                title(row["arguments"]["task"]),
+                *({**row["arguments"], **values}[column] for column in columns),
+                number(values["steps_per_second"]),
+                f"{values['ratio']:.2f}",
+                " to ".join(f"{bound:.2f}" for bound in values["interval"]),
+                values["runs"],
+            ]
+            for row in succeeded(rows)
+            for values in row["values"]
+        ]
+        names = {"num_envs": "environments", "autoreset_mode": "autoreset"}
+        heads = ("task", *(names.get(column, column) for column in columns))
+        return table((*heads, "steps/s", "ratio", "interval", "rounds"), lines)
+
+    return draw
+
+
+def _gigabytes(row: Row | None) -> str:
+    if row is None or row["status"] != "ok":
+        return "-"
+    held = row["peak_bytes"]["device"] or row["peak_bytes"]["host"]
+    return number(held / 1e9 if held else None)

@@ -1,0 +1,103 @@
+"""How time is taken: compilation apart, every result waited for."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
+
+import jax
+import numpy as np
+
+from pixelbrax_jax.compilation import compiler_options
+
+SECONDS = 90.0
+"""About how long the runs of a comparison take altogether."""
+REPETITIONS = 5
+REPETITION_SECONDS = 0.5
+"""Least duration of a repetition."""
+
+Name = TypeVar("Name")
+
+
+def compiled(function: Callable, *arguments: Any, **jit_options: Any) -> tuple[Any, float]:
+    """The compiled program and the seconds it took to trace and compile."""
+    started = time.perf_counter()
+    jitted = jax.jit(function, compiler_options=compiler_options(), **jit_options)
+    program = jitted.lower(*arguments).compile()
+    return program, time.perf_counter() - started
+
+
+def rate(run: Callable[[int], Any], least_calls: int = 1) -> dict[str, float]:
+    """Calls per second.
+
+    Args:
+        run: does so many calls and returns something to wait for.
+        least_calls: of a repetition.
+
+    Returns:
+        Median, slowest and fastest repetition, and the calls of each.
+    """
+    calls = least_calls
+    jax.block_until_ready(run(calls))
+    while True:
+        started = time.perf_counter()
+        jax.block_until_ready(run(calls))
+        seconds = time.perf_counter() - started
+        if seconds >= REPETITION_SECONDS:
+            break
+        wanted = 1.1 * REPETITION_SECONDS / max(seconds, 1e-6)
+        calls = max(calls + 1, int(calls * min(10.0, wanted)))
+    rates = []
+    for _ in range(REPETITIONS):
+        started = time.perf_counter()
+        jax.block_until_ready(run(calls))
+        rates.append(calls / (time.perf_counter() - started))
+    return {
+        "median": float(np.median(rates)),
+        "slowest": min(rates),
+        "fastest": max(rates),
+        "calls": calls,
+    }
+
+
+def take_interleaved(
+    runners: Mapping[Name, Callable[[], Any]], seconds: float = SECONDS
+) -> dict[Name, list[float]]:
+    """Seconds of each runner's runs, one in each round: at least five rounds, at most 300.
+
+    A change of the machine's mood then strikes everyone alike, so that ratios hold where speeds
+    do not. Turns are short and their order is drawn anew in each round.
+
+    Args:
+        runners: each runs, and waits for what it has done.
+        seconds: about how long all runs take altogether.
+    """
+    for run in runners.values():
+        run()
+    order = list(runners)
+    draw = np.random.default_rng(0)
+    started = time.perf_counter()
+    times: dict[Name, list[float]] = {key: [] for key in runners}
+    rounds = 0
+    while rounds < 5 or (rounds < 300 and time.perf_counter() - started < seconds):
+        rounds += 1
+        for place in draw.permutation(len(order)):
+            key = order[place]
+            began = time.perf_counter()
+            runners[key]()
+            times[key].append(time.perf_counter() - began)
+    return times
+
+
+def speed_ratio(seconds: list[float], standard: list[float]) -> dict[str, Any]:
+    """How fast a runner is beside a standard, round by round.
+
+    Returns:
+        ``ratio``, the median over the rounds, more than 1 for the faster, and ``interval``, the
+        bounds of its bootstrap interval of 95 %.
+    """
+    ratios = np.divide(standard, seconds)
+    drawn = np.random.default_rng(0).choice(ratios, (2000, len(ratios)))
+    low, high = np.quantile(np.median(drawn, axis=1), [0.025, 0.975])
+    return {"ratio": float(np.median(ratios)), "interval": [float(low), float(high)]}

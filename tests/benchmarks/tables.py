@@ -1,0 +1,164 @@
+"""Tables of what is measured besides ``pixelbrax bench``."""
+
+from __future__ import annotations
+
+from pixelbrax_gym.bench.case import Row
+from pixelbrax_gym.bench.cases import TASKS
+from pixelbrax_gym.bench.tables import cell, find, number, ratio, succeeded, table, title, value
+from tests.benchmarks.original import ORIGINAL
+
+
+def sizes(rows: list[Row]) -> str:
+    lines = []
+    for row in rows:
+        if row["measure"] == "throughput.scan":
+            frames = find(rows, "throughput.renderer", **row["arguments"])
+            lines.append(
+                [
+                    title(row["arguments"]["task"]),
+                    row["arguments"]["num_envs"],
+                    cell(row, "steps_per_second"),
+                    cell(frames, "frames_per_second"),
+                ]
+            )
+    return table(("64 x 64", "environments", "pixels, steps/s", "renderer, frames/s"), lines)
+
+
+def original(rows: list[Row]) -> str:
+    lines = []
+    for task, num_envs, theirs in ORIGINAL:
+        row = find(rows, "throughput.scan", task=task, num_envs=num_envs)
+        ours = value(row, "steps_per_second")
+        cells = (cell(row, "steps_per_second"), theirs, ratio(ours, theirs))
+        lines.append((title(task), num_envs, *cells))
+    return table(("task", "environments", "steps/s", "original", "ratio"), lines)
+
+
+def startup(rows: list[Row]) -> str:
+    rows = succeeded(rows)
+    stages = list(rows[0]["values"]["seconds"]) if rows else []
+    lines = [
+        [row["arguments"]["cache"], *(f"{row['values']['seconds'][s]:.1f}" for s in stages)]
+        for row in rows
+    ]
+    return table(("compilation cache", *(f"{stage}, s" for stage in stages)), lines)
+
+
+def clips(rows: list[Row]) -> str:
+    lines = [
+        [
+            number(row["values"]["frames"]),
+            number(row["values"]["file_bytes"] / 1e6),
+            number(row["values"]["bank_bytes"] / 1e6),
+            *(number(seconds) for seconds in row["values"]["seconds"].values()),
+        ]
+        for row in succeeded(rows)
+    ]
+    stages = (f"{stage}, s" for row in succeeded(rows)[:1] for stage in row["values"]["seconds"])
+    return table(("frames", "MB of files", "MB on the device", *stages), lines)
+
+
+def devices(rows: list[Row]) -> str:
+    lines = [
+        [
+            row["arguments"]["num_devices"],
+            row["arguments"]["num_envs"],
+            number(row["values"]["steps_per_second"]),
+            number(row["values"]["bytes_on_a_device"] / 1e6),
+        ]
+        for row in succeeded(rows)
+        if row["measure"] == "scaling.stepping"
+    ]
+    stepping = table(("devices", "environments", "steps/s", "MB on a device"), lines)
+    alone = value(find(rows, "scaling.training", num_devices=1, cores=1), "steps_per_second")
+    lines = []
+    for row in succeeded(rows):
+        if row["measure"] == "scaling.training":
+            where, speed = row["arguments"], row["values"]["steps_per_second"]
+            share = ratio(speed, alone and alone * where["cores"])
+            compilation = number(row["values"]["compile_seconds"])
+            lines.append(
+                [
+                    where["num_devices"],
+                    where["cores"],
+                    where["num_envs"],
+                    number(speed),
+                    share,
+                    compilation,
+                ]
+            )
+    heads = ("devices", "cores", "environments", "steps/s", "of ideal", "compilation, s")
+    training = f"\n\nTraining, PPO's preset `ci`:\n\n{table(heads, lines)}" if lines else ""
+    return stepping + training
+
+
+def peers(rows: list[Row]) -> str:
+    lines = []
+    for task in TASKS:
+        of_task = [row for row in rows if row["arguments"]["task"] == task]
+        ours = find(of_task, "throughput.gymnasium", num_envs=256)
+        speed = value(ours, "steps_per_second")
+        for row in of_task:
+            if row["measure"] in _RENDERERS:
+                continue
+            values = row.get("values", {})
+            theirs = values.get("steps_per_second")
+            who, count = _who(row)
+            dt = values.get("control_dt")
+            lines.append(
+                [
+                    who,
+                    count,
+                    number(1e3 * dt) if dt else "",
+                    number(theirs) if theirs else row["status"],
+                    ratio(speed, theirs),
+                    values.get("opengl", ""),
+                ]
+            )
+    heads = (
+        "who",
+        "environments",
+        "control step, ms",
+        "steps/s",
+        "PixelBrax at 256 is faster by",
+        "OpenGL",
+    )
+    environments = table(heads, lines)
+    lines = []
+    for row in rows:
+        if row["measure"] == "peers.mujoco_warp_renderer":
+            where = row["arguments"]
+            ours = find(rows, "throughput.renderer", **where)
+            cells = [cell(ours, "frames_per_second"), cell(row, "frames_per_second")]
+            faster = ratio(value(ours, "frames_per_second"), value(row, "frames_per_second"))
+            lines.append([where["size"], where["num_envs"], *cells, faster])
+    heads = ("pixels", "environments", "PixelBrax, frames/s", "MuJoCo Warp, frames/s", "ratio")
+    return f"{environments}\n\nFrames of Ant:\n\n{table(heads, lines)}\n\n{_peer_versions(rows)}"
+
+
+_RENDERERS = ("throughput.renderer", "peers.mujoco_warp_renderer")
+
+
+def _who(row: Row) -> tuple[str, str]:
+    values, name = row.get("values", {}), title(row["arguments"]["task"])
+    measure = row["measure"].split(".")[1]
+    if measure == "gymnasium":
+        return f"PixelBrax {name}, Gymnasium", str(row["arguments"]["num_envs"])
+    if measure == "dm_control_envs":
+        processes = row["arguments"]["processes"]
+        how = "SubprocVecEnv" if processes else "alone"
+        count = values.get("processes", processes) or 1
+        return f"DM Control {row['arguments']['domain']}, {how}", str(count)
+    if measure == "gymnasium_envs":
+        return f"Gymnasium {name}-v5, AsyncVectorEnv", str(values.get("processes", ""))
+    return f"EnvPool {name}-v5", str(values.get("num_envs", ""))
+
+
+def _peer_versions(rows: list[Row]) -> str:
+    # Each peer has an environment of its own: two may have different versions of a library.
+    versions = {
+        f"{name} {version}"
+        for row in succeeded(rows)
+        for name, version in row["values"].get("versions", {}).items()
+    }
+    return f"Peers' versions: {', '.join(sorted(versions))}."
