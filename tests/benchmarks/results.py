@@ -16,6 +16,7 @@ import numpy as np
 
 from pixelbrax_jax import VectorPixelEnv, make
 from pixelbrax_jax.agents.runner.evaluate import interquartile_mean
+from tests.benchmarks.pages import redraw
 
 FOLDER = Path(__file__).parents[2] / "docs" / "results"
 PAGE = FOLDER.with_suffix(".md")
@@ -201,20 +202,24 @@ def plot(runs: dict[str, list[dict]], untrained: dict[str, dict], path: Path) ->
     figure.savefig(path, dpi=130)
 
 
+def tables(runs: dict[str, list[dict]], untrained: dict[str, dict]) -> dict[str, str]:
+    """All of the page's tables, by name."""
+    return {"clean": table(runs, untrained), "distracted": distracted_table(runs)}
+
+
+def kept_runs() -> dict[str, dict]:
+    """All that is kept, by name."""
+    return {path.stem: json.loads(path.read_text()) for path in (FOLDER / "runs").glob("*.json")}
+
+
 def main() -> None:
     """Draw everything."""
-    runs = {path.stem: json.loads(path.read_text()) for path in (FOLDER / "runs").glob("*.json")}
+    runs = kept_runs()
     if not runs:
         raise SystemExit("no run is kept yet: python -m tests.benchmarks.experiments makes them")
     without, grouped = baselines(runs), groups(runs)
-    tables = {"clean": table(grouped, without), "distracted": distracted_table(grouped)}
-    page = PAGE.read_text("utf-8")
-    for name, text in tables.items():
-        between = re.compile(f"(<!-- {name} -->\n).*?(<!-- end -->)", re.DOTALL)
-        page = between.sub(lambda found, text=text: found[1] + text + found[2], page)
-    PAGE.write_text(page, "utf-8")
+    redraw(PAGE, tables(grouped, without))
     plot(grouped, without, FOLDER / "clean.png")
-    print(*tables.values(), sep="\n")
 
 
 if __name__ == "__main__":

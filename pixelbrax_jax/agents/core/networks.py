@@ -18,6 +18,10 @@ LOG_STD_RANGE = (-5.0, 2.0)
 """Between which logarithms of standard deviations are kept."""
 
 _ROOT_2 = math.sqrt(2.0)
+_GREY = 0.5
+"""Taken from pixels in [0, 1] by the encoders that are not published ones. A gradient has the same
+sign for all weights of a filter that sees positive numbers only, and large steps then leave most
+filters at zero for ever, under videos all of them."""
 
 
 def max_pool(x: jax.Array) -> jax.Array:
@@ -91,6 +95,7 @@ class Small(nn.Module):
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         """Map (B, H, W, C) float32 to (B, 128) features."""
+        x = x - _GREY
         for channels, size, stride in ((16, 4, 2), (32, 4, 2), (32, 3, 1)):
             x = nn.relu(Conv(channels, size, stride)(x))
         return nn.relu(_dense(128)(_flat(x)))
@@ -105,6 +110,7 @@ class Patch(nn.Module):
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         """Map (B, H, W, C) float32 to (B, 256) features."""
+        x = x - _GREY
         for channels, size, stride in ((32, 4, 4), (32, 2, 2), (32, 3, 1)):
             x = nn.relu(Conv(channels, size, stride)(x))
         return nn.relu(_dense(256)(_flat(x)))

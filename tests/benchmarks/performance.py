@@ -1,0 +1,110 @@
+"""Draws docs/performance.md's tables from the results of `tests.benchmarks.run`.
+
+python -m tests.benchmarks.performance
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from pixelbrax_gym.bench.cases import TASKS
+from pixelbrax_gym.bench.tables import cell, find, ratio, table, title, value
+from tests.benchmarks.pages import redraw
+
+DOCS = Path(__file__).parents[2] / "docs"
+PAGE = DOCS / "performance.md"
+ADAPTERS = {
+    "Gymnasium, jax": '`gymnasium.make_vec`, `output="jax"`',
+    "Gymnasium, numpy": '`gymnasium.make_vec`, `output="numpy"`',
+    "Gymnasium, torch": '`gymnasium.make_vec`, `output="torch"`',
+    "TorchRL": "TorchRL's collectors: `step_and_maybe_reset`",
+    "Stable-Baselines3": "Stable-Baselines3's `VecEnv`",
+}
+DISTRACTORS = {
+    "color, each frame": "color, for a frame",
+    "color, each material": "color, for each material",
+    "video overlay": "video over the image",
+    "video background": "video as background",
+    "camera": "camera",
+    "all three": "all three",
+}
+PEERS = (
+    ("DM Control's quadruped, alone", "peers.dm_control_envs", {"processes": 0}),
+    (
+        "DM Control's quadruped, SB3's `SubprocVecEnv`, 32 processes",
+        "peers.dm_control_envs",
+        {"processes": 32},
+    ),
+    ("Gymnasium's Ant-v5, `AsyncVectorEnv`, 2 processes", "peers.gymnasium_envs", {}),
+    ("EnvPool's Ant-v5 with pixels", "peers.envpool_envs", {}),
+)
+
+
+def rows_of(machine: str, group: str) -> list[dict]:
+    """Outcomes of a group: ``machine`` is a file's name without its ending."""
+    kept = json.loads((DOCS / "benchmarks" / f"{machine}.json").read_text("utf-8"))
+    return [row for row in kept["cases"].values() if row["group"] == group]
+
+
+def environments() -> str:
+    """Steps per second over the number of environments."""
+    rows, lines = rows_of("cpu-avx512", "environments"), []
+    for task in TASKS:
+        pixels = [
+            find(rows, "throughput.scan", task=task, num_envs=count, obs_mode="pixels")
+            for count in (1, 100, 1000)
+        ]
+        state = find(rows, "throughput.scan", task=task, num_envs=1000, obs_mode="state")
+        frames = find(rows, "throughput.renderer", task=task, num_envs=1000)
+        speeds = [cell(row, "steps_per_second") for row in (*pixels, state)]
+        lines.append([title(task), *speeds, cell(frames, "frames_per_second")])
+    heads = ("task", "1 environment", "100", "1000", "1000, state alone", "renderer alone")
+    return table(heads, lines)
+
+
+def peers() -> str:
+    """Ant beside others."""
+    rows = [row for row in rows_of("cpu-avx2", "peers") if row["arguments"]["task"] == "ant"]
+    ours = find(rows, "throughput.gymnasium", num_envs=256)
+    lines = [["PixelBrax, `gymnasium.make_vec`", cell(ours, "steps_per_second"), ""]]
+    for who, measure, arguments in PEERS:
+        theirs = find(rows, measure, **arguments)
+        both = value(ours, "steps_per_second"), value(theirs, "steps_per_second")
+        lines.append([who, cell(theirs, "steps_per_second"), ratio(*both)])
+    return table(("who", "steps per second", "PixelBrax is faster by"), lines)
+
+
+def adapters() -> str:
+    """What an adapter costs."""
+    return _ratios("adapters.compare", "adapter", "adapters", ADAPTERS, (256, 1))
+
+
+def distractors() -> str:
+    """What distractors cost."""
+    return _ratios("distractors.compare", "distractors", "distractors", DISTRACTORS, (256, 1024))
+
+
+def _ratios(
+    measure: str, column: str, group: str, names: dict[str, str], counts: tuple[int, ...]
+) -> str:
+    rows = rows_of("cpu-avx512", group)
+    found = {}
+    for count in counts:
+        row = find(rows, measure, task="ant", num_envs=count)
+        found[count] = {line[column]: line["ratio"] for line in row["values"]} if row else {}
+    lines = [
+        [text, *(f"{found[count][name]:.2f}" for count in counts)] for name, text in names.items()
+    ]
+    heads = [f"{count} environment{'s' if count > 1 else ''}" for count in counts]
+    return table((column, *heads), lines)
+
+
+def tables() -> dict[str, str]:
+    """All of the page's tables, by name."""
+    drawings = (environments, peers, adapters, distractors)
+    return {draw.__name__: f"{draw()}\n" for draw in drawings}
+
+
+if __name__ == "__main__":
+    redraw(PAGE, tables())

@@ -1,0 +1,211 @@
+"""Figures on README and documentation pages are those of JSON files in the repository."""
+
+from __future__ import annotations
+
+import json
+import re
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pixelbrax_gym.bench.cases import TASKS
+from pixelbrax_gym.bench.tables import find, number
+from tests.benchmarks import performance, results
+from tests.benchmarks.original import ORIGINAL
+from tests.benchmarks.pages import drawn, without_tables
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+
+PAGES = ("README.md", "docs/performance.md", "docs/results.md")
+"""Those that report measurements."""
+
+FIGURE = re.compile(r"(?<![\w.,/-])(?:\d{1,3}(?:,\d{3})+|\d+\.\d+)(?![\w.,/-]*\d)")
+"""Thousands with a comma, or a decimal fraction."""
+
+
+@cache
+def read(name: str) -> Any:
+    return json.loads((DOCS / name).read_text("utf-8"))
+
+
+def measured(machine: str, group: str, measure: str, **arguments: Any) -> Any:
+    row = find(performance.rows_of(machine, group), measure, **arguments)
+    return row["values"]
+
+
+def span(values: list[float], form: str = "{:.2f}") -> list[str]:
+    return [form.format(min(values)), form.format(max(values))]
+
+
+def rounded(value: float, digits: int) -> str:
+    """So many significant digits, thousands apart."""
+    return f"{float(f'{value:.{digits - 1}e}'):,.0f}"
+
+
+def seconds(cache: str, stage: str = "import to first step") -> float:
+    return measured("cpu-avx512", "startup", "startup.first_frame", cache=cache)["seconds"][stage]
+
+
+def training(num_devices: int, cores: int) -> float:
+    where = {"num_devices": num_devices, "cores": cores}
+    return measured("cpu-avx512", "devices", "scaling.training", **where)["steps_per_second"]
+
+
+def batches(num_envs: int) -> list[float]:
+    return [
+        line["ratio"]
+        for task in TASKS
+        for line in measured("cpu-avx512", "batches", "batches.compare", task=task)
+        if line["num_envs"] == num_envs
+    ]
+
+
+def distractor_ratios() -> list[float]:
+    found = [
+        line
+        for num_envs in (256, 1024)
+        for line in measured(
+            "cpu-avx512", "distractors", "distractors.compare", task="ant", num_envs=num_envs
+        )
+    ]
+    return [line["ratio"] for line in found if not line["distractors"].startswith("none")]
+
+
+def ours_to_original() -> list[float]:
+    return [
+        measured("cpu-avx2", "original", "throughput.scan", task=task, num_envs=num_envs)[
+            "steps_per_second"
+        ]
+        / theirs
+        for task, num_envs, theirs in ORIGINAL
+    ]
+
+
+def frames(peer: str) -> str:
+    row = measured("cpu-avx2", "peers", peer, task="ant", num_envs=256, size=84)
+    return number(row["frames_per_second"])
+
+
+def ant() -> float:
+    where = {"task": "ant", "num_envs": 256}
+    return measured("cpu-avx2", "peers", "throughput.gymnasium", **where)["steps_per_second"]
+
+
+def dm_control() -> str:
+    where = {"task": "ant", "processes": 32}
+    row = measured("cpu-avx2", "peers", "peers.dm_control_envs", **where)
+    return f"{row['steps_per_second']:.0f}"
+
+
+def held() -> list[float]:
+    rows = performance.rows_of("cpu-avx512", "environments")
+    pixels = [row for row in rows if row["arguments"].get("obs_mode") == "pixels"]
+    return [row["values"]["bytes_per_env"] / 1e3 for row in pixels]
+
+
+def adapter(name: str, num_envs: int = 256, value: str = "steps_per_second") -> float:
+    rows = measured("cpu-avx512", "adapters", "adapters.compare", task="ant", num_envs=num_envs)
+    return next(row[value] for row in rows if row["adapter"] == name)
+
+
+def ends(name: str) -> list[float]:
+    """Returns of the mean action at the end of the runs of that name, by seed."""
+    runs = results.groups(results.kept_runs())[name]
+    return [results.final(run)["return"] for run in runs]
+
+
+def mean_end(name: str, digits: int = 2) -> str:
+    return rounded(sum(ends(name)) / len(ends(name)), digits)
+
+
+STATEMENTS = {
+    "README.md": (
+        ("step {} times a second through Gymnasium", [number(ant())]),
+        ("under Stable-Baselines3's workers steps {} times there", [dm_control()]),
+        ("at {} to {} of the speed without", span(distractor_ratios())),
+        ("steps per second, two CPU cores | {} | 4 | {}", [number(ant()), dm_control()]),
+    ),
+    "docs/performance.md": (
+        ("step {} to {} times", [rounded(ant(), 1), rounded(adapter("Gymnasium, torch"), 1)]),
+        ("a thousand have {} to {} of their speed", span(batches(1000))),
+        ("ten {} to {}", span(batches(10))),
+        ("takes {} to {} kB", span(held(), "{:.0f}")),
+        ("MuJoCo Warp draws {} frames", [frames("peers.mujoco_warp_renderer")]),
+        ("there and PixelBrax {}", [frames("throughput.renderer")]),
+        ("makes {} to {} steps a second on two", span([row[2] for row in ORIGINAL], "{:.0f}")),
+        ("{} to {} times as many", [rounded(x, 2) for x in sorted(ours_to_original())[::4]]),
+        ("{} times a Python loop's speed", [f"{adapter('JAX scan', 1, 'ratio'):.1f}"]),
+        (
+            "{} (cheetah) and {} (walker)",
+            [
+                f"{read('benchmarks/dm_control_texture.json')[domain]['ratio']:.2f}"
+                for domain in ("cheetah", "walker")
+            ],
+        ),
+        (
+            "take {} s, most of it XLA's compilation; {} s with",
+            [f"{seconds(cache):.0f}" for cache in ("none", "warm")],
+        ),
+        (
+            "made, reset and stepped in {} s",
+            [f"{seconds('none', 'make, reset and step once more'):.2f}"],
+        ),
+        ("{} steps per second on one core", [rounded(training(1, 1), 2)]),
+        ("{} on two devices", [rounded(training(2, 2), 2)]),
+        ("each, {} of ideal", [f"{training(2, 2) / training(1, 1) / 2:.2f}"]),
+    ),
+    "docs/results.md": (),
+}
+"""Page -> what it says, and the figures in it."""
+
+FROM_OTHERS = {
+    "README.md": ("report 402,000 steps per second", "Apache License 2.0"),
+    "docs/performance.md": ("The aim of 0.97",),
+    "docs/results.md": (),
+}
+"""Page -> what it says that is not of ours to measure."""
+
+
+def plain(page: str) -> str:
+    """A page's prose: neither code nor addresses nor drawn tables; spaces for line ends."""
+    text = without_tables((ROOT / page).read_text("utf-8"))
+    text = re.sub(r"^\s*```.*?^\s*```$", "", text, flags=re.DOTALL | re.MULTILINE)
+    text = re.sub(r"`[^`\n]*`", "", text)
+    text = re.sub(r"https?://[^\s)]+|arXiv [\d.]+|Python [\d.]+", "", text)
+    return re.sub(r"\s+", " ", text)
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_what_a_page_says_is_what_was_measured(page):
+    text = plain(page)
+    for statement, figures in STATEMENTS[page]:
+        assert statement.format(*figures) in text
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_figure_is_among_them(page):
+    text = plain(page)
+    said = [statement.format(*figures) for statement, figures in STATEMENTS[page]]
+    for known in (*said, *FROM_OTHERS[page]):
+        assert known in text
+        text = text.replace(known, "")
+    assert FIGURE.findall(text) == []
+
+
+@pytest.mark.parametrize("name", performance.tables())
+def test_tables_of_performance_are_those_of_the_results(name):
+    assert drawn(performance.PAGE, name) == performance.tables()[name]
+
+
+@pytest.mark.parametrize("name", ["clean", "distracted"])
+def test_tables_of_results_are_those_of_the_runs(name):
+    tables = results.tables(results.groups(results.kept_runs()), read("results/untrained.json"))
+    assert drawn(results.PAGE, name) == tables[name]
+
+
+def test_a_figure_is_seen():
+    text = "We make 8,160 steps, 0.94 of 4.5, version 2.0.1, arXiv 2502.00021 in 84 x 84."
+    assert FIGURE.findall(text) == ["8,160", "0.94", "4.5", "2502.00021"]
