@@ -12,6 +12,7 @@ import pytest
 
 from pixelbrax_gym.bench.cases import TASKS
 from pixelbrax_gym.bench.tables import find, number
+from pixelbrax_jax.policy import read_pretrained
 from tests.benchmarks import performance, results
 from tests.benchmarks.original import ORIGINAL
 from tests.benchmarks.pages import drawn, without_tables
@@ -121,11 +122,21 @@ def mean_end(name: str, digits: int = 2) -> str:
     return rounded(sum(ends(name)) / len(ends(name)), digits)
 
 
+def without_action(task: str) -> str:
+    return f"{read('results/untrained.json')[task]['none']['return']:,.0f}"
+
+
+def pretrained(name: str) -> str:
+    return f"{read_pretrained(name)['return']:,.0f}"
+
+
 STATEMENTS = {
     "README.md": (
         ("step {} times a second through Gymnasium", [number(ant())]),
         ("under Stable-Baselines3's workers steps {} times there", [dm_control()]),
         ("at {} to {} of the speed without", span(distractor_ratios())),
+        ("to a return of {} in", [mean_end("ppo-halfcheetah")]),
+        ("Ant to {}", [mean_end("ppo-ant")]),
         ("steps per second, two CPU cores | {} | 4 | {}", [number(ant()), dm_control()]),
     ),
     "docs/performance.md": (
@@ -157,14 +168,25 @@ STATEMENTS = {
         ("{} on two devices", [rounded(training(2, 2), 2)]),
         ("each, {} of ideal", [f"{training(2, 2) / training(1, 1) / 2:.2f}"]),
     ),
-    "docs/results.md": (),
+    "docs/results.md": (
+        ("{} on HalfCheetah", [mean_end("ppo-halfcheetah")]),
+        ("{} on Ant", [mean_end("ppo-ant")]),
+        ("{} on Humanoid", [mean_end("ppo-humanoid")]),
+        ("and {} on HalfCheetah in thirteen", [mean_end("ppo-halfcheetah-long")]),
+        ("earns up to {}", ["1,000"]),
+        ("which is what no action earns, {}", [without_action("ant")]),
+    ),
 }
 """Page -> what it says, and the figures in it."""
 
 FROM_OTHERS = {
     "README.md": ("report 402,000 steps per second", "Apache License 2.0"),
     "docs/performance.md": ("The aim of 0.97",),
-    "docs/results.md": (),
+    "docs/results.md": (
+        "took 0.5 from its pixels",
+        "With 0.5 taken from the pixels",
+        "0.6 MB each",
+    ),
 }
 """Page -> what it says that is not of ours to measure."""
 
@@ -200,7 +222,7 @@ def test_tables_of_performance_are_those_of_the_results(name):
     assert drawn(performance.PAGE, name) == performance.tables()[name]
 
 
-@pytest.mark.parametrize("name", ["clean", "distracted"])
+@pytest.mark.parametrize("name", ["clean", "distracted", "centering"])
 def test_tables_of_results_are_those_of_the_runs(name):
     tables = results.tables(results.groups(results.kept_runs()), read("results/untrained.json"))
     assert drawn(results.PAGE, name) == tables[name]

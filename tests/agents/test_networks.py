@@ -115,6 +115,17 @@ def inputs_of_last_layer(name: str, size: int) -> int:
     return params["Dense_0"]["kernel"].shape[0]
 
 
+@pytest.mark.parametrize("name", ["small", "patch"])
+def test_encoders_of_ours_see_pixels_around_zero(name):
+    """With pixels in [0, 1] nearly all filters of these went to zero under videos."""
+    encoder, grey = ENCODERS[name](), jnp.full((1, 32, 32, 3), 0.5)
+    weights = encoder.init(jax.random.key(0), grey)
+    # Biases are zero at first, so that only what differs from grey is seen.
+    assert not encoder.apply(weights, grey).any()
+    assert encoder.apply(weights, grey + 0.1).any()
+    assert encoder.apply(weights, grey - 0.1).any()
+
+
 @pytest.mark.parametrize("name", ENCODERS)
 def test_an_encoder_s_smallest_size_is_the_smallest(name):
     assert inputs_of_last_layer(name, SMALLEST[name]) > 0

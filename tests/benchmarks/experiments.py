@@ -42,6 +42,9 @@ DISTRACTORS = {
     "video": ("--distractors", "paper-video", "--clips", "procedural"),
     "color": ("--distractors", "paper-color"),
 }
+REVISION = 2
+"""Of what the presets train; runs of different ones do not belong together. 1: the encoder `patch`
+saw pixels in [0, 1]; 2: it sees them in [-0.5, 0.5]."""
 GPU_STEPS = {
     "halfcheetah": 25_000_000,
     "walker2d": 25_000_000,
@@ -115,6 +118,7 @@ def record(folder: Path, arguments: list[str]) -> dict:
     packages = ("jax", "jaxlib", "brax", "pixelbrax")
     return {
         "command": shlex.join(["pixelbrax", *arguments]),
+        "revision": REVISION,
         "algorithm": about["algorithm"],
         "config": about["config"],
         "machine": describe_cpu(),

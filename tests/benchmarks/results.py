@@ -16,6 +16,7 @@ import numpy as np
 
 from pixelbrax_jax import VectorPixelEnv, make
 from pixelbrax_jax.agents.runner.evaluate import interquartile_mean
+from tests.benchmarks.experiments import REVISION
 from tests.benchmarks.pages import redraw
 
 FOLDER = Path(__file__).parents[2] / "docs" / "results"
@@ -84,11 +85,19 @@ def return_at(run: dict, seconds: float) -> float:
 
 
 def groups(runs: dict[str, dict]) -> dict[str, list[dict]]:
-    """Runs that differ in their seeds alone, by their common name."""
+    """Runs that differ in their seeds alone, by their common name; the latest revision of each."""
     found: dict[str, list[dict]] = {}
     for name in sorted(runs):
         found.setdefault(re.sub(r"-\d+$", "", name), []).append(runs[name])
+    for name, seeds in found.items():
+        latest = max(run["revision"] for run in seeds)
+        found[name] = [run for run in seeds if run["revision"] == latest]
     return found
+
+
+def seeds_of(runs: list[dict]) -> str:
+    """How many there are, with a star for those of an earlier revision."""
+    return f"{len(runs)}{'' if runs[0]['revision'] == REVISION else '*'}"
 
 
 def middle(scores: list[float]) -> str:
@@ -133,9 +142,9 @@ def table(runs: dict[str, list[dict]], untrained: dict[str, dict]) -> str:
             ends = middle([final(run)["return"] for run in seeds])
             above = min(distance(run, without) for run in seeds)
             minutes = np.median([run["seconds"][-1] for run in seeds]) / 60.0
+            agent = f"{algorithm.upper()}, {minutes:.0f} min"
             lines.append(
-                f"| {task} | {algorithm.upper()}, {minutes:.0f} min | {len(seeds)} | {times} | "
-                f"{ends} | {above:.0f} s.e. |"
+                f"| {task} | {agent} | {seeds_of(seeds)} | {times} | {ends} | {above:.0f} s.e. |"
             )
     return "\n".join(lines) + "\n"
 
@@ -154,11 +163,30 @@ def distracted_table(runs: dict[str, list[dict]]) -> str:
         splits = [[final(r, s)["return"] for r in seeds] for s in ("clean", "train", "test")]
         share = np.mean(splits[2]) / np.mean(splits[1])
         cells = " | ".join(middle(scores) for scores in splits)
-        lines.append(
-            f"| {task} | `paper-{variant[0]}` | {algorithm.upper()} | {len(seeds)} | {cells} | "
-            f"{share:.2f} |"
-        )
+        who = f"`paper-{variant[0]}` | {algorithm.upper()} | {seeds_of(seeds)}"
+        lines.append(f"| {task} | {who} | {cells} | {share:.2f} |")
     return "\n".join(lines) + "\n" if len(lines) > 2 else "Not run yet.\n"
+
+
+def centering_table() -> str:
+    """What short runs reach with pixels as they come and around zero."""
+    found = json.loads((FOLDER / "centering.json").read_text())["runs"]
+    lines = [
+        "| task | agent | steps | pixels in [0, 1] | pixels around 0 |",
+        "|---|---|---|---|---|",
+    ]
+    for plain, centered in zip(found[::2], found[1::2], strict=True):
+        ends = []
+        for run in (plain, centered):
+            late = np.array(run["steps"]) > 0.8 * run["total_steps"]
+            counts = np.array(run["episodes"])[late]
+            ends.append(f"{np.average(np.array(run['return'])[late], weights=counts):,.0f}")
+        video = ", `paper-video`" if run["options"] else ""
+        lines.append(
+            f"| {run['task']}{video} | {run['algorithm'].upper()} | {run['total_steps']:,} | "
+            f"{' | '.join(ends)} |"
+        )
+    return "\n".join(lines) + "\n"
 
 
 def plot(runs: dict[str, list[dict]], untrained: dict[str, dict], path: Path) -> None:
@@ -204,7 +232,11 @@ def plot(runs: dict[str, list[dict]], untrained: dict[str, dict], path: Path) ->
 
 def tables(runs: dict[str, list[dict]], untrained: dict[str, dict]) -> dict[str, str]:
     """All of the page's tables, by name."""
-    return {"clean": table(runs, untrained), "distracted": distracted_table(runs)}
+    return {
+        "clean": table(runs, untrained),
+        "distracted": distracted_table(runs),
+        "centering": centering_table(),
+    }
 
 
 def kept_runs() -> dict[str, dict]:
