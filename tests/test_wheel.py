@@ -114,3 +114,28 @@ def test_the_wheel_works_in_an_empty_environment(wheel, tmp_path):
     empty.mkdir()
     output = run(python, "-W", "error", "-c", PROGRAM, cwd=empty)
     assert output.strip().endswith(f"works {wheel.name.split('-')[1]}")
+
+
+COMMANDS = (
+    "doctor",
+    "bench --only renderer",
+    "play inverted_pendulum --gif pendulum.gif --num-frames 4 --size 64",
+    "train ppo --preset ci --total-steps 20000 --output-dir run",
+    "evaluate run --episodes 2",
+    "record run --num-frames 8 --grid 2 --size 64",
+)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_every_command_works_outside_of_a_clone(wheel, tmp_path):
+    venv.create(tmp_path / "env", with_pip=True)
+    (python,) = (tmp_path / "env").glob("*/python")
+    extras = f"{wheel}[train,video]"
+    run(python, "-m", "pip", "install", "-q", "-c", ROOT / "constraints.txt", extras, cwd=tmp_path)
+    where = tmp_path / "empty"
+    where.mkdir()
+    for command in COMMANDS:
+        run(python.parent / "pixelbrax", *command.split(), cwd=where)
+    written = ("runs/bench/cpu*.json", "runs/bench/cpu*.md", "pendulum.gif", "run/videos/*.mp4")
+    assert all(list(where.glob(name)) for name in written)

@@ -172,6 +172,11 @@ def run(arguments: list[str], folder: Path, until: float) -> int:
                 signal.signal(number, handler)
 
 
+def is_made(path: Path) -> bool:
+    """Whether a run is kept, and of what the presets train today."""
+    return path.exists() and json.loads(path.read_text())["revision"] == REVISION
+
+
 def main() -> int:
     """Run the command; the exit status is 1 if a run failed."""
     parser = argparse.ArgumentParser(
@@ -191,21 +196,23 @@ def main() -> int:
     until, failed = time.monotonic() + 60.0 * options.minutes, []
     for name, arguments in chosen.items():
         path = KEPT / f"{name}.json"
+        # Checkpoints of another revision would go on as if they were of this one.
+        folder = options.output_dir / f"revision-{REVISION}" / name
         if options.list:
-            print(f"{name:24s} {'done' if path.exists() else '    '} {shlex.join(arguments)}")
-        if options.list or path.exists():
+            print(f"{name:24s} {'done' if is_made(path) else '    '} {shlex.join(arguments)}")
+        if options.list or is_made(path):
             continue
-        status = run(arguments, options.output_dir / name, until)
+        status = run(arguments, folder, until)
         if status > 128 or status < 0:
             print(f"stopped in {name}; the same command goes on", file=sys.stderr)
             break
         if status:
             failed.append(name)
             continue
-        kept = record(options.output_dir / name, arguments)
+        kept = record(folder, arguments)
         path.write_text(json.dumps(kept) + "\n")
         if kept["config"]["task"] in TASKS and not kept["config"]["distractors"]:
-            offer(kept["config"]["task"], options.output_dir / name, kept)
+            offer(kept["config"]["task"], folder, kept)
     if failed:
         print(f"failed: {', '.join(failed)}", file=sys.stderr)
     return bool(failed)
