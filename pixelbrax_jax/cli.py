@@ -225,8 +225,10 @@ def _record(options: argparse.Namespace) -> int:
 
 
 def _bench(arguments: list[str]) -> int:
-    from pixelbrax_gym.bench.command import main as bench
-
+    try:
+        from pixelbrax_gym.bench.command import main as bench
+    except KeyboardInterrupt:
+        return 128 + signal.SIGINT
     return bench(arguments)
 
 

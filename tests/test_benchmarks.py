@@ -399,3 +399,4 @@ def test_adapters_that_are_not_installed_are_left_out(monkeypatch):
         "Gymnasium, jax",
         "Gymnasium, numpy",
     ]
+    assert len(made) == 3

@@ -173,7 +173,6 @@ STATEMENTS = {
         ("{} on Ant", [mean_end("ppo-ant")]),
         ("{} on Humanoid", [mean_end("ppo-humanoid")]),
         ("and {} on HalfCheetah in thirteen", [mean_end("ppo-halfcheetah-long")]),
-        ("earns up to {}", ["1,000"]),
         ("which is what no action earns, {}", [without_action("ant")]),
     ),
 }
@@ -217,7 +216,7 @@ def test_every_figure_is_among_them(page):
     assert FIGURE.findall(text) == []
 
 
-@pytest.mark.parametrize("name", performance.tables())
+@pytest.mark.parametrize("name", ["environments", "peers", "adapters", "distractors"])
 def test_tables_of_performance_are_those_of_the_results(name):
     assert drawn(performance.PAGE, name) == performance.tables()[name]
 

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
+from subprocess import SubprocessError
 
 from pixelbrax_gym.bench.case import Case, Group
 from pixelbrax_gym.bench.cases import FULL, QUICK, TASKS
@@ -35,6 +36,8 @@ def main(arguments: Sequence[str]) -> int:
     add_options(parser, list(FULL), "runs/bench")
     options = parser.parse_args(arguments)
     groups = FULL if options.full else QUICK
+    if options.full:
+        options.output_dir /= "full"
     if lacking := [name for name in options.only or () if name not in groups]:
         parser.error(f"--only {' '.join(lacking)} is measured by --full alone; add it")
     return run(parser.prog, options, groups, options.only or list(groups))
@@ -84,12 +87,12 @@ def run(
     except KeyboardInterrupt:
         sys.stderr.write(f"\n{program}: stopped; the same command goes on from here\n")
         return 130
-    except (OSError, ValueError, RuntimeError) as error:
+    except (OSError, ValueError, RuntimeError, MemoryError, SubprocessError) as error:
         sys.stderr.write(f"{program}: {error}\n")
         return 1
     page, picture = file.with_suffix(".md"), file.with_suffix(".png")
     if groups is QUICK:
-        sys.stdout.write(f"\n{page.read_text()}\n")
+        sys.stdout.write(f"\n{page.read_text('utf-8')}\n")
     sys.stdout.write(f"Tables: {page.resolve()}\n")
     if find_spec("matplotlib") is None:
         sys.stdout.write(f"A plot needs matplotlib; try: {install_extra('demo')}\n")

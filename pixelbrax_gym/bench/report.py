@@ -14,12 +14,16 @@ from pixelbrax_gym.bench.tables import table
 
 def write(file: Path, groups: Mapping[str, Group]) -> None:
     """Write the page, and with matplotlib the plot, that belong to the results in ``file``."""
-    kept = json.loads(file.read_text())
+    kept = json.loads(file.read_text("utf-8"))
     known = {case.key for group in groups.values() for case in group.cases()}
     rows = [row for key, row in kept["cases"].items() if key in known]
-    plotted = find_spec("matplotlib") is not None and plot(rows, file.with_suffix(".png"))
+    picture = file.with_suffix(".png")
+    plotted = find_spec("matplotlib") is not None and plot(rows, picture)
+    if not plotted:
+        picture.unlink(missing_ok=True)
     part = file.with_suffix(".md.part")
-    part.write_text(page(kept["machines"], rows, groups, f"{file.stem}.png" if plotted else None))
+    text = page(kept["machines"], rows, groups, picture.name if plotted else None)
+    part.write_text(text, "utf-8")
     part.replace(file.with_suffix(".md"))
 
 
@@ -30,7 +34,7 @@ def page(
     used = {row["machine"] for row in rows}
     parts = [
         "# Measurements",
-        "Written by `pixelbrax bench`. Medians of at least five repetitions of half a second or "
+        "Medians of at least five repetitions of half a second or "
         "more, unless a part says otherwise; compilation is apart, every call is waited for, "
         "actions are drawn, and episodes begin anew. Each case has a process of its own.",
         *(_machine(machine) for name, machine in machines.items() if name in used),

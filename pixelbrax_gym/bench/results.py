@@ -27,8 +27,11 @@ class Results:
         self.machine = hashlib.sha256(json.dumps(machine).encode()).hexdigest()[:8]
         self.kept: dict[str, Any] = {"machines": {}, "cases": {}}
         if file.exists():
-            kept = json.loads(file.read_text())
-            if not {"machines", "cases"} <= kept.keys():
+            try:
+                kept = json.loads(file.read_text("utf-8"))
+            except ValueError:
+                kept = None
+            if not isinstance(kept, dict) or not {"machines", "cases"} <= kept.keys():
                 raise ValueError(f"{file} is not a result of this benchmark: move it away.")
             self.kept = kept
         self.kept["machines"][self.machine] = machine
@@ -53,5 +56,5 @@ class Results:
         self.kept["machines"] = {k: v for k, v in self.kept["machines"].items() if k in used}
         self.file.parent.mkdir(parents=True, exist_ok=True)
         part = self.file.with_suffix(".part")
-        part.write_text(json.dumps(self.kept, indent=1) + "\n")
+        part.write_text(json.dumps(self.kept, indent=1) + "\n", "utf-8")
         part.replace(self.file)

@@ -28,7 +28,7 @@ OUT_OF_MEMORY = (
 )
 
 
-class KilledError(Exception):
+class KilledError(RuntimeError):
     """The system killed a process, most likely for its memory."""
 
 
@@ -56,12 +56,13 @@ def measure_all(
         absent.
     """
     # A process must not outlive this one and disturb the next one's measurements.
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     describe = Case("machine", "machine.describe")
     machine = process(describe.command(), {}, 300.0)["values"]
     file = output_dir / f"{file_stem(machine)}.json"
     results = Results(file, machine)
     todo = [case for case in cases if again or not results.has(case)]
+    output_dir.mkdir(parents=True, exist_ok=True)
     _say(f"{len(todo)} of {len(cases)} cases are to be measured; results in {file}")
     failed = False
     try:
@@ -74,6 +75,7 @@ def measure_all(
     finally:
         if file.exists():
             report.write(file, groups)
+        signal.signal(signal.SIGTERM, before)
     return file, failed
 
 
@@ -115,12 +117,13 @@ def process(command: Sequence[str], environ: Mapping[str, str], timeout: float) 
     status, output, errors = _run(command, {**os.environ, **own, **environ}, timeout)
     if status == 0:
         try:
-            return dict(json.loads(output.strip().splitlines()[-1]))
-        except (ValueError, IndexError) as error:
+            found = json.loads(output.strip().splitlines()[-1])
+            return {"values": found["values"], "peak_bytes": found.get("peak_bytes")}
+        except (ValueError, TypeError, KeyError, IndexError) as error:
             raise RuntimeError(f"its last line is no result: {output[-200:]!r}") from error
     lines = errors.strip().splitlines()
     why = lines[-1] if lines else f"exit status {status}"
-    if status == -signal.SIGKILL:
+    if os.name == "posix" and status == -signal.SIGKILL:
         raise KilledError("killed by the system, most likely for its memory")
     if status == ABSENT:
         raise AbsentError(why)

@@ -4,7 +4,7 @@ The Distracting Control Suite (arXiv 2101.02722) writes each video frame into th
 and uploads it to OpenGL. This measures DM Control's pixels with and without such an upload, in the
 environment that the benchmark makes for it:
 
-    pixelbrax bench --only peers --task halfcheetah
+    python -m tests.benchmarks.run --only peers --task halfcheetah
     MUJOCO_GL=osmesa .venv-peers/dm_control/bin/python tests/benchmarks/peers/dm_control_texture.py
 
 It needs an OpenGL library, e.g. Debian's libosmesa6.
