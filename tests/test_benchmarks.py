@@ -380,7 +380,7 @@ def test_a_part_that_only_the_full_benchmark_has_is_named(workers, capsys):
 
 
 def test_options_that_leave_nothing_are_told(workers, capsys):
-    assert command.main(["--task", "walker2d"]) == 1
+    assert command.main(["--task", "humanoid"]) == 1
     assert "no case fits" in capsys.readouterr().err
 
 
