@@ -334,7 +334,8 @@ def test_a_real_case_runs_in_a_process_of_its_own():
 def test_more_real_cases_run(measure, options):
     ours = measure.split(".")[0] in ("throughput", "adapters", "distractors")
     package = "pixelbrax_gym.bench" if ours else "tests.benchmarks"
-    outcome = runner.measure(Case("adapters", measure, options, package), 900.0)
+    kind = all_cases.DevicesCase if "num_devices" in options else Case
+    outcome = runner.measure(kind("adapters", measure, options, package), 900.0)
     assert outcome["status"] == "ok", outcome
 
 

@@ -12,10 +12,10 @@ import pytest
 
 from pixelbrax_gym.bench.cases import TASKS
 from pixelbrax_gym.bench.tables import find, number
-from pixelbrax_jax.policy import read_pretrained
 from tests.benchmarks import performance, results
 from tests.benchmarks.original import ORIGINAL
 from tests.benchmarks.pages import drawn, without_tables
+from tests.test_docs import without_code
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -112,10 +112,14 @@ def adapter(name: str, num_envs: int = 256, value: str = "steps_per_second") -> 
     return next(row[value] for row in rows if row["adapter"] == name)
 
 
+@cache
+def groups() -> dict[str, list[dict]]:
+    return results.groups(results.kept_runs())
+
+
 def ends(name: str) -> list[float]:
     """Returns of the mean action at the end of the runs of that name, by seed."""
-    runs = results.groups(results.kept_runs())[name]
-    return [results.final(run)["return"] for run in runs]
+    return [results.final(run)["return"] for run in groups()[name]]
 
 
 def mean_end(name: str, digits: int = 2) -> str:
@@ -124,10 +128,6 @@ def mean_end(name: str, digits: int = 2) -> str:
 
 def without_action(task: str) -> str:
     return f"{read('results/untrained.json')[task]['none']['return']:,.0f}"
-
-
-def pretrained(name: str) -> str:
-    return f"{read_pretrained(name)['return']:,.0f}"
 
 
 STATEMENTS = {
@@ -193,9 +193,7 @@ FROM_OTHERS = {
 
 def plain(page: str) -> str:
     """A page's prose: neither code nor addresses nor drawn tables; spaces for line ends."""
-    text = without_tables((ROOT / page).read_text("utf-8"))
-    text = re.sub(r"^\s*```.*?^\s*```$", "", text, flags=re.DOTALL | re.MULTILINE)
-    text = re.sub(r"`[^`\n]*`", "", text)
+    text = without_code(without_tables((ROOT / page).read_text("utf-8")))
     text = re.sub(r"https?://[^\s)]+|arXiv [\d.]+|Python [\d.]+", "", text)
     return re.sub(r"\s+", " ", text)
 
@@ -224,7 +222,7 @@ def test_tables_of_performance_are_those_of_the_results(name):
 
 @pytest.mark.parametrize("name", ["clean", "distracted", "centering"])
 def test_tables_of_results_are_those_of_the_runs(name):
-    tables = results.tables(results.groups(results.kept_runs()), read("results/untrained.json"))
+    tables = results.tables(groups(), read("results/untrained.json"))
     assert drawn(results.PAGE, name) == tables[name]
 
 

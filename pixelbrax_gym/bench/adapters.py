@@ -111,12 +111,12 @@ def _jax_loops(
 
 def _gymnasium(task: str, num_envs: int, output: str, actions: np.ndarray) -> Callable[[], Any]:
     envs = gymnasium.make_vec(TASKS[task].gymnasium_id, num_envs=num_envs, output=output)
-    envs.reset(seed=0)
+    first, _ = envs.reset(seed=0)
     own = list(actions)
     if output == "jax":
         own = [jax.device_put(action) for action in actions]
     elif output == "torch":
-        own = _tensors(actions)
+        own = _tensors(actions, first.device)
 
     def run() -> Any:
         for action in own:
@@ -134,7 +134,7 @@ def _torchrl(task: str, num_envs: int, actions: np.ndarray) -> Callable[[], Any]
     env = pixelbrax_gym.PixelBraxTorchRLEnv(task, num_envs)
     env.set_seed(0)
     carry = {"td": env.reset()}
-    own = _tensors(actions)
+    own = _tensors(actions, env.device)
 
     def run() -> Any:
         for action in own:
@@ -158,11 +158,10 @@ def _sb3(task: str, num_envs: int, actions: np.ndarray) -> Callable[[], Any]:
     return run
 
 
-def _tensors(actions: np.ndarray) -> list[Any]:
-    """One tensor a step, where JAX computes."""
+def _tensors(actions: np.ndarray, device: Any) -> list[Any]:
+    """One tensor a step, where the environments are."""
     import torch
 
-    device = "cuda" if jax.default_backend() == "gpu" and torch.cuda.is_available() else "cpu"
     return [torch.from_numpy(action).to(device) for action in actions]
 
 

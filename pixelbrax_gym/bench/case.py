@@ -51,6 +51,10 @@ class Case:
         arguments = json.dumps(dict(self.arguments))
         return [sys.executable, "-m", "pixelbrax_gym.bench.worker", function, arguments]
 
+    def environ(self) -> dict[str, str]:
+        """Variables that its process needs besides those of this one."""
+        return {}
+
 
 @dataclass(frozen=True)
 class Group:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -34,9 +34,8 @@ def page(
     used = {row["machine"] for row in rows}
     parts = [
         "# Measurements",
-        "Medians of at least five repetitions of half a second or "
-        "more, unless a part says otherwise; compilation is apart, every call is waited for, "
-        "actions are drawn, and episodes begin anew. Each case has a process of its own.",
+        "Medians of at least five repetitions of half a second or more, unless a part says otherwise; "
+        "compilation is apart, every call is waited for, actions are drawn, and episodes begin anew. Each case has a process of its own.",
         *(_machine(machine) for name, machine in machines.items() if name in used),
     ]
     if plot:
@@ -50,11 +49,7 @@ def page(
     if missing:
         lines = [(_name(row), row["status"], _line(row["why"])) for row in missing]
         parts += ["## Not measured", table(("case", "", "why"), lines)]
-    return "\n\n".join(_stripped(parts)) + "\n"
-
-
-def _stripped(parts: Iterable[str]) -> Iterable[str]:
-    return (part.strip() for part in parts)
+    return "\n\n".join(part.strip() for part in parts) + "\n"
 
 
 def _machine(machine: Row) -> str:

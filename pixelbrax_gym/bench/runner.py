@@ -82,12 +82,8 @@ def measure_all(
 def measure(case: Case, timeout: float) -> dict[str, Any]:
     """The outcome of a case: its values, or why there are none."""
     started = time.perf_counter()
-    environ = {}
-    if "num_devices" in case.arguments:
-        flag = f"--xla_force_host_platform_device_count={case.arguments['num_devices']}"
-        environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flag}".strip()
     try:
-        outcome = {"status": "ok"} | process(case.command(), environ, timeout)
+        outcome = {"status": "ok"} | process(case.command(), case.environ(), timeout)
     except AbsentError as error:
         outcome = {"status": "absent", "why": str(error)}
     except MemoryError as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,6 +39,14 @@ class PeerCase(Case):
             arguments["scene"] = runner.process(describe.command(), {}, 300.0)["values"]
         script = Path(__file__).parent / f"{self.measure.replace('.', '/')}.py"
         return [python, str(script), json.dumps(arguments)]
+
+
+class DevicesCase(Case):
+    """One for which XLA emulates devices, as many as its argument ``num_devices``."""
+
+    def environ(self) -> dict[str, str]:
+        flag = f"--xla_force_host_platform_device_count={self.arguments['num_devices']}"
+        return {"XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {flag}".strip()}
 
 
 def batches() -> Iterator[Case]:
@@ -76,10 +85,12 @@ def devices() -> Iterator[Case]:
     """One device and eight, with as many environments in all, and with as many on each."""
     for num_devices, num_envs in ((1, 64), (8, 64), (8, 512)):
         where = {"task": "ant", "num_devices": num_devices, "num_envs": num_envs}
-        yield Case("devices", "scaling.stepping", where, HERE)
+        yield DevicesCase("devices", "scaling.stepping", where, HERE)
     for num_devices, cores, num_envs in ((1, 1, 64), (2, 2, 128), (1, 2, 128), (4, 2, 128)):
         where = {"num_devices": num_devices, "cores": cores, "num_envs": num_envs}
-        yield Case("devices", "scaling.training", {"task": "inverted_pendulum", **where}, HERE)
+        yield DevicesCase(
+            "devices", "scaling.training", {"task": "inverted_pendulum", **where}, HERE
+        )
 
 
 def peers() -> Iterator[Case]:

@@ -92,7 +92,7 @@ def _ratios(
     found = {}
     for count in counts:
         row = find(rows, measure, task="ant", num_envs=count)
-        found[count] = {line[column]: line["ratio"] for line in row["values"]} if row else {}
+        found[count] = {line[column]: line["ratio"] for line in row["values"]}
     lines = [
         [text, *(f"{found[count][name]:.2f}" for count in counts)] for name, text in names.items()
     ]

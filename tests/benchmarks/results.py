@@ -14,6 +14,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from pixelbrax_gym.bench.tables import table as markdown_table
 from pixelbrax_jax import VectorPixelEnv, make
 from pixelbrax_jax.agents.runner.evaluate import interquartile_mean
 from tests.benchmarks.experiments import REVISION
@@ -68,18 +69,24 @@ def baselines(runs: dict[str, dict]) -> dict[str, dict]:
     return known
 
 
-def return_at(run: dict, seconds: float) -> float:
-    """Mean return of the episodes that ended within a minute before; NaN beyond the run.
+def return_at(run: dict, when: float, clock: str = "seconds", window: float = WINDOW) -> float:
+    """Mean return of the episodes that ended within a window before; NaN beyond the run.
 
     A run that ended in the last tenth of that time counts with its end.
+
+    Args:
+        run: what is kept of it.
+        when: on that clock.
+        clock: ``"seconds"`` or ``"steps"``.
+        window: on that clock.
     """
-    times = np.array(run["seconds"])
-    if times[-1] < 0.9 * seconds:
+    times = np.array(run[clock])
+    if times[-1] < 0.9 * when:
         return float("nan")
-    seconds = min(seconds, times[-1])
+    when = min(when, times[-1])
     # All episodes may end in one iteration: the latest of them then.
-    last = times[times <= seconds].max(initial=times[0])
-    chosen = (times > min(seconds - WINDOW, last - 1e-3)) & (times <= max(seconds, last))
+    last = times[times <= when].max(initial=times[0])
+    chosen = (times > min(when - window, last - 1e-3)) & (times <= max(when, last))
     count = np.array(run["episodes"])[chosen]
     return float(np.average(np.array(run["return"])[chosen], weights=count))
 
@@ -95,9 +102,14 @@ def groups(runs: dict[str, dict]) -> dict[str, list[dict]]:
     return found
 
 
+def is_latest(runs: list[dict]) -> bool:
+    """Whether runs of one name are of what the presets train today."""
+    return runs[0]["revision"] == REVISION
+
+
 def seeds_of(runs: list[dict]) -> str:
     """How many there are, with a star for those of an earlier revision."""
-    return f"{len(runs)}{'' if runs[0]['revision'] == REVISION else '*'}"
+    return f"{len(runs)}{'' if is_latest(runs) else '*'}"
 
 
 def middle(scores: list[float]) -> str:
@@ -171,10 +183,7 @@ def distracted_table(runs: dict[str, list[dict]]) -> str:
 def centering_table() -> str:
     """What short runs reach with pixels as they come and around zero."""
     found = json.loads((FOLDER / "centering.json").read_text())["runs"]
-    lines = [
-        "| task | agent | steps | pixels in [0, 1] | pixels around 0 |",
-        "|---|---|---|---|---|",
-    ]
+    lines = []
     for plain, centered in zip(found[::2], found[1::2], strict=True):
         ends = []
         for run in (plain, centered):
@@ -182,15 +191,17 @@ def centering_table() -> str:
             counts = np.array(run["episodes"])[late]
             ends.append(f"{np.average(np.array(run['return'])[late], weights=counts):,.0f}")
         video = ", `paper-video`" if run["options"] else ""
-        lines.append(
-            f"| {run['task']}{video} | {run['algorithm'].upper()} | {run['total_steps']:,} | "
-            f"{' | '.join(ends)} |"
-        )
-    return "\n".join(lines) + "\n"
+        steps = f"{run['total_steps']:,}"
+        lines.append([f"{run['task']}{video}", run["algorithm"].upper(), steps, *ends])
+    heads = ("task", "agent", "steps", "pixels in [0, 1]", "pixels around 0")
+    return markdown_table(heads, lines) + "\n"
 
 
 def plot(runs: dict[str, list[dict]], untrained: dict[str, dict], path: Path) -> None:
-    """Return over minutes: a thin line for each seed, a thick one and a band for their middle."""
+    """Return over steps: a thin line for each seed, a thick one and a band for their middle.
+
+    Minutes depend on the machine, and runs are from several.
+    """
     import matplotlib
 
     matplotlib.use("Agg")
@@ -207,26 +218,28 @@ def plot(runs: dict[str, list[dict]], untrained: dict[str, dict], path: Path) ->
             if name not in shown:
                 continue
             color, seeds = colors[name.split("-")[0]], shown[name]
-            grid = np.arange(40.0, min(r["seconds"][-1] for r in seeds) + 1.0, 10.0)
-            lines = np.array([[return_at(run, t) for t in grid] for run in seeds])
+            end = min(r["steps"][-1] for r in seeds)
+            grid, window = np.linspace(0.05 * end, end, 40), 0.1 * end
+            lines = np.array([[return_at(run, t, "steps", window) for t in grid] for run in seeds])
             for line in lines:
-                axes.plot(grid / 60, line, color=color, alpha=0.3, linewidth=0.7)
-            label = name.split("-")[0].upper()
+                axes.plot(grid / 1e6, line, color=color, alpha=0.3, linewidth=0.7)
+            label = name.split("-")[0].upper() + ("" if is_latest(seeds) else "*")
             if len(seeds) > 1:
                 found = [interquartile_mean(column) for column in lines.T]
                 low, high = [f.low for f in found], [f.high for f in found]
-                axes.fill_between(grid / 60, low, high, color=color, alpha=0.2, linewidth=0)
+                axes.fill_between(grid / 1e6, low, high, color=color, alpha=0.2, linewidth=0)
                 lines = np.array([[f.value for f in found]])
-            axes.plot(grid / 60, lines[0], color=color, linewidth=1.8, label=label)
+            axes.plot(grid / 1e6, lines[0], color=color, linewidth=1.8, label=label)
         for kind, style in (("random", ":"), ("none", "--")):
             label = {"random": "random policy", "none": "no action"}[kind]
             axes.axhline(
                 untrained[task][kind]["return"], color="gray", linestyle=style, label=label
             )
-        axes.set(xlabel="minutes on two CPU cores", title=task)
+        axes.set(xlabel="million control steps", title=task)
         axes.grid(alpha=0.3)
     panels[0][0].set_ylabel("return of training episodes")
-    panels[0][0].legend(fontsize=8)
+    for axes in panels[0]:
+        axes.legend(fontsize=7)
     figure.savefig(path, dpi=130)
 
 
