@@ -34,8 +34,9 @@ def page(
     used = {row["machine"] for row in rows}
     parts = [
         "# Measurements",
-        "Medians of at least five repetitions of half a second or more, unless a part says otherwise; "
-        "compilation is apart, every call is waited for, actions are drawn, and episodes begin anew. Each case has a process of its own.",
+        "Medians of at least five repetitions of half a second or more, unless a part says "
+        "otherwise; compilation is apart, every call is waited for, actions are drawn, and "
+        "episodes begin anew. Each case has a process of its own.",
         *(_machine(machine) for name, machine in machines.items() if name in used),
     ]
     if plot:
