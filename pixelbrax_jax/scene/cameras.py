@@ -68,7 +68,7 @@ def _rig_of(view: View) -> CameraRig:
     return rig(view.eye, view.target, view.fovy, link=view.link, up=view.up)
 
 
-DEFAULT = {name: _rig_of(row.camera) for name, row in TASKS.items()}
+DEFAULT = {name: _rig_of(row.camera) for name, row in TASKS.items() if row.camera}
 ORIGINAL = {
     name: _rig_of(row.original_camera) for name, row in TASKS.items() if row.original_camera
 }
