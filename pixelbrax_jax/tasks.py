@@ -53,7 +53,8 @@ class Task:
         original_camera: that of the paper, None where it has none.
         backends: those that simulate the task sanely, sorted.
         engine: folder of ``pixelbrax_jax.physics`` that simulates it.
-        domain: name of the model in the DM Control Suite, empty for Brax's tasks.
+        domain: name of the domain in the DM Control Suite, empty for Brax's tasks.
+        task: name of the task there, likewise.
         colors: colors by geom name that replace the model's.
         drawn_radius: metres, spheres by name that are drawn larger than they are.
         paper_options: arguments of Brax's environment for the "paper" reward preset.
@@ -72,6 +73,7 @@ class Task:
     backends: tuple[str, ...] = BRAX_BACKENDS
     engine: str = "brax"
     domain: str = ""
+    task: str = ""
     colors: Mapping[str, Color] = field(default_factory=dict)
     drawn_radius: Mapping[str, float] = field(default_factory=dict)
     paper_options: Mapping[str, float] = field(default_factory=dict)
@@ -215,6 +217,7 @@ def _dmc(domain: str, task: str, summary: str) -> Task:
         backends=("mjx",),
         engine="mjx",
         domain=domain,
+        task=task,
     )
 
 

@@ -26,8 +26,8 @@ class MjxPhysics(GuardedPhysics):
     Links are the model's bodies without the world; then ``camera/com``, the centre of mass that
     cameras and lights follow, and ``target``, this episode's target, where a task has them.
 
-    Beyond the interface it has ``rig``, the task's own camera, ``rigs``, all of the model's cameras
-    by name, ``look``, the model's lights, sky and ground, and ``batch_last``, whether a CPU
+    Beyond the interface it has ``rigs``, the model's cameras by name, with the task's own as
+    ``default``; ``look``, the model's lights, sky and ground; and ``batch_last``, whether a CPU
     computes a batch faster with the environments as last axis.
     """
 
@@ -48,7 +48,8 @@ class MjxPhysics(GuardedPhysics):
         """
         task.edit(model)
         scene = read_scene(model, task.camera, movable=task.movable)
-        self.geoms, self.rig, self.rigs, self.look = scene.geoms, scene.rig, scene.rigs, scene.look
+        self.geoms, self.look = scene.geoms, scene.look
+        self.rigs = scene.rigs | {"default": scene.rig}
         bodies = [model.body(i).name or f"link/{i - 1}" for i in range(1, model.nbody)]
         self.link_names = (*bodies, *scene.links)
         self.dynamics = Dynamics(

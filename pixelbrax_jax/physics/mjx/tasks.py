@@ -50,7 +50,7 @@ def dmc_task(task: str) -> DmcTask:
     """
     row = DMC_TASKS[task]
     module = import_module(f"pixelbrax_jax.physics.mjx.domains.{row.domain}")
-    parts: DmcTask = module.TASKS[task.removeprefix(f"dmc_{row.domain}_")]
+    parts: DmcTask = module.TASKS[row.task]
     return parts
 
 

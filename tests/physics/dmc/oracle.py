@@ -33,10 +33,8 @@ def load(task: str, seed: int = 0) -> Any:
 
     from pixelbrax_jax.tasks import DMC_TASKS
 
-    domain = DMC_TASKS[task].domain
-    return suite.load(
-        domain, task.removeprefix(f"dmc_{domain}_"), task_kwargs={"random": seed}
-    )
+    row = DMC_TASKS[task]
+    return suite.load(row.domain, row.task, task_kwargs={"random": seed})
 
 
 def target_of(physics: Any) -> np.ndarray:
