@@ -137,7 +137,7 @@ def _grow_swimmer(root: ElementTree.Element, *, num_bodies: int) -> None:
     bend = 360.0 / num_bodies
     for camera in parent.findall("camera"):
         if camera.get("mode") == "trackcom":
-            place = [float(number) * num_bodies / 6.0 for number in camera.attrib["pos"].split()]
+            place = [float(number) * (num_bodies / 6.0) for number in camera.attrib["pos"].split()]
             camera.set("pos", " ".join(map(str, place)))
     for i in range(num_bodies - 1):
         body = ElementTree.SubElement(parent, "body", name=f"segment_{i}", pos="0 .1 0")
