@@ -100,7 +100,7 @@ def drawn(task: str, count: int) -> np.ndarray:
     """(count, Q) joint positions of initial states."""
     start, dynamics = dmc_task(task).start, make_physics(task).dynamics
     keys = jax.random.split(jax.random.key(0), count)
-    return np.asarray(jax.jit(jax.vmap(lambda key: start(dynamics, key).qpos))(keys))
+    return np.array(jax.jit(jax.vmap(lambda key: start(dynamics, key).qpos))(keys))
 
 
 def number_of_contacts(model: mujoco.MjModel, qpos: np.ndarray) -> int:
