@@ -74,19 +74,19 @@ class Suite:
     def _names(self, kind: str) -> list[str]:
         return [getattr(self.model, kind)(i).name for i in range(getattr(self.model, f"n{kind}"))]
 
-    def links(self) -> tuple[np.ndarray, np.ndarray]:
-        """Poses of the links now."""
-        extra = []
+    def links(self, data: mujoco.MjData | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Poses of the links, of our own data unless others are given."""
+        data, extra = data or self.data, []
         for name in self.scene.links:
             if name == "camera/com":
-                extra.append(self.data.subtree_com[tracked_body(self.model)])
+                extra.append(data.subtree_com[tracked_body(self.model)])
             elif "target" in self._names("geom"):
-                extra.append(self.data.geom("target").xpos)
+                extra.append(data.geom("target").xpos)
             else:
-                extra.append(self.data.site("target").xpos)
-        xpos = np.concatenate([self.data.xpos[1:], *[row[None] for row in extra]])
+                extra.append(data.site("target").xpos)
+        xpos = np.concatenate([data.xpos[1:], *[row[None] for row in extra]])
         upright = np.tile([1.0, 0.0, 0.0, 0.0], (len(extra), 1))
-        xquat = np.concatenate([self.data.xquat[1:], upright])
+        xquat = np.concatenate([data.xquat[1:], upright])
         return xpos.astype(np.float32), xquat.astype(np.float32)
 
 
@@ -97,5 +97,9 @@ def load(domain: str) -> Suite:
     task, camera, movable = MODELS[domain]
     environment = suite.load(domain, task, task_kwargs={"random": 0})
     environment.reset()  # targets get their sizes here
-    model = environment.physics.model.ptr
+    return of(domain, environment.physics.model.ptr, camera, movable)
+
+
+def of(domain: str, model: mujoco.MjModel, camera: int, movable: tuple[str, ...]) -> Suite:
+    """Read a model as it is now."""
     return Suite(domain, model, camera, read_scene(model, camera, movable=movable), movable)
