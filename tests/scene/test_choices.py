@@ -36,7 +36,7 @@ def test_dmcs_look_is_the_suites():
 
 def test_cameras_of_a_model_are_rigs_by_name():
     rigs = named_rigs("a task", OWN)
-    assert list(rigs)[0] == "default"
+    assert next(iter(rigs)) == "default"
     assert set(rigs) == {"default", "side", "front", "top", "back"}
     for name, own in OWN.items():
         assert rigs[name] is own
