@@ -20,7 +20,7 @@ from tests.test_docs import without_code
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 
-PAGES = ("README.md", "docs/performance.md", "docs/results.md")
+PAGES = ("README.md", "docs/performance.md", "docs/results.md", "docs/measurements.md")
 """Those that report measurements."""
 
 FIGURE = re.compile(r"(?<![\w.,/-])(?:\d{1,3}(?:,\d{3})+|\d+\.\d+)(?![\w.,/-]*\d)")
@@ -168,6 +168,7 @@ STATEMENTS = {
         ("{} on two devices", [rounded(training(2, 2), 2)]),
         ("each, {} of ideal", [f"{training(2, 2) / training(1, 1) / 2:.2f}"]),
     ),
+    "docs/measurements.md": (),
     "docs/results.md": (
         ("{} on HalfCheetah", [mean_end("ppo-halfcheetah")]),
         ("{} on Ant", [mean_end("ppo-ant")]),
@@ -181,6 +182,7 @@ STATEMENTS = {
 FROM_OTHERS = {
     "README.md": ("report 402,000 steps per second", "Apache License 2.0"),
     "docs/performance.md": ("The aim of 0.97",),
+    "docs/measurements.md": ("JAX 0.10.2",),
     "docs/results.md": (
         "which earns up to 1,000",
         "took 0.5 from its pixels",
@@ -218,6 +220,11 @@ def test_every_figure_is_among_them(page):
 @pytest.mark.parametrize("name", ["environments", "peers", "adapters", "distractors"])
 def test_tables_of_performance_are_those_of_the_results(name):
     assert drawn(performance.PAGE, name) == performance.tables()[name]
+
+
+@pytest.mark.parametrize("name", ["physics", "renderer"])
+def test_tables_of_measurements_are_those_of_the_results(name):
+    assert drawn(performance.FORMS_PAGE, name) == performance.forms_tables()[name]
 
 
 @pytest.mark.parametrize("name", ["clean", "distracted", "centering"])
