@@ -134,9 +134,10 @@ STATEMENTS = {
     "README.md": (
         ("step {} times a second through Gymnasium", [number(ant())]),
         ("under Stable-Baselines3's workers steps {} times there", [dm_control()]),
-        ("at {} to {} of the speed without", span(distractor_ratios())),
+        ("a step keeps {} to {} of its speed", span(distractor_ratios())),
         ("to a return of {} in", [mean_end("ppo-halfcheetah")]),
         ("Ant to {}", [mean_end("ppo-ant")]),
+        ("standing still earns {}", [without_action("ant")]),
         ("steps per second, two CPU cores | {} | 4 | {}", [number(ant()), dm_control()]),
     ),
     "docs/performance.md": (
@@ -148,7 +149,7 @@ STATEMENTS = {
         ("there and PixelBrax {}", [frames("throughput.renderer")]),
         ("makes {} to {} steps a second on two", span([row[2] for row in ORIGINAL], "{:.0f}")),
         ("{} to {} times as many", [rounded(x, 2) for x in sorted(ours_to_original())[::4]]),
-        ("{} times a Python loop's speed", [f"{adapter('JAX scan', 1, 'ratio'):.1f}"]),
+        ("it has {} times a Python loop's speed", [f"{adapter('JAX scan', 1, 'ratio'):.1f}"]),
         (
             "{} (cheetah) and {} (walker)",
             [
@@ -173,8 +174,12 @@ STATEMENTS = {
         ("{} on HalfCheetah", [mean_end("ppo-halfcheetah")]),
         ("{} on Ant", [mean_end("ppo-ant")]),
         ("{} on Humanoid", [mean_end("ppo-humanoid")]),
-        ("and {} on HalfCheetah in thirteen", [mean_end("ppo-halfcheetah-long")]),
+        ("and {} on HalfCheetah in a run", [mean_end("ppo-halfcheetah-long")]),
         ("which is what no action earns, {}", [without_action("ant")]),
+        (
+            "which sees the state, ends at {} after",
+            [f"{read('results/from_state.json')['walker2d x 1']['return'][-1]:,.0f}"],
+        ),
     ),
 }
 """Page -> what it says, and the figures in it."""

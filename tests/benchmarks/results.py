@@ -139,36 +139,39 @@ def final(run: dict, split: str = "clean") -> dict:
     return {name: last[f"{split}/{name}"] for name in ("return", "standard_error")}
 
 
-def distance(run: dict, untrained: dict) -> float:
-    """Standard errors by which the last evaluation is above the random policy."""
-    reached, random = final(run), untrained["random"]
-    error = np.hypot(reached["standard_error"], random["standard_error"])
-    return (reached["return"] - random["return"]) / error
+def distance(run: dict, other: dict) -> float:
+    """Standard errors by which the last evaluation is above what is earned without learning."""
+    reached = final(run)
+    error = np.hypot(reached["standard_error"], other["standard_error"])
+    return (reached["return"] - other["return"]) / error
 
 
 def table(runs: dict[str, list[dict]], untrained: dict[str, dict]) -> str:
     """Return over time, clean, in Markdown."""
     lines = [
         "| task | agent | seeds | " + " | ".join(f"{m} min" for m in MINUTES) + " | mean action, "
-        "at the end | above the random policy |",
-        "|" + "---|" * (5 + len(MINUTES)),
+        "at the end | above random | above no action |",
+        "|" + "---|" * (6 + len(MINUTES)),
     ]
     for task, without in untrained.items():
         for name, text in (("random", "random policy"), ("none", "no action")):
             value, error = without[name]["return"], without[name]["standard_error"]
             blank = " | " * len(MINUTES)
-            lines.append(f"| {task} | {text} | {blank} | {value:,.0f} ± {error:,.0f} | |")
+            lines.append(f"| {task} | {text} | {blank} | {value:,.0f} ± {error:,.0f} | | |")
         for name, seeds in runs.items():
             algorithm, of_task, *variant = name.split("-")
             if of_task != task or variant not in ([], ["long"]):
                 continue
             times = " | ".join(middle([return_at(r, 60.0 * m) for r in seeds]) for m in MINUTES)
             ends = middle([final(run)["return"] for run in seeds])
-            above = min(distance(run, without) for run in seeds)
+            random, none = (
+                f"{min(distance(run, without[name]) for run in seeds):.0f} s.e."
+                for name in ("random", "none")
+            )
             minutes = np.median([run["seconds"][-1] for run in seeds]) / 60.0
             agent = f"{algorithm.upper()}, {minutes:.0f} min"
             lines.append(
-                f"| {task} | {agent} | {seeds_of(seeds)} | {times} | {ends} | {above:.0f} s.e. |"
+                f"| {task} | {agent} | {seeds_of(seeds)} | {times} | {ends} | {random} | {none} |"
             )
     return "\n".join(lines) + "\n"
 
