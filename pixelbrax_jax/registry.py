@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
@@ -22,8 +22,8 @@ from pixelbrax_jax.physics import make_physics
 from pixelbrax_jax.physics.base import Physics
 from pixelbrax_jax.scene.cameras import make_rig, rig_around
 from pixelbrax_jax.scene.look import make_look
-from pixelbrax_jax.tasks import TASKS
-from pixelbrax_jax.types import Camera, CameraRig, Clips, EnvParams, GeomKind
+from pixelbrax_jax.tasks import DMC_TASKS, SUITES, TASKS
+from pixelbrax_jax.types import Camera, CameraRig, Clips, EnvParams, GeomKind, Look
 from pixelbrax_jax.validation import check_choice
 
 
@@ -46,9 +46,19 @@ class _OwnTask:
 _OWN_TASKS: dict[str, _OwnTask] = {}
 
 
-def list_envs() -> tuple[str, ...]:
-    """Return the names that ``make`` accepts, sorted."""
-    return tuple(sorted([*TASKS, *_OWN_TASKS]))
+def list_envs(suite: str | None = None) -> tuple[str, ...]:
+    """Return the names that ``make`` accepts, sorted.
+
+    Args:
+        suite: ``"brax"`` or ``"dmc"`` (the DM Control Suite) for the tasks of one; None for all,
+            also those that were registered.
+
+    Raises:
+        ValueError: there is no such suite.
+    """
+    if suite is None:
+        return tuple(sorted([*TASKS, *_OWN_TASKS]))
+    return tuple(sorted(SUITES[check_choice("suite", suite, SUITES)]))
 
 
 def register(
@@ -103,8 +113,7 @@ def make(task: str | EnvConfig, **options: Any) -> tuple[PixelEnv, EnvParams]:
     program = {name: getattr(config, name) for name in PROGRAM_OPTIONS}
     program["distractors"] = resolve(config.distractors, config.task)
     env = PixelEnv(physics, **program)
-    fallback = None if config.task in TASKS else _OWN_TASKS[config.task].default_rig
-    rig = make_rig(config.task, config.camera, fallback)
+    rig = make_rig(config.task, config.camera, _own_rigs(config.task, physics))
     if not rig.link < len(physics.link_names):
         raise ValueError(
             f"the camera follows link {rig.link}, but task {config.task!r} has only "
@@ -113,7 +122,7 @@ def make(task: str | EnvConfig, **options: Any) -> tuple[PixelEnv, EnvParams]:
     return env, EnvParams(
         geoms=physics.geoms,
         rig=rig,
-        look=make_look(config.look, shadows=config.shadows),
+        look=_look(config, physics),
         clips=_clips(config, env),
         episode_length=np.int32(config.episode_length),
     )
@@ -137,7 +146,7 @@ make.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
 
 
 def _physics(config: EnvConfig) -> Physics:
-    check_choice("task", config.task, list_envs())
+    check_choice("task", config.task, list_envs(), meant=_meant(config.task))
     if config.task in TASKS:
         return make_physics(config.task, backend=config.backend, reward_preset=config.reward_preset)
     if config.backend is not None or config.reward_preset != "brax":
@@ -146,6 +155,30 @@ def _physics(config: EnvConfig) -> Physics:
             "reward there, not in make()."
         )
     return _OWN_TASKS[config.task].physics
+
+
+def _meant(task: object) -> str | None:
+    """Return the task of the DM Control Suite that is meant by its name in other libraries."""
+    name = str(task).lower().replace("-", "_").removeprefix("dmc_")
+    found = [full for full, row in DMC_TASKS.items() if name in (full, full[4:], row.task)]
+    return found[0] if len(found) == 1 else None
+
+
+def _own_rigs(task: str, physics: Physics) -> CameraRig | Mapping[str, CameraRig] | None:
+    """Return the viewpoints of a task that its row has not."""
+    if task in _OWN_TASKS:
+        return _OWN_TASKS[task].default_rig
+    return getattr(physics, "rigs", None)
+
+
+def _look(config: EnvConfig, physics: Physics) -> Look:
+    """Return the look; the default one of a task of the DM Control Suite is its model's own."""
+    own = config.task in DMC_TASKS and config.look == "default"
+    return make_look(
+        "dmc" if own else config.look,
+        shadows=config.shadows,
+        own=getattr(physics, "look", None),
+    )
 
 
 def _clips(config: EnvConfig, env: PixelEnv) -> Clips | None:

@@ -45,14 +45,16 @@ class Task:
     """What there is to know about one task.
 
     Attributes:
-        name: what ``make`` calls it, and Brax.
+        name: what ``make`` calls it; of Brax's tasks, what Brax does.
         gymnasium_id: what Gymnasium calls it.
         summary: one sentence: the goal, and what ends an episode before the time limit.
         default_backend: the physics backend used by default.
-        camera: the default viewpoint.
+        camera: the default viewpoint; None for the model's own camera.
         original_camera: that of the paper, None where it has none.
         backends: those that simulate the task sanely, sorted.
         engine: folder of ``pixelbrax_jax.physics`` that simulates it.
+        domain: name of the domain in the DM Control Suite, empty for Brax's tasks.
+        task: name of the task there, likewise.
         colors: colors by geom name that replace the model's.
         drawn_radius: metres, spheres by name that are drawn larger than they are.
         paper_options: arguments of Brax's environment for the "paper" reward preset.
@@ -66,10 +68,12 @@ class Task:
     gymnasium_id: str
     summary: str
     default_backend: str
-    camera: View
+    camera: View | None
     original_camera: View | None
     backends: tuple[str, ...] = BRAX_BACKENDS
     engine: str = "brax"
+    domain: str = ""
+    task: str = ""
     colors: Mapping[str, Color] = field(default_factory=dict)
     drawn_radius: Mapping[str, float] = field(default_factory=dict)
     paper_options: Mapping[str, float] = field(default_factory=dict)
@@ -91,7 +95,7 @@ _LYING = View((2.2, -2.2, 1.7), (0.0, 0.0, 0.55), 50.0, link=0)
 
 # Default backends are those of the paper, which leaves the choice open for ant, humanoid and
 # humanoidstandup and lacks the double pendulum.
-_ROWS = (
+_BRAX_ROWS = (
     Task(
         "ant",
         "PixelBrax/Ant-v0",
@@ -198,4 +202,71 @@ _ROWS = (
         paper_options={"forward_reward_weight": 10.0},
     ),
 )
-TASKS: Mapping[str, Task] = MappingProxyType({row.name: row for row in _ROWS})
+
+
+def _dmc(domain: str, task: str, summary: str) -> Task:
+    """Return the row of a task of the DM Control Suite."""
+    words = [*domain.split("_"), *task.split("_")]
+    return Task(
+        f"dmc_{domain}_{task}",
+        f"PixelBrax/DMC-{''.join(word[:1].upper() + word[1:] for word in words)}-v0",
+        summary,
+        "mjx",
+        camera=None,
+        original_camera=None,
+        backends=("mjx",),
+        engine="mjx",
+        domain=domain,
+        task=task,
+    )
+
+
+# None of them ends before the time limit.
+_DMC_ROWS = (
+    _dmc("acrobot", "swingup", "Two poles in a row swing up, moved at the elbow."),
+    _dmc("acrobot", "swingup_sparse", "The same, rewarded at the target alone."),
+    _dmc("ball_in_cup", "catch", "A cup on springs catches a ball on a string."),
+    _dmc("cartpole", "balance", "A cart balances a pole that begins upright."),
+    _dmc("cartpole", "balance_sparse", "The same, rewarded near upright alone."),
+    _dmc("cartpole", "swingup", "A cart swings up a pole and balances it."),
+    _dmc("cartpole", "swingup_sparse", "The same, rewarded near upright alone."),
+    _dmc("cheetah", "run", "A planar two-legged body runs along x."),
+    _dmc("finger", "spin", "A finger spins a body on a hinge."),
+    _dmc("finger", "turn_easy", "A finger turns a body's tip into a large target."),
+    _dmc("finger", "turn_hard", "A finger turns a body's tip into a small target."),
+    _dmc("fish", "upright", "A fish rights itself."),
+    _dmc("fish", "swim", "A fish swims to a target."),
+    _dmc("hopper", "stand", "A planar one-legged body stands up."),
+    _dmc("hopper", "hop", "A planar one-legged body hops along x."),
+    _dmc("humanoid", "stand", "A humanoid stands still."),
+    _dmc("humanoid", "walk", "A humanoid walks in any direction."),
+    _dmc("humanoid", "run", "A humanoid runs in any direction."),
+    _dmc("pendulum", "swingup", "A pendulum swings up, rewarded near upright alone."),
+    _dmc("point_mass", "easy", "A point is pushed to the middle of an arena."),
+    _dmc("quadruped", "walk", "A four-legged body walks forward."),
+    _dmc("quadruped", "run", "A four-legged body runs forward."),
+    _dmc("reacher", "easy", "A planar arm reaches for a large target."),
+    _dmc("reacher", "hard", "A planar arm reaches for a small target."),
+    _dmc("swimmer", "swimmer6", "A planar chain of six bodies swims to a target."),
+    _dmc("swimmer", "swimmer15", "A planar chain of fifteen bodies swims to a target."),
+    _dmc("walker", "stand", "A planar two-legged body stands up."),
+    _dmc("walker", "walk", "A planar two-legged body walks along x."),
+    _dmc("walker", "run", "A planar two-legged body runs along x."),
+)
+
+
+def _table(rows: tuple[Task, ...]) -> Mapping[str, Task]:
+    return MappingProxyType({row.name: row for row in rows})
+
+
+BRAX_TASKS = _table(_BRAX_ROWS)
+"""Brax's tasks by name."""
+
+DMC_TASKS = _table(_DMC_ROWS)
+"""Tasks of the DM Control Suite by name."""
+
+TASKS = _table((*_BRAX_ROWS, *_DMC_ROWS))
+"""All built-in tasks by name."""
+
+SUITES: Mapping[str, Mapping[str, Task]] = MappingProxyType({"brax": BRAX_TASKS, "dmc": DMC_TASKS})
+"""The built-in tasks of each suite."""

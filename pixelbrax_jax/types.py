@@ -32,6 +32,22 @@ class GeomKind(IntEnum):
     BOX = 6
 
 
+class String(struct.PyTreeNode):
+    """A thread between two points, drawn as a chain of capsules that hangs where it is slack.
+
+    Attributes:
+        geoms: static, rows of ``Geoms`` that are its pieces, in order; all capsules on no link.
+        link: (2,) static, indices of the links that carry its ends, -1 for the world.
+        ends: (2, 3) float32, metres, its ends in the frames of these links.
+        length: () float32, metres; a distance of the ends that is greater stretches it.
+    """
+
+    geoms: tuple[int, ...] = struct.field(pytree_node=False)
+    link: tuple[int, int] = struct.field(pytree_node=False)
+    ends: jax.Array
+    length: jax.Array
+
+
 class Geoms(struct.PyTreeNode):
     """The visible shapes of a task, each fixed in the frame of its link.
 
@@ -41,10 +57,15 @@ class Geoms(struct.PyTreeNode):
         material: (G,) static, row of ``rgb`` that colors the geom.
         name: (G,) static, the model's geom name, or ``kind/index`` where it has none.
         size: (G, 3) float32, metres, with MuJoCo's meaning per kind: radius, half length,
-            half extents. Planes are drawn without bounds whatever their size.
+            half extents.
         pos: (G, 3) float32, metres, in the link's frame.
         quat: (G, 4) float32, unit, in the link's frame.
         rgb: (M, 3) float32, one color per material.
+        bounded: (G,) static, planes that end at their size along their x and y, where a size of
+            0 is no end. Empty where no plane ends, whatever its size.
+        patterned: (G,) static, planes that are ground: drawn with the look's pattern, others in
+            their own color. Empty where every plane is.
+        strings: threads, the pieces of which are among the geoms.
     """
 
     kind: tuple[int, ...] = struct.field(pytree_node=False)
@@ -55,6 +76,18 @@ class Geoms(struct.PyTreeNode):
     pos: jax.Array
     quat: jax.Array
     rgb: jax.Array
+    bounded: tuple[bool, ...] = struct.field(pytree_node=False, default=())
+    patterned: tuple[bool, ...] = struct.field(pytree_node=False, default=())
+    strings: tuple[String, ...] = ()
+
+    def is_bounded(self, geom: int) -> bool:
+        """Return whether a geom is a plane that ends."""
+        return bool(self.bounded) and self.bounded[geom]
+
+    def is_ground(self, geom: int) -> bool:
+        """Return whether a geom is a plane with the look's pattern."""
+        plane = self.kind[geom] == GeomKind.PLANE
+        return plane and (not self.patterned or self.patterned[geom])
 
 
 class PhysicsState(struct.PyTreeNode):
@@ -116,6 +149,31 @@ class CameraRig(struct.PyTreeNode):
     fovy: jax.Array
 
 
+class Lamp(struct.PyTreeNode):
+    """A spot light that may follow a link.
+
+    It stands at ``offset + xpos[link]`` and never turns. A point at direction d from it (unit
+    length) is lit by ``max(d.axis, 0) ** exponent`` of its strength, and not at all if the angle
+    between d and the axis exceeds the cutoff.
+
+    Attributes:
+        link: static, index of the followed link, -1 for a lamp at rest.
+        exponent: static int, at least 0.
+        pos: (3,) float32, metres, the offset; in a scene the place in the world.
+        axis: (3,) float32, unit, world direction in which it shines.
+        cos_cutoff: () float32, cosine of the angle at which its light ends; -1 for none.
+        diffuse, highlight: () float32 coefficients, as in ``Look``.
+    """
+
+    link: int = struct.field(pytree_node=False)
+    exponent: int = struct.field(pytree_node=False)
+    pos: jax.Array
+    axis: jax.Array
+    cos_cutoff: jax.Array
+    diffuse: jax.Array
+    highlight: jax.Array
+
+
 class Look(struct.PyTreeNode):
     """Light, sky and ground.
 
@@ -126,23 +184,31 @@ class Look(struct.PyTreeNode):
         c * (ambient + diffuse * max(n.l, 0) + specular * s) + highlight * s,
         s = max(r_z, 0) ** shininess
 
-    then clipped to [0, 1].
+    then clipped to [0, 1]. Lamps (each with its own l, s and strength a) add to that
+    ``a * (c * diffuse * max(n.l, 0) + highlight * s)``. With a ``headlight`` h the picture is
+    MuJoCo's: there is ``h * max(n_z, 0)`` more ambient light, the sum of both is at most 1 on the
+    ground, and highlights are multiplied by the ground's color.
 
     Attributes:
-        ground: static, ``"checker"`` or ``"grid"`` (thin dark lines), drawn on every plane.
+        ground: static, ``"checker"`` or ``"grid"`` (thin dark lines), drawn on planes that are
+            ground, from the corner of those that end and from the middle of others.
         shadows: static, whether geoms cast shadows (diffuse and specular light vanish there).
         shininess: static positive int, the exponent.
-        light: (3,) float32, world direction from the scene TO the light, any length but 0.
+        light: (3,) float32, world direction from the scene TO the light, any length but 0; None
+            for no such light.
         ambient, diffuse, specular, highlight: () float32 coefficients.
-        sky: (2, 3) float32, color at and below the horizon, and straight above.
+        sky: (2, 3) float32, color at and below the horizon, and straight above; or (3, 3), and
+            straight below.
         ground_rgb: (2, 3) float32, colors of the two checker tiles, or of tile and line.
         ground_pitch: () float32, metres, edge of one tile or distance of two lines.
+        headlight: () float32, coefficient of diffuse light from the camera's side; None for none.
+        lamps: spot lights.
     """
 
     ground: str = struct.field(pytree_node=False)
     shadows: bool = struct.field(pytree_node=False)
     shininess: int = struct.field(pytree_node=False)
-    light: jax.Array
+    light: jax.Array | None
     ambient: jax.Array
     diffuse: jax.Array
     specular: jax.Array
@@ -150,6 +216,8 @@ class Look(struct.PyTreeNode):
     sky: jax.Array
     ground_rgb: jax.Array
     ground_pitch: jax.Array
+    headlight: jax.Array | None = None
+    lamps: tuple[Lamp, ...] = ()
 
 
 class Scene(struct.PyTreeNode):
@@ -178,7 +246,7 @@ class Frame(struct.PyTreeNode):
         depth: (H, W) float32, metres along the camera's viewing axis (not along the ray),
             ``inf`` where nothing is hit.
         seg: (H, W) int32, index of the geom seen, -1 for the sky.
-        ground: (H, W) bool, a plane is seen; cheaper to ask than ``seg``.
+        ground: (H, W) bool, a plane that is ground is seen; cheaper to ask than ``seg``.
     """
 
     r: jax.Array

@@ -36,13 +36,16 @@ _ADVICE = {
 """What to do in place of an option that there is not."""
 
 
-def check_choice(what: str, value: object, allowed: Iterable[str]) -> str:
+def check_choice(
+    what: str, value: object, allowed: Iterable[str], *, meant: str | None = None
+) -> str:
     """Return ``value`` if it is one of ``allowed``.
 
     Args:
         what: what the value stands for, as the message should call it.
         value: what the user gave.
         allowed: every accepted name.
+        meant: the one that a wrong value surely stands for; None suggests the nearest one.
 
     Returns:
         ``value``.
@@ -53,9 +56,8 @@ def check_choice(what: str, value: object, allowed: Iterable[str]) -> str:
     names = sorted(allowed)
     if isinstance(value, str) and value in names:
         return value
-    raise ValueError(
-        f"unknown {what}: {value!r}; allowed: {', '.join(names)}.{suggest(value, names)}"
-    )
+    question = f" Did you mean {meant!r}?" if meant in names else suggest(value, names)
+    raise ValueError(f"unknown {what}: {value!r}; allowed: {', '.join(names)}.{question}")
 
 
 def check_options(given: Iterable[str], allowed: Iterable[str]) -> None:

@@ -12,7 +12,7 @@ import gymnasium
 import pixelbrax_gym
 import pixelbrax_jax as pb
 from pixelbrax_jax.config import EnvConfig
-from pixelbrax_jax.tasks import TASKS
+from pixelbrax_jax.tasks import BRAX_TASKS
 
 ROOT = Path(__file__).parents[1]
 
@@ -50,13 +50,13 @@ def test_every_task_is_listed():
             task.default_backend,
             task.summary,
         ]
-        for name, task in TASKS.items()
+        for name, task in BRAX_TASKS.items()
     ]
     assert table("docs/tasks.md", "| Gymnasium id |") == expected, "\n".join(
         "| " + " | ".join(row) + " |" for row in expected
     )
 
-    for name, task in TASKS.items():
+    for name, task in BRAX_TASKS.items():
         assert gymnasium.spec(task.gymnasium_id).kwargs == {"task": name}
 
 
@@ -64,7 +64,7 @@ def test_every_task_has_its_animation():
     shown = re.findall(
         r"!\[(\w+)\]\((images/tasks/\w+\.gif)\)", (ROOT / "docs/tasks.md").read_text()
     )
-    assert shown == [(name, f"images/tasks/{name}.gif") for name in TASKS]
+    assert shown == [(name, f"images/tasks/{name}.gif") for name in BRAX_TASKS]
     for _, path in shown:
         assert (ROOT / "docs" / path).is_file()
 

@@ -16,7 +16,9 @@ _CHUNK = 128
 Step = Callable[..., tuple[Any, jax.Array]]
 
 
-def step_rows(step: Step, state: Any, rows: Any, shared: Any) -> tuple[Any, jax.Array]:
+def step_rows(
+    step: Step, state: Any, rows: Any, shared: Any, *, last: bool = True
+) -> tuple[Any, jax.Array]:
     """Step every row of a batch, as ``jax.vmap(step, (0, 0, None))(state, rows, shared)``.
 
     Args:
@@ -24,6 +26,8 @@ def step_rows(step: Step, state: Any, rows: Any, shared: Any) -> tuple[Any, jax.
         state: tree of arrays with a leading axis N.
         rows: what else differs from row to row, likewise.
         shared: what is the same for all.
+        last: whether the batch is the last axis of intermediate results, see ``batch_last``;
+            else it is the first.
 
     Returns:
         The next states and (N,) results; they differ from those of ``jax.vmap`` by rounding.
@@ -31,7 +35,8 @@ def step_rows(step: Step, state: Any, rows: Any, shared: Any) -> tuple[Any, jax.
     num_rows = len(jax.tree.leaves(state)[0])
     if num_rows == 1:
         return jax.vmap(step, in_axes=(0, 0, None))(state, rows, shared)
-    step_chunk = batch_last(step, in_axes=(0, 0, None))
+    batch = batch_last if last else jax.vmap
+    step_chunk = batch(step, in_axes=(0, 0, None))
     size = chunk_size(num_rows)
     if size == num_rows:
         return step_chunk(state, rows, shared)

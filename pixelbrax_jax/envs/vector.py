@@ -195,7 +195,8 @@ class VectorPixelEnv:
 
         # Not left to the lowering: a program for an accelerator never traces what is for CPUs.
         if self.env.physics_batching == "auto" and jax.default_backend() == "cpu":
-            return step_rows(step, sim, (keys, action), params)
+            last = getattr(self.env.physics, "batch_last", True)
+            return step_rows(step, sim, (keys, action), params, last=last)
         return jax.vmap(step, in_axes=(0, 0, None))(sim, (keys, action), params)
 
     def _env_keys(self, key: jax.Array) -> jax.Array:

@@ -16,7 +16,7 @@ from pixelbrax_jax.validation import check_choice
 VISIBLE_GROUPS = (0, 1, 2)
 
 # How many of a geom's three size numbers mean something.
-_SIZES = {
+SIZES: Mapping[GeomKind, int] = {
     GeomKind.PLANE: 3,
     GeomKind.SPHERE: 1,
     GeomKind.CAPSULE: 2,
@@ -75,11 +75,7 @@ def read_geoms(
     if model.nflex or model.nskin:
         raise ValueError("flexes and skins cannot be drawn; remove them from the model")
 
-    shown = [
-        i
-        for i in range(model.ngeom)
-        if model.geom_group[i] in geom_groups and _rgba(model, i)[3] > 0
-    ]
+    shown = shown_geoms(model, geom_groups)
     if not shown:
         raise ValueError(
             f"no geom is visible: all have alpha 0 or a group outside {tuple(geom_groups)}"
@@ -95,7 +91,7 @@ def read_geoms(
 
     size = np.array(model.geom_size[shown], np.float32)
     for row, i, kind in zip(size, shown, kinds, strict=True):
-        row[_SIZES[kind] :] = 0
+        row[SIZES[kind] :] = 0
         row[0] = drawn_radius.get(names[i], row[0])
     return Geoms(
         kind=tuple(int(kind) for kind in kinds),
@@ -130,7 +126,19 @@ def _kind(model: mujoco.MjModel, index: int, name: str) -> GeomKind:
     return GeomKind[kind.upper()]
 
 
-def _rgba(model: mujoco.MjModel, index: int) -> np.ndarray:
-    """Return (4,) float32: a material colors a geom whose own rgba is the default."""
-    own, material = model.geom_rgba[index], int(model.geom_matid[index])
+def shown_geoms(model: mujoco.MjModel, geom_groups: Collection[int] = VISIBLE_GROUPS) -> list[int]:
+    """Return indices of the geoms that ``read_geoms`` returns, in its order."""
+    return [
+        i
+        for i in range(model.ngeom)
+        if model.geom_group[i] in geom_groups and _rgba(model, i)[3] > 0
+    ]
+
+
+def resolve_rgba(model: mujoco.MjModel, own: np.ndarray, material: int) -> np.ndarray:
+    """Return (4,) float32: a material colors what has MuJoCo's default rgba itself."""
     return model.mat_rgba[material] if material >= 0 and (own == _DEFAULT_RGBA).all() else own
+
+
+def _rgba(model: mujoco.MjModel, index: int) -> np.ndarray:
+    return resolve_rgba(model, model.geom_rgba[index], int(model.geom_matid[index]))

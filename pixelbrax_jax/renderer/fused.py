@@ -12,20 +12,20 @@ unsigned integers. Only the winner is shaded, from two products of its normal.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from pixelbrax_jax import spatial
-from pixelbrax_jax.renderer import ground
+from pixelbrax_jax.renderer import ground, shading
 from pixelbrax_jax.renderer.bounds import at_least, at_most, between
 from pixelbrax_jax.renderer.intersect import Axes, Hit, Vector, dot, intersect
-from pixelbrax_jax.types import Frame, GeomKind, Geoms, Look, Scene
+from pixelbrax_jax.renderer.shading import SHADOW_BIAS
+from pixelbrax_jax.types import Frame, GeomKind, Geoms, Lamp, Look, Scene
 
 _INF_BITS = np.uint32(0x7F800000)
-
-_SHADOW_BIAS = 1e-3
-"""Metres that a shadow ray must travel before a hit counts."""
 
 
 def render(
@@ -44,15 +44,18 @@ def render(
         The band, every plane (num_rows, W). Its depth is exact to a relative
         ``2**(b - 24)``, where b bits hold a rank.
     """
-    geoms, look = scene.geoms, scene.look
     to_camera = scene.camera.xmat
     pos = (scene.pos - scene.camera.pos) @ to_camera
     xmat = jnp.einsum("ji,gjk->gik", to_camera, scene.xmat)
-    light = spatial.unit(look.light) @ to_camera
+    light = None if scene.look.light is None else spatial.unit(scene.look.light) @ to_camera
+    lamps = [
+        ((lamp.pos - scene.camera.pos) @ to_camera, lamp.axis @ to_camera)
+        for lamp in scene.look.lamps
+    ]
     pixel = 2.0 * jnp.tan(jnp.deg2rad(scene.camera.fovy) / 2.0) / height
     # The barrier keeps these few numbers out of the loop over pixels.
-    pos, xmat, light, pixel, up, scene = jax.lax.optimization_barrier(
-        (pos, xmat, light, pixel, to_camera[2], scene)
+    pos, xmat, light, lamps, pixel, up, scene = jax.lax.optimization_barrier(
+        (pos, xmat, light, lamps, pixel, to_camera[2], scene)
     )
     geoms, look = scene.geoms, scene.look
 
@@ -61,69 +64,140 @@ def render(
     ray = _rays(pixel, height, width, first_row, num_rows)
     # Geoms of one material get neighboring ranks, so that a material is a range of ranks.
     order = sorted(range(len(geoms.kind)), key=lambda g: geoms.material[g])
-    kinds = [geoms.kind[g] for g in order]
-    centers: list[Vector] = [tuple(pos[g]) for g in order]
-    axes: list[Axes] = [
-        (tuple(xmat[g, :, 0]), tuple(xmat[g, :, 1]), tuple(xmat[g, :, 2])) for g in order
+    solids = [
+        _Solid(
+            kind=geoms.kind[g],
+            center=tuple(pos[g]),
+            axes=(tuple(xmat[g, :, 0]), tuple(xmat[g, :, 1]), tuple(xmat[g, :, 2])),
+            size=tuple(geoms.size[g]),
+            bounded=geoms.is_bounded(g),
+            ground=geoms.is_ground(g),
+        )
+        for g in order
     ]
-    sizes: list[Vector] = [tuple(geoms.size[g]) for g in order]
-    geometry = list(zip(kinds, centers, axes, sizes, strict=True))
-    hits = [intersect(kind, ray, at, along, size) for kind, at, along, size in geometry]
+    hits = [solid.hit(ray, solid.center) for solid in solids]
 
     t, winner = _nearest(hits, shape)
     seen = [winner == rank for rank in range(len(order))]
     sky = winner == len(order)
-
-    to_light, z_axis = tuple(light), (0.0, 0.0, 1.0)
-    ray_light = dot(ray, to_light)
-    n_l = n_z = jnp.zeros(shape)
-    for hit, here in zip(hits, seen, strict=True):
-        n_l = jnp.where(here, hit.normal_dot(to_light, ray_light), n_l)
-        n_z = jnp.where(here, hit.normal_dot(z_axis, ray[2]), n_z)
-    lit = jnp.ones(shape, bool)
-    if look.shadows:
-        points = tuple(t * component for component in ray)
-        for rank, kind in enumerate(kinds):
-            if kind != GeomKind.PLANE:
-                # A convex geom cannot shade a point of itself that faces the light.
-                there = tuple(c - p for c, p in zip(centers[rank], points, strict=True))
-                blocked = intersect(kind, to_light, there, axes[rank], sizes[rank]).t > _SHADOW_BIAS
-                lit &= ~(blocked & ~seen[rank])
+    points = tuple(t * component for component in ray)
 
     color = _surface_colors(geoms, order, winner)
-    for rank, kind in enumerate(kinds):
-        if kind == GeomKind.PLANE:
-            fraction = _ground_fraction(look, ray, hits[rank].t, pixel, centers[rank], axes[rank])
+    for rank, solid in enumerate(solids):
+        if solid.ground:
+            fraction = _ground_fraction(look, ray, hits[rank].t, pixel, solid)
             for c in range(3):
                 first, second = look.ground_rgb[0, c], look.ground_rgb[1, c]
                 color[c] = jnp.where(seen[rank], first + fraction * (second - first), color[c])
 
-    gloss = at_least(2.0 * n_l * n_z - light[2], 0.0) ** look.shininess
-    gloss = jnp.where(lit & (n_l > 0.0), gloss, 0.0)
-    diffuse = jnp.where(lit, at_least(n_l, 0.0), 0.0)
-    shade = look.ambient + look.diffuse * diffuse + look.specular * gloss
-    rise = between(0.0, dot(ray, tuple(up)), 1.0)
+    normal = _Normal(hits, seen, ray)
+    n_z = normal.dot((0.0, 0.0, 1.0), ray[2])
+    shade: jax.Array = look.ambient
+    gleam: jax.Array | float = 0.0
+    on_ground = jnp.zeros(shape, bool)
+    for rank, solid in enumerate(solids):
+        if solid.ground:
+            on_ground |= seen[rank]
+    if look.headlight is not None:
+        shade += look.headlight * at_least(n_z, 0.0)
+        shade = jnp.where(on_ground, at_most(shade, 1.0), shade)
+    if light is not None:
+        to_light = tuple(light)
+        n_l = normal.dot(to_light, dot(ray, to_light))
+        lit = jnp.ones(shape, bool)
+        if look.shadows:
+            for rank, solid in enumerate(solids):
+                if solid.kind != GeomKind.PLANE:
+                    # A convex geom cannot shade a point of itself that faces the light.
+                    there = tuple(c - p for c, p in zip(solid.center, points, strict=True))
+                    blocked = solid.hit(to_light, there).t > SHADOW_BIAS
+                    lit &= ~(blocked & ~seen[rank])
+        gloss = shading.gloss(n_l, n_z, light[2], look.shininess)
+        gloss = jnp.where(lit & (n_l > 0.0), gloss, 0.0)
+        diffuse = jnp.where(lit, at_least(n_l, 0.0), 0.0)
+        shade = shade + look.diffuse * diffuse + look.specular * gloss
+        gleam = look.highlight * gloss
+    for lamp, place in zip(look.lamps, lamps, strict=True):
+        more, glitter = _lamplight(lamp, place, look, points, normal, n_z, solids)
+        shade, gleam = shade + more, gleam + glitter
+    if look.headlight is not None:
+        # A texture dims the highlight too.
+        shade = shade + jnp.where(on_ground, gleam, 0.0)
+        gleam = jnp.where(on_ground, 0.0, gleam)
+
+    rise = dot(ray, tuple(up))
     planes = []
     for c in range(3):
-        surface = between(0.0, color[c] * shade + look.highlight * gloss, 1.0)
-        air = look.sky[0, c] + rise * (look.sky[1, c] - look.sky[0, c])
-        planes.append(jnp.where(sky, air, surface))
+        surface = between(0.0, color[c] * shade + gleam, 1.0)
+        planes.append(jnp.where(sky, shading.sky(look, rise, c), surface))
 
     geom_of_rank = jnp.array([*order, -1], jnp.int32)
     depth = jnp.where(sky, jnp.inf, -t * ray[2])
-    on_plane = jnp.zeros(shape, bool)
-    for rank, kind in enumerate(kinds):
-        if kind == GeomKind.PLANE:
-            on_plane |= seen[rank]
     frame = Frame(
         r=planes[0],
         g=planes[1],
         b=planes[2],
         depth=depth,
         seg=geom_of_rank[winner],
-        ground=on_plane,
+        ground=on_ground,
     )
     return jax.tree.map(lambda plane: plane.reshape(num_rows, width), frame)
+
+
+class _Solid(NamedTuple):
+    """One geom in the camera's frame; fields as in ``intersect``, and whether it is ground."""
+
+    kind: int
+    center: Vector
+    axes: Axes
+    size: Vector
+    bounded: bool
+    ground: bool
+
+    def hit(self, ray: Vector, center: Vector) -> Hit:
+        """Return where rays enter it, with its center at another place."""
+        return intersect(self.kind, ray, center, self.axes, self.size, self.bounded)
+
+
+class _Normal(NamedTuple):
+    """The outer unit normal of what each pixel sees; 0 where that is the sky."""
+
+    hits: list[Hit]
+    seen: list[jax.Array]
+    ray: Vector
+
+    def dot(self, v: Vector, ray_v: jax.Array) -> jax.Array:
+        """Return its product with ``v``, given the ray's."""
+        product = jnp.zeros(self.ray[0].shape)
+        for hit, here in zip(self.hits, self.seen, strict=True):
+            product = jnp.where(here, hit.normal_dot(v, ray_v), product)
+        return product
+
+
+def _lamplight(
+    lamp: Lamp,
+    place: tuple[jax.Array, jax.Array],
+    look: Look,
+    points: Vector,
+    normal: _Normal,
+    n_z: jax.Array,
+    solids: list[_Solid],
+) -> tuple[jax.Array, jax.Array]:
+    """Return what a lamp adds to the factor of colors, and to colors themselves."""
+    pos, axis = tuple(place[0]), tuple(place[1])
+    ray, distance, strength = shading.beam(lamp, pos, axis, points)
+    to_lamp = tuple(-component for component in ray)
+    n_l = normal.dot(to_lamp, dot(normal.ray, to_lamp))
+    strength = jnp.where(n_l > 0.0, strength, 0.0)
+    if look.shadows:
+        for rank, solid in enumerate(solids):
+            if solid.kind != GeomKind.PLANE:
+                there = tuple(c - p for c, p in zip(solid.center, pos, strict=True))
+                way = solid.hit(ray, there).t
+                blocked = (way > 0.0) & (way < distance - SHADOW_BIAS)
+                strength = jnp.where(blocked & ~normal.seen[rank], 0.0, strength)
+    shine = shading.gloss(n_l, n_z, to_lamp[2], look.shininess)
+    return strength * lamp.diffuse * n_l, strength * lamp.highlight * shine
 
 
 def _rays(
@@ -166,22 +240,21 @@ def _surface_colors(geoms: Geoms, order: list[int], winner: jax.Array) -> list[j
 
 
 def _ground_fraction(
-    look: Look,
-    ray: Vector,
-    t: jax.Array,
-    pixel: jax.Array,
-    center: Vector,
-    axes: Axes,
+    look: Look, ray: Vector, t: jax.Array, pixel: jax.Array, plane: _Solid
 ) -> jax.Array:
     """Return the fraction of the ground's second color in pixels that see a plane at ``t``."""
-    normal = axes[2]
+    normal = plane.axes[2]
     slope = 1.0 / at_most(dot(ray, normal), -1e-7)
     inv_pitch = 1.0 / look.ground_pitch
     step = -t * ray[2] * pixel * inv_pitch
     coords, widths = [], []
-    for axis in axes[:2]:
+    for axis, half in zip(plane.axes[:2], plane.size[:2], strict=True):
         ray_axis = dot(ray, axis)
-        coords.append((t * ray_axis - dot(center, axis)) * inv_pitch)
+        along = t * ray_axis - dot(plane.center, axis)
+        if plane.bounded:
+            # MuJoCo's textures begin at the corner of least x and greatest y.
+            along = along + half if axis is plane.axes[0] else half - along
+        coords.append(along * inv_pitch)
         # Derivatives of the coordinate by one pixel to the right and one up.
         right = axis[0] - ray_axis * slope * normal[0]
         above = axis[1] - ray_axis * slope * normal[1]

@@ -58,6 +58,15 @@ def _plane(ray: Vector, pos: Vector, axes: Axes, size: Vector) -> Hit:
     return Hit(t, lambda v, ray_v: dot(normal, v))
 
 
+def _rectangle(ray: Vector, pos: Vector, axes: Axes, size: Vector) -> Hit:
+    t, normal_dot = _plane(ray, pos, axes, size)
+    inside: bool | jax.Array = True
+    for axis, half in zip(axes[:2], size[:2], strict=True):
+        reach = jnp.where(half > 0.0, half, jnp.inf)
+        inside &= jnp.abs(t * dot(ray, axis) - dot(pos, axis)) <= reach
+    return Hit(jnp.where(inside, t, -1.0), normal_dot)
+
+
 def _sphere(ray: Vector, pos: Vector, axes: Axes, size: Vector) -> Hit:
     b = dot(ray, pos)
     t = b - jnp.sqrt(b * b - (dot(pos, pos) - size[0] * size[0]))
@@ -150,7 +159,9 @@ _BY_KIND = {
 }
 
 
-def intersect(kind: int, ray: Vector, pos: Vector, axes: Axes, size: Vector) -> Hit:
+def intersect(
+    kind: int, ray: Vector, pos: Vector, axes: Axes, size: Vector, bounded: bool = False
+) -> Hit:
     """Return where unit rays from the origin enter a geom.
 
     Args:
@@ -159,8 +170,11 @@ def intersect(kind: int, ray: Vector, pos: Vector, axes: Axes, size: Vector) -> 
         pos: the geom's center, metres, in the rays' frame.
         axes: the geom's x, y and z directions in the rays' frame.
         size: the geom's three size numbers, as in ``Geoms.size``.
+        bounded: whether a plane ends at its size; see ``Geoms.bounded``.
 
     Returns:
         The hit, in the shape to which ``ray`` and ``pos`` broadcast.
     """
+    if bounded and kind == GeomKind.PLANE:
+        return _rectangle(ray, pos, axes, size)
     return _BY_KIND[GeomKind(kind)](ray, pos, axes, size)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from pixelbrax_jax import spatial
 from pixelbrax_jax.renderer import ground
-from pixelbrax_jax.types import Camera, Frame, GeomKind, Look, Scene
+from pixelbrax_jax.types import Camera, Frame, GeomKind, Lamp, Scene
 
 _SHADOW_BIAS = 1e-3
 
@@ -35,8 +35,8 @@ def render(
     geoms, look, camera = scene.geoms, scene.look, scene.camera
     rays = pixel_rays(camera, height, width, first_row + jnp.arange(num_rows))
     distances, normals = [], []
-    for g, kind in enumerate(geoms.kind):
-        t, normal = _cast(kind, camera.pos, rays, scene.pos[g], scene.xmat[g], geoms.size[g])
+    for g in range(len(geoms.kind)):
+        t, normal = _cast_geom(scene, g, camera.pos, rays)
         distances.append(t)
         normals.append(normal)
     t = jnp.stack(distances)
@@ -47,31 +47,43 @@ def render(
     normal = jnp.take_along_axis(jnp.stack(normals), nearest[None, :, :, None], axis=0)[0]
     points = camera.pos + t[..., None] * rays
 
-    to_light = spatial.unit(look.light)
-    lit = jnp.ones_like(hit)
-    if look.shadows:
-        for g, kind in enumerate(geoms.kind):
-            if kind != GeomKind.PLANE:
-                light_rays = jnp.broadcast_to(to_light, points.shape)
-                way, _ = _cast(kind, points, light_rays, scene.pos[g], scene.xmat[g], geoms.size[g])
-                lit &= ~(jnp.isfinite(way) & (way > _SHADOW_BIAS) & (nearest != g))
-
     color = jnp.asarray(geoms.rgb)[jnp.array(geoms.material)[nearest]]
-    for g, kind in enumerate(geoms.kind):
-        if kind == GeomKind.PLANE:
-            tiles = _ground_color(look, camera, rays, scene.pos[g], scene.xmat[g], height)
+    is_ground = [geoms.is_ground(g) for g in range(len(geoms.kind))]
+    on_ground = hit & jnp.array(is_ground)[nearest]
+    for g in range(len(geoms.kind)):
+        if is_ground[g]:
+            tiles = _ground_color(scene, g, rays, height)
             color = jnp.where((nearest == g)[..., None], tiles, color)
 
     back = camera.xmat[:, 2]
-    n_l, n_z = normal @ to_light, normal @ back
-    bright = lit & (n_l > 0.0)
-    gloss = jnp.maximum(2.0 * n_l * n_z - to_light @ back, 0.0) ** look.shininess
-    gloss = jnp.where(bright, gloss, 0.0)[..., None]
-    diffuse = jnp.where(bright, n_l, 0.0)[..., None]
-    shade = look.ambient + look.diffuse * diffuse + look.specular * gloss
-    surface = jnp.clip(color * shade + look.highlight * gloss, 0.0, 1.0)
-    rise = jnp.clip(rays[..., 2:], 0.0, 1.0)
-    sky = look.sky[0] + rise * (look.sky[1] - look.sky[0])
+    n_z = normal @ back
+    shade, gleam = look.ambient, jnp.zeros(())
+    if look.headlight is not None:
+        shade = shade + look.headlight * jnp.maximum(n_z, 0.0)
+        shade = jnp.where(on_ground, jnp.minimum(shade, 1.0), shade)
+    if look.light is not None:
+        to_light = spatial.unit(look.light)
+        n_l = normal @ to_light
+        lit = n_l > 0.0
+        if look.shadows:
+            light_rays = jnp.broadcast_to(to_light, points.shape)
+            lit &= ~_shaded(scene, points, light_rays, jnp.inf, nearest)
+        gloss = jnp.maximum(2.0 * n_l * n_z - to_light @ back, 0.0) ** look.shininess
+        gloss = jnp.where(lit, gloss, 0.0)
+        shade = shade + look.diffuse * jnp.where(lit, n_l, 0.0) + look.specular * gloss
+        gleam = gleam + look.highlight * gloss
+    for lamp in look.lamps:
+        more, glitter = _lamplight(scene, lamp, points, normal, nearest)
+        shade, gleam = shade + more, gleam + glitter
+    if look.headlight is not None:
+        # A texture dims the highlight too.
+        shade, gleam = jnp.where(on_ground, shade + gleam, shade), jnp.where(on_ground, 0.0, gleam)
+    shade, gleam = (jnp.broadcast_to(x, hit.shape)[..., None] for x in (shade, gleam))
+    surface = jnp.clip(color * shade + gleam, 0.0, 1.0)
+    rise = rays[..., 2:]
+    sky = look.sky[0] + jnp.clip(rise, 0.0, 1.0) * (look.sky[1] - look.sky[0])
+    if look.sky.shape[0] == 3:
+        sky += jnp.clip(-rise, 0.0, 1.0) * (look.sky[2] - look.sky[0])
     rgb = jnp.where(hit[..., None], surface, sky)
     return Frame(
         r=rgb[..., 0],
@@ -79,7 +91,7 @@ def render(
         b=rgb[..., 2],
         depth=jnp.where(hit, -t * (rays @ back), jnp.inf),
         seg=jnp.where(hit, nearest, -1).astype(jnp.int32),
-        ground=hit & (jnp.array(geoms.kind)[nearest] == GeomKind.PLANE),
+        ground=on_ground,
     )
 
 
@@ -90,6 +102,59 @@ def pixel_rays(camera: Camera, height: int, width: int, rows: jax.Array) -> jax.
     y = (0.5 * (height - 1) - rows) * pixel
     x, y = jnp.meshgrid(x, y)
     return spatial.unit(jnp.stack([x, y, -jnp.ones_like(x)], axis=-1)) @ camera.xmat.T
+
+
+def _cast_geom(
+    scene: Scene, g: int, origin: jax.Array, rays: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Return distances at which rays enter geom ``g`` (``inf`` if never), and normals."""
+    geoms = scene.geoms
+    t, normal = _cast(geoms.kind[g], origin, rays, scene.pos[g], scene.xmat[g], geoms.size[g])
+    if geoms.is_bounded(g):
+        at = _at((origin - scene.pos[g]) @ scene.xmat[g], rays @ scene.xmat[g], t)[..., :2]
+        half = geoms.size[g, :2]
+        inside = jnp.all((jnp.abs(at) <= half) | (half <= 0.0), axis=-1)
+        t = jnp.where(inside, t, jnp.inf)
+    return t, normal
+
+
+def _shaded(
+    scene: Scene, origin: jax.Array, rays: jax.Array, until: jax.Array | float, nearest: jax.Array
+) -> jax.Array:
+    """Return whether another geom than that seen is on the way to the light; planes never are.
+
+    Args:
+        scene: the scene.
+        origin: where rays begin; (3,) or (H, W, 3) metres.
+        rays: (H, W, 3) unit directions.
+        until: metres, where they end.
+        nearest: (H, W) int, the geom seen.
+    """
+    shaded = jnp.zeros(nearest.shape, bool)
+    for g, kind in enumerate(scene.geoms.kind):
+        if kind != GeomKind.PLANE:
+            way, _ = _cast_geom(scene, g, origin, rays)
+            blocked = jnp.isfinite(way) & (way > _SHADOW_BIAS) & (way < until)
+            shaded |= blocked & (nearest != g)
+    return shaded
+
+
+def _lamplight(
+    scene: Scene, lamp: Lamp, points: jax.Array, normal: jax.Array, nearest: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Return what a lamp adds to the factor of colors, and to colors themselves, (H, W) each."""
+    away = points - lamp.pos
+    ray = spatial.unit(away)
+    along = ray @ lamp.axis
+    n_l = -jnp.sum(ray * normal, -1)
+    lit = (along >= lamp.cos_cutoff) & (n_l > 0.0)
+    if scene.look.shadows:
+        until = jnp.sum(away * ray, -1) - _SHADOW_BIAS
+        lit &= ~_shaded(scene, lamp.pos, ray, until, nearest)
+    strength = jnp.where(lit, jnp.maximum(along, 0.0) ** lamp.exponent, 0.0)
+    back = scene.camera.xmat[:, 2]
+    shine = jnp.maximum(2.0 * n_l * (normal @ back) + ray @ back, 0.0) ** scene.look.shininess
+    return strength * lamp.diffuse * n_l, strength * lamp.highlight * shine
 
 
 def _cast(
@@ -123,7 +188,7 @@ def _at(o: jax.Array, d: jax.Array, t: jax.Array) -> jax.Array:
 
 
 def _plane(o: jax.Array, d: jax.Array, size: jax.Array) -> tuple[jax.Array, jax.Array]:
-    del size  # drawn without bounds
+    del size  # see _cast_geom
     descends = d[..., 2] < -1e-7
     t = -o[..., 2] / jnp.where(descends, d[..., 2], -1.0)
     normal = jnp.broadcast_to(jnp.array([0.0, 0.0, 1.0]), d.shape)
@@ -201,10 +266,9 @@ _LOCAL = {
 }
 
 
-def _ground_color(
-    look: Look, camera: Camera, rays: jax.Array, pos: jax.Array, xmat: jax.Array, height: int
-) -> jax.Array:
-    """Return the plane's pattern where the rays meet it, (H, W, 3)."""
+def _ground_color(scene: Scene, g: int, rays: jax.Array, height: int) -> jax.Array:
+    """Return the pattern of plane ``g`` where the rays meet it, (H, W, 3)."""
+    look, camera, pos, xmat = scene.look, scene.camera, scene.pos[g], scene.xmat[g]
     o, d = (camera.pos - pos) @ xmat, rays @ xmat
     pixel = 2.0 * jnp.tan(jnp.deg2rad(camera.fovy) / 2.0) / height
     # Rays of length 1 along the viewing axis are linear in the pixel's position, so their
@@ -218,7 +282,11 @@ def _ground_color(
         turn = (axis * pixel) @ xmat
         moved = s[..., None] * (turn[:2] - d[..., :2] * (turn[2] / down)[..., None])
         footprint += jnp.abs(moved)
-    coords = (o[:2] + s[..., None] * d[..., :2]) / look.ground_pitch
+    coords = o[:2] + s[..., None] * d[..., :2]
+    if scene.geoms.is_bounded(g):
+        # MuJoCo's textures begin at the corner of least x and greatest y.
+        coords = scene.geoms.size[g, :2] + coords * jnp.array([1.0, -1.0])
+    coords /= look.ground_pitch
     footprint = footprint / look.ground_pitch
     fraction = ground.second_color_fraction(
         look.ground, coords[..., 0], coords[..., 1], footprint[..., 0], footprint[..., 1]

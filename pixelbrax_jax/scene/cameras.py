@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -68,7 +69,7 @@ def _rig_of(view: View) -> CameraRig:
     return rig(view.eye, view.target, view.fovy, link=view.link, up=view.up)
 
 
-DEFAULT = {name: _rig_of(row.camera) for name, row in TASKS.items()}
+DEFAULT = {name: _rig_of(row.camera) for name, row in TASKS.items() if row.camera}
 ORIGINAL = {
     name: _rig_of(row.original_camera) for name, row in TASKS.items() if row.original_camera
 }
@@ -82,18 +83,26 @@ def _around(base: CameraRig, direction: Vector, up: Vector) -> CameraRig:
     return dataclasses.replace(base, eye=eye, up=_f32(up))
 
 
-def named_rigs(task: str, fallback: CameraRig | None = None) -> dict[str, CameraRig]:
+def named_rigs(
+    task: str, fallback: CameraRig | Mapping[str, CameraRig] | None = None
+) -> dict[str, CameraRig]:
     """Return all rigs of a task by name.
 
     Args:
         task: Brax's name of the task, or any name with ``fallback`` given.
-        fallback: default rig of a task that has no row of its own.
+        fallback: default rig of a task that has no row of its own; or several rigs by name, one
+            of them ``default``.
 
     Returns:
         ``default``, ``side`` (seen along +y), ``front`` (along -x), ``top`` (from above, +y up
-        in the image), and ``original`` where the paper has one.
+        in the image), those of ``fallback``, and ``original`` where the paper has one.
     """
-    default = DEFAULT.get(task, fallback)
+    given: Mapping[str, CameraRig] = {}
+    if isinstance(fallback, Mapping):
+        given = fallback
+    elif fallback is not None:
+        given = {"default": fallback}
+    default = DEFAULT.get(task, given.get("default"))
     if default is None:
         raise ValueError(f"no camera rig is known for task {task!r}: give one as `camera=`.")
     rigs = {
@@ -101,21 +110,24 @@ def named_rigs(task: str, fallback: CameraRig | None = None) -> dict[str, Camera
         "side": _around(default, (0.0, -1.0, 0.15), (0.0, 0.0, 1.0)),
         "front": _around(default, (1.0, 0.0, 0.15), (0.0, 0.0, 1.0)),
         "top": _around(default, (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)),
-    }
+        **given,
+    } | {"default": default}
     if task in ORIGINAL:
         rigs["original"] = ORIGINAL[task]
     return rigs
 
 
 def make_rig(
-    task: str, camera: str | CameraRig | Camera = "default", fallback: CameraRig | None = None
+    task: str,
+    camera: str | CameraRig | Camera = "default",
+    fallback: CameraRig | Mapping[str, CameraRig] | None = None,
 ) -> CameraRig:
     """Return a rig by name, the given one, or one that holds a camera at rest.
 
     Args:
         task: the task's name.
         camera: a name of ``named_rigs``, a ``CameraRig`` or a ``Camera``.
-        fallback: default rig of a task that has no row of its own.
+        fallback: default rig of a task that has no row of its own, or several by name.
 
     Returns:
         The rig.

@@ -1,4 +1,4 @@
-"""The two looks: ``default``, made to be read, and ``original``, as in the paper."""
+"""The looks: ``default``, made to be read; ``original``, as in the paper; ``dmc``, DM Control's."""
 
 from __future__ import annotations
 
@@ -46,15 +46,35 @@ LOOKS: dict[str, Look] = {
         ground_rgb=_f32([[200 / 255] * 3, [0.0] * 3]),
         ground_pitch=_f32(2000 / 2048),
     ),
+    # Headlight, checker and sky of the DM Control Suite (common/visual.xml, materials.xml,
+    # skybox.xml), and the light from above that its models have. Tasks of the suite bring their
+    # own of this look, with the lights of their models.
+    "dmc": Look(
+        ground="checker",
+        shadows=True,
+        shininess=16,
+        light=_f32([0.0, 0.0, 1.0]),
+        ambient=_f32(0.4),
+        diffuse=_f32(0.6),
+        specular=_f32(0.0),
+        highlight=_f32(0.15),
+        sky=_f32([[0.20, 0.31, 0.40], [0.39, 0.58, 0.77], [0.03, 0.04, 0.05]]),
+        ground_rgb=_f32([[0.1, 0.2, 0.3], [0.2, 0.3, 0.4]]),
+        ground_pitch=_f32(1.0),
+        headlight=_f32(0.8),
+    ),
 }
 
 
-def make_look(look: str | Look = "default", *, shadows: bool | None = None) -> Look:
+def make_look(
+    look: str | Look = "default", *, shadows: bool | None = None, own: Look | None = None
+) -> Look:
     """Return a look by name, or the given one.
 
     Args:
-        look: ``"default"``, ``"original"`` or a ``Look``.
+        look: ``"default"``, ``"original"``, ``"dmc"`` or a ``Look``.
         shadows: whether geoms cast shadows; None keeps the look's own choice.
+        own: what a task's model has for ``"dmc"``.
 
     Returns:
         The look.
@@ -64,7 +84,8 @@ def make_look(look: str | Look = "default", *, shadows: bool | None = None) -> L
         TypeError: ``look`` is neither a string nor a ``Look``; ``shadows`` is no truth value.
     """
     if isinstance(look, str):
-        look = LOOKS[check_choice("look", look, LOOKS)]
+        name = check_choice("look", look, LOOKS)
+        look = own if name == "dmc" and own is not None else LOOKS[name]
     elif not isinstance(look, Look):
         raise TypeError(f"look must be a name or a pixelbrax_jax.Look, got {type(look).__name__}.")
     if shadows is None:

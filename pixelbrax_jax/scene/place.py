@@ -7,12 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from pixelbrax_jax import spatial
+from pixelbrax_jax.scene import strings
 from pixelbrax_jax.scene.cameras import aim
 from pixelbrax_jax.types import CameraRig, Geoms, Look, Scene
 
 
 def place(geoms: Geoms, rig: CameraRig, look: Look, xpos: jax.Array, xquat: jax.Array) -> Scene:
-    """Carry every geom along with its link, and aim the camera.
+    """Carry every geom and lamp along with its link, stretch the strings, and aim the camera.
 
     Args:
         geoms: shapes in their links' frames.
@@ -32,4 +33,18 @@ def place(geoms: Geoms, rig: CameraRig, look: Look, xpos: jax.Array, xquat: jax.
     link_quat = jnp.concatenate([xquat, upright])[link]
     pos = link_pos + spatial.rotate(link_quat, geoms.pos)
     xmat = spatial.quat_to_mat(spatial.quat_multiply(link_quat, geoms.quat))
+    for string in geoms.strings:
+        ends = [
+            xpos[link] + spatial.rotate(xquat[link], end) if link >= 0 else end
+            for link, end in zip(string.link, string.ends, strict=True)
+        ]
+        rows = np.array(string.geoms)
+        centers, axes, half = strings.pieces(string, jnp.stack(ends), len(rows))
+        pos, xmat = pos.at[rows].set(centers), xmat.at[rows].set(axes)
+        geoms = geoms.replace(size=jnp.asarray(geoms.size).at[rows, 1].set(half))
+    lamps = tuple(
+        lamp.replace(pos=lamp.pos + xpos[lamp.link]) if lamp.link >= 0 else lamp
+        for lamp in look.lamps
+    )
+    look = look.replace(lamps=lamps)
     return Scene(geoms=geoms, pos=pos, xmat=xmat, camera=aim(rig, xpos), look=look)

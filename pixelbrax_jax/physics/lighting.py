@@ -1,0 +1,170 @@
+"""Lights, sky and ground of a MuJoCo model, as a look.
+
+MuJoCo's renderer is OpenGL's fixed pipeline: ambient and diffuse light times a material's color,
+and a white highlight. Its light types and modes, and its textures, are documented in the XML
+reference (mujoco.readthedocs.io, elements ``light``, ``headlight``, ``texture``, ``material``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from pixelbrax_jax.physics.viewpoints import follows_tracked
+from pixelbrax_jax.types import Lamp, Look
+
+_DIRECTIONAL = int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
+_TRACKCOM = int(mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM)
+_RGB = int(mujoco.mjtTextureRole.mjTEXROLE_RGB)
+
+_SPECULAR = 0.5
+"""What MuJoCo's default material reflects of a light's specular part."""
+
+_SHININESS = 16
+"""A default material's exponent of 0.5 * 128 belongs to the half vector between light and viewer;
+Phong's mirrored vector turns twice as far, for which a quarter of it is as wide."""
+
+
+def read_look(
+    model: mujoco.MjModel,
+    *,
+    com_link: int,
+    movable: Collection[str] = (),
+    target_link: int = -1,
+    anchor: np.ndarray | None = None,
+) -> Look:
+    """Return the look of a model's own picture.
+
+    Args:
+        model: the compiled model; link i is its body i + 1.
+        com_link: index of the link at the tracked center of mass, -1 if there is none.
+        movable: names of lamps that move along with the target.
+        target_link: index of the target's link, -1 if there is none.
+        anchor: (3,) metres, where the target is in the model.
+
+    Returns:
+        The look. Colors of lights become shades of grey, a lamp on a body follows but does not
+        turn, and the sky's texture becomes its best fit by three colors.
+    """
+    active = [i for i in range(model.nlight) if model.light_active[i]]
+    suns = [i for i in active if model.light_type[i] == _DIRECTIONAL]
+    headlight = model.vis.headlight
+    has_headlight = bool(headlight.active)
+    ambient = sum((model.light_ambient[i].mean() for i in active), 0.0)
+    if has_headlight:
+        ambient += headlight.ambient.mean()
+    elif not active:
+        ambient = 0.3  # MuJoCo's own, where there is no light at all
+    sun = suns[0] if suns else None
+    lamps = []
+    for i in active:
+        if model.light_type[i] == _DIRECTIONAL:
+            continue
+        lamp = _lamp(model, i, com_link)
+        if lamp is not None and target_link >= 0 and model.light(i).name in movable:
+            lamp = lamp.replace(link=target_link, pos=lamp.pos - _f32(anchor))
+        lamps.append(lamp)
+    pitch, colors = _ground(model)
+    return Look(
+        ground="checker",
+        shadows=True,
+        shininess=_SHININESS,
+        light=None if sun is None else _f32(-model.light_dir[sun]),
+        ambient=_f32(ambient),
+        diffuse=_f32(0.0 if sun is None else model.light_diffuse[sun].mean()),
+        specular=_f32(0.0),
+        highlight=_f32(0.0 if sun is None else _SPECULAR * model.light_specular[sun].mean()),
+        sky=_sky(model),
+        ground_rgb=colors,
+        ground_pitch=pitch,
+        headlight=_f32(headlight.diffuse.mean()) if has_headlight else None,
+        lamps=tuple(lamp for lamp in lamps if lamp is not None),
+    )
+
+
+def checker(model: mujoco.MjModel, geom: int) -> np.ndarray | None:
+    """Return the two colors of a geom's checkered texture, (2, 3) in [0, 1]; None for none."""
+    material = int(model.geom_matid[geom])
+    texture = int(model.mat_texid[material, _RGB]) if material >= 0 else -1
+    if texture < 0 or model.tex_type[texture] != int(mujoco.mjtTexture.mjTEXTURE_2D):
+        return None
+    pixels = _pixels(model, texture)
+    # Quarters: first and last of one color, the others of another; only their edges may differ.
+    rows, columns = (np.arange(1, 4, 2) * size // 4 for size in pixels.shape[:2])
+    (a, b), (c, d) = pixels[np.ix_(rows, columns)]
+    if not ((a == d).all() and (b == c).all() and (a != b).any()):
+        return None
+    return np.stack([a, b]) / 255.0 * model.mat_rgba[material, :3]
+
+
+def _lamp(model: mujoco.MjModel, light: int, com_link: int) -> Lamp | None:
+    mode, body = int(model.light_mode[light]), int(model.light_bodyid[light])
+    link, pos, axis = body - 1, model.light_pos0[light], model.light_dir0[light]
+    if body == 0:
+        # Of a model that was edited since it was compiled these are up to date.
+        pos, axis = model.light_pos[light], model.light_dir[light]
+    if mode == _TRACKCOM:
+        if not follows_tracked(model, body):
+            return None
+        link, pos = com_link, model.light_poscom0[light]
+    cutoff = float(model.light_cutoff[light])
+    return Lamp(
+        link=link,
+        exponent=round(float(model.light_exponent[light])),
+        pos=_f32(pos),
+        axis=_f32(axis),
+        cos_cutoff=_f32(-1.0 if cutoff >= 180.0 else np.cos(np.deg2rad(cutoff))),
+        diffuse=_f32(model.light_diffuse[light].mean()),
+        highlight=_f32(_SPECULAR * model.light_specular[light].mean()),
+    )
+
+
+def _ground(model: mujoco.MjModel) -> tuple[Any, Any]:
+    """Return pitch and colors of the first checkered plane; MuJoCo puts two tiles in a texture."""
+    for geom in range(model.ngeom):
+        colors = checker(model, geom) if model.geom_type[geom] == 0 else None
+        if colors is not None:
+            material = int(model.geom_matid[geom])
+            repeat = float(model.mat_texrepeat[material, 0])
+            if not model.mat_texuniform[material]:
+                repeat /= max(float(model.geom_size[geom, 0]), 1e-6)
+            return _f32(1.0 / repeat), _f32(colors)
+    return _f32(1.0), _f32([[0.1, 0.2, 0.3], [0.2, 0.3, 0.4]])
+
+
+def _sky(model: mujoco.MjModel) -> Any:
+    """Return (3, 3): horizon, above and below, of which the sky's texture is nearest to a mix."""
+    skies = np.flatnonzero(model.tex_type == int(mujoco.mjtTexture.mjTEXTURE_SKYBOX))
+    if not len(skies):
+        return _f32(np.zeros((3, 3)))
+    pixels = _pixels(model, int(skies[0]))
+    size = pixels.shape[1]
+    if pixels.shape[0] != 6 * size:
+        return _f32([pixels.reshape(-1, 3).mean(0) / 255.0] * 3)
+    step = max(size // 50, 1)
+    middle = 2.0 * (np.arange(size) + 0.5) / size - 1.0
+    across, down = np.meshgrid(middle, middle)
+    length = np.sqrt(across**2 + down**2 + 1.0)
+    # Faces are right, left, up, down, front and back, their first rows on top.
+    rises = [-down / length, -down / length, 1.0 / length, -1.0 / length]
+    rises += rises[:2]
+    rise = np.stack([face[::step, ::step] for face in rises]).ravel()
+    colors = pixels.reshape(6, size, size, 3)[:, ::step, ::step].reshape(-1, 3) / 255.0
+    weights = np.stack([1.0 - np.abs(rise), np.maximum(rise, 0.0), np.maximum(-rise, 0.0)], -1)
+    fit, *_ = np.linalg.lstsq(weights, colors, rcond=None)
+    return _f32(np.clip(fit, 0.0, 1.0))
+
+
+def _pixels(model: mujoco.MjModel, texture: int) -> np.ndarray:
+    """Return (H, W, 3) uint8."""
+    height, width = int(model.tex_height[texture]), int(model.tex_width[texture])
+    channels, first = int(model.tex_nchannel[texture]), int(model.tex_adr[texture])
+    pixels = model.tex_data[first : first + height * width * channels]
+    return pixels.reshape(height, width, channels)[..., :3]
+
+
+def _f32(values: Any) -> Any:
+    return np.asarray(values, np.float32)

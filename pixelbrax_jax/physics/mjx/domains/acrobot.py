@@ -1,0 +1,43 @@
+"""Two poles in a row, of which only the elbow is actuated."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+
+from pixelbrax_jax.physics.mjx.dynamics import Dynamics
+from pixelbrax_jax.physics.mjx.rewards import tolerance
+from pixelbrax_jax.physics.mjx.snapshot import Snapshot, joined
+from pixelbrax_jax.physics.mjx.task import DmcTask, Start
+
+
+def _start(dynamics: Dynamics, key: jax.Array) -> Start:
+    """Draw both angles uniformly."""
+    return Start(jax.random.uniform(key, (dynamics.model.nq,), minval=-jnp.pi, maxval=jnp.pi))
+
+
+def _observe(seen: Snapshot) -> jax.Array:
+    """Return x and z parts of both arms' axes, then velocities."""
+    axes = jnp.stack([seen.xmat("upper_arm")[:, 2], seen.xmat("lower_arm")[:, 2]])
+    return joined(axes[:, 0], axes[:, 2], seen.qvel)
+
+
+def _reward(seen: Snapshot, *, margin: float) -> jax.Array:
+    """Return how near the tip is to the target above."""
+    distance = jnp.linalg.norm(seen.site_pos("target") - seen.site_pos("tip"))
+    radius = float(seen.model.site("target").size[0])
+    return tolerance(distance, (0.0, radius), margin=margin)
+
+
+def _task(margin: float) -> DmcTask:
+    return DmcTask(
+        "acrobot",
+        _start,
+        _observe,
+        partial(_reward, margin=margin),
+    )
+
+
+TASKS = {"swingup": _task(1.0), "swingup_sparse": _task(0.0)}

@@ -1,0 +1,55 @@
+"""A planar two-legged body that runs."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from pixelbrax_jax.physics.mjx.dynamics import Dynamics
+from pixelbrax_jax.physics.mjx.resets import random_joints
+from pixelbrax_jax.physics.mjx.rewards import tolerance
+from pixelbrax_jax.physics.mjx.snapshot import Snapshot, joined
+from pixelbrax_jax.physics.mjx.task import DmcTask, Start
+
+_RUN_SPEED = 10.0
+_SETTLING_STEPS = 200
+
+
+def _start(dynamics: Dynamics, key: jax.Array) -> Start:
+    """Draw limited joints uniformly, then let the body fall for 200 physics steps.
+
+    DM Control draws joint positions after the forces of the model's own pose are known. The first
+    of these steps moves by them, and so by the same velocity in every episode.
+    """
+    model = dynamics.model
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data)
+    joints = random_joints(model, key)
+    # The root's hinge has no limit, and so stays where it is.
+    limited = np.zeros(model.nq, bool)
+    limited[model.jnt_qposadr[model.jnt_limited == 1]] = True
+    qpos = jnp.where(limited, joints, model.qpos0) + (data.qpos - model.qpos0)
+    state = dynamics.state(qpos, data.qvel)
+    state, _ = dynamics.step(state, _SETTLING_STEPS - 1)
+    return Start(state.qpos, state.qvel)
+
+
+def _observe(seen: Snapshot) -> jax.Array:
+    """Return joint positions without the place along x, and velocities."""
+    return joined(seen.qpos[1:], seen.qvel)
+
+
+def _reward(seen: Snapshot) -> jax.Array:
+    """Return the speed along x as a fraction of 10 m/s."""
+    return tolerance(
+        seen.sensor("torso_subtreelinvel")[0],
+        (_RUN_SPEED, jnp.inf),
+        margin=_RUN_SPEED,
+        value_at_margin=0.0,
+        sigmoid="linear",
+    )
+
+
+TASKS = {"run": DmcTask("cheetah", _start, _observe, _reward)}

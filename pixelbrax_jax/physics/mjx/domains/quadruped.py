@@ -1,0 +1,95 @@
+"""A four-legged body that walks or runs."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from pixelbrax_jax.physics.mjx.dynamics import Dynamics
+from pixelbrax_jax.physics.mjx.resets import random_rotation
+from pixelbrax_jax.physics.mjx.rewards import tolerance
+from pixelbrax_jax.physics.mjx.snapshot import Snapshot, joined
+from pixelbrax_jax.physics.mjx.task import DmcTask, Start
+
+_LIFT = 0.01
+"""Metres between two heights that are tried."""
+
+_MAX_ATTEMPTS = 1000
+"""Heights tried; at 10 m nothing of the body reaches the floor."""
+
+_EPISODE = 20.0
+"""Seconds of an episode, for which the floor is large enough."""
+
+
+def _start(dynamics: Dynamics, key: jax.Array) -> Start:
+    """Draw any rotation, at the lowest height, in whole centimetres, where nothing touches."""
+    model = dynamics.model
+    rotation = random_rotation(key)
+
+    def pose(number: jax.Array) -> jax.Array:
+        place = jnp.stack([0.0, 0.0, _LIFT * number.astype(jnp.float32)])
+        return joined(place, rotation, jnp.asarray(model.qpos0[7:], jnp.float32))
+
+    def too_low(number: jax.Array) -> jax.Array:
+        return dynamics.touches(pose(number)) & (number < _MAX_ATTEMPTS)
+
+    return Start(pose(jax.lax.while_loop(too_low, lambda number: number + 1, jnp.int32(0))))
+
+
+def _hinges(model: mujoco.MjModel) -> list[str]:
+    hinge = mujoco.mjtJoint.mjJNT_HINGE
+    return [model.joint(int(i)).name for i in np.flatnonzero(model.jnt_type == hinge)]
+
+
+def _observe(seen: Snapshot) -> jax.Array:
+    """Return hinges, activations, the torso's motion, and forces and torques at the toes."""
+    kinds, hinges = mujoco.mjtSensor, _hinges(seen.model)
+    return joined(
+        seen.joint_pos(*hinges),
+        seen.joint_vel(*hinges),
+        seen.act,
+        seen.sensor("velocimeter"),
+        seen.xmat("torso")[2, 2],
+        seen.sensors_of(kinds.mjSENS_GYRO, kinds.mjSENS_ACCELEROMETER),
+        jnp.arcsinh(seen.sensors_of(kinds.mjSENS_FORCE, kinds.mjSENS_TORQUE)),
+    )
+
+
+def _reward(seen: Snapshot, *, speed: float) -> jax.Array:
+    """Return uprightness times the wanted speed along the torso's x axis."""
+    upright = tolerance(
+        seen.xmat("torso")[2, 2],
+        (1.0, jnp.inf),
+        margin=2.0,
+        value_at_margin=0.0,
+        sigmoid="linear",
+    )
+    move = tolerance(
+        seen.sensor("velocimeter")[0],
+        (speed, jnp.inf),
+        margin=speed,
+        value_at_margin=0.5,
+        sigmoid="linear",
+    )
+    return upright * move
+
+
+def _task(speed: float) -> DmcTask:
+    return DmcTask(
+        "quadruped",
+        _start,
+        _observe,
+        partial(_reward, speed=speed),
+        substeps=4,
+        options={"floor_size": _EPISODE * speed},
+        camera=2,
+        reads_forces=True,
+        starts_with_forces=True,
+    )
+
+
+TASKS = {"walk": _task(0.5), "run": _task(5.0)}

@@ -1,0 +1,194 @@
+"""MuJoCo XLA's steps between states that have no more than what the next step needs."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+from flax import struct
+
+from pixelbrax_jax.physics.brax.compatibility import import_silenced, load_onto_own_device
+
+with import_silenced():
+    from mujoco import mjx
+    from mujoco.mjx._src import collision_driver, forward, sensor, smooth
+    from mujoco.mjx._src import io as mjx_io
+
+
+class MjxState(struct.PyTreeNode):
+    """The integration state: everything that the next step depends on.
+
+    Attributes:
+        qpos: (Q,) float32, joint positions: metres, radians, unit quaternions.
+        qvel: (V,) float32, joint velocities, per second.
+        act: activations of actuators that have a state.
+        qacc_warmstart: (V,) float32, accelerations from which the solver starts.
+        ctrl: (A,) float32, the last controls, which rewards read.
+        target: (3,) float32, metres, this episode's target; (0,) for tasks without.
+    """
+
+    qpos: jax.Array
+    qvel: jax.Array
+    act: jax.Array
+    qacc_warmstart: jax.Array
+    ctrl: jax.Array
+    target: jax.Array
+
+
+class Dynamics:
+    """A model's motion, for one environment.
+
+    Attributes:
+        model: the compiled model.
+        reads_forces: whether sensors of forces and accelerations are computed.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        *,
+        iterations: int,
+        ls_iterations: int,
+        reads_forces: bool = False,
+    ):
+        """Put the model on the device; compile nothing.
+
+        Args:
+            model: a compiled model.
+            iterations: bound on the iterations of the constraint solver.
+            ls_iterations: bound on those of its line search.
+            reads_forces: whether to compute sensors of forces and accelerations.
+
+        Raises:
+            NotImplementedError: the model has features that MuJoCo XLA lacks.
+        """
+        load_onto_own_device(mjx_io)
+        self.model = model
+        self.reads_forces = reads_forces
+        self._simulated = _simulated(model)
+        self._mx = mjx.put_model(self._simulated, impl="jax")
+        option = self._mx.opt.replace(
+            iterations=min(iterations, model.opt.iterations),
+            ls_iterations=min(ls_iterations, model.opt.ls_iterations),
+        )
+        self._mx = self._mx.replace(opt=option)
+        self._moving = (
+            self._mx if reads_forces else self._without(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+        )
+        self._passive = self._without(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
+
+    def _without(self, feature: mujoco.mjtDisableBit) -> Any:
+        flags = type(self._mx.opt.disableflags)(int(self._mx.opt.disableflags) | int(feature))
+        return self._mx.replace(opt=self._mx.opt.replace(disableflags=flags))
+
+    def state(
+        self,
+        qpos: jax.Array,
+        qvel: jax.Array | None = None,
+        target: jax.Array | None = None,
+    ) -> MjxState:
+        """Return a state without control, activation or a solution to start from.
+
+        Args:
+            qpos: (Q,) float32, joint positions.
+            qvel: (V,) float32, joint velocities; None means at rest.
+            target: (3,) float32, metres; None for tasks without.
+        """
+        model = self.model
+        return MjxState(
+            qpos=jnp.asarray(qpos, jnp.float32),
+            qvel=jnp.zeros(model.nv) if qvel is None else jnp.asarray(qvel, jnp.float32),
+            act=jnp.zeros(model.na),
+            qacc_warmstart=jnp.zeros(model.nv),
+            ctrl=jnp.zeros(model.nu),
+            target=jnp.zeros(0) if target is None else jnp.asarray(target, jnp.float32),
+        )
+
+    def step(self, state: MjxState, num_steps: int) -> tuple[MjxState, jax.Array]:
+        """Advance by physics steps under the state's controls.
+
+        Args:
+            state: where to start.
+            num_steps: how many, at least 1.
+
+        Returns:
+            The state afterwards, and all sensors as the last step read them before it moved.
+        """
+
+        def one(state: MjxState) -> tuple[MjxState, jax.Array]:
+            data = forward.step(self._moving, self._data(state))
+            moved = state.replace(
+                qpos=data.qpos, qvel=data.qvel, act=data.act, qacc_warmstart=data.qacc_warmstart
+            )
+            return moved, data.sensordata
+
+        if num_steps == 1:
+            return one(state)
+        sensors = jnp.zeros(self.model.nsensordata)
+        # One copy of the step in the program, however many there are.
+        return jax.lax.fori_loop(0, num_steps, lambda _, carry: one(carry[0]), (state, sensors))
+
+    def at_rest(self, state: MjxState) -> tuple[MjxState, jax.Array]:
+        """Find the forces in a first state, with actuators off, as DM Control's resets do.
+
+        Args:
+            state: a first state.
+
+        Returns:
+            The state with accelerations to start the solver from, and all sensors.
+        """
+        data = forward.forward(self._passive, self._data(state))
+        return state.replace(qacc_warmstart=data.qacc), data.sensordata
+
+    def refresh(self, state: MjxState, sensors: jax.Array) -> Any:
+        """Compute positions, velocities and their sensors, as ``mj_step1`` does.
+
+        Args:
+            state: a state.
+            sensors: all sensors, of which those of forces and accelerations are kept.
+
+        Returns:
+            ``mujoco.mjx.Data``, of which forces and accelerations mean nothing.
+        """
+        mx = self._mx
+        data = self._data(state).replace(sensordata=sensors)
+        data = smooth.kinematics(mx, data)
+        data = smooth.com_pos(mx, data)
+        data = smooth.com_vel(mx, data)
+        if self.model.nsensor:
+            data = sensor.sensor_pos(mx, data)
+            data = sensor.sensor_vel(mx, data)
+        return data
+
+    def touches(self, qpos: jax.Array) -> jax.Array:
+        """Return () bool, whether any geoms touch at joint positions (Q,)."""
+        data = self._data(self.state(qpos))
+        data = smooth.kinematics(self._mx, data)
+        contact = collision_driver.collision(self._mx, data)._impl.contact
+        return jnp.any(contact.dist < contact.includemargin)
+
+    def _data(self, state: MjxState) -> Any:
+        return mjx.make_data(self._simulated, impl="jax").replace(
+            qpos=state.qpos,
+            qvel=state.qvel,
+            act=state.act,
+            qacc_warmstart=state.qacc_warmstart,
+            ctrl=state.ctrl,
+        )
+
+
+def _simulated(model: mujoco.MjModel) -> mujoco.MjModel:
+    """Return the model without what MuJoCo XLA refuses and no step depends on.
+
+    That is the energy, which is only reported, and contacts where they are off anyway: it refuses
+    pairs of shapes that it cannot collide all the same.
+    """
+    model = copy.copy(model)
+    model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_ENERGY)
+    off = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    if model.opt.disableflags & off:
+        model.geom_contype[:] = model.geom_conaffinity[:] = 0
+    return model

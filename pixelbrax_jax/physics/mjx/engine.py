@@ -1,0 +1,148 @@
+"""Tasks of the DM Control Suite behind the ``Physics`` interface."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from pixelbrax_jax.physics.divergence import GuardedPhysics
+from pixelbrax_jax.physics.mjx.dynamics import Dynamics, MjxState
+from pixelbrax_jax.physics.mjx.snapshot import Snapshot
+from pixelbrax_jax.physics.mjx.task import DmcTask
+from pixelbrax_jax.physics.model_scene import read_scene, tracked_body
+from pixelbrax_jax.types import PhysicsState
+
+_UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+
+
+class MjxPhysics(GuardedPhysics):
+    """A task of the DM Control Suite as ``Physics``, simulated by MuJoCo XLA.
+
+    Links are the model's bodies without the world; then ``camera/com``, the centre of mass that
+    cameras and lights follow, and ``target``, this episode's target, where a task has them.
+
+    Beyond the interface it has ``rigs``, the model's cameras by name, with the task's own as
+    ``default``; ``look``, the model's lights, sky and ground; and ``batch_last``, whether a CPU
+    computes a batch faster with the environments as last axis.
+    """
+
+    backend = "mjx"
+
+    def __init__(self, task: DmcTask, model: mujoco.MjModel, *, identity: Hashable):
+        """Put the model on the device and read what is drawn; compile nothing.
+
+        Args:
+            task: the task.
+            model: the compiled model of its domain; changed as the task wants it.
+            identity: objects of one identity are equal, and environments over them share compiled
+                programs.
+
+        Raises:
+            ValueError: the model has something visible that cannot be drawn.
+            NotImplementedError: the model has features that MuJoCo XLA lacks.
+        """
+        task.edit(model)
+        scene = read_scene(model, task.camera, movable=task.movable)
+        self.geoms, self.look = scene.geoms, scene.look
+        self.rigs = scene.rigs | {"default": scene.rig}
+        bodies = [model.body(i).name or f"link/{i - 1}" for i in range(1, model.nbody)]
+        self.link_names = (*bodies, *scene.links)
+        self.dynamics = Dynamics(
+            model,
+            iterations=task.iterations,
+            ls_iterations=task.ls_iterations,
+            reads_forces=task.reads_forces,
+        )
+        self.dt = float(f"{model.opt.timestep * task.substeps:.6g}")
+        self.action_size = int(model.nu)
+        self.batch_last = task.batch_last
+        self._task = task
+        self._model = model
+        self._tracked_body = tracked_body(model)
+        self._extra_links = scene.links
+        self._identity = identity
+        low, high = model.actuator_ctrlrange.T.astype(np.float32)
+        self._is_unit_range = bool((low == -1).all() and (high == 1).all())
+        self._control_range = low, high
+        first = jax.eval_shape(self.reset, jax.random.key(0))
+        self.state_size = int(first.obs.shape[0])
+
+    def __eq__(self, other: object) -> bool:
+        return type(self) is type(other) and self._identity == getattr(other, "_identity", None)
+
+    def __hash__(self) -> int:
+        return hash(self._identity)
+
+    def control(self, action: jax.Array) -> jax.Array:
+        """Return the controls that an action stands for.
+
+        Args:
+            action: (A,) float32; [-1, 1] is mapped to the control range of each actuator, which
+                is [-1, 1] too but for the quadruped.
+        """
+        action = jnp.asarray(action, jnp.float32)
+        if self._is_unit_range:
+            return action
+        low, high = self._control_range
+        return low + 0.5 * (action + 1) * (high - low)
+
+    def observe(self, state: MjxState, sensors: jax.Array) -> PhysicsState:
+        """Return what is known of a state, without a step.
+
+        Args:
+            state: joint positions and velocities, controls and target.
+            sensors: readings of all sensors, of which those of forces and accelerations are
+                taken as they are and the others computed.
+
+        Returns:
+            Links, observation and reward of the state.
+        """
+        data = self.dynamics.refresh(state, sensors)
+        seen = Snapshot(self._model, data, state.target)
+        xpos, xquat = self._links(data, state.target)
+        return PhysicsState(
+            engine=state,
+            xpos=xpos,
+            xquat=xquat,
+            obs=self._task.observe(seen).astype(jnp.float32),
+            reward=self._task.reward(seen).astype(jnp.float32),
+            terminated=jnp.zeros((), bool),
+            non_finite=jnp.zeros((), bool),
+        )
+
+    def _reset(self, key: jax.Array) -> PhysicsState:
+        """See ``Physics.reset``."""
+        start = self._task.start(self.dynamics, key)
+        state = self.dynamics.state(start.qpos, start.qvel, start.target)
+        sensors = jnp.zeros(self._model.nsensordata)
+        if self._task.starts_with_forces:
+            state, sensors = self.dynamics.at_rest(state)
+        return self.observe(state, sensors)
+
+    def _step(self, state: PhysicsState, action: jax.Array) -> PhysicsState:
+        """See ``Physics.step``.
+
+        Raises:
+            ValueError: when traced, if the action's shape is not ``(action_size,)``.
+        """
+        action = jnp.asarray(action, jnp.float32)
+        if action.shape != (self.action_size,):
+            raise ValueError(f"action must have shape ({self.action_size},), got {action.shape}")
+        moved, sensors = self.dynamics.step(
+            state.engine.replace(ctrl=self.control(action)), self._task.substeps
+        )
+        return self.observe(moved, sensors)
+
+    def _watched(self, state: PhysicsState) -> Any:
+        return state.engine, state.xpos
+
+    def _links(self, data: Any, target: jax.Array) -> tuple[jax.Array, jax.Array]:
+        places = {"target": target, "camera/com": data.subtree_com[self._tracked_body]}
+        rows = [places[name][None] for name in self._extra_links]
+        upright = jnp.tile(jnp.array(_UPRIGHT), (len(rows), 1))
+        return jnp.concatenate([data.xpos[1:], *rows]), jnp.concatenate([data.xquat[1:], upright])

@@ -1,0 +1,176 @@
+"""DM Control's own models, read from the installed package without importing it."""
+
+from __future__ import annotations
+
+import hashlib
+import sys
+import warnings
+from collections.abc import Callable
+from importlib import metadata
+from importlib.util import find_spec
+from pathlib import Path
+from xml.etree import ElementTree
+
+import mujoco
+
+from pixelbrax_jax.extras import install_extra
+from pixelbrax_jax.physics.brax.compatibility import loading_silenced
+
+KNOWN_VERSION = "1.0.50"
+"""The release of dm_control whose models the tests compare with."""
+
+KNOWN_MODELS = {
+    "acrobot": "318565bb75f5587f",
+    "ball_in_cup": "aed8880a33227847",
+    "cartpole": "049fc7484ab1a118",
+    "cheetah": "e200f6f051961105",
+    "finger": "b849081be69e1470",
+    "fish": "82214f68b3ec4770",
+    "hopper": "c14ce94c4bc108d7",
+    "humanoid": "f18638be4e464429",
+    "pendulum": "c5c4b0342074bbdb",
+    "point_mass": "a9b36a3581197253",
+    "quadruped": "0fb169bde60fc592",
+    "reacher": "5eb539927a2e8933",
+    "swimmer": "aab420a1503b7e2c",
+    "walker": "e5efd523aa043683",
+    "manipulator": "608a06bb47623612",
+}
+"""Domain -> start of the SHA-256 of its XML file and those that it includes, in that release."""
+
+_NO_WHEELS = (3, 13)
+"""The first Python without wheels of what dm_control requires; its models are read all the same."""
+
+_INCLUDED = ("common/materials.xml", "common/skybox.xml", "common/visual.xml")
+
+_warned: list[str] = []
+"""Warnings given in this process: one at most."""
+
+
+def load_model(domain: str, **options: float) -> mujoco.MjModel:
+    """Compile the model of a domain.
+
+    Args:
+        domain: file name in DM Control's suite, without ending.
+        **options: what the domain's generator takes: ``num_bodies`` of the swimmer, ``floor_size``
+            of the quadruped, metres.
+
+    Returns:
+        The model, which the caller may change.
+
+    Raises:
+        ImportError: dm_control is not installed; the message has the line that installs it.
+    """
+    folder = suite_folder()
+    files = {name: (folder / name).read_bytes() for name in (f"{domain}.xml", *_INCLUDED)}
+    _warn_if_unknown(domain, files)
+    xml = files.pop(f"{domain}.xml").decode()
+    if domain in _GENERATORS:
+        root = ElementTree.fromstring(xml)
+        _GENERATORS[domain](root, **options)
+        xml = ElementTree.tostring(root, encoding="unicode")
+    assets = {f"./{name}": content for name, content in files.items()}
+    with loading_silenced():
+        return mujoco.MjModel.from_xml_string(xml, assets)
+
+
+def suite_folder() -> Path:
+    """Return the folder of the suite in the installed dm_control.
+
+    Raises:
+        ImportError: there is none.
+    """
+    spec = find_spec("dm_control")
+    folders = (
+        [] if spec is None else [Path(place) for place in spec.submodule_search_locations or ()]
+    )
+    for folder in folders:
+        if (folder / "suite").is_dir():
+            return folder / "suite"
+    newer = f" (from Python {_NO_WHEELS[0]}.{_NO_WHEELS[1]} on: pip install --no-deps dm_control)"
+    raise ImportError(
+        "dm_control is not installed, from which tasks of the DM Control Suite read their models; "
+        f"try: {install_extra('dmc')}{newer if sys.version_info >= _NO_WHEELS else ''}"
+    )
+
+
+def digest(files: dict[str, bytes]) -> str:
+    """Return the start of the SHA-256 of files, whatever their line ends."""
+    content = b"".join(files[name].replace(b"\r\n", b"\n") for name in sorted(files))
+    return hashlib.sha256(content).hexdigest()[:16]
+
+
+def _warn_if_unknown(domain: str, files: dict[str, bytes]) -> None:
+    if _warned or KNOWN_MODELS[domain] == digest(files):
+        return
+    _warned.append(domain)
+    warnings.warn(
+        f"dm_control {metadata.version('dm_control')} has another model of {domain!r} than "
+        f"dm_control {KNOWN_VERSION}, with which the tasks of PixelBrax are compared: results may "
+        f'differ from those of others. pip install "dm_control=={KNOWN_VERSION}" has the model '
+        "that is known.",
+        UserWarning,
+        stacklevel=2,
+    )
+
+
+def _find(root: ElementTree.Element, path: str) -> ElementTree.Element:
+    element = root.find(path)
+    if element is None:
+        raise ValueError(f"the model of dm_control has no element {path}.")
+    return element
+
+
+def _grow_swimmer(root: ElementTree.Element, *, num_bodies: int) -> None:
+    """Append a chain of equal bodies to the swimmer's head, as DM Control generates it.
+
+    Each has a hinge with a motor, and a site with a velocimeter and a gyroscope. Joints bend up to
+    360 degrees by the number of bodies, and cameras stand as far away as the chain is long.
+
+    Args:
+        root: the XML of a swimmer that is only a head; changed in place.
+        num_bodies: bodies of the chain, the head included.
+    """
+    parent = _find(root, "./worldbody/body")
+    actuator = ElementTree.SubElement(root, "actuator")
+    sensor = _find(root, "./sensor")
+    bend = 360.0 / num_bodies
+    for camera in parent.findall("camera"):
+        if camera.get("mode") == "trackcom":
+            place = [float(number) * (num_bodies / 6.0) for number in camera.attrib["pos"].split()]
+            camera.set("pos", " ".join(map(str, place)))
+    for i in range(num_bodies - 1):
+        body = ElementTree.SubElement(parent, "body", name=f"segment_{i}", pos="0 .1 0")
+        for role in ("visual", "inertial"):
+            ElementTree.SubElement(body, "geom", {"class": role, "name": f"{role}_{i}"})
+        ElementTree.SubElement(body, "site", name=f"site_{i}")
+        ElementTree.SubElement(body, "joint", name=f"joint_{i}", range=f"{-bend} {bend}")
+        ElementTree.SubElement(actuator, "motor", name=f"motor_{i}", joint=f"joint_{i}")
+        for kind in ("velocimeter", "gyro"):
+            ElementTree.SubElement(sensor, kind, name=f"{kind}_{i}", site=f"site_{i}")
+        parent = body
+
+
+def _strip_quadruped(root: ElementTree.Element, *, floor_size: float) -> None:
+    """Take away what walking does not need, and size the floor, as DM Control does.
+
+    Args:
+        root: the XML of the quadruped; changed in place.
+        floor_size: half the edge of the floor, metres.
+    """
+    _find(root, ".//geom[@name='floor']").set("size", f"{floor_size} {floor_size} .5")
+    walls = [f"geom[@name='wall_{side}']" for side in ("px", "py", "nx", "ny")]
+    unused = [*walls, "geom[@name='terrain']", "site[@name='target']", "body[@name='ball']"]
+    for path in unused:
+        world = _find(root, "./worldbody")
+        world.remove(_find(world, path))
+    sensor = _find(root, "./sensor")
+    for rangefinder in sensor.findall("rangefinder"):
+        sensor.remove(rangefinder)
+
+
+_GENERATORS: dict[str, Callable[..., None]] = {
+    "quadruped": _strip_quadruped,
+    "swimmer": _grow_swimmer,
+}
+"""Domain -> what its XML undergoes before it is compiled."""

@@ -1,0 +1,85 @@
+"""How initial states are drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from pixelbrax_jax.physics.mjx.dynamics import Dynamics
+
+MAX_ATTEMPTS = 1000
+"""Draws of a pose after which one that touches something is taken."""
+
+
+def random_joints(model: mujoco.MjModel, key: jax.Array) -> jax.Array:
+    """Draw joint positions as DM Control's ``randomize_limited_and_rotational_joints`` does.
+
+    Limited hinges and sliders are uniform in their range, other hinges in [-pi, pi]. A free joint
+    keeps its place, and its quaternion is drawn uniformly from [0, 1]^4 and normalised, which is
+    not uniform over rotations: DM Control keeps it so for the sake of its results. The suite's
+    tasks that ask for it have no ball joints.
+
+    Args:
+        model: the compiled model.
+        key: PRNG key.
+
+    Returns:
+        (Q,) float32, metres, radians, unit quaternions.
+    """
+    low, high = np.array(model.qpos0), np.array(model.qpos0)
+    rotations = []
+    for kind, limited, reach, at in zip(
+        model.jnt_type, model.jnt_limited, model.jnt_range, model.jnt_qposadr, strict=True
+    ):
+        if kind == mujoco.mjtJoint.mjJNT_FREE:
+            low[at + 3 : at + 7], high[at + 3 : at + 7] = 0.0, 1.0
+            rotations.append(int(at) + 3)
+        elif limited:
+            low[at], high[at] = reach
+        elif kind == mujoco.mjtJoint.mjJNT_HINGE:
+            low[at], high[at] = -np.pi, np.pi
+    qpos = low + (high - low) * jax.random.uniform(key, (model.nq,))
+    qpos = qpos.astype(jnp.float32)
+    for at in rotations:
+        quat = qpos[at : at + 4]
+        qpos = qpos.at[at : at + 4].set(quat / jnp.linalg.norm(quat))
+    return qpos
+
+
+def random_rotation(key: jax.Array) -> jax.Array:
+    """Draw a (4,) float32 unit quaternion, uniformly over rotations."""
+    quat = jax.random.normal(key, (4,))
+    return quat / jnp.linalg.norm(quat)
+
+
+def free_of_contact(
+    dynamics: Dynamics, key: jax.Array, draw: Callable[[jax.Array], jax.Array]
+) -> jax.Array:
+    """Draw joint positions until no geoms touch.
+
+    Args:
+        dynamics: the model's motion.
+        key: PRNG key.
+        draw: returns (Q,) joint positions for a key.
+
+    Returns:
+        (Q,) float32; after ``MAX_ATTEMPTS`` draws the last one, whatever it touches.
+    """
+
+    def again(carry: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
+        attempt, _, touches = carry
+        return touches & (attempt < MAX_ATTEMPTS)
+
+    def attempt(
+        carry: tuple[jax.Array, jax.Array, jax.Array],
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        number, _, _ = carry
+        qpos = draw(jax.random.fold_in(key, number))
+        return number + 1, qpos, dynamics.touches(qpos)
+
+    nothing = jnp.zeros(dynamics.model.nq, jnp.float32)
+    return jax.lax.while_loop(again, attempt, (jnp.int32(0), nothing, jnp.bool_(True)))[1]

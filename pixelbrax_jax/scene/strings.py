@@ -1,0 +1,74 @@
+"""Threads between two points: straight where they are stretched, else hanging."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from pixelbrax_jax import spatial
+from pixelbrax_jax.types import String
+
+_NEWTON_STEPS = 8
+
+
+def pieces(string: String, ends: jax.Array, num: int) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Return capsules that cover a thread.
+
+    Args:
+        string: the thread.
+        ends: (2, 3) float32, metres, its ends in the world frame.
+        num: how many capsules.
+
+    Returns:
+        (num, 3) centers, (num, 3, 3) orientations whose third columns are along the thread,
+        (num,) half lengths.
+    """
+    points = hang(ends, string.length, num)
+    along = points[1:] - points[:-1]
+    z = spatial.unit(along)
+    # Any direction across will do; this one is never parallel.
+    aside = jnp.where(jnp.abs(z[:, :1]) < 0.9, jnp.eye(3)[0], jnp.eye(3)[1])
+    x = spatial.unit(jnp.cross(aside, z))
+    half = 0.5 * jnp.sqrt(jnp.maximum(jnp.sum(along * along, -1), 1e-12))
+    return 0.5 * (points[1:] + points[:-1]), jnp.stack([x, jnp.cross(z, x), z], axis=-1), half
+
+
+def hang(ends: jax.Array, length: jax.Array, num: int) -> jax.Array:
+    """Return points on a thread under gravity along -z, at equal distances along it.
+
+    A hanging thread is a catenary, z = a cosh(x / a) + const. With h and v its horizontal and
+    vertical extent and u = h / 2a, its length obeys ``sqrt(length^2 - v^2) / h = sinh(u) / u``, and
+    the parameter x / a at the middle between the ends is ``artanh(v / length)``.
+
+    Args:
+        ends: (2, 3) float32, metres.
+        length: () float32, metres.
+        num: pieces.
+
+    Returns:
+        (num + 1, 3) float32, metres; on the straight line where ``length`` is too short.
+    """
+    start, end = ends[0], ends[1]
+    way = end - start
+    fraction = jnp.linspace(0.0, 1.0, num + 1)
+    straight = start + fraction[:, None] * way
+    distance = jnp.sqrt(jnp.maximum(jnp.sum(way * way), 1e-12))
+    slack = distance < 0.999 * length
+    # Of a stretched thread any numbers that give finite derivatives.
+    length = jnp.where(slack, length, 1.01 * distance)
+
+    flat = way * jnp.array([1.0, 1.0, 0.0])
+    h = jnp.sqrt(jnp.maximum(jnp.sum(flat * flat), (1e-3 * length) ** 2))
+    v = jnp.clip(way[2], -0.999 * length, 0.999 * length)
+    ratio = jnp.maximum(jnp.sqrt(length * length - v * v) / h, 1.0 + 1e-4)
+    u = jnp.sqrt(6.0 * (ratio - 1.0))
+    for _ in range(_NEWTON_STEPS):
+        excess = u + jnp.log(-jnp.expm1(-2.0 * u) / (2.0 * u)) - jnp.log(ratio)
+        u = jnp.maximum(u - excess / (1.0 / jnp.tanh(u) - 1.0 / u), 1e-2)
+    a = h / (2.0 * u)
+    first = jnp.arctanh(v / length) - u
+    place = jnp.arcsinh(jnp.sinh(first) + fraction * length / a)
+    along = (place - first) / (2.0 * u)
+    height = a * (jnp.cosh(place) - jnp.cosh(first))
+    hanging = start + along[:, None] * flat + height[:, None] * jnp.array([0.0, 0.0, 1.0])
+    return jnp.where(slack, hanging, straight)
