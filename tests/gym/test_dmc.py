@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import functools
+
 import gymnasium
 import numpy as np
 import pytest
+import torch
 from gymnasium.utils.env_checker import check_env as check_gymnasium_env
 from stable_baselines3.common.env_checker import check_env as check_sb3_env
 from torchrl.envs import check_env_specs
@@ -12,6 +15,7 @@ from torchrl.envs import check_env_specs
 import pixelbrax_gym
 import pixelbrax_jax
 from pixelbrax_jax.tasks import TASKS
+from tests.distractors.conftest import make_bank
 from tests.gym.test_vector_env import MODES
 
 pytest.importorskip("dm_control", reason="the tasks' models come with pixelbrax[dmc]")
@@ -91,3 +95,21 @@ def test_stable_baselines_vector_environments(task):
         assert [info.get("TimeLimit.truncated", False) for info in infos] == list(dones)
     assert not np.array_equal(obs["state"], first["state"])
     env.close()
+
+
+@pytest.mark.parametrize("task", every_task(*FAST[:1]))
+def test_distractors_change_pixels_alone(task):
+    """The same episodes, to rounding: other options make another program."""
+    options = {"num_envs": 2, "obs_mode": "both", "output": "torch", **SIZE}
+    make = functools.partial(gymnasium.make_vec, TASKS[task].gymnasium_id, **options)
+    plain = make()
+    chain = ("video", "color", "camera")
+    distracted = make(distractors=chain, clips=make_bank(**SIZE))
+    draw = np.random.default_rng(0)
+    obs, seen = plain.reset(seed=0)[0], distracted.reset(seed=0)[0]
+    for _ in range(4):
+        assert (obs["pixels"] != seen["pixels"]).float().mean() > 0.5
+        torch.testing.assert_close(obs["state"], seen["state"], rtol=1e-3, atol=1e-3)
+        action = torch.as_tensor(draw.uniform(-1, 1, plain.action_space.shape).astype(np.float32))
+        (obs, reward, *_), (seen, other, *_) = plain.step(action), distracted.step(action)
+        torch.testing.assert_close(reward, other, rtol=1e-3, atol=1e-3)
