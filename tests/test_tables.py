@@ -12,7 +12,7 @@ import gymnasium
 import pixelbrax_gym
 import pixelbrax_jax as pb
 from pixelbrax_jax.config import EnvConfig
-from pixelbrax_jax.tasks import TASKS
+from pixelbrax_jax.tasks import BRAX_TASKS
 
 ROOT = Path(__file__).parents[1]
 
@@ -50,13 +50,13 @@ def test_every_task_is_listed():
             task.default_backend,
             task.summary,
         ]
-        for name, task in TASKS.items()
+        for name, task in BRAX_TASKS.items()
     ]
     assert table("docs/tasks.md", "| Gymnasium id |") == expected, "\n".join(
         "| " + " | ".join(row) + " |" for row in expected
     )
 
-    for name, task in TASKS.items():
+    for name, task in BRAX_TASKS.items():
         assert gymnasium.spec(task.gymnasium_id).kwargs == {"task": name}
 
 
@@ -67,7 +67,7 @@ def test_every_task_has_its_images():
             task.summary,
             f"![{task.gymnasium_id.partition('/')[2].partition('-')[0]}](images/gallery/{name}.png)",
         ]
-        for name, task in TASKS.items()
+        for name, task in BRAX_TASKS.items()
     ]
     shown = table("docs/tasks.md", "| task |")
     assert shown == expected, "\n".join("| " + " | ".join(row) + " |" for row in expected)

@@ -42,9 +42,9 @@ class Physics(Protocol):
     to. Environments over equal physics share compiled programs; it must hence be hashable, and
     equal only to what computes the same.
 
-    An engine may have more attributes: ``rigs``, cameras by name, of which ``default`` is the task's
-    own; ``look``, the lights, sky and ground of its model; and ``batch_last``, False where a CPU
-    computes a batch faster with the environments as first axis.
+    An engine may have more attributes: ``rigs``, cameras by name, of which ``default`` is the
+    task's own; ``look``, the lights, sky and ground of its model; and ``batch_last``, False where a
+    CPU computes a batch faster with the environments as first axis.
 
     Attributes:
         geoms: the visible shapes, each fixed in a link's frame.

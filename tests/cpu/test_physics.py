@@ -9,7 +9,7 @@ import pytest
 import pixelbrax_jax as pb
 from pixelbrax_jax._cpu import interpreter
 from pixelbrax_jax._cpu.interpreter import batch_last
-from pixelbrax_jax.tasks import TASKS
+from pixelbrax_jax.tasks import BRAX_TASKS
 from tests.cpu.equations import equations
 
 NUM_ENVS = 48
@@ -22,7 +22,7 @@ CASES = [
         backend,
         marks=() if name in FAST and backend == task.default_backend else pytest.mark.slow,
     )
-    for name, task in TASKS.items()
+    for name, task in BRAX_TASKS.items()
     for backend in task.backends
 ]
 

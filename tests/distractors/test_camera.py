@@ -9,7 +9,7 @@ import pytest
 
 from pixelbrax_jax import distractors, make, place
 from pixelbrax_jax.scene.cameras import aim, named_rigs, rig
-from pixelbrax_jax.tasks import TASKS
+from pixelbrax_jax.tasks import BRAX_TASKS
 from tests.distractors.conftest import walk
 from tests.envs.toy import PARAMS
 
@@ -142,7 +142,7 @@ def test_rigs_of_all_kinds_yield_sound_cameras(task, name):
     "task",
     [
         task if task == "inverted_pendulum" else pytest.param(task, marks=pytest.mark.slow)
-        for task in TASKS
+        for task in BRAX_TASKS
     ],
 )
 def test_the_agent_stays_in_view_at_the_easy_level(task):

@@ -15,7 +15,7 @@ from PIL import Image
 
 import pixelbrax_jax as pb
 from pixelbrax_jax.scene.look import LOOKS
-from pixelbrax_jax.tasks import TASKS
+from pixelbrax_jax.tasks import BRAX_TASKS
 
 FOLDER = Path(__file__).parent
 SIZE = 48
@@ -55,7 +55,7 @@ def kept(task: str) -> np.ndarray:
 def main() -> None:
     """Rewrite the images of some tasks, or of all."""
     parser = argparse.ArgumentParser(description=main.__doc__)
-    parser.add_argument("tasks", nargs="*", default=sorted(TASKS), metavar="task")
+    parser.add_argument("tasks", nargs="*", default=sorted(BRAX_TASKS), metavar="task")
     for task in parser.parse_args().tasks:
         Image.fromarray(draw(task)).save(FOLDER / f"{task}.png", optimize=True)
 

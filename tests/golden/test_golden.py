@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pixelbrax_jax.tasks import TASKS
+from pixelbrax_jax.tasks import BRAX_TASKS
 from tests.golden.images import draw, kept
 
 ROUNDING = 2
@@ -21,7 +21,7 @@ def fraction_changed(one: np.ndarray, other: np.ndarray) -> float:
     return float((difference > ROUNDING).mean())
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", BRAX_TASKS)
 def test_images_are_those_that_were_accepted(task):
     image, golden = draw(task), kept(task)
     assert image.shape == golden.shape

@@ -29,7 +29,7 @@ import pixelbrax_jax
 from pixelbrax_gym.interop.dlpack import torch_device
 from pixelbrax_gym.torchrl import specs as torchrl_specs
 from pixelbrax_gym.torchrl.specs import PixelSpec
-from pixelbrax_jax.tasks import TASKS
+from pixelbrax_jax.tasks import BRAX_TASKS
 from tests.compilations import counted
 from tests.gym.conftest import ID, TASK
 
@@ -53,7 +53,7 @@ def test_specs(make_torchrl, obs_mode):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", BRAX_TASKS)
 @pytest.mark.parametrize("obs_mode", ["pixels", "both"])
 def test_specs_of_every_task(task, obs_mode):
     env = pixelbrax_gym.PixelBraxTorchRLEnv(task, 2, height=16, width=16, obs_mode=obs_mode)

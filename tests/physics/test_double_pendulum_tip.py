@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pixelbrax_jax.tasks import TASKS
+from pixelbrax_jax.tasks import BRAX_TASKS
 
 TASK = "inverted_double_pendulum"
 # (cart, first hinge, second hinge) -> tip (x, z); agrees with MuJoCo's site "tip".
@@ -17,8 +17,10 @@ TIPS = [
 backends = pytest.mark.parametrize(
     "backend",
     [
-        pytest.param(name, marks=() if name == TASKS[TASK].default_backend else pytest.mark.slow)
-        for name in TASKS[TASK].backends
+        pytest.param(
+            name, marks=() if name == BRAX_TASKS[TASK].default_backend else pytest.mark.slow
+        )
+        for name in BRAX_TASKS[TASK].backends
     ],
 )
 

@@ -8,13 +8,13 @@ import pytest
 
 from pixelbrax_jax.physics import make_physics
 from pixelbrax_jax.physics.brax.tasks import load_brax_env
-from pixelbrax_jax.tasks import BRAX_BACKENDS, TASKS
+from pixelbrax_jax.tasks import BRAX_BACKENDS, BRAX_TASKS
 
 ENVS = 2
 # MJX is slow on the pusher: its solver seems not to converge in float32 and to take all 20 x 50
 # iterations.
 STEPS = {("pusher", "mjx"): 10}
-PAIRS = [(task, backend) for task, spec in TASKS.items() for backend in spec.backends]
+PAIRS = [(task, backend) for task, spec in BRAX_TASKS.items() for backend in spec.backends]
 
 # How far links may come apart, metres: Brax's maximal engines hold joints by springs or
 # corrections, the others not at all loosely.

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from pixelbrax_jax.physics.geometry import read_geoms
-from pixelbrax_jax.tasks import TASKS
+from pixelbrax_jax.tasks import BRAX_TASKS
 from pixelbrax_jax.types import GeomKind
 
 LOOKS = """
@@ -65,7 +65,7 @@ def test_colors_and_visibility():
     np.testing.assert_allclose(geoms.size[geoms.name.index("default")], [0.1, 0, 0])
 
 
-@pytest.mark.parametrize("task", sorted(TASKS))
+@pytest.mark.parametrize("task", sorted(BRAX_TASKS))
 def test_colors_of_the_tasks(task, unfused_model):
     model = unfused_model(task)
     assert_as_in_viewer(model, read_geoms(model))
@@ -150,7 +150,7 @@ def test_visible_height_field():
 
 
 def test_task_colors_name_geoms_that_exist(program):
-    for task, spec in TASKS.items():
+    for task, spec in BRAX_TASKS.items():
         if not spec.colors:
             continue
         geoms = program(task).physics.geoms

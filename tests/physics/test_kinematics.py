@@ -5,12 +5,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from pixelbrax_jax.tasks import TASKS
+from pixelbrax_jax.tasks import BRAX_TASKS
 
-ALL_TASKS = sorted(TASKS)
+ALL_TASKS = sorted(BRAX_TASKS)
 
 
-ENLARGED = {name for spec in TASKS.values() for name in spec.drawn_radius}
+ENLARGED = {name for spec in BRAX_TASKS.values() for name in spec.drawn_radius}
 """Geoms that are drawn larger than they are."""
 
 

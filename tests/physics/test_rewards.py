@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from pixelbrax_jax.tasks import TASKS
+from pixelbrax_jax.tasks import BRAX_TASKS
 
 
 def step_once(program, task, preset="brax", backend=None, scale=1.0):
@@ -168,7 +168,7 @@ def test_tasks_that_the_paper_leaves_alone(task, program):
 def test_every_paper_setting_belongs_to_a_task_that_differs():
     changed = {
         name
-        for name, spec in TASKS.items()
+        for name, spec in BRAX_TASKS.items()
         if spec.paper_options or spec.paper_unscaled or spec.paper_reward
     }
     assert changed == {

@@ -8,7 +8,7 @@ import pytest
 
 from pixelbrax_jax.physics import make_physics
 from pixelbrax_jax.physics.base import Physics
-from pixelbrax_jax.tasks import BRAX_BACKENDS, TASKS
+from pixelbrax_jax.tasks import BRAX_BACKENDS, BRAX_TASKS
 from pixelbrax_jax.types import GeomKind
 
 # task: (planes, capsules, spheres), actions, observations, dt by backend
@@ -29,7 +29,7 @@ FACTS = {
 
 
 def test_all_eleven_tasks_of_brax():
-    assert set(TASKS) == set(FACTS)
+    assert set(BRAX_TASKS) == set(FACTS)
 
 
 @pytest.mark.parametrize("task", sorted(FACTS))
@@ -41,7 +41,7 @@ def test_sizes(task, program):
     assert tuple(count[k] for k in (GeomKind.PLANE, GeomKind.CAPSULE, GeomKind.SPHERE)) == kinds
     assert physics.action_size == actions
     assert physics.state_size == observations
-    assert physics.backend == TASKS[task].default_backend
+    assert physics.backend == BRAX_TASKS[task].default_backend
     assert len(set(physics.link_names)) == len(physics.link_names)
 
 
@@ -60,7 +60,7 @@ def test_dt_depends_on_the_backend(task):
 
 @pytest.mark.parametrize("task", sorted(FACTS))
 def test_default_backend_is_supported(task):
-    spec = TASKS[task]
+    spec = BRAX_TASKS[task]
     assert spec.default_backend in spec.backends
     assert set(spec.backends) <= set(BRAX_BACKENDS)
     assert list(spec.backends) == sorted(spec.backends)

@@ -14,7 +14,7 @@ from etils import epath
 
 import pixelbrax_jax
 from pixelbrax_jax import place, render
-from pixelbrax_jax.tasks import TASKS
+from pixelbrax_jax.tasks import BRAX_TASKS
 from tests.renderer import scenes
 from tests.renderer.mujoco_rays import cast
 
@@ -41,7 +41,7 @@ def compare(model: mujoco.MjModel, batch, shown: list[int]) -> None:
     assert seen >= 2 * NUM_POSES, "the poses show too little to compare"
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", BRAX_TASKS)
 def test_task_at_random_poses(task):
     _, params = pixelbrax_jax.make(task)
     name = {"halfcheetah": "half_cheetah"}.get(task, task)

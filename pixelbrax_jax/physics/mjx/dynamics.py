@@ -75,7 +75,9 @@ class Dynamics:
             ls_iterations=min(ls_iterations, model.opt.ls_iterations),
         )
         self._mx = self._mx.replace(opt=option)
-        self._moving = self._mx if reads_forces else self._without(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+        self._moving = (
+            self._mx if reads_forces else self._without(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+        )
         self._passive = self._without(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
 
     def _without(self, feature: mujoco.mjtDisableBit) -> Any:

@@ -120,7 +120,7 @@ class MjxPhysics(GuardedPhysics):
         start = self._task.start(self.dynamics, key)
         state = self.dynamics.state(start.qpos, start.qvel, start.target)
         sensors = jnp.zeros(self._model.nsensordata)
-        if self._task.reads_forces:
+        if self._task.starts_with_forces:
             state, sensors = self.dynamics.at_rest(state)
         return self.observe(state, sensors)
 

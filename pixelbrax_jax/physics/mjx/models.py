@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import sys
 import warnings
 from collections.abc import Callable
 from importlib import metadata
@@ -36,6 +37,9 @@ KNOWN_MODELS = {
     "manipulator": "608a06bb47623612",
 }
 """Domain -> start of the SHA-256 of its XML file and those that it includes, in that release."""
+
+_NO_WHEELS = (3, 13)
+"""The first Python without wheels of what dm_control requires; its models are read all the same."""
 
 _INCLUDED = ("common/materials.xml", "common/skybox.xml", "common/visual.xml")
 
@@ -77,12 +81,16 @@ def suite_folder() -> Path:
         ImportError: there is none.
     """
     spec = find_spec("dm_control")
-    folders = [] if spec is None else [Path(place) for place in spec.submodule_search_locations or ()]
+    folders = (
+        [] if spec is None else [Path(place) for place in spec.submodule_search_locations or ()]
+    )
     for folder in folders:
         if (folder / "suite").is_dir():
             return folder / "suite"
+    newer = f" (from Python {_NO_WHEELS[0]}.{_NO_WHEELS[1]} on: pip install --no-deps dm_control)"
     raise ImportError(
-        f"tasks of the DM Control Suite read their models from dm_control: {install_extra('dmc')}"
+        "dm_control is not installed, from which tasks of the DM Control Suite read their models; "
+        f"try: {install_extra('dmc')}{newer if sys.version_info >= _NO_WHEELS else ''}"
     )
 
 
@@ -129,7 +137,7 @@ def _grow_swimmer(root: ElementTree.Element, *, num_bodies: int) -> None:
     bend = 360.0 / num_bodies
     for camera in parent.findall("camera"):
         if camera.get("mode") == "trackcom":
-            place = [float(number) * num_bodies / 6.0 for number in camera.attrib["pos"].split()]
+            place = [float(number) * (num_bodies / 6.0) for number in camera.attrib["pos"].split()]
             camera.set("pos", " ".join(map(str, place)))
     for i in range(num_bodies - 1):
         body = ElementTree.SubElement(parent, "body", name=f"segment_{i}", pos="0 .1 0")

@@ -7,8 +7,6 @@ import math
 import jax
 import jax.numpy as jnp
 
-_INF = math.inf
-
 
 def tolerance(
     x: jax.Array,
@@ -37,10 +35,8 @@ def tolerance(
     inside = (x >= lower) & (x <= upper)
     if margin == 0:
         return jnp.where(inside, 1.0, 0.0)
-    if upper == _INF:
-        distance = lower - x
-    else:
-        distance = jnp.where(x < lower, lower - x, x - upper)
+    # Nothing is above an infinite bound, and the distance to it would be infinite.
+    distance = lower - x if upper == math.inf else jnp.where(x < lower, lower - x, x - upper)
     return jnp.where(inside, 1.0, _SIGMOIDS[sigmoid](distance / margin, value_at_margin))
 
 

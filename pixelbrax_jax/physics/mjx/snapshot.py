@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import jax
@@ -100,6 +99,6 @@ class Snapshot:
         return self.data.site_xpos[self.model.site(name).id]  # type: ignore[attr-defined]
 
 
-def joined(*parts: jax.Array | Sequence[jax.Array]) -> jax.Array:
+def joined(*parts: jax.Array | float) -> jax.Array:
     """Return arrays and scalars one after the other, flattened."""
     return jnp.concatenate([jnp.ravel(jnp.asarray(part)) for part in parts])

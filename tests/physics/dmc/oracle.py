@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import os
+import warnings
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
 import numpy as np
 
+from pixelbrax_jax.tasks import DMC_TASKS
+
 # Nothing is drawn, and importing must not look for a display.
 os.environ.setdefault("MUJOCO_GL", "disable")
+
+_FIELDS = ("qpos", "qvel", "act", "qacc_warmstart", "ctrl", "sensordata", "xpos")
+_EPISODE = 1000
 
 
 @dataclass(frozen=True)
@@ -18,8 +24,8 @@ class Transitions:
     """N states of DM Control, and the control steps from them. All arrays are float64.
 
     Attributes:
-        before, after: name -> (N, ...) what ``record`` reads of the states.
-        action: (N, A) actions between them, in the model's control ranges.
+        before, after: name -> (N, ...), what ``record`` reads of the states.
+        action: (N, A) actions between them, in the actuators' control ranges.
     """
 
     before: dict[str, np.ndarray]
@@ -29,23 +35,25 @@ class Transitions:
 
 def load(task: str, seed: int = 0) -> Any:
     """DM Control's environment of one of our tasks."""
-    from dm_control import suite
+    with warnings.catch_warnings():
+        # Of its own, and of what it imports.
+        warnings.simplefilter("ignore")
+        from dm_control import suite
 
-    from pixelbrax_jax.tasks import DMC_TASKS
-
-    row = DMC_TASKS[task]
-    return suite.load(row.domain, row.task, task_kwargs={"random": seed})
+        row = DMC_TASKS[task]
+        return suite.load(row.domain, row.task, task_kwargs={"random": seed})
 
 
 def target_of(physics: Any) -> np.ndarray:
     """(3,) where the model has its target; (0,) without one."""
-    for names, positions in (
-        (physics.named.model.geom_pos.axes.row.names, physics.named.model.geom_pos),
-        (physics.named.model.site_pos.axes.row.names if physics.model.nsite else [], None),
+    model = physics.model
+    for kind, count, places in (
+        ("geom", model.ngeom, model.geom_pos),
+        ("site", model.nsite, model.site_pos),
     ):
+        names = [model.id2name(i, kind) for i in range(count)]
         if "target" in names:
-            positions = physics.named.model.site_pos if positions is None else positions
-            return np.array(positions["target"])
+            return np.array(places[names.index("target")])
     return np.zeros(0)
 
 
@@ -54,37 +62,43 @@ def flatten(observation: Any) -> np.ndarray:
     return np.concatenate([np.ravel(part) for part in observation.values()])
 
 
-def record(env: Any, reward: float, observation: Any) -> dict[str, np.ndarray]:
+def record(env: Any, timestep: Any) -> dict[str, np.ndarray]:
     """What of a state is compared."""
     data = env.physics.data
-    fields = ("qpos", "qvel", "act", "qacc_warmstart", "ctrl", "sensordata", "xpos")
     return {
-        **{name: np.array(getattr(data, name)) for name in fields},
+        **{name: np.array(getattr(data, name)) for name in _FIELDS},
         "target": target_of(env.physics),
-        "reward": np.array(reward),
-        "obs": flatten(observation),
+        "reward": np.array(timestep.reward or 0.0),
+        "obs": flatten(timestep.observation),
     }
 
 
 @cache
 def transitions(task: str, count: int, *, episodes: int = 4, seed: int = 0) -> Transitions:
-    """Draw states from episodes of random actions, evenly along them."""
+    """Take states from episodes of random actions, evenly along them, never the first."""
     env = load(task, seed)
     spec = env.action_spec()
     random = np.random.RandomState(seed + 1)
-    every = max(1, 1000 * episodes // count)
+    chosen = set(np.linspace(1, _EPISODE - 1, -(-count // episodes)).astype(int).tolist())
     before, after, actions = [], [], []
     for _ in range(episodes):
-        step = env.reset()
-        for number in range(1000):
-            state = record(env, step.reward or 0.0, step.observation) if number else None
+        timestep = env.reset()
+        for number in range(_EPISODE):
             action = random.uniform(spec.minimum, spec.maximum)
-            step = env.step(action)
-            if number and number % every == every // 2 % every or (every == 1 and number):
-                before.append(state)
+            if number in chosen:
+                before.append(record(env, timestep))
                 actions.append(action)
-                after.append(record(env, step.reward, step.observation))
+            timestep = env.step(action)
+            if number in chosen:
+                after.append(record(env, timestep))
     return Transitions(_stack(before[:count]), np.array(actions[:count]), _stack(after[:count]))
+
+
+@cache
+def starts(task: str, count: int, seed: int = 0) -> dict[str, np.ndarray]:
+    """Initial states of episodes."""
+    env = load(task, seed)
+    return _stack([record(env, env.reset()) for _ in range(count)])
 
 
 def _stack(rows: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:

@@ -53,7 +53,15 @@ def _reward_hop(seen: Snapshot) -> jax.Array:
 
 
 def _task(reward: Callable[[Snapshot], jax.Array]) -> DmcTask:
-    return DmcTask("hopper", _start, _observe, reward, substeps=4, reads_forces=True)
+    return DmcTask(
+        "hopper",
+        _start,
+        _observe,
+        reward,
+        substeps=4,
+        reads_forces=True,
+        starts_with_forces=True,
+    )
 
 
 TASKS = {"stand": _task(_reward_stand), "hop": _task(_reward_hop)}

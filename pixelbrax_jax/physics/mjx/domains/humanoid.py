@@ -38,9 +38,7 @@ def _observe(seen: Snapshot) -> jax.Array:
 
 def _reward(seen: Snapshot, *, speed: float) -> jax.Array:
     """Return a product: head high, torso upright, little force, and the wanted speed."""
-    standing = tolerance(
-        seen.xpos("head")[2], (_STAND_HEIGHT, jnp.inf), margin=_STAND_HEIGHT / 4
-    )
+    standing = tolerance(seen.xpos("head")[2], (_STAND_HEIGHT, jnp.inf), margin=_STAND_HEIGHT / 4)
     upright = tolerance(
         seen.xmat("torso")[2, 2],
         (0.9, jnp.inf),

@@ -88,6 +88,7 @@ def _task(speed: float) -> DmcTask:
         options={"floor_size": _EPISODE * speed},
         camera=2,
         reads_forces=True,
+        starts_with_forces=True,
     )
 
 

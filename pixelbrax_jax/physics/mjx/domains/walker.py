@@ -29,9 +29,7 @@ def _observe(seen: Snapshot) -> jax.Array:
 
 def _reward(seen: Snapshot, *, speed: float) -> jax.Array:
     """Return standing height and uprightness, times the wanted speed along x."""
-    standing = tolerance(
-        seen.xpos("torso")[2], (_STAND_HEIGHT, jnp.inf), margin=_STAND_HEIGHT / 2
-    )
+    standing = tolerance(seen.xpos("torso")[2], (_STAND_HEIGHT, jnp.inf), margin=_STAND_HEIGHT / 2)
     stand = (3 * standing + (1 + seen.xmat("torso")[2, 2]) / 2) / 4
     if speed == 0:
         return stand

@@ -1,0 +1,107 @@
+"""Our tasks of the DM Control Suite do what DM Control's do, which is asked itself."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from pixelbrax_jax.physics import make_physics
+from pixelbrax_jax.physics.mjx import models
+from pixelbrax_jax.physics.mjx.tasks import dmc_task
+from pixelbrax_jax.tasks import DMC_TASKS
+from tests.physics.dmc import measure, oracle
+
+FAST = ("dmc_ball_in_cup_catch", "dmc_cartpole_swingup", "dmc_reacher_easy")
+"""Tasks that compile soon: one drawn with rejection, one integrated with Runge-Kutta."""
+
+EACH = [
+    pytest.param(task, marks=() if task in FAST else [pytest.mark.slow, pytest.mark.timeout(1800)])
+    for task in DMC_TASKS
+]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def dm_control():
+    pytest.importorskip("dm_control", exc_type=ImportError)
+    try:
+        oracle.load("dmc_pendulum_swingup")
+    except AttributeError as error:
+        pytest.skip(f"this dm_control and this mujoco do not go together: {error}")
+
+
+def number_of_states(task: str) -> int:
+    return 40 if task in FAST else measure.STATES
+
+
+@pytest.mark.parametrize("task", EACH)
+def test_the_same_state_has_the_same_observation_and_reward(task):
+    errors = measure.same_state(task, number_of_states(task))
+    # Rounding to float32 of states and constants.
+    assert errors["reward"] < 1e-6
+    assert errors["observation"] < 1e-5
+    assert errors["links"] < 1e-5
+
+
+@pytest.mark.parametrize("task", EACH)
+def test_one_control_step(task):
+    errors = measure.control_step(task, number_of_states(task))
+    assert errors["reward"] < 1e-4, errors
+    assert errors["velocity"] < 1e-2, errors
+
+
+@pytest.mark.parametrize("task", EACH)
+def test_initial_states_have_the_same_distribution(task):
+    episodes = measure.EPISODES
+    first = measure.initial_states(task, episodes)
+    low = [name for name, p in first.items() if not p > 0.01]
+    if low:
+        # One of a hundred is that low by chance; of another sample none may be.
+        second = measure.initial_states(task, episodes, seed=1)
+        assert {name: second[name] for name in low if not second[name] > 0.01} == {}
+
+
+@pytest.mark.parametrize("task", DMC_TASKS)
+def test_models_are_equal(task):
+    """Also those that are generated: swimmers and the quadruped."""
+    parts = dmc_task(task)
+    ours = models.load_model(parts.domain, **parts.options)
+    parts.edit(ours)
+    env = oracle.load(task)
+    theirs = env.physics.model
+    # Each reset puts the target elsewhere, and the first one resizes or hides it.
+    places = {name: getattr(theirs, name).copy() for name in ("geom_pos", "site_pos", "light_pos")}
+    env.reset()
+    for name in dir(ours):
+        value = getattr(ours, name)
+        if isinstance(value, np.ndarray) and not name.startswith("_"):
+            expected = places.get(name, getattr(theirs, name))
+            np.testing.assert_array_equal(value, expected, err_msg=name)
+    for option in ("timestep", "integrator", "cone", "disableflags", "density", "viscosity"):
+        assert getattr(ours.opt, option) == getattr(theirs.opt, option), option
+
+
+@pytest.mark.parametrize("task", DMC_TASKS)
+def test_sizes_and_times(task):
+    physics, env = make_physics(task), oracle.load(task)
+    observation = oracle.flatten(env.reset().observation)
+    assert physics.state_size == observation.size
+    assert physics.action_size == env.action_spec().shape[0]
+    assert physics.dt == pytest.approx(env.control_timestep())
+    assert env._step_limit == pytest.approx(1000)
+    low, high = (physics.control(jnp.full(physics.action_size, end)) for end in (-1.0, 1.0))
+    np.testing.assert_allclose(low, env.action_spec().minimum, rtol=1e-6)
+    np.testing.assert_allclose(high, env.action_spec().maximum, rtol=1e-6)
+
+
+def test_rejection_leaves_no_contact():
+    physics = make_physics("dmc_ball_in_cup_catch")
+    first = jax.jit(jax.vmap(physics.reset))(jax.random.split(jax.random.key(0), measure.EPISODES))
+    model = models.load_model("ball_in_cup")
+    data = mujoco.MjData(model)
+    for qpos in np.asarray(first.engine.qpos):
+        data.qpos[:] = qpos
+        mujoco.mj_forward(model, data)
+        assert data.ncon == 0

@@ -1,0 +1,110 @@
+"""Names, errors and episodes of the DM Control Suite's tasks."""
+
+from __future__ import annotations
+
+import importlib.util
+from importlib import metadata
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+import pixelbrax_jax as pb
+from pixelbrax_jax.physics import make_physics
+from pixelbrax_jax.physics.mjx import models
+from pixelbrax_jax.tasks import BRAX_TASKS, DMC_TASKS
+from tests.physics.dmc.test_against_dm_control import FAST
+
+EACH = [
+    pytest.param(task, marks=() if task == "dmc_cartpole_swingup" else pytest.mark.slow)
+    for task in DMC_TASKS
+]
+
+needs_models = pytest.mark.skipif(
+    importlib.util.find_spec("dm_control") is None, reason="dm_control is not installed"
+)
+
+
+def test_suites_are_listed_apart():
+    assert pb.list_envs(suite="dmc") == tuple(sorted(DMC_TASKS))
+    assert pb.list_envs(suite="brax") == tuple(sorted(BRAX_TASKS))
+    assert len(DMC_TASKS) == 29
+    with pytest.raises(ValueError, match="allowed: brax, dmc"):
+        pb.list_envs(suite="dm_control")
+
+
+@pytest.mark.parametrize(
+    ("given", "meant"),
+    [
+        ("cheetah_run", "dmc_cheetah_run"),
+        ("cheetah-run", "dmc_cheetah_run"),
+        ("dmc-cheetah-run", "dmc_cheetah_run"),
+        ("hopper-hop", "dmc_hopper_hop"),
+        ("Ball_In_Cup-Catch", "dmc_ball_in_cup_catch"),
+        ("swimmer6", "dmc_swimmer_swimmer6"),
+    ],
+)
+def test_other_libraries_names_are_understood(given, meant):
+    with pytest.raises(ValueError, match=rf"Did you mean '{meant}'\?$"):
+        pb.make(given)
+
+
+def test_without_dm_control_the_extra_is_named(monkeypatch):
+    monkeypatch.setattr(models, "find_spec", lambda name: None)
+    with pytest.raises(ImportError, match=r'try: pip install "pixelbrax\[dmc\]"'):
+        models.load_model("cheetah")
+
+
+def test_pythons_without_wheels_are_told_another_way(monkeypatch):
+    monkeypatch.setattr(models, "find_spec", lambda name: None)
+    monkeypatch.setattr(models.sys, "version_info", (3, 13, 0))
+    with pytest.raises(ImportError, match="pip install --no-deps dm_control"):
+        models.load_model("cheetah")
+
+
+@needs_models
+def test_other_models_are_warned_of_once(monkeypatch):
+    monkeypatch.setattr(models, "_warned", [])
+    monkeypatch.setitem(models.KNOWN_MODELS, "pendulum", "another")
+    both = rf"dm_control {metadata.version('dm_control')} .* dm_control {models.KNOWN_VERSION}"
+    with pytest.warns(UserWarning, match=both):
+        models.load_model("pendulum")
+    models.load_model("pendulum")
+
+
+@needs_models
+def test_every_domains_models_are_known():
+    for domain in {row.domain for row in DMC_TASKS.values()}:
+        assert domain in models.KNOWN_MODELS
+
+
+@needs_models
+def test_rewards_and_backends_are_dm_controls_own():
+    with pytest.raises(ValueError, match="DM Control's own rewards"):
+        pb.make("dmc_cartpole_swingup", reward_preset="paper")
+    with pytest.raises(ValueError, match="allowed: mjx"):
+        pb.make("dmc_cartpole_swingup", backend="spring")
+
+
+@needs_models
+def test_equal_tasks_are_equal():
+    task, other, _ = FAST
+    assert make_physics(task) == make_physics(task, backend="mjx")
+    assert hash(make_physics(task)) == hash(make_physics(task))
+    assert make_physics(task) != make_physics(other)
+
+
+@needs_models
+@pytest.mark.parametrize("task", EACH)
+def test_episodes_are_truncated_after_1000_control_steps(task):
+    env, params = pb.make(task, obs_mode="state")
+    state, _ = env.reset(jax.random.key(0), params)
+    actions = jax.random.uniform(jax.random.key(1), (1001, env.action_size), minval=-1.0)
+
+    def step(state, action):
+        state, timestep = env.step(state, action, params)
+        return state, (timestep.terminated, timestep.truncated)
+
+    _, (terminated, truncated) = jax.jit(lambda s: jax.lax.scan(step, s, actions))(state)
+    assert not jnp.any(terminated)
+    assert int(jnp.argmax(truncated)) == 999
