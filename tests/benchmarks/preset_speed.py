@@ -4,7 +4,7 @@
 
 The runs of that page were made in the background of other work, and on several machines. What
 they reach after some minutes is read at the steps that these speeds give, so nothing else may
-compute meanwhile. Ten minutes on two cores.
+compute meanwhile. Eight minutes on two cores.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from pixelbrax_jax.agents.runner.metrics import read_metrics
 from tests.benchmarks.experiments import TASKS
 
 KEPT = Path(__file__).parents[2] / "docs" / "results" / "speed.json"
-ITERATIONS = 32
+ITERATIONS = 16
 
 
 def measure(algorithm: str, task: str) -> dict[str, float]:
