@@ -13,7 +13,12 @@ from pathlib import Path
 from pixelbrax_jax.extras import install_extra
 
 _PACKAGES = ("pixelbrax", "jax", "jaxlib", "brax", "mujoco", "gymnasium", "numpy")
-_OPTIONAL = {"torch": "torch", "torchrl": "torchrl", "stable-baselines3": "sb3"}
+_OPTIONAL = {
+    "torch": "torch",
+    "torchrl": "torchrl",
+    "stable-baselines3": "sb3",
+    "dm-control": "dmc",
+}
 """Package -> the extra that brings it."""
 
 _JAX_ON_CUDA = install_extra("cuda12", "cuda13")

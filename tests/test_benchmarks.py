@@ -60,6 +60,7 @@ ANSWERS = {
     "bank.load": {"frames": 4200, "file_bytes": 2e8, "bank_bytes": 1e8, "seconds": {"read": 9.0}},
     "startup.first_frame": {"seconds": {"import": 1.0, "make": 2.0}},
     "scene.describe": {},
+    "dmc.pixels": {"steps_per_second": 500.0, "first_frame": {"without": 40.0, "with": 9.0}},
     "peers.dm_control_envs": {"steps_per_second": 4.0, "processes": 2, "opengl": "a software one"},
     "peers.gymnasium_envs": {
         "steps_per_second": 5.0,
@@ -226,6 +227,7 @@ def test_the_page_has_every_table_and_right_ratios(workers, tmp_path, monkeypatc
     assert "## Not measured" not in page
     # 500 steps/s of ours over 4 of DM Control's, 12.6 of the original, 800 frames/s over 100.
     assert "| DM Control quadruped, alone | 2 | | 4.00 | 125 | a software one |" in page
+    assert "| `dmc_cheetah_run` | 500 | 4.00 | 125 | 40.0 | 9.00 |" in page
     assert "| HalfCheetah | 4 | 500 | 12.6 | 39.7 |" in page
     assert "| 84 | 256 | 800 | 100 | 8.00 |" in page
     assert "gymnasium 3, mujoco 1, mujoco 2." in page

@@ -24,7 +24,7 @@ def main(arguments: Sequence[str]) -> int:
     """
     parser = argparse.ArgumentParser(
         prog="pixelbrax bench",
-        description="Measures renderer, environments and adapters on this machine, in about three "
+        description="Measures renderer, environments and adapters on this machine, in about two "
         "minutes, and writes JSON, a page of tables and a plot. What has been measured is kept: a "
         "run that was stopped goes on where it was.",
     )
@@ -43,13 +43,19 @@ def main(arguments: Sequence[str]) -> int:
     return run(parser.prog, options, groups, options.only or list(groups))
 
 
-def add_options(parser: argparse.ArgumentParser, names: Sequence[str], output_dir: str) -> None:
+def add_options(
+    parser: argparse.ArgumentParser,
+    names: Sequence[str],
+    output_dir: str,
+    tasks: Sequence[str] = TASKS,
+) -> None:
     """Add what every benchmark takes.
 
     Args:
         parser: the command's.
         names: parts of the benchmark.
         output_dir: where results are kept unless another folder is given.
+        tasks: those that are measured.
     """
     parser.add_argument(
         "--output-dir",
@@ -58,7 +64,7 @@ def add_options(parser: argparse.ArgumentParser, names: Sequence[str], output_di
         help=f"where results are kept (default: {output_dir})",
     )
     parser.add_argument("--only", nargs="+", choices=names, help="parts to measure")
-    parser.add_argument("--task", nargs="+", choices=TASKS, help="only cases of these tasks")
+    parser.add_argument("--task", nargs="+", choices=tasks, help="only cases of these tasks")
     parser.add_argument("--max-envs", type=int, help="only cases of at most so many environments")
     parser.add_argument("--again", action="store_true", help="measure anew what has been measured")
     parser.add_argument("--timeout", type=float, default=900.0, help="seconds of one case at most")

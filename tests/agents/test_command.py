@@ -17,6 +17,7 @@ from pixelbrax_jax.agents.runner import train_command as command
 from pixelbrax_jax.agents.runner.train_command import parse
 from pixelbrax_jax.agents.runner.trained import load_config
 from pixelbrax_jax.cli import main
+from pixelbrax_jax.tasks import TASKS
 from tests.benchmarks.experiments import experiments, gpu_experiments
 
 TINY = (
@@ -34,8 +35,10 @@ def test_every_preset_is_valid_and_comes_back_from_json(algorithm, name):
     assert load_config(stored) == config
 
 
-@pytest.mark.parametrize("task", TASK_SETTINGS["cpu"]["ppo"])
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.parametrize(
+    ("algorithm", "task"),
+    [(algorithm, task) for algorithm in ALGORITHMS for task in TASK_SETTINGS["cpu"][algorithm]],
+)
 def test_a_preset_may_have_settings_of_a_task(algorithm, task):
     config, _ = parse(algorithm, "cpu", ["--task", task, "--num-steps", "64"])
     assert config == replace(preset(algorithm, "cpu", task), num_steps=64)  # type: ignore[arg-type]
@@ -91,7 +94,32 @@ def test_errors_name_the_setting_and_the_cure(capsys):
     assert main(["train", "ppo", "--task", "antt"]) == 1
     assert "Did you mean 'ant'?" in capsys.readouterr().err
     assert main(["record", "/nowhere"]) == 1
-    assert "no checkpoint" in capsys.readouterr().err
+    assert "no checkpoint in /nowhere/checkpoints, for there is no such folder" in (
+        capsys.readouterr().err
+    )
+    with pytest.raises(SystemExit):
+        main(["train", "--task", "ant"])
+    assert "name an algorithm first, as in 'pixelbrax train ppo --task" in capsys.readouterr().err
+
+
+def test_tasks_are_listed(capsys):
+    assert main(["tasks"]) == 0
+    listed = [line.split()[0] for line in capsys.readouterr().out.splitlines()]
+    assert listed == list(TASKS)
+
+
+@pytest.mark.slow
+def test_a_task_of_the_dm_control_suite_from_training_to_the_film(capsys, tmp_path):
+    folder = str(tmp_path)
+    line = [*TINY, "--task", "dmc_cartpole_swingup", "--output-dir", folder]
+    assert main(["train", "ppo", *line, "--action-repeat", "8", "--num-evals", "1"]) == 0
+    capsys.readouterr()
+    assert main(["evaluate", folder, "--episodes", "2"]) == 0
+    clean = json.loads(capsys.readouterr().out)["clean"]
+    assert 0.0 <= clean["return"] <= 1000.0
+    assert clean["episodes"] == 2
+    assert main(["record", folder, "--num-frames", "3", "--output", str(tmp_path / "a.gif")]) == 0
+    assert len(imageio.imread(tmp_path / "a.gif", index=None)) == 3
 
 
 @pytest.mark.parametrize(("given", "told"), [("0", "positive integer"), ("2", "comes too late")])

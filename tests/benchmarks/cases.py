@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,7 @@ from pixelbrax_gym.bench.cases import FULL, TASKS
 from pixelbrax_gym.bench.machine import num_cores
 from pixelbrax_gym.bench.plot import DM_CONTROL
 from pixelbrax_gym.bench.tables import interleaved
+from pixelbrax_jax.tasks import DMC_TASKS
 from tests.benchmarks import tables
 from tests.benchmarks.original import ORIGINAL
 from tests.benchmarks.peers.install import peer_python
@@ -26,13 +28,13 @@ class PeerCase(Case):
     """A script that measures another simulator, in an environment of that one's own.
 
     Attributes:
-        peer: its name in ``peers.install.PEERS``.
+        peer: its name in ``peers.install.PEERS``; empty for one that is installed beside us.
     """
 
     peer: str = ""
 
     def command(self) -> list[str]:
-        python = peer_python(self.peer)
+        python = peer_python(self.peer) if self.peer else sys.executable
         arguments = {**self.arguments, "cores": num_cores()}
         if self.peer == "mujoco_warp":
             describe = Case("scene", "scene.describe", {"task": arguments["task"]}, HERE)
@@ -109,6 +111,16 @@ def peers() -> Iterator[Case]:
         yield PeerCase("peers", "peers.mujoco_warp_renderer", where, peer="mujoco_warp")
 
 
+def dmc() -> Iterator[Case]:
+    """Every task of the DM Control Suite, of ours and of dm_control, which draws without a GPU."""
+    for task, row in DMC_TASKS.items():
+        yield Case("dmc", "dmc.pixels", {"task": task, "num_envs": 128}, HERE)
+        where = {"task": task, "domain": row.domain, "goal": row.task, "processes": 0}
+        # The camera that the field takes; the quadruped is out of the sight of its first one.
+        where |= {"camera": 2 if row.domain == "quadruped" else 0, "seconds": 1.0}
+        yield PeerCase("dmc", "peers.dm_control_envs", where)
+
+
 GROUPS = {
     "renderer": FULL["renderer"],
     "startup": Group(
@@ -139,6 +151,15 @@ GROUPS = {
         "not, and would be faster with a GPU; this compares what a machine without one can do. "
         "MuJoCo Warp draws the same model in the same pose from our camera, without textures and "
         "shadows.",
+    ),
+    "dmc": Group(
+        dmc,
+        tables.dmc,
+        "128 environments through `gymnasium.make_vec`, 84 x 84, three frames, NumPy arrays; "
+        "dm_control has one environment and one frame in one process, and draws through a software "
+        "OpenGL, which a GPU would speed up. To the first frame: from the start of a Python "
+        "process to the end of the first step of 128 environments, one sample, with an empty "
+        "compilation cache and with one that such a process has filled.",
     ),
     "devices": Group(
         devices,

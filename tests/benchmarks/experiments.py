@@ -8,8 +8,9 @@
 
 A run that was cut short, by Ctrl-C or by --minutes, goes on from its checkpoint at the next call.
 Of a finished one docs/results/runs/<name>.json is kept; `tests.benchmarks.results` draws all of
-them. A run's minutes are those on its own clock: nothing else should compute meanwhile. The best
-policy of each task goes into the package, for --pretrained.
+them. Those in tasks of the DM Control Suite are kept in docs/dmc/runs, `tests.benchmarks.dmc_page`
+draws them. A run's minutes are those on its own clock: nothing else should compute meanwhile. The
+best policy of each of Brax's tasks goes into the package, for --pretrained.
 """
 
 from __future__ import annotations
@@ -28,12 +29,15 @@ from pathlib import Path
 
 import pixelbrax_jax
 from pixelbrax_gym.bench.machine import describe_cpu
-from pixelbrax_jax.agents.algorithms.presets import preset
+from pixelbrax_jax.agents.algorithms.presets import TASK_SETTINGS, preset
 from pixelbrax_jax.agents.algorithms.registry import ALGORITHMS
 from pixelbrax_jax.agents.runner.checkpoint import read_about
 from pixelbrax_jax.agents.runner.metrics import read_metrics
+from pixelbrax_jax.tasks import DMC_TASKS
 
-KEPT = Path(__file__).parents[2] / "docs" / "results" / "runs"
+DOCS = Path(__file__).parents[2] / "docs"
+KEPT = DOCS / "results" / "runs"
+KEPT_DMC = DOCS / "dmc" / "runs"
 PRETRAINED = Path(pixelbrax_jax.__file__).parent / "pretrained"
 EPISODES = 32
 TASKS = ("halfcheetah", "walker2d", "ant", "humanoid")
@@ -82,7 +86,16 @@ def experiments() -> dict[str, list[str]]:
                     add(algorithm, task, seed, *options, "--num-evals", "1", name=name)
     for algorithm in ALGORITHMS:
         add(algorithm, "inverted_pendulum", 0, "--num-evals", "3")
+    for seed in range(3):
+        for task in TASK_SETTINGS["cpu"]["ppo"]:
+            if task in DMC_TASKS:
+                add("ppo", task, seed, "--num-evals", "3")
     return runs
+
+
+def kept_at(name: str) -> Path:
+    """The file that keeps a run."""
+    return (KEPT_DMC if name.split("-")[1] in DMC_TASKS else KEPT) / f"{name}.json"
 
 
 def gpu_experiments() -> dict[str, list[str]]:
@@ -115,7 +128,8 @@ def record(folder: Path, arguments: list[str]) -> dict:
         for r in records
         if "eval/clean/return" in r
     ]
-    packages = ("jax", "jaxlib", "brax", "pixelbrax")
+    physics = ("mujoco", "mujoco-mjx") if about["config"]["task"] in DMC_TASKS else ("brax",)
+    packages = ("jax", "jaxlib", *physics, "pixelbrax")
     return {
         "command": shlex.join(["pixelbrax", *arguments]),
         "revision": REVISION,
@@ -192,10 +206,9 @@ def main() -> int:
     chosen = {name: line for name, line in runs.items() if options.only in name}
     if not chosen:
         parser.error(f"no run has {options.only!r} in its name; --list shows all")
-    KEPT.mkdir(parents=True, exist_ok=True)
     until, failed = time.monotonic() + 60.0 * options.minutes, []
     for name, arguments in chosen.items():
-        path = KEPT / f"{name}.json"
+        path = kept_at(name)
         # Checkpoints of another revision would go on as if they were of this one.
         folder = options.output_dir / f"revision-{REVISION}" / name
         if options.list:
@@ -210,6 +223,7 @@ def main() -> int:
             failed.append(name)
             continue
         kept = record(folder, arguments)
+        path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(kept) + "\n")
         if kept["config"]["task"] in TASKS and not kept["config"]["distractors"]:
             offer(kept["config"]["task"], folder, kept)

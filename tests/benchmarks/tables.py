@@ -92,6 +92,34 @@ def devices(rows: list[Row]) -> str:
     return stepping + training
 
 
+def dmc(rows: list[Row]) -> str:
+    lines = []
+    for task in dict.fromkeys(row["arguments"]["task"] for row in rows):
+        ours = find(rows, "dmc.pixels", task=task)
+        theirs = find(rows, "peers.dm_control_envs", task=task)
+        faster = ratio(value(ours, "steps_per_second"), value(theirs, "steps_per_second"))
+        frame = value(ours, "first_frame") or {}
+        lines.append(
+            [
+                f"`{task}`",
+                cell(ours, "steps_per_second"),
+                cell(theirs, "steps_per_second"),
+                faster,
+                number(frame.get("without")),
+                number(frame.get("with")),
+            ]
+        )
+    heads = (
+        "task",
+        "PixelBrax, steps/s",
+        "dm_control, steps/s",
+        "faster by",
+        "first frame, s",
+        "with programs kept, s",
+    )
+    return f"{table(heads, lines)}\n\n{_peer_versions(rows)}"
+
+
 def peers(rows: list[Row]) -> str:
     lines = []
     for task in TASKS:

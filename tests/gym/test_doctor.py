@@ -13,7 +13,7 @@ from pixelbrax_gym import doctor
 from pixelbrax_jax import cli
 
 HEALTHY = doctor.Machine(
-    versions=dict.fromkeys(("jax", "torch", "torchrl", "stable-baselines3"), "1.0"),
+    versions=dict.fromkeys(("jax", "torch", "torchrl", "stable-baselines3", "dm-control"), "1.0"),
     jax_device="cuda:0",
     jax_platform="gpu",
     jax_error=None,

@@ -121,6 +121,10 @@ _CPU_TASKS = {
     "ant": {"action_repeat": 2, "gamma": 0.97, "total_steps": 3_400_000},
     "humanoid": {"action_repeat": 3, "gamma": 0.98, "total_steps": 3_500_000},
 }
+# Tasks of the DM Control Suite; tried with PPO alone.
+_CPU_DMC_TASKS: dict[str, dict[str, Any]] = {
+    "dmc_cartpole_swingup": {"action_repeat": 8, "gamma": 0.97, "total_steps": 2_500_000},
+}
 _CPU_SHARES = {"ppo": 1.0, "ppg": 0.7, "dcpg": 0.6}
 """Steps that an algorithm makes in the time in which PPO makes one."""
 
@@ -134,6 +138,7 @@ TASK_SETTINGS: dict[str, dict[str, dict[str, dict[str, Any]]]] = {
         for algorithm, share in _CPU_SHARES.items()
     },
 }
+TASK_SETTINGS["cpu"]["ppo"] |= _CPU_DMC_TASKS
 """Further changes, by name of the preset, of the algorithm and of the task; such a preset has no
 other tasks."""
 

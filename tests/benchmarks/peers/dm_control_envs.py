@@ -3,7 +3,8 @@
     python dm_control_envs.py '{"domain": "cheetah", "processes": 8, "cores": 8}'
 
 Each environment step is one control step with one image; under SubprocVecEnv the last three are
-stacked. Exits with 3 where no OpenGL works.
+stacked. `goal`, `camera` and `seconds` of a repetition may be given. Exits with 3 where no OpenGL
+works.
 """
 
 from __future__ import annotations
@@ -21,10 +22,10 @@ TASKS = {"cheetah": "run", "walker": "walk", "quadruped": "walk", "humanoid": "w
 SECONDS, SIZE = 3.0, 84
 
 
-def load(domain: str, seed: int) -> Any:
+def load(domain: str, goal: str, seed: int) -> Any:
     from dm_control import suite
 
-    return suite.load(domain, TASKS[domain], task_kwargs={"random": seed})
+    return suite.load(domain, goal, task_kwargs={"random": seed})
 
 
 def opengl() -> str:
@@ -54,29 +55,29 @@ def opengl() -> str:
     sys.exit(3)
 
 
-def alone(domain: str) -> Callable[[], int]:
+def alone(domain: str, goal: str, camera: int) -> Callable[[], int]:
     """One environment in this process; the function takes one step."""
-    env = load(domain, 0)
+    env = load(domain, goal, 0)
     env.reset()
     spec, rng = env.action_spec(), np.random.default_rng(0)
 
     def step() -> int:
         if env.step(rng.uniform(spec.minimum, spec.maximum)).last():
             env.reset()
-        env.physics.render(SIZE, SIZE, camera_id=0)
+        env.physics.render(SIZE, SIZE, camera_id=camera)
         return 1
 
     return step
 
 
-def vectorised(domain: str, processes: int) -> Callable[[], int]:
+def vectorised(domain: str, goal: str, camera: int, processes: int) -> Callable[[], int]:
     """Environments in processes of their own; the function takes one step of all."""
     import gymnasium
     from stable_baselines3.common.vec_env import SubprocVecEnv, VecFrameStack
 
     class Env(gymnasium.Env):
         def __init__(self, seed: int) -> None:
-            self.env = load(domain, seed)
+            self.env = load(domain, goal, seed)
             spec = self.env.action_spec()
             self.action_space = gymnasium.spaces.Box(
                 spec.minimum.astype(np.float32), spec.maximum.astype(np.float32)
@@ -85,11 +86,11 @@ def vectorised(domain: str, processes: int) -> Callable[[], int]:
 
         def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
             self.env.reset()
-            return self.env.physics.render(SIZE, SIZE, camera_id=0), {}
+            return self.env.physics.render(SIZE, SIZE, camera_id=camera), {}
 
         def step(self, action: np.ndarray) -> Any:
             step = self.env.step(action)
-            image = self.env.physics.render(SIZE, SIZE, camera_id=0)
+            image = self.env.physics.render(SIZE, SIZE, camera_id=camera)
             return image, float(step.reward or 0.0), False, bool(step.last()), {}
 
     makers = [lambda seed=seed: Env(seed) for seed in range(processes)]
@@ -112,11 +113,13 @@ def main() -> None:
     renderer = opengl()
     domain, processes = arguments["domain"], arguments["processes"]
     processes = arguments["cores"] if processes == "cores" else processes
-    step = vectorised(domain, processes) if processes else alone(domain)
-    speed = speed_of(step, SECONDS)
-    env = load(domain, 0)
+    goal, camera = arguments.get("goal", TASKS.get(domain)), arguments.get("camera", 0)
+    which = (domain, goal, camera)
+    step = vectorised(*which, processes) if processes else alone(*which)
+    speed = speed_of(step, arguments.get("seconds", SECONDS))
+    env = load(domain, goal, 0)
     env.reset()
-    if np.ptp(env.physics.render(SIZE, SIZE, camera_id=0)) == 0:
+    if np.ptp(env.physics.render(SIZE, SIZE, camera_id=camera)) == 0:
         raise RuntimeError("it draws nothing")
     from importlib.metadata import version
 

@@ -1,0 +1,91 @@
+"""Tasks of the DM Control Suite through Gymnasium: steps per second, seconds to the first frame."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pixelbrax_jax.tasks import TASKS
+
+
+def pixels(task: str, num_envs: int) -> dict[str, Any]:
+    """Measure 84 x 84 pixels, three frames, as NumPy arrays, with drawn actions.
+
+    Two processes follow each other, each with its own clock from its start to the end of its first
+    step. The first one finds an empty compilation cache, the second one that of the first.
+
+    Args:
+        task: the task.
+        num_envs: environments.
+
+    Returns:
+        ``steps_per_second`` over all environments, ``speed``, and ``first_frame``, the seconds
+        ``without`` and ``with`` compiled programs.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        ours = ("JAX_COMPILATION", "JAX_ENABLE_COMPILATION")
+        environ = {k: v for k, v in os.environ.items() if not k.startswith(ours)}
+        environ["JAX_COMPILATION_CACHE_DIR"] = str(Path(folder) / "programs")
+        environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.3"
+        first = _process(task, num_envs, "measure", environ)
+        again = _process(task, num_envs, "start", environ)
+    return {
+        "steps_per_second": num_envs * first["speed"]["median"],
+        "speed": first["speed"],
+        "first_frame": {"without": first["first_frame"], "with": again["first_frame"]},
+    }
+
+
+def _process(task: str, num_envs: int, what: str, environ: dict[str, str]) -> dict[str, Any]:
+    arguments = [TASKS[task].gymnasium_id, str(num_envs), what, str(time.time())]
+    done = subprocess.run(
+        [sys.executable, "-m", __name__, *arguments],
+        env=environ,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if done.returncode:
+        raise RuntimeError(done.stderr[-2000:])
+    found: dict[str, Any] = json.loads(done.stdout.strip().splitlines()[-1])
+    return found
+
+
+def main() -> None:
+    """Start, step once, and measure if asked to."""
+    name, num_envs, what, started = sys.argv[1], int(sys.argv[2]), sys.argv[3], float(sys.argv[4])
+    import gymnasium
+
+    import pixelbrax_gym  # noqa: F401  # registers the ids
+
+    envs = gymnasium.make_vec(name, num_envs=num_envs, output="numpy")
+    envs.reset(seed=0)
+    low, high = envs.action_space.low, envs.action_space.high
+    draw = np.random.default_rng(0)
+    obs = envs.step(draw.uniform(low, high).astype(np.float32))[0]
+    found: dict[str, Any] = {"first_frame": time.time() - started}
+    if np.ptp(obs) == 0:
+        raise RuntimeError("it draws nothing")
+
+    def run(calls: int) -> Any:
+        for _ in range(calls):
+            obs = envs.step(draw.uniform(low, high).astype(np.float32))[0]
+        return obs
+
+    if what == "measure":
+        from pixelbrax_gym.bench.timing import rate
+
+        found["speed"] = rate(run)
+    sys.stdout.write(json.dumps(found) + "\n")
+
+
+if __name__ == "__main__":
+    main()

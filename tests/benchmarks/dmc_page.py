@@ -1,0 +1,129 @@
+"""Draws docs/dmc.md's tables and learning curves from the results in docs/dmc.
+
+python -m tests.benchmarks.dmc_page
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from pixelbrax_gym.bench.tables import table
+from pixelbrax_jax.tasks import DMC_TASKS
+from tests.benchmarks import tables
+from tests.benchmarks.pages import redraw
+from tests.benchmarks.results import final, groups, return_at
+
+FOLDER = Path(__file__).parents[2] / "docs" / "dmc"
+PAGE = FOLDER.with_suffix(".md")
+
+
+def speed() -> str:
+    """Each task beside dm_control, in Markdown; of the machine that was measured last."""
+    files = sorted(FOLDER.glob("cpu-*.json"))
+    kept = [json.loads(file.read_text("utf-8")) for file in files]
+    cases = max(
+        (k["cases"] for k in kept), key=lambda found: max(c["date"] for c in found.values())
+    )
+    return tables.dmc([row for row in cases.values() if row["group"] == "dmc"])
+
+
+def kept_runs() -> dict[str, list[dict]]:
+    """What is kept of the agents, by name; those of one name differ in their seeds alone."""
+    runs = {path.stem: json.loads(path.read_text("utf-8")) for path in FOLDER.glob("runs/*.json")}
+    return groups(runs)
+
+
+def learned() -> str:
+    """What the agents reach, in Markdown."""
+    lines = []
+    for name, seeds in kept_runs().items():
+        algorithm, task = name.split("-")[:2]
+        config = seeds[0]["config"]
+        ends = [final(run) for run in seeds]
+        reached = ", ".join(f"{end['return']:.0f} ± {end['standard_error']:.0f}" for end in ends)
+        minutes = np.median([run["seconds"][-1] for run in seeds]) / 60.0
+        steps = f"{config['total_steps'] / 1e6:.1f}"
+        lines.append(
+            [
+                f"`{task}`",
+                algorithm.upper(),
+                config["action_repeat"],
+                steps,
+                f"{minutes:.0f}",
+                reached,
+            ]
+        )
+    heads = ("task", "agent", "action repeat", "million control steps", "minutes", "return")
+    return table(heads, lines)
+
+
+def tasks() -> str:
+    """All tasks, in Markdown."""
+    lines = [[f"`{r.gymnasium_id}`", f"`{r.name}`", r.summary] for r in DMC_TASKS.values()]
+    return table(("Gymnasium id", "in JAX", "goal"), lines)
+
+
+def physics() -> str:
+    """How far each task is from dm_control's, in Markdown."""
+    kept = json.loads((FOLDER / "physics.json").read_text("utf-8"))["tasks"]
+    lines = []
+    for task in DMC_TASKS:
+        if task not in kept:
+            continue
+        same, step = kept[task]["same_state"], kept[task]["control_step"]
+        errors = (same["reward"], same["observation"], step["reward"], step["velocity_median"])
+        far = f"{step['velocities_off']} of {kept[task]['states']}"
+        p = kept[task]["initial_states"]["lowest_p"]
+        lines.append([f"`{task}`", *(f"{error:.0e}" for error in errors), far, f"{p:.2g}"])
+    heads = (
+        "task",
+        "reward",
+        "observation",
+        "reward, a step on",
+        "velocity, a step on: median",
+        "beyond 0.01",
+        "lowest p",
+    )
+    return table(heads, lines)
+
+
+def plot(path: Path) -> None:
+    """Return of training episodes over control steps, a line for each seed."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    runs = kept_runs()
+    figure, panels = plt.subplots(
+        1, len(runs), figsize=(4 * len(runs), 3.4), layout="constrained", squeeze=False
+    )
+    for (name, seeds), axes in zip(runs.items(), panels[0], strict=True):
+        for run in seeds:
+            end = run["steps"][-1]
+            grid = np.linspace(0.04 * end, end, 60)
+            line = [return_at(run, when, "steps", 0.04 * end) for when in grid]
+            axes.plot(grid / 1e6, line, color="C0", label="training episodes")
+            evaluated = [(e["steps"] / 1e6, e["clean/return"]) for e in run["evaluations"]]
+            axes.plot(*zip(*evaluated, strict=True), "o", color="C1", label="mean action")
+        axes.set(xlabel="million control steps", title=name.split("-")[1], ylim=(0, 1000))
+        axes.grid(alpha=0.3)
+    panels[0][0].set_ylabel("return")
+    handles, labels = panels[0][0].get_legend_handles_labels()
+    named = dict(zip(labels, handles, strict=True))
+    panels[0][0].legend(named.values(), named.keys(), fontsize=8)
+    figure.savefig(path, dpi=130)
+
+
+def page_tables() -> dict[str, str]:
+    """All of the page's tables, by name."""
+    return {draw.__name__: f"{draw()}\n" for draw in (speed, physics, learned, tasks)}
+
+
+if __name__ == "__main__":
+    if PAGE.exists():
+        redraw(PAGE, page_tables())
+    plot(FOLDER / "learning.png")

@@ -1,0 +1,115 @@
+"""Every checker is content with the tasks of the DM Control Suite."""
+
+from __future__ import annotations
+
+import functools
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env as check_gymnasium_env
+from stable_baselines3.common.env_checker import check_env as check_sb3_env
+from torchrl.envs import check_env_specs
+
+import pixelbrax_gym
+import pixelbrax_jax
+from pixelbrax_jax.tasks import TASKS
+from tests.distractors.conftest import make_bank
+from tests.gym.test_vector_env import MODES
+
+pytest.importorskip("dm_control", reason="the tasks' models come with pixelbrax[dmc]")
+
+SIZE = {"height": 24, "width": 24}
+RENDER = {"render_mode": "rgb_array", "render_height": 8, "render_width": 8}
+FAST = ("dmc_cartpole_swingup", "dmc_cheetah_run", "dmc_reacher_easy")
+
+
+def every_task(*fast):
+    """Each task as a parameter; those that are not named take a place among the slow tests."""
+    return [
+        pytest.param(task, marks=() if task in fast else pytest.mark.slow)
+        for task in pixelbrax_jax.list_envs(suite="dmc")
+    ]
+
+
+@pytest.mark.parametrize("task", every_task(*FAST))
+def test_our_own_checker(task):
+    pixelbrax_jax.check_env(*pixelbrax_jax.make(task, obs_mode="both", **SIZE))
+
+
+@pytest.mark.parametrize("task", every_task(*FAST))
+def test_checkers_of_single_environments(task):
+    env = gymnasium.make(TASKS[task].gymnasium_id, **SIZE, **RENDER).unwrapped
+    check_gymnasium_env(env)
+    check_sb3_env(env)
+
+
+@pytest.mark.parametrize("task", every_task(*FAST))
+def test_checker_of_vector_environments(task):
+    check_vector(task, "next_step")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", sorted(set(MODES) - {"next_step"}))
+@pytest.mark.parametrize("task", every_task())
+def test_checker_of_vector_environments_in_other_modes(task, mode):
+    check_vector(task, mode)
+
+
+def check_vector(task, mode):
+    env = gymnasium.make_vec(
+        TASKS[task].gymnasium_id,
+        num_envs=2,
+        obs_mode="both",  # at this size a reset may move less than a pixel
+        max_episode_steps=6,
+        autoreset_mode=mode,
+        **SIZE,
+        **RENDER,
+    )
+    pixelbrax_gym.check_vector_env(env, num_steps=15)
+
+
+@pytest.mark.parametrize("task", every_task(*FAST))
+def test_checker_of_torchrl(task):
+    env = pixelbrax_gym.PixelBraxTorchRLEnv(task, 2, obs_mode="both", **SIZE)
+    check_env_specs(env)
+    env.close()
+
+
+@pytest.mark.parametrize("task", every_task(*FAST))
+def test_stable_baselines_vector_environments(task):
+    env = pixelbrax_gym.PixelBraxSB3VecEnv(task, 2, obs_mode="both", episode_length=3, **SIZE)
+    env.seed(0)
+    draw = np.random.default_rng(0)
+    first = env.reset()
+    for step in range(1, 5):
+        obs, rewards, dones, infos = env.step(
+            draw.uniform(-1, 1, (2, *env.action_space.shape)).astype(np.float32)
+        )
+        for index in range(2):
+            assert {name: rows[index] for name, rows in obs.items()} in env.observation_space
+        assert ((rewards >= 0) & (rewards <= 1)).all()
+        # DM Control's episodes end at the time limit alone.
+        assert list(dones) == [step == 3] * 2
+        assert [info.get("TimeLimit.truncated", False) for info in infos] == list(dones)
+    assert not np.array_equal(obs["state"], first["state"])
+    env.close()
+
+
+@pytest.mark.parametrize("task", every_task(*FAST[:1]))
+def test_distractors_change_pixels_alone(task):
+    """The same episodes, to rounding: other options make another program."""
+    options = {"num_envs": 2, "obs_mode": "both", "output": "torch", **SIZE}
+    make = functools.partial(gymnasium.make_vec, TASKS[task].gymnasium_id, **options)
+    plain = make()
+    chain = ("video", "color", "camera")
+    distracted = make(distractors=chain, clips=make_bank(**SIZE))
+    draw = np.random.default_rng(0)
+    obs, seen = plain.reset(seed=0)[0], distracted.reset(seed=0)[0]
+    for _ in range(4):
+        assert (obs["pixels"] != seen["pixels"]).float().mean() > 0.5
+        torch.testing.assert_close(obs["state"], seen["state"], rtol=1e-3, atol=1e-3)
+        action = torch.as_tensor(draw.uniform(-1, 1, plain.action_space.shape).astype(np.float32))
+        (obs, reward, *_), (seen, other, *_) = plain.step(action), distracted.step(action)
+        torch.testing.assert_close(reward, other, rtol=1e-3, atol=1e-3)
