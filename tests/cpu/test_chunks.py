@@ -29,15 +29,16 @@ def step(state, row, shared):
     return {"x": x, "empty": state["empty"]}, x.sum()
 
 
+@pytest.mark.parametrize("last", [True, False])
 @pytest.mark.parametrize("num_rows", [1, 6, 7])
-def test_chunks_give_what_the_whole_gives(num_rows, monkeypatch):
+def test_chunks_give_what_the_whole_gives(num_rows, last, monkeypatch):
     keys = jax.random.split(jax.random.key(num_rows), 3)
     state = {"x": jax.random.normal(keys[0], (num_rows, 3)), "empty": jnp.zeros((num_rows, 0))}
     row, shared = jax.random.normal(keys[1], (num_rows, 3)), jax.random.normal(keys[2], (3, 3))
     expected = jax.jit(jax.vmap(step, in_axes=(0, 0, None)))(state, row, shared)
     for largest in (128, 4, 3, 1):
         monkeypatch.setattr(chunks, "_CHUNK", largest)
-        actual = jax.jit(lambda *args: step_rows(step, *args))(state, row, shared)
+        actual = jax.jit(partial(step_rows, step, last=last))(state, row, shared)
         for a, b in zip(jax.tree.leaves(actual), jax.tree.leaves(expected), strict=True):
             assert a.shape == b.shape
             np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)
@@ -53,6 +54,26 @@ def test_physics_may_be_batched_by_vmap():
         _, results[batching] = envs.step(state, jnp.full((5, 1), 0.3), PARAMS)
     close = partial(np.testing.assert_allclose, rtol=1e-6, atol=1e-6)
     jax.tree.map(close, results["auto"], results["vmap"])
+
+
+def test_physics_say_which_axis_a_batch_is(monkeypatch):
+    """An engine that is faster with the environments as first axis is computed by `jax.vmap`."""
+
+    def fail(*args, **kwargs):
+        raise AssertionError("the batch is the last axis")
+
+    class BallByFirstAxis(Ball):
+        batch_last = False
+
+    monkeypatch.setattr(chunks, "batch_last", fail)
+    for physics in (BallByFirstAxis(), Ball()):
+        envs = pb.VectorPixelEnv(pb.PixelEnv(physics, obs_mode="state", frame_stack=9), 3)
+        state, _ = jax.eval_shape(envs.reset, jax.random.key(0), PARAMS)
+        if physics.__class__ is BallByFirstAxis:
+            jax.eval_shape(envs.step, state, jnp.zeros((3, 1)), PARAMS)
+        else:
+            with pytest.raises(AssertionError, match="last axis"):
+                jax.eval_shape(envs.step, state, jnp.zeros((3, 1)), PARAMS)
 
 
 @pytest.mark.parametrize(
