@@ -66,6 +66,7 @@ class Geoms(struct.PyTreeNode):
         patterned: (G,) static, planes that are ground: drawn with the look's pattern, others in
             their own color. Empty where every plane is.
         strings: threads, the pieces of which are among the geoms.
+        material_name: (M,) static, the model's name of each material. Empty where none is known.
     """
 
     kind: tuple[int, ...] = struct.field(pytree_node=False)
@@ -79,6 +80,7 @@ class Geoms(struct.PyTreeNode):
     bounded: tuple[bool, ...] = struct.field(pytree_node=False, default=())
     patterned: tuple[bool, ...] = struct.field(pytree_node=False, default=())
     strings: tuple[String, ...] = ()
+    material_name: tuple[str, ...] = struct.field(pytree_node=False, default=())
 
     def is_bounded(self, geom: int) -> bool:
         """Return whether a geom is a plane that ends."""

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax.distractors.base import Distractor
-from pixelbrax_jax.types import EnvParams, Frame, GeomKind
+from pixelbrax_jax.types import EnvParams, Frame
 from pixelbrax_jax.validation import check_choice, check_fraction
 
 MODES = ("frame", "geom")
@@ -26,7 +26,9 @@ class Color(Distractor):
 
     ``mode="frame"`` adds one offset (red, green, blue) to every pixel and clips to [0, 1].
     ``mode="geom"`` gives every material a color of its own near the true one, clipped to
-    [0, 1]; the ground shifts by what its material shifts by.
+    [0, 1]; the ground shifts by what its material shifts by. With ``sky=True`` the sky is one
+    more: straight above it shifts by all of the amount, at the horizon by all or, of a sky that
+    has a color below too, by half, and below not at all.
 
     An amount x is drawn from a normal distribution of standard deviation ``scale``, or from a
     uniform one on [-scale, scale], cut to where colors stay in [0, 1] for materials. When, is
@@ -39,19 +41,27 @@ class Color(Distractor):
 
     Sources: one normal offset for each frame, of standard deviation 0.3, is that of the paper,
     arXiv 2502.00021 (preset ``"paper-color"``). Materials on a walk are those of the Distracting
-    Control Suite, arXiv 2101.02722, at scales 0.1, 0.2, 0.3.
+    Control Suite, arXiv 2101.02722, at scales 0.1, 0.2, 0.3. Robot, ground and sky in another
+    color each episode are color-easy and color-hard of the DMControl Generalization Benchmark,
+    arXiv 2011.13389; it picks one of 100 recorded palettes, which are normal samples of standard
+    deviation 0.1 and 0.2 about the true colors, cut to [0, 1]. We draw new ones.
 
     Attributes:
         mode: ``"frame"`` or ``"geom"``.
         dynamics: ``"iid"``, ``"walk"`` or ``"static"``.
         scale: size of the shift, in units of the color range [0, 1].
         distribution: ``"normal"`` or ``"uniform"``.
+        sky: whether the sky shifts too; of ``mode="geom"`` only.
+        materials: the model's names of the materials that shift, of ``mode="geom"`` only; None
+            for all. Where materials have no names, all shift.
     """
 
     mode: str = "frame"
     dynamics: str = "iid"
     scale: float = 0.3
     distribution: str = "normal"
+    sky: bool = False
+    materials: tuple[str, ...] | None = None
 
     kind: ClassVar[str] = "color"
     stream: ClassVar[int] = 1
@@ -66,9 +76,11 @@ class Color(Distractor):
         check_choice("dynamics of Color", self.dynamics, DYNAMICS)
         check_choice("distribution of Color", self.distribution, DISTRIBUTIONS)
         check_fraction("scale of Color", self.scale)
+        if self.mode == "frame" and (self.sky or self.materials is not None):
+            raise ValueError("sky and materials of Color mean something with mode='geom' alone.")
 
     def reset(self, key: jax.Array, params: EnvParams) -> jax.Array:
-        """Return the shift: (3,) of the frame, or (M, 3) of the materials."""
+        """Return the shift: (3,) of the frame, or (M, 3) of the materials, the sky's last."""
         shift = self._draw(key, params)
         # A walk starts inside the box that it stays in.
         return self._in_box(shift, params) if self.dynamics == "walk" else shift
@@ -90,6 +102,11 @@ class Color(Distractor):
         if self.mode == "frame":
             return params
         geoms, look = params.geoms, params.look
+        if self.sky:
+            state, shift = state[:-1], state[-1]
+            weights = (0.5, 1.0, 0.0) if look.sky.shape[0] == 3 else (1.0, 1.0)
+            moved = jnp.asarray(look.sky) + jnp.array(weights)[:, None] * shift
+            look = look.replace(sky=jnp.clip(moved, 0.0, 1.0))
         plane = _plane_material(params)
         if plane is not None:
             look = look.replace(ground_rgb=look.ground_rgb + state[plane])
@@ -135,12 +152,20 @@ class Color(Distractor):
             # Planes are drawn in the ground's colors, not in their own.
             ground = jnp.asarray(params.look.ground_rgb)
             low, high = low.at[plane].set(-ground.min(0)), high.at[plane].set(1 - ground.max(0))
+        names = params.geoms.material_name
+        if self.materials is not None and names:
+            moves = jnp.array([name in self.materials for name in names])[:, None]
+            low, high = jnp.where(moves, low, 0.0), jnp.where(moves, high, 0.0)
+        if self.sky:
+            above = jnp.asarray(params.look.sky)[1]
+            low = jnp.concatenate([low, -above[None]])
+            high = jnp.concatenate([high, 1.0 - above[None]])
         return low, high
 
 
 def _plane_material(params: EnvParams) -> int | None:
-    """Return the material of the first plane."""
-    for kind, material in zip(params.geoms.kind, params.geoms.material, strict=True):
-        if kind == GeomKind.PLANE:
+    """Return the material of the first plane that is ground."""
+    for g, material in enumerate(params.geoms.material):
+        if params.geoms.is_ground(g):
             return material
     return None

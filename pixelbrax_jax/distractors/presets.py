@@ -13,8 +13,17 @@ from pixelbrax_jax.validation import check_choice
 _SCALES = {"easy": 0.1, "medium": 0.2, "hard": 0.3}
 _NUM_CLIPS = {"easy": 4, "medium": 8, "hard": None}
 
-_GROUND_ALPHA = {"reacher": 0.0, "walker2d": 1.0, "halfcheetah": 1.0, "hopper": 1.0}
-"""Of the Distracting Control Suite, which has 0 for reacher, 1 for walker and cheetah."""
+_GROUND_ALPHA = {
+    "reacher": 0.0,
+    "walker2d": 1.0,
+    "halfcheetah": 1.0,
+    "hopper": 1.0,
+    "dmc_reacher": 0.0,
+    "dmc_walker": 1.0,
+    "dmc_cheetah": 1.0,
+}
+"""Of the Distracting Control Suite, which has 0 for reacher, 1 for walker and cheetah; for its own
+tasks by domain."""
 
 _OTHER_GROUND_ALPHA = 0.3
 
@@ -26,6 +35,21 @@ _FIXED: dict[str, tuple[Distractor, ...]] = {
     "paper-video": (Video(mode="overlay", alpha=0.5, dynamics="loop"),),
     "video-easy": (Video(ground_alpha=1.0, dynamics="loop", num_clips=10, random_start=False),),
     "video-hard": (Video(ground_alpha=0.0, dynamics="loop", num_clips=100, random_start=False),),
+}
+
+_FIXED |= {
+    f"color-{level}": (
+        Color(
+            mode="geom",
+            dynamics="static",
+            scale=scale,
+            distribution="normal",
+            sky=True,
+            # DM Control's materials of robot and ground.
+            materials=("self", "grid"),
+        ),
+    )
+    for level, scale in (("easy", 0.1), ("hard", 0.2))
 }
 
 PRESETS = (
@@ -41,8 +65,8 @@ def preset(name: str, task: str) -> tuple[Distractor, ...]:
     * ``"paper-color"``, ``"paper-video"``: those of the paper, arXiv 2502.00021.
     * ``"dcs-easy"``, ``"dcs-medium"``, ``"dcs-hard"``, and each with ``"-static"``: color, video
       and camera of the Distracting Control Suite, arXiv 2101.02722.
-    * ``"video-easy"``, ``"video-hard"``: of the DMControl Generalization Benchmark, arXiv
-      2011.13389.
+    * ``"color-easy"``, ``"color-hard"``, ``"video-easy"``, ``"video-hard"``: of the DMControl
+      Generalization Benchmark, arXiv 2011.13389; colors are drawn, see ``Color``.
 
     Args:
         name: one of ``PRESETS``.
@@ -63,7 +87,7 @@ def preset(name: str, task: str) -> tuple[Distractor, ...]:
     return (
         Camera(scale=scale, dynamic=dynamic),
         Video(
-            ground_alpha=_GROUND_ALPHA.get(task, _OTHER_GROUND_ALPHA),
+            ground_alpha=_ground_alpha(task),
             dynamics="pingpong" if dynamic else "static",
             num_clips=_NUM_CLIPS[level],
         ),
@@ -74,6 +98,14 @@ def preset(name: str, task: str) -> tuple[Distractor, ...]:
             distribution="uniform",
         ),
     )
+
+
+def _ground_alpha(task: str) -> float:
+    """Return the fraction of the ground that DCS keeps; of DM Control's tasks by their domain."""
+    for name, alpha in _GROUND_ALPHA.items():
+        if task == name or (name.startswith("dmc_") and task.startswith(f"{name}_")):
+            return alpha
+    return _OTHER_GROUND_ALPHA
 
 
 def as_tuple(

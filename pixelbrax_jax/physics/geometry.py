@@ -72,8 +72,7 @@ def read_geoms(
                 f"drawn_radius must be a positive number for a sphere, got {radius!r} for geom "
                 f"{name!r}, a {shape}."
             )
-    if model.nflex or model.nskin:
-        raise ValueError("flexes and skins cannot be drawn; remove them from the model")
+    _check_surfaces(model, geom_groups)
 
     shown = shown_geoms(model, geom_groups)
     if not shown:
@@ -124,6 +123,21 @@ def _kind(model: mujoco.MjModel, index: int, name: str) -> GeomKind:
             "geom_groups."
         )
     return GeomKind[kind.upper()]
+
+
+def _check_surfaces(model: mujoco.MjModel, groups: Collection[int]) -> None:
+    """Raise an error for a visible flex or skin."""
+    flexes = (mujoco.mjtObj.mjOBJ_FLEX, model.nflex, model.flex_group, model.flex_rgba)
+    skins = (mujoco.mjtObj.mjOBJ_SKIN, model.nskin, model.skin_group, model.skin_rgba)
+    for element, count, group, rgba in (flexes, skins):
+        kind = element.name.removeprefix("mjOBJ_").lower()
+        for i in range(count):
+            if group[i] in groups and rgba[i, 3] > 0:
+                name = mujoco.mj_id2name(model, element, i) or f"{kind}/{i}"
+                raise ValueError(
+                    f"{kind} {name!r} cannot be drawn: hide it with alpha 0, leave its group "
+                    f"({int(group[i])}) out of geom_groups, or remove it from the model."
+                )
 
 
 def shown_geoms(model: mujoco.MjModel, geom_groups: Collection[int] = VISIBLE_GROUPS) -> list[int]:

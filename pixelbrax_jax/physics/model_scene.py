@@ -123,7 +123,9 @@ def _with_planes(model: mujoco.MjModel) -> Geoms:
     """Return the geoms, with bounds of planes and whether they are checkered."""
     geoms = read_geoms(model)
     rows = shown_geoms(model)
+    first = [geoms.material.index(m) for m in range(len(geoms.rgb))]
     return geoms.replace(
+        material_name=tuple(_material(model, model.geom_matid[rows[g]]) for g in first),
         bounded=tuple(
             bool(model.geom_type[i] == GeomKind.PLANE and (model.geom_size[i, :2] > 0).any())
             for i in rows
@@ -152,6 +154,7 @@ def _with_sites(model: mujoco.MjModel, geoms: Geoms) -> Geoms:
                 pos=model.site_pos[i],
                 quat=model.site_quat[i],
                 rgb=rgba[:3],
+                material=_material(model, model.site_matid[i]),
             )
         )
     return _append(geoms, rows)
@@ -186,6 +189,7 @@ def _with_strings(model: mujoco.MjModel, geoms: Geoms) -> Geoms:
                 pos=np.zeros(3),
                 quat=np.array([1.0, 0.0, 0.0, 0.0]),
                 rgb=rgba[:3],
+                material=_material(model, model.tendon_matid[tendon]),
             )
             names = [f"tendon/{name}/{k * pieces + piece}" for piece in range(pieces)]
             geoms = _append(geoms, [row._replace(name=piece) for piece in names])
@@ -218,7 +222,7 @@ def _hangs(model: mujoco.MjModel, tendon: int) -> bool:
 
 
 class _Row(NamedTuple):
-    """One more geom; fields as in ``Geoms``."""
+    """One more geom; fields as in ``Geoms``, and its material's name."""
 
     kind: int
     link: int
@@ -227,13 +231,19 @@ class _Row(NamedTuple):
     pos: np.ndarray
     quat: np.ndarray
     rgb: np.ndarray
+    material: str
+
+
+def _material(model: mujoco.MjModel, index: int) -> str:
+    """Return a material's name, empty for none."""
+    return str(model.material(index).name) if index >= 0 else ""
 
 
 def _append(geoms: Geoms, rows: list[_Row]) -> Geoms:
     """Return the geoms with more; those of a known color share its material."""
     if not rows:
         return geoms
-    rgb = [np.asarray(color) for color in geoms.rgb]
+    rgb, names = [np.asarray(color) for color in geoms.rgb], list(geoms.material_name)
     of_planes = {m for m, kind in zip(geoms.material, geoms.kind, strict=True) if kind == 0}
     materials = []
     for row in rows:
@@ -241,6 +251,7 @@ def _append(geoms: Geoms, rows: list[_Row]) -> Geoms:
         same = [m for m, c in enumerate(rgb) if m not in of_planes and (c == color).all()]
         if not same:
             rgb.append(color)
+            names.append(row.material)
         materials.append(same[0] if same else len(rgb) - 1)
 
     def stack(old: object, name: str) -> object:
@@ -257,6 +268,7 @@ def _append(geoms: Geoms, rows: list[_Row]) -> Geoms:
         pos=stack(geoms.pos, "pos"),
         quat=stack(geoms.quat, "quat"),
         rgb=jnp.asarray(np.stack(rgb)),
+        material_name=tuple(names),
         bounded=geoms.bounded + none,
         patterned=geoms.patterned + none,
     )

@@ -92,6 +92,7 @@ def render(
 
     normal = _Normal(hits, seen, ray)
     n_z = normal.dot((0.0, 0.0, 1.0), ray[2])
+    components = (normal.dot((1.0, 0.0, 0.0), ray[0]), normal.dot((0.0, 1.0, 0.0), ray[1]), n_z)
     shade: jax.Array = look.ambient
     gleam: jax.Array | float = 0.0
     on_ground = jnp.zeros(shape, bool)
@@ -118,7 +119,7 @@ def render(
         shade = shade + look.diffuse * diffuse + look.specular * gloss
         gleam = look.highlight * gloss
     for lamp, place in zip(look.lamps, lamps, strict=True):
-        more, glitter = _lamplight(lamp, place, look, points, normal, n_z, solids)
+        more, glitter = _lamplight(lamp, place, look, points, components, seen, solids)
         shade, gleam = shade + more, gleam + glitter
     if look.headlight is not None:
         # A texture dims the highlight too.
@@ -179,24 +180,24 @@ def _lamplight(
     place: tuple[jax.Array, jax.Array],
     look: Look,
     points: Vector,
-    normal: _Normal,
-    n_z: jax.Array,
+    normal: Vector,
+    seen: list[jax.Array],
     solids: list[_Solid],
 ) -> tuple[jax.Array, jax.Array]:
     """Return what a lamp adds to the factor of colors, and to colors themselves."""
     pos, axis = tuple(place[0]), tuple(place[1])
-    ray, distance, strength = shading.beam(lamp, pos, axis, points)
+    ray, inv_distance, strength = shading.beam(lamp, pos, axis, points)
     to_lamp = tuple(-component for component in ray)
-    n_l = normal.dot(to_lamp, dot(normal.ray, to_lamp))
+    n_l = dot(normal, to_lamp)
     strength = jnp.where(n_l > 0.0, strength, 0.0)
     if look.shadows:
         for rank, solid in enumerate(solids):
             if solid.kind != GeomKind.PLANE:
                 there = tuple(c - p for c, p in zip(solid.center, pos, strict=True))
                 way = solid.hit(ray, there).t
-                blocked = (way > 0.0) & (way < distance - SHADOW_BIAS)
-                strength = jnp.where(blocked & ~normal.seen[rank], 0.0, strength)
-    shine = shading.gloss(n_l, n_z, to_lamp[2], look.shininess)
+                blocked = (way > 0.0) & ((way + SHADOW_BIAS) * inv_distance < 1.0)
+                strength = jnp.where(blocked & ~seen[rank], 0.0, strength)
+    shine = shading.gloss(n_l, normal[2], to_lamp[2], look.shininess)
     return strength * lamp.diffuse * n_l, strength * lamp.highlight * shine
 
 

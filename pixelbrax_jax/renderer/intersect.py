@@ -6,7 +6,8 @@ geom in scalars) and shadow rays towards a distant light (ray in scalars, geom i
 Rays have unit length. A ray enters a geom from outside; a geom around the origin is not seen.
 
 A missed geom yields NaN or a negative distance, never +inf: `fused.py` relies on it. Formulas
-follow from substituting the ray into the surface's equation.
+follow from substituting the ray into the surface's equation. A quotient or a root is used once: XLA
+keeps what is expensive in memory, an image of it, if two operations read it.
 """
 
 # ruff: noqa: ARG001, ARG005  # all shapes share one signature, whatever they need of it
@@ -46,8 +47,9 @@ def dot(a: Vector, b: Vector) -> jax.Array:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def _nonzero(x: jax.Array) -> jax.Array:
-    return jnp.where(jnp.abs(x) < _TINY, _TINY, x)
+def _inverse(x: jax.Array) -> jax.Array:
+    """Return ``1 / x``, or a great number where ``x`` is nearly 0."""
+    return jnp.where(jnp.abs(x) < _TINY, 1.0 / _TINY, 1.0 / x)
 
 
 def _plane(ray: Vector, pos: Vector, axes: Axes, size: Vector) -> Hit:
@@ -95,48 +97,52 @@ def _capsule(ray: Vector, pos: Vector, axes: Axes, size: Vector) -> Hit:
 
 def _ellipsoid(ray: Vector, pos: Vector, axes: Axes, size: Vector) -> Hit:
     # In coordinates divided by the radii the ellipsoid is the unit sphere.
-    d = [dot(ray, axis) / radius for axis, radius in zip(axes, size, strict=True)]
-    o = [-dot(pos, axis) / radius for axis, radius in zip(axes, size, strict=True)]
+    inv_size = [1.0 / radius for radius in size]
+    d = [dot(ray, axis) * inv for axis, inv in zip(axes, inv_size, strict=True)]
+    o = [-dot(pos, axis) * inv for axis, inv in zip(axes, inv_size, strict=True)]
     a, b, c = dot(d, d), dot(d, o), dot(o, o) - 1.0
-    t = (-b - jnp.sqrt(b * b - a * c)) / a
-    n = [(o[k] + t * d[k]) / size[k] for k in range(3)]
-    inv_length = jax.lax.rsqrt(dot(n, n))
+    t = (-b - jnp.sqrt(b * b - a * c)) * (1.0 / a)
+    n = [(o[k] + t * d[k]) * inv_size[k] for k in range(3)]
+    square = dot(n, n)
 
     def normal_dot(v: Vector, ray_v: jax.Array) -> jax.Array:
-        return dot(n, [dot(axis, v) for axis in axes]) * inv_length
+        return dot(n, [dot(axis, v) for axis in axes]) * jax.lax.rsqrt(square)
 
     return Hit(t, normal_dot)
 
 
 def _cylinder(ray: Vector, pos: Vector, axes: Axes, size: Vector) -> Hit:
-    radius, half = size[0], size[1]
-    dx, dy, dz = (dot(ray, axis) for axis in axes)
-    ox, oy, oz = (-dot(pos, axis) for axis in axes)
-    a = at_least(dx * dx + dy * dy, _TINY)
-    b, c = ox * dx + oy * dy, ox * ox + oy * oy - radius * radius
-    t_side = (-b - jnp.sqrt(b * b - a * c)) / a
-    on_side = jnp.abs(oz + t_side * dz) <= half  # False for NaN
+    radius, half, axis = size[0], size[1], axes[2]
+    pos_axis, pos_pos = dot(pos, axis), dot(pos, pos)
+    ray_axis, ray_pos = dot(ray, axis), dot(ray, pos)
+    a = at_least(1.0 - ray_axis * ray_axis, _TINY)
+    b = ray_pos - ray_axis * pos_axis
+    c = pos_pos - pos_axis * pos_axis - radius * radius
+    t_side = (b - jnp.sqrt(b * b - a * c)) * (1.0 / a)
+    y = t_side * ray_axis - pos_axis
+    on_side = jnp.abs(y) <= half  # False for NaN
     # Otherwise the ray can only enter through the cap that faces it.
-    dz = _nonzero(dz)
-    facing = jnp.where(dz > 0, -1.0, 1.0)
-    t_cap = (facing * half - oz) / dz
-    x, y = ox + t_cap * dx, oy + t_cap * dy
-    t = jnp.where(on_side, t_side, jnp.where(x * x + y * y <= radius * radius, t_cap, -1.0))
+    inv_slant = _inverse(ray_axis)
+    facing = jnp.where(inv_slant > 0, -1.0, 1.0)
+    t_cap = (facing * half + pos_axis) * inv_slant
+    from_axis = (t_cap - 2.0 * ray_pos) * t_cap + (pos_pos - half * half)
+    t = jnp.where(on_side, t_side, jnp.where(from_axis <= radius * radius, t_cap, -1.0))
+    inv_radius = 1.0 / radius
 
     def normal_dot(v: Vector, ray_v: jax.Array) -> jax.Array:
-        vx, vy, vz = (dot(axis, v) for axis in axes)
-        side = ((ox + t * dx) * vx + (oy + t * dy) * vy) / radius
-        return jnp.where(on_side, side, facing * vz)
+        axis_v = dot(axis, v)
+        side = (t * ray_v - dot(pos, v) - y * axis_v) * inv_radius
+        return jnp.where(on_side, side, facing * axis_v)
 
     return Hit(t, normal_dot)
 
 
 def _box(ray: Vector, pos: Vector, axes: Axes, size: Vector) -> Hit:
-    d = [_nonzero(dot(ray, axis)) for axis in axes]
+    inv_d = [_inverse(dot(ray, axis)) for axis in axes]
     o = [-dot(pos, axis) for axis in axes]
-    facing = [jnp.where(d[k] > 0, -1.0, 1.0) for k in range(3)]
-    near = [(facing[k] * size[k] - o[k]) / d[k] for k in range(3)]
-    far = [(-facing[k] * size[k] - o[k]) / d[k] for k in range(3)]
+    facing = [jnp.where(inv_d[k] > 0, -1.0, 1.0) for k in range(3)]
+    near = [(facing[k] * size[k] - o[k]) * inv_d[k] for k in range(3)]
+    far = [(-facing[k] * size[k] - o[k]) * inv_d[k] for k in range(3)]
     entry = at_least(at_least(near[0], near[1]), near[2])
     leave = at_most(at_most(far[0], far[1]), far[2])
     t = jnp.where(entry <= leave, entry, -1.0)

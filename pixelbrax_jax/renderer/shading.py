@@ -41,16 +41,17 @@ def beam(lamp: Lamp, pos: Vector, axis: Vector, points: Vector) -> tuple[Vector,
         points: metres.
 
     Returns:
-        Unit directions from the lamp to the points; their distances in metres; the lamp's strength
-        there, in [0, 1].
+        Unit directions from the lamp to the points; one over their distances in metres; how
+        strong the lamp is there, in [0, 1].
     """
     away = [p - c for p, c in zip(points, pos, strict=True)]
     square = dot(away, away)
-    inv_distance = jax.lax.rsqrt(jnp.where(square > 0.0, square, 1.0))
+    # A choice, for XLA would keep the root itself in memory: it has several readers.
+    inv_distance = jnp.where(square > 0.0, jax.lax.rsqrt(square), 1.0)
     ray = tuple(component * inv_distance for component in away)
     along = dot(ray, axis)
     strength = jnp.where(along >= lamp.cos_cutoff, at_least(along, 0.0) ** lamp.exponent, 0.0)
-    return ray, square * inv_distance, strength
+    return ray, inv_distance, strength
 
 
 def sky(look: Look, rise: jax.Array, channel: int) -> jax.Array:

@@ -112,6 +112,32 @@ def test_nothing_moves_at_scale_zero():
     )
 
 
+DOWN = rig((0.3, 0.1, 0.75), (0.3, 0.1, 0.01), 45.0, up=(0.0, 1.0, 0.0))
+"""As DM Control's reacher and point_mass are seen, and its fish from above."""
+
+
+def test_a_camera_that_looks_straight_down():
+    """It leaves the pole, keeps its subject in the middle, and does not turn upside down."""
+    params, b = PARAMS.replace(rig=DOWN), 0.3
+    camera = distractors.Camera(scale=b)
+    states = walk(camera, params, 500, num=4)
+    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), states)
+    none = jnp.zeros((1, 3))
+    seen = jax.jit(jax.vmap(lambda state: aim(camera.change_params(state, params).rig, none)))(flat)
+    away = np.asarray(seen.pos) - DOWN.target
+    tilt = np.arccos(away[:, 2] / np.linalg.norm(away, axis=1))
+    assert tilt.max() <= 0.5 * np.pi * b + 1e-3
+    assert np.ptp(tilt) > 0.5 * b
+    middle = np.einsum("ni,nij->nj", -away, seen.xmat)
+    np.testing.assert_allclose(middle[:, :2], 0.0, atol=1e-4)
+    # Its own up is +y; what is left of that after a roll of at most 27 degrees.
+    assert np.asarray(seen.xmat)[:, 1, 1].min() > 0.5
+    clean = jax.tree.map(jnp.zeros_like, jax.tree.map(lambda x: x[0], flat))
+    undisturbed = aim(camera.change_params(clean.replace(radius=jnp.ones(())), params).rig, none)
+    np.testing.assert_allclose(undisturbed.pos, DOWN.eye, atol=1e-6)
+    np.testing.assert_allclose(undisturbed.xmat, np.eye(3), atol=1e-6)
+
+
 # A rig from the side, from above, from near the pole, from beyond it, and from a corner.
 @pytest.mark.parametrize(
     ("task", "name"),

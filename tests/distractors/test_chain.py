@@ -190,8 +190,28 @@ def test_presets():
         assert (video.dynamics, video.ground_alpha, color.dynamics) == ("static", 0.0, "static")
     easy, hard = (distractors.preset(f"video-{n}", "ant")[0] for n in ("easy", "hard"))
     assert (easy.ground_alpha, hard.ground_alpha) == (1.0, 0.0)
+    for level, scale in (("easy", 0.1), ("hard", 0.2)):
+        (color,) = distractors.preset(f"color-{level}", "dmc_walker_walk")
+        assert (color.mode, color.dynamics, color.distribution) == ("geom", "static", "normal")
+        assert (color.scale, color.sky, color.materials) == (scale, True, ("self", "grid"))
     for name in distractors.PRESETS:
         assert distractors.preset(name, "ant")
+
+
+def test_ground_under_videos_of_dm_controls_tasks():
+    """By domain, as the Distracting Control Suite has it; the Brax tasks of like names differ."""
+    kept = {
+        "dmc_reacher_easy": 0.0,
+        "dmc_walker_run": 1.0,
+        "dmc_cheetah_run": 1.0,
+        "dmc_hopper_hop": 0.3,
+        "dmc_ball_in_cup_catch": 0.3,
+        "hopper": 1.0,
+        "walker_of_mine": 0.3,
+    }
+    for task, alpha in kept.items():
+        _, video, _ = distractors.preset("dcs-easy", task)
+        assert video.ground_alpha == alpha, task
 
 
 def test_names_and_objects_may_be_mixed():

@@ -134,6 +134,48 @@ def test_uniform_materials_are_uniform_in_the_room_they_have():
     np.testing.assert_allclose(shifts.std(0), (high - low) / np.sqrt(12), rtol=0.02)
 
 
+def test_the_sky_shifts_too():
+    color = distractors.Color("geom", "static", 0.2, "normal", sky=True)
+    three = np.concatenate([PARAMS.look.sky, np.zeros((1, 3), np.float32)])
+    for sky, weights in ((PARAMS.look.sky, (1.0, 1.0)), (three, (0.5, 1.0, 0.0))):
+        params = PARAMS.replace(look=PARAMS.look.replace(sky=sky))
+        draw = jax.jit(jax.vmap(lambda key, p=params: color.reset(key, p)))
+        shifts = np.asarray(draw(KEYS[:2000]))
+        assert shifts.shape[1:] == (len(PARAMS.geoms.rgb) + 1, 3)
+        assert (sky[1] + shifts[:, -1]).min() >= 0.0
+        assert (sky[1] + shifts[:, -1]).max() <= 1.0 + 1e-6
+        changed = color.change_params(shifts[0], params)
+        expected = np.clip(sky + np.array(weights)[:, None] * shifts[0, -1], 0, 1)
+        np.testing.assert_allclose(changed.look.sky, expected, atol=1e-6)
+        np.testing.assert_allclose(changed.geoms.rgb, PARAMS.geoms.rgb + shifts[0, :-1], atol=1e-6)
+
+
+def test_only_some_materials_shift():
+    color = distractors.Color("geom", "static", 0.3, "uniform", materials=("skin",))
+    for names, moves in ((("floor", "skin"), [False, True]), ((), [True, True])):
+        params = PARAMS.replace(geoms=PARAMS.geoms.replace(material_name=names))
+        shifts = np.asarray(color.reset(jax.random.key(0), params))
+        assert (shifts != 0).any(axis=1).tolist() == moves
+
+
+def test_plain_planes_are_no_ground():
+    """The first plane with the pattern decides the ground's shift, not a wall before it."""
+    geoms = PARAMS.geoms
+    geoms = geoms.replace(
+        kind=(geoms.kind[0], geoms.kind[0]), bounded=(True, True), patterned=(False, True)
+    )
+    color = distractors.Color("geom", "static", 0.3, "uniform")
+    shift = jnp.array([[0.3, 0.3, 0.3], [0.1, 0.0, -0.1]])
+    changed = color.change_params(shift, PARAMS.replace(geoms=geoms))
+    expected = PARAMS.look.ground_rgb + shift[1]
+    np.testing.assert_allclose(changed.look.ground_rgb, expected, atol=1e-6)
+
+
+def test_what_a_whole_frame_has_not():
+    with pytest.raises(ValueError, match=r"sky and materials of Color .* mode='geom' alone"):
+        distractors.Color(sky=True)
+
+
 def test_environments_differ():
     env = VectorPixelEnv(PixelEnv(Ball(), **SIZE, distractors=(distractors.Color(),)), 8)
     _, timestep = env.reset(jax.random.key(0), PARAMS)

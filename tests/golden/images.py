@@ -14,10 +14,10 @@ import numpy as np
 from PIL import Image
 
 import pixelbrax_jax as pb
-from pixelbrax_jax.scene.look import LOOKS
 from pixelbrax_jax.tasks import BRAX_TASKS
 
 FOLDER = Path(__file__).parent
+LOOKS = ("default", "original")
 SIZE = 48
 """Pixels of an image, each way."""
 
@@ -42,7 +42,7 @@ def draw(task: str) -> np.ndarray:
 
     rows = [
         np.concatenate([image(rig, look) for rig in pb.named_rigs(task).values()], axis=1)
-        for look in LOOKS.values()
+        for look in map(pb.make_look, LOOKS)
     ]
     return np.round(255 * np.clip(np.concatenate(rows), 0, 1)).astype(np.uint8)
 

@@ -149,6 +149,38 @@ def test_visible_height_field():
         read_geoms(model)
 
 
+SKIN = """
+<mujoco>
+  <deformable>
+    <skin name="hide" {more} vertex="0 0 0 1 0 0 0 1 0" face="0 1 2">
+      <bone body="b" bindpos="0 0 0" bindquat="1 0 0 0" vertid="0 1 2" vertweight="1 1 1"/>
+    </skin>
+  </deformable>
+  <worldbody><body name="b"><geom name="ball" size=".1"/></body></worldbody>
+</mujoco>
+"""
+
+
+def test_visible_skin():
+    with pytest.raises(ValueError, match=r"skin 'hide' cannot be drawn: hide it with alpha 0, .*2"):
+        read_geoms(mujoco.MjModel.from_xml_string(SKIN.format(more='group="2"')))
+
+
+@pytest.mark.parametrize("more", ['rgba="1 1 1 0"', 'group="4"'])
+def test_hidden_skin_is_no_concern(more):
+    assert read_geoms(mujoco.MjModel.from_xml_string(SKIN.format(more=more))).name == ("ball",)
+
+
+def test_visible_flex():
+    cloth = """
+    <mujoco><worldbody>
+      <flexcomp name="cloth" type="grid" count="3 3 1" spacing=".1 .1 .1" dim="2" mass="1"
+                radius=".01"/>
+    </worldbody></mujoco>"""
+    with pytest.raises(ValueError, match="flex 'cloth' cannot be drawn"):
+        read_geoms(mujoco.MjModel.from_xml_string(cloth))
+
+
 def test_task_colors_name_geoms_that_exist(program):
     for task, spec in BRAX_TASKS.items():
         if not spec.colors:

@@ -1,0 +1,193 @@
+"""What a MuJoCo model says about its picture: planes, sites, tendons, cameras, lights."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+
+from pixelbrax_jax.physics.model_scene import read_scene, tracked_body
+from pixelbrax_jax.types import GeomKind
+
+MODEL = """
+<mujoco>
+  <visual><headlight ambient=".3 .3 .3" diffuse=".6 .6 .6"/></visual>
+  <asset>
+    <texture name="checker" type="2d" builtin="checker" rgb1=".2 .4 .6" rgb2=".8 .6 .4"
+             width="40" height="40" mark="edge" markrgb="1 0 0"/>
+    <texture name="flat" type="2d" builtin="flat" rgb1=".2 .4 .6" width="8" height="8"/>
+    <texture name="sky" type="skybox" builtin="gradient" rgb1=".4 .6 .8" rgb2="0 0 0"
+             width="100" height="100"/>
+    <material name="floor" texture="checker" texrepeat="2 2" texuniform="true"/>
+    <material name="plain" texture="flat"/>
+    <material name="skin" rgba=".7 .5 .3 1"/>
+  </asset>
+  <worldbody>
+    <light name="sun" directional="true" dir="1 0 -1" diffuse=".5 .5 .5" specular=".2 .2 .2"/>
+    <light name="spot" pos="1 1 3" cutoff="30" exponent="4" diffuse=".7 .7 .7"/>
+    <light name="off" pos="0 0 9" active="false"/>
+    <camera name="fixed" pos="0 -4 1" xyaxes="1 0 0 0 0 1" fovy="30"/>
+    <camera name="down" pos="0 0 3" xyaxes="1 0 0 0 1 0"/>
+    <camera name="aimed" pos="0 -2 2" mode="targetbody" target="arm"/>
+    <geom name="ground" type="plane" size="2 0 .1" material="floor"/>
+    <geom name="wall" type="plane" size=".5 .1 .1" pos="2 0 .1" zaxis="-1 0 0" material="plain"/>
+    <geom name="goal" size=".05" pos=".5 .6 .7" material="skin"/>
+    <site name="mark" size=".02" pos=".5 .6 .9" rgba="1 0 0 1"/>
+    <site name="hidden" size=".02" group="4"/>
+    <site name="clear" size=".02" rgba="1 0 0 0"/>
+    <site name="hook" size=".01" pos="0 0 2"/>
+    <body name="arm" pos="0 0 1">
+      <joint name="arm" type="ball"/>
+      <light name="lamp" pos="0 0 2" mode="trackcom"/>
+      <camera name="follow" pos="0 -3 0" xyaxes="1 0 0 0 0 1" mode="trackcom"/>
+      <camera name="track" pos="0 -3 0" xyaxes="1 0 0 0 0 1" mode="track"/>
+      <camera name="eye" pos="0 0 .1"/>
+      <geom name="arm" type="capsule" fromto="0 0 0 0 0 -.5" size=".05" material="skin"/>
+      <site name="hand" type="box" size=".01 .02 .03" pos="0 0 -.5" material="skin"/>
+    </body>
+  </worldbody>
+  <tendon>
+    <spatial name="string" limited="true" range="0 .6" width=".004" rgba="0 1 0 1">
+      <site site="hook"/><site site="hand"/>
+    </spatial>
+    <spatial name="spring" stiffness="3" width=".002">
+      <site site="hook"/><site site="hand"/>
+    </spatial>
+    <spatial name="unseen" group="5"><site site="hook"/><site site="hand"/></spatial>
+  </tendon>
+</mujoco>
+"""
+
+
+@pytest.fixture(scope="module")
+def model():
+    return mujoco.MjModel.from_xml_string(MODEL)
+
+
+@pytest.fixture(scope="module")
+def scene(model):
+    return read_scene(model, "follow", movable=("goal", "mark", "spot"))
+
+
+def row(geoms, name):
+    return geoms.name.index(name)
+
+
+def test_planes(scene):
+    geoms = scene.geoms
+    ground, wall, arm = (row(geoms, name) for name in ("ground", "wall", "arm"))
+    assert [geoms.is_bounded(g) for g in (ground, wall, arm)] == [True, True, False]
+    assert [geoms.is_ground(g) for g in (ground, wall, arm)] == [True, False, False]
+    assert geoms.material_name[geoms.material[ground]] == "floor"
+    np.testing.assert_allclose(geoms.size[ground, :2], [2.0, 0.0])
+
+
+def test_sites_are_geoms_in_the_colors_of_materials(scene):
+    geoms = scene.geoms
+    assert {name for name in geoms.name if name.startswith("site/")} == {
+        "site/mark",
+        "site/hook",
+        "site/hand",
+    }
+    hand = row(geoms, "site/hand")
+    assert geoms.kind[hand] == GeomKind.BOX
+    assert geoms.link[hand] == 0
+    assert geoms.material[hand] == geoms.material[row(geoms, "arm")]
+    np.testing.assert_allclose(geoms.pos[hand], [0, 0, -0.5])
+    np.testing.assert_allclose(geoms.rgb[geoms.material[row(geoms, "site/mark")]], [1, 0, 0])
+
+
+def test_tendons_are_strings(scene, model):
+    string, spring = scene.geoms.strings
+    assert string.length == pytest.approx(0.6)
+    assert spring.length == 0.0, "a spring is straight"
+    assert len(spring.geoms) == 1 < len(string.geoms)
+    assert string.link == (-1, 0)
+    np.testing.assert_allclose(string.ends, [[0, 0, 2], [0, 0, -0.5]])
+    assert {scene.geoms.kind[g] for g in string.geoms} == {GeomKind.CAPSULE}
+    assert not any("unseen" in name for name in scene.geoms.name)
+    np.testing.assert_allclose(scene.geoms.size[list(string.geoms), 0], 0.004)
+
+
+def test_what_moves_is_on_a_link_of_its_own(scene, model):
+    assert scene.links == ("camera/com", "target")
+    assert tracked_body(model) == model.body("arm").id
+    target = model.nbody - 1 + scene.links.index("target")
+    geoms = scene.geoms
+    goal, mark = row(geoms, "goal"), row(geoms, "site/mark")
+    assert geoms.link[goal] == geoms.link[mark] == target
+    np.testing.assert_allclose(geoms.pos[goal], 0.0, atol=1e-7)
+    np.testing.assert_allclose(geoms.pos[mark], [0, 0, 0.2], atol=1e-6)
+    spot, lamp = scene.look.lamps
+    assert spot.link == target
+    np.testing.assert_allclose(spot.pos, [0.5, 0.4, 2.3], atol=1e-6)
+    assert lamp.link == scene.rig.link == model.nbody - 1
+    # The middle of the arm is 0.25 below its body, 2 below the lamp.
+    np.testing.assert_allclose(lamp.pos, [0, 0, 2.25], atol=1e-5)
+
+
+def test_nothing_movable_is_no_link(model):
+    assert read_scene(model).links == ("camera/com",)
+    with pytest.raises(ValueError, match=r"unknown geom, site or light: 'gaol'.*mean 'goal'"):
+        read_scene(model, movable=("gaol",))
+    with pytest.raises(ValueError, match="'hand' cannot be movable: it is fixed to a body"):
+        read_scene(model, movable=("hand",))
+
+
+def test_cameras(scene, model):
+    assert set(scene.rigs) == {"fixed", "down", "follow", "track"}
+    fixed, down, track = (scene.rigs[name] for name in ("fixed", "down", "track"))
+    assert (fixed.link, track.link) == (-1, 0)
+    assert fixed.fovy == 30
+    np.testing.assert_allclose(fixed.eye, [0, -4, 1])
+    # As deep as the center of mass, which is straight ahead; and straight below.
+    np.testing.assert_allclose(fixed.target, [0, 0, 1], atol=1e-5)
+    np.testing.assert_allclose(down.target, [0, 0, 0.75], atol=1e-2)
+    np.testing.assert_allclose(scene.rig.eye, [0, -3, 0.25], atol=1e-5)
+    np.testing.assert_allclose(track.eye, [0, -3, 0], atol=1e-5)
+
+
+def test_unknown_cameras(model):
+    with pytest.raises(ValueError, match=r"unknown camera: 'folow'.*Did you mean 'follow'"):
+        read_scene(model, "folow")
+    with pytest.raises(ValueError, match=r"unknown camera: 'eye'; allowed: down, fixed, follow"):
+        read_scene(model, model.camera("eye").id)
+    with pytest.raises(ValueError, match="the model has no camera 9; it has 6"):
+        read_scene(model, 9)
+
+
+def test_lights(scene):
+    look = scene.look
+    np.testing.assert_allclose(look.light, [-(0.5**0.5), 0, 0.5**0.5], atol=1e-6)
+    assert (look.ambient, look.headlight) == (pytest.approx(0.3), pytest.approx(0.6))
+    assert (look.diffuse, look.highlight) == (pytest.approx(0.5), pytest.approx(0.5 * 0.2))
+    spot = look.lamps[0]
+    assert (spot.exponent, float(spot.diffuse)) == (4, pytest.approx(0.7))
+    assert spot.cos_cutoff == pytest.approx(np.cos(np.deg2rad(30)))
+    assert len(look.lamps) == 2, "one is off"
+
+
+def test_ground_and_sky_come_from_the_textures(scene):
+    look = scene.look
+    np.testing.assert_allclose(look.ground_rgb, [[0.2, 0.4, 0.6], [0.8, 0.6, 0.4]], atol=2e-3)
+    # Two repeats a metre of MuJoCo's uniform texture, which is 2 m and has two tiles.
+    assert look.ground_pitch == pytest.approx(0.5)
+    horizon, above, below = look.sky
+    np.testing.assert_allclose(horizon, [0.2, 0.3, 0.4], atol=0.03)
+    assert (above > horizon + 0.1).all()
+    assert (above <= [0.4, 0.6, 0.8]).all()
+    assert (below < 0.1).all()
+
+
+def test_what_cannot_be_drawn_is_named():
+    over_a_geom = """
+    <mujoco><worldbody>
+      <geom name="reel" type="cylinder" size=".1 .1"/><site name="a" pos="1 0 0"/>
+      <site name="b" pos="-1 0 .1"/>
+      <camera/>
+    </worldbody>
+    <tendon>
+      <spatial name="rope"><site site="a"/><geom geom="reel"/><site site="b"/></spatial>
+    </tendon></mujoco>"""
+    with pytest.raises(ValueError, match=r"tendon 'rope' runs over geoms .* alpha 0 or group 3"):
+        read_scene(mujoco.MjModel.from_xml_string(over_a_geom))
