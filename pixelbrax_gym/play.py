@@ -33,13 +33,14 @@ def play(options: argparse.Namespace) -> int:
         The exit status: 130 after Ctrl-C, which leaves a whole file.
     """
     written = options.gif
-    if written is None and (lacking := _no_window()):
-        written = f"{options.task}.gif"
-        sys.stderr.write(f"pixelbrax play: {lacking}; it becomes {written}\n")
     try:
         check_positive_int("size", options.size)
         check_positive_int("num_frames", options.num_frames)
         env, act = _make(options)
+        if written is None and (lacking := _no_window()):
+            written = f"{options.task}.gif"
+            sys.stderr.write(f"pixelbrax play: {lacking}; writing {written} in its place\n")
+        sys.stderr.write("pixelbrax play: compiling, which takes up to a minute\n")
         shown = images(env, act, options.seed, options.size if options.observation else None)
         if written is None:
             _show(shown, env.metadata["render_fps"], f"PixelBrax {options.task}")
@@ -117,8 +118,8 @@ def _show(shown: Iterator[np.ndarray], fps: int, title: str) -> None:
 def _no_window() -> str:
     """Why no window can be opened; empty if one can."""
     if find_spec("pygame") is None:
-        return f"a window needs pygame; try: {install_extra('human')}"
+        return f"no window, for pygame is missing; try: {install_extra('human')}"
     known = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
     if sys.platform == "linux" and not any(map(os.environ.get, known)):
-        return "there is no display for a window"
+        return "no window, for there is no display"
     return ""

@@ -10,6 +10,7 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 from pixelbrax_jax.extras import install_extra
+from pixelbrax_jax.tasks import TASKS
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -34,6 +35,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "is.",
     )
     command.set_defaults(run=_doctor)
+    command = commands.add_parser("tasks", help="list the tasks", description="Lists the tasks.")
+    command.set_defaults(run=_tasks)
     _add_play(commands)
     _add_clips(commands)
     # Its options are the fields of the settings' classes, which tyro reads by itself.
@@ -50,6 +53,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return int(options.run(options))
 
 
+def _tasks(options: argparse.Namespace) -> int:
+    del options
+    width = max(map(len, TASKS))
+    for name, row in TASKS.items():
+        sys.stdout.write(f"{name:{width}}  {row.gymnasium_id}: {row.summary}\n")
+    return 0
+
+
 def _add_play(commands: Any) -> None:
     command = commands.add_parser(
         "play",
@@ -57,7 +68,7 @@ def _add_play(commands: Any) -> None:
         description="Plays a task in a window, or, with --gif or where there is no display, into "
         "an animated image.",
     )
-    command.add_argument("task", help="as ant; 'pixelbrax play x' lists them")
+    command.add_argument("task", help="as ant; 'pixelbrax tasks' lists them")
     command.add_argument(
         "--policy",
         choices=("random", "zero", "pretrained"),

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax.extras import install_extra
-from pixelbrax_jax.validation import check_choice
+from pixelbrax_jax.validation import check_choice, suggest
 
 FOLDER = Path(__file__).parent / "pretrained"
 """Where the policies lie that come with the package: for each a .jax and a .json."""
@@ -88,7 +88,8 @@ def load_policy(path: str | Path) -> Policy:
     if not path.is_file():
         if name not in (names := list_pretrained()):
             raise FileNotFoundError(
-                f"there is no policy at {path}; with the package come {', '.join(names)}."
+                f"{name!r} is no file, and no policy of that name comes with the package; there "
+                f"are: {', '.join(names)}.{suggest(name, names)}"
             )
         path, about = FOLDER / f"{name}.jax", read_pretrained(name)
     try:

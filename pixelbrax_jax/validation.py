@@ -26,6 +26,15 @@ _ELSEWHERE = {
 }
 """Options under the names that other libraries give them."""
 
+_ADVICE = {
+    "device": " Frames are where JAX computes: on an NVIDIA GPU with the extra cuda12 or cuda13.",
+    "num_envs": " Several environments in one program: gymnasium.make_vec.",
+    **dict.fromkeys(
+        ("image_size", "img_size", "resolution", "size"), " Did you mean 'height' and 'width'?"
+    ),
+}
+"""What to do in place of an option that there is not."""
+
 
 def check_choice(
     what: str, value: object, allowed: Iterable[str], *, meant: str | None = None
@@ -67,7 +76,7 @@ def check_options(given: Iterable[str], allowed: Iterable[str]) -> None:
         if name not in names:
             raise TypeError(
                 f"got an unexpected keyword argument {name!r}; allowed: {', '.join(names)}."
-                + suggest(_ELSEWHERE.get(name, name), names, _SIMILAR_OPTION)
+                + (_ADVICE.get(name) or suggest(_ELSEWHERE.get(name, name), names, _SIMILAR_OPTION))
             )
 
 

@@ -20,7 +20,7 @@ from tests.test_docs import without_code
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 
-PAGES = ("README.md", "docs/performance.md", "docs/results.md")
+PAGES = ("README.md", "docs/performance.md", "docs/results.md", "docs/measurements.md")
 """Those that report measurements."""
 
 FIGURE = re.compile(r"(?<![\w.,/-])(?:\d{1,3}(?:,\d{3})+|\d+\.\d+)(?![\w.,/-]*\d)")
@@ -134,9 +134,10 @@ STATEMENTS = {
     "README.md": (
         ("step {} times a second through Gymnasium", [number(ant())]),
         ("under Stable-Baselines3's workers steps {} times there", [dm_control()]),
-        ("at {} to {} of the speed without", span(distractor_ratios())),
+        ("a step keeps {} to {} of its speed", span(distractor_ratios())),
         ("to a return of {} in", [mean_end("ppo-halfcheetah")]),
         ("Ant to {}", [mean_end("ppo-ant")]),
+        ("standing still earns {}", [without_action("ant")]),
         ("steps per second, two CPU cores | {} | 4 | {}", [number(ant()), dm_control()]),
     ),
     "docs/performance.md": (
@@ -148,7 +149,7 @@ STATEMENTS = {
         ("there and PixelBrax {}", [frames("throughput.renderer")]),
         ("makes {} to {} steps a second on two", span([row[2] for row in ORIGINAL], "{:.0f}")),
         ("{} to {} times as many", [rounded(x, 2) for x in sorted(ours_to_original())[::4]]),
-        ("{} times a Python loop's speed", [f"{adapter('JAX scan', 1, 'ratio'):.1f}"]),
+        ("it has {} times a Python loop's speed", [f"{adapter('JAX scan', 1, 'ratio'):.1f}"]),
         (
             "{} (cheetah) and {} (walker)",
             [
@@ -168,12 +169,17 @@ STATEMENTS = {
         ("{} on two devices", [rounded(training(2, 2), 2)]),
         ("each, {} of ideal", [f"{training(2, 2) / training(1, 1) / 2:.2f}"]),
     ),
+    "docs/measurements.md": (),
     "docs/results.md": (
         ("{} on HalfCheetah", [mean_end("ppo-halfcheetah")]),
         ("{} on Ant", [mean_end("ppo-ant")]),
         ("{} on Humanoid", [mean_end("ppo-humanoid")]),
-        ("and {} on HalfCheetah in thirteen", [mean_end("ppo-halfcheetah-long")]),
+        ("and {} on HalfCheetah in a run", [mean_end("ppo-halfcheetah-long")]),
         ("which is what no action earns, {}", [without_action("ant")]),
+        (
+            "which sees the state, ends at {} after",
+            [f"{read('results/from_state.json')['walker2d x 1']['return'][-1]:,.0f}"],
+        ),
     ),
 }
 """Page -> what it says, and the figures in it."""
@@ -181,6 +187,7 @@ STATEMENTS = {
 FROM_OTHERS = {
     "README.md": ("report 402,000 steps per second", "Apache License 2.0"),
     "docs/performance.md": ("The aim of 0.97",),
+    "docs/measurements.md": ("JAX 0.10.2",),
     "docs/results.md": (
         "which earns up to 1,000",
         "took 0.5 from its pixels",
@@ -218,6 +225,11 @@ def test_every_figure_is_among_them(page):
 @pytest.mark.parametrize("name", ["environments", "peers", "adapters", "distractors"])
 def test_tables_of_performance_are_those_of_the_results(name):
     assert drawn(performance.PAGE, name) == performance.tables()[name]
+
+
+@pytest.mark.parametrize("name", ["physics", "renderer"])
+def test_tables_of_measurements_are_those_of_the_results(name):
+    assert drawn(performance.FORMS_PAGE, name) == performance.forms_tables()[name]
 
 
 @pytest.mark.parametrize("name", ["clean", "distracted", "centering"])

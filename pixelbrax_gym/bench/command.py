@@ -24,7 +24,7 @@ def main(arguments: Sequence[str]) -> int:
     """
     parser = argparse.ArgumentParser(
         prog="pixelbrax bench",
-        description="Measures renderer, environments and adapters on this machine, in about three "
+        description="Measures renderer, environments and adapters on this machine, in about two "
         "minutes, and writes JSON, a page of tables and a plot. What has been measured is kept: a "
         "run that was stopped goes on where it was.",
     )

@@ -114,6 +114,11 @@ class PixelBraxVectorEnv(gymnasium.vector.VectorEnv):
             ImportError: torch is missing and wanted.
             RuntimeError: this process is a fork that cannot run JAX.
         """
+        if render_mode == "human":
+            raise ValueError(
+                "render_mode='human' shows one environment: gymnasium.make takes it; here there is "
+                "'rgb_array'."
+            )
         if render_mode is not None:
             check_choice("render_mode", render_mode, ("rgb_array",))
         self.autoreset_mode = as_autoreset_mode(autoreset_mode)

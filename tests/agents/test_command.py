@@ -17,6 +17,7 @@ from pixelbrax_jax.agents.runner import train_command as command
 from pixelbrax_jax.agents.runner.train_command import parse
 from pixelbrax_jax.agents.runner.trained import load_config
 from pixelbrax_jax.cli import main
+from pixelbrax_jax.tasks import TASKS
 from tests.benchmarks.experiments import experiments, gpu_experiments
 
 TINY = (
@@ -93,7 +94,18 @@ def test_errors_name_the_setting_and_the_cure(capsys):
     assert main(["train", "ppo", "--task", "antt"]) == 1
     assert "Did you mean 'ant'?" in capsys.readouterr().err
     assert main(["record", "/nowhere"]) == 1
-    assert "no checkpoint" in capsys.readouterr().err
+    assert "no checkpoint in /nowhere/checkpoints, for there is no such folder" in (
+        capsys.readouterr().err
+    )
+    with pytest.raises(SystemExit):
+        main(["train", "--task", "ant"])
+    assert "name an algorithm first, as in 'pixelbrax train ppo --task" in capsys.readouterr().err
+
+
+def test_tasks_are_listed(capsys):
+    assert main(["tasks"]) == 0
+    listed = [line.split()[0] for line in capsys.readouterr().out.splitlines()]
+    assert listed == list(TASKS)
 
 
 @pytest.mark.slow

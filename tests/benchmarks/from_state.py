@@ -23,8 +23,11 @@ from pixelbrax_jax.agents.core.config import TrainConfig
 OUTPUT = Path(__file__).parents[2] / "docs" / "results" / "from_state.json"
 
 
-def curve(config: TrainConfig, times: int, evaluations: int) -> dict:
-    """Mean returns of 128 episodes with the mean action, over control steps and seconds."""
+def keep(config: TrainConfig, times: int, evaluations: int) -> None:
+    """Train, and keep the curve: mean returns of 128 episodes with the mean action.
+
+    What is known of it is written with every evaluation.
+    """
     env = BraxPixelEnv(*make(config, obs_mode="state"))
     found: dict = {"steps": [], "seconds": [], "return": [], "length": []}
     began = time.monotonic()
@@ -35,6 +38,8 @@ def curve(config: TrainConfig, times: int, evaluations: int) -> dict:
         found["return"].append(round(float(metrics["eval/episode_reward"]), 1))
         found["length"].append(float(metrics["eval/avg_episode_length"]) * config.action_repeat)
         print(config.task, found["steps"][-1], found["return"][-1], flush=True)
+        known = json.loads(OUTPUT.read_text()) if OUTPUT.exists() else {}
+        OUTPUT.write_text(json.dumps(known | {f"{config.task} x {times}": found}) + "\n")
 
     ppo.train(
         env,
@@ -55,7 +60,6 @@ def curve(config: TrainConfig, times: int, evaluations: int) -> dict:
         deterministic_eval=True,
         progress_fn=progress,
     )
-    return found
 
 
 def main() -> None:
@@ -68,9 +72,7 @@ def main() -> None:
     parser.add_argument("--times", type=int, default=1, help="the preset's number of steps")
     options = parser.parse_args()
     for task in options.tasks:
-        found = curve(preset("ppo", "cpu", task), options.times, 10)
-        known = json.loads(OUTPUT.read_text()) if OUTPUT.exists() else {}
-        OUTPUT.write_text(json.dumps(known | {f"{task} x {options.times}": found}) + "\n")
+        keep(preset("ppo", "cpu", task), options.times, 10)
 
 
 if __name__ == "__main__":

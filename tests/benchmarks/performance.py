@@ -1,4 +1,4 @@
-"""Draws docs/performance.md's tables from the results of `tests.benchmarks.run`.
+"""Draws the tables of docs/performance.md and docs/measurements.md from results that are kept.
 
 python -m tests.benchmarks.performance
 """
@@ -9,11 +9,12 @@ import json
 from pathlib import Path
 
 from pixelbrax_gym.bench.cases import TASKS
-from pixelbrax_gym.bench.tables import cell, find, ratio, table, title, value
+from pixelbrax_gym.bench.tables import cell, find, number, ratio, table, title, value
 from tests.benchmarks.pages import redraw
 
 DOCS = Path(__file__).parents[2] / "docs"
 PAGE = DOCS / "performance.md"
+FORMS_PAGE = DOCS / "measurements.md"
 ADAPTERS = {
     "Gymnasium, jax": '`gymnasium.make_vec`, `output="jax"`',
     "Gymnasium, numpy": '`gymnasium.make_vec`, `output="numpy"`',
@@ -100,6 +101,23 @@ def _ratios(
     return table((column, *heads), lines)
 
 
+def forms(area: str) -> str:
+    """Forms of the same program, and how fast they were beside another."""
+    kept = json.loads((DOCS / "benchmarks" / "forms.json").read_text("utf-8"))["rows"]
+    lines = []
+    for row in (row for row in kept if row["area"] == area):
+        speed, low, high = (row[name] and number(row[name]) for name in ("ratio", "low", "high"))
+        interval = f" ({low} to {high})" if low else ""
+        about = (row["form"], row["against"], row["where"])
+        lines.append([*about, f"{speed}{interval}", "yes" if row["kept"] else ""])
+    return table(("form", "against", "where", "speed", "kept"), lines)
+
+
+def forms_tables() -> dict[str, str]:
+    """All of the contributors' page's tables, by name."""
+    return {area: f"{forms(area)}\n" for area in ("physics", "renderer")}
+
+
 def tables() -> dict[str, str]:
     """All of the page's tables, by name."""
     drawings = (environments, peers, adapters, distractors)
@@ -108,3 +126,4 @@ def tables() -> dict[str, str]:
 
 if __name__ == "__main__":
     redraw(PAGE, tables())
+    redraw(FORMS_PAGE, forms_tables())

@@ -47,6 +47,8 @@ def test_options(kind, options, message):
             r"unexpected keyword argument 'heigth'; allowed: .*width.* Did you mean 'height'\?",
         ),
         ({"rendermode": 3}, r"Did you mean 'render_mode'\?"),
+        ({"device": "cuda"}, r"on an NVIDIA GPU with the extra cuda12"),
+        ({"image_size": 64}, r"Did you mean 'height' and 'width'\?"),
         ({"frame_skip": 3}, r"Did you mean 'action_repeat'\?"),
         ({"backend": ("a", ["b"])}, r"backend must be a single value, got a tuple"),
         ({"backend": ["spring"]}, r"backend must be a single value, got a list: \['spring'\]"),
@@ -110,7 +112,7 @@ def test_autoreset_mode(mode):
 
 
 def test_human_rendering_of_many():
-    with pytest.raises(ValueError, match="unknown render_mode: 'human'; allowed: rgb_array"):
+    with pytest.raises(ValueError, match=r"gymnasium\.make takes it; here there is 'rgb_array'"):
         PixelBraxVectorEnv(TASK, 2, render_mode="human")
 
 

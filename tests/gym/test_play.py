@@ -29,7 +29,7 @@ def test_without_a_display_it_becomes_a_gif(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["play", TASK, *SHORT]) == 0
     told = capsys.readouterr()
-    assert "no display for a window; it becomes inverted_pendulum.gif" in told.err
+    assert "there is no display; writing inverted_pendulum.gif in its place" in told.err
     assert told.out.strip() == str(tmp_path / "inverted_pendulum.gif")
     assert imageio.imread(tmp_path / "inverted_pendulum.gif", index=None).shape == (3, 40, 40, 3)
 
@@ -96,7 +96,7 @@ def test_ctrl_c_leaves_a_whole_file(tmp_path, monkeypatch):
     [
         (["antt"], "Did you mean 'ant'?"),
         (["ant", "--look", "origin"], "'original'"),
-        (["reacher", "--policy", "pretrained"], "with the package come"),
+        (["reacher", "--policy", "pretrained"], "comes with the package"),
         (["ant", "--size", "0"], "size must be a positive integer"),
         (["ant", "--num-frames", "0"], "num_frames must be a positive integer"),
     ],

@@ -291,7 +291,8 @@ def read_about(folder: str | Path, steps: int | None = None) -> dict[str, Any]:
     folder = Path(folder)
     known = _all_steps(folder)
     if not known:
-        raise CheckpointError(f"there is no checkpoint in {folder}.")
+        why = "" if folder.exists() else ", for there is no such folder"
+        raise CheckpointError(f"there is no checkpoint in {folder}{why}.")
     path = folder / str(known[-1] if steps is None else steps) / "about" / "metadata"
     if not path.exists():
         raise CheckpointError(

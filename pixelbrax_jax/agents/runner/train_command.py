@@ -48,7 +48,9 @@ def train(arguments: list[str]) -> int:
 
 
 def _train(arguments: list[str]) -> int:
-    first = argparse.ArgumentParser(prog="pixelbrax train", add_help=False)
+    first = argparse.ArgumentParser(
+        prog="pixelbrax train", add_help=False, usage="pixelbrax train ALGORITHM [options]"
+    )
     first.add_argument("algorithm", choices=sorted(ALGORITHMS))
     first.add_argument("--preset", choices=sorted(PRESETS), default="default")
     first.add_argument("--coordinator", help="host:port of process 0, of several processes")
@@ -64,6 +66,11 @@ def _train(arguments: list[str]) -> int:
             + "}] [options]\n\nAll options: pixelbrax train ppo --help\n"
         )
         return 0
+    if arguments[0].startswith("-"):
+        first.error(
+            f"name an algorithm first, as in 'pixelbrax train ppo {arguments[0]} ...'; there are "
+            f"{', '.join(ALGORITHMS)}"
+        )
     chosen, rest = first.parse_known_args(arguments)
     spread = (chosen.coordinator, chosen.num_processes, chosen.process_id)
     if None in spread and any(given is not None for given in spread):

@@ -1,7 +1,7 @@
-"""The animated image of the front page: tasks and distractors, side by side.
+"""The documentation's images of tasks: a wall of them, one animation of each, looks and cameras.
 
-    python examples/render_wall.py --output docs/images/wall.gif
-    python examples/render_wall.py --output runs/wall.gif --num-frames 8 --only ant reacher
+    python examples/render_tasks.py --output-dir docs/images
+    python examples/render_tasks.py --output-dir runs/images --num-frames 8 --only ant reacher
 
 Tasks for which a policy comes with the package are played by it, the others by random actions.
 Under distractors the policy sees the clean observation, for it was trained on that.
@@ -11,11 +11,12 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 
 import pixelbrax_jax as pb
 from pixelbrax_jax.distractors import Video
@@ -23,7 +24,17 @@ from pixelbrax_jax.distractors.presets import resolve
 
 SIZE = 120  # pixels of a tile
 GAP = 4
+CAPTION = 16
 COLUMNS = 5
+VIEWS = {
+    "default": {},
+    "shadows": {"shadows": True},
+    "original": {"look": "original"},
+    "side": {"camera": "side"},
+    "front": {"camera": "front"},
+    "top": {"camera": "top"},
+}
+"""Looks and cameras, and the options that they take."""
 COLORS = 128  # one palette for all frames: small files that do not flicker
 FPS = 20
 WARM_UP = 20  # frames before the first that is shown: by then agents are under way
@@ -98,7 +109,27 @@ def wall(tiles: Sequence[np.ndarray]) -> np.ndarray:
     return np.concatenate(rows, axis=1)[:, :-GAP, :-GAP]
 
 
-def save(frames: np.ndarray, path: str) -> None:
+def named(name: str, frames: np.ndarray) -> np.ndarray:
+    """Frames with a name below, (T, SIZE + CAPTION, SIZE, 3) uint8."""
+    caption = Image.new("RGB", (SIZE, CAPTION), "white")
+    font = ImageFont.load_default(size=11 if len(name) < 20 else 9)
+    ImageDraw.Draw(caption).text((SIZE / 2, CAPTION / 2), name, "black", font, anchor="mm")
+    below = np.broadcast_to(np.asarray(caption), (len(frames), CAPTION, SIZE, 3))
+    return np.concatenate([frames, below], axis=1)
+
+
+def views(task: str, states: Any) -> np.ndarray:
+    """The first state in every look and from every camera, in a row, (H, W, 3) uint8."""
+    first = jax.tree.map(lambda x: x[0], states)
+    images = []
+    for options in VIEWS.values():
+        env, params = pb.make(task, **options)
+        images.append(np.asarray(env.image(first, params, SIZE, SIZE)))
+    gap = np.full((SIZE, GAP, 3), 255, np.uint8)
+    return np.concatenate([part for image in images for part in (image, gap)][:-1], axis=1)
+
+
+def save(frames: np.ndarray, path: Path) -> None:
     """Write a GIF whose frames have one palette."""
     sample = Image.fromarray(np.concatenate(frames[:: max(1, len(frames) // 6)]))
     palette = sample.quantize(COLORS)
@@ -109,15 +140,28 @@ def save(frames: np.ndarray, path: str) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
+    """Writes ``wall.gif``, ``tasks/<task>.gif`` and ``views.png``."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--output", default="docs/images/wall.gif")
+    parser.add_argument("--output-dir", type=Path, default=Path("docs/images"))
     parser.add_argument("--num-frames", type=int, default=60)
-    parser.add_argument("--only", nargs="+", default=pb.list_envs(), help="tiles of these tasks")
+    tasks = pb.list_envs()
+    parser.add_argument("--only", nargs="+", default=tasks, choices=tasks, help="these tasks")
     options = parser.parse_args(arguments)
-    chosen = [(task, behind) for task, behind in TILES if task in options.only]
-    states = {task: episode(task, options.num_frames) for task in {task for task, _ in chosen}}
-    tiles = [tile(*which, states[which[0]], seed) for seed, which in enumerate(chosen)]
-    save(wall(tiles), options.output)
+    (options.output_dir / "tasks").mkdir(parents=True, exist_ok=True)
+    states = {task: episode(task, options.num_frames) for task in options.only}
+    clean = {task: tile(task, None, states[task], 0) for task in states}
+    for task, frames in clean.items():
+        save(named(task, frames), options.output_dir / "tasks" / f"{task}.gif")
+    tiles = [
+        tile(task, behind, states[task], seed) if behind else clean[task]
+        for seed, (task, behind) in enumerate(TILES)
+        if task in states
+    ]
+    if tiles:
+        save(wall(tiles), options.output_dir / "wall.gif")
+    first = next(iter(states))
+    shown = "ant" if "ant" in states else first
+    Image.fromarray(views(shown, states[shown])).save(options.output_dir / "views.png")
 
 
 if __name__ == "__main__":
