@@ -12,7 +12,7 @@ import pytest
 
 from pixelbrax_gym.bench.cases import TASKS
 from pixelbrax_gym.bench.tables import find, number
-from tests.benchmarks import performance, results
+from tests.benchmarks import dmc_page, performance, results
 from tests.benchmarks.original import ORIGINAL
 from tests.benchmarks.pages import drawn, without_tables
 from tests.test_docs import without_code
@@ -20,7 +20,13 @@ from tests.test_docs import without_code
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 
-PAGES = ("README.md", "docs/performance.md", "docs/results.md", "docs/measurements.md")
+PAGES = (
+    "README.md",
+    "docs/performance.md",
+    "docs/results.md",
+    "docs/measurements.md",
+    "docs/dmc.md",
+)
 """Those that report measurements."""
 
 FIGURE = re.compile(r"(?<![\w.,/-])(?:\d{1,3}(?:,\d{3})+|\d+\.\d+)(?![\w.,/-]*\d)")
@@ -170,6 +176,7 @@ STATEMENTS = {
         ("each, {} of ideal", [f"{training(2, 2) / training(1, 1) / 2:.2f}"]),
     ),
     "docs/measurements.md": (),
+    "docs/dmc.md": (),
     "docs/results.md": (
         ("{} on HalfCheetah", [mean_end("ppo-halfcheetah")]),
         ("{} on Ant", [mean_end("ppo-ant")]),
@@ -185,9 +192,10 @@ STATEMENTS = {
 """Page -> what it says, and the figures in it."""
 
 FROM_OTHERS = {
-    "README.md": ("report 402,000 steps per second", "Apache License 2.0"),
+    "README.md": ("report 402,000 steps per second", "Apache License 2.0", ", 3.12)"),
     "docs/performance.md": ("The aim of 0.97",),
     "docs/measurements.md": ("JAX 0.10.2",),
+    "docs/dmc.md": ("on MuJoCo 3.17", "differ by more than 0.01 in a velocity"),
     "docs/results.md": (
         "which earns up to 1,000",
         "took 0.5 from its pixels",
@@ -230,6 +238,11 @@ def test_tables_of_performance_are_those_of_the_results(name):
 @pytest.mark.parametrize("name", ["physics", "renderer"])
 def test_tables_of_measurements_are_those_of_the_results(name):
     assert drawn(performance.FORMS_PAGE, name) == performance.forms_tables()[name]
+
+
+@pytest.mark.parametrize("name", ["speed", "physics", "learned", "tasks"])
+def test_tables_of_dm_control_are_those_of_the_results(name):
+    assert drawn(dmc_page.PAGE, name) == dmc_page.page_tables()[name]
 
 
 @pytest.mark.parametrize("name", ["clean", "distracted", "centering"])

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from pixelbrax_gym.bench.tables import table
+from pixelbrax_jax.tasks import DMC_TASKS
 from tests.benchmarks import tables
 from tests.benchmarks.pages import redraw
 from tests.benchmarks.results import final, groups, return_at
@@ -59,6 +60,36 @@ def learned() -> str:
     return table(heads, lines)
 
 
+def tasks() -> str:
+    """All tasks, in Markdown."""
+    lines = [[f"`{r.gymnasium_id}`", f"`{r.name}`", r.summary] for r in DMC_TASKS.values()]
+    return table(("Gymnasium id", "in JAX", "goal"), lines)
+
+
+def physics() -> str:
+    """How far each task is from dm_control's, in Markdown."""
+    kept = json.loads((FOLDER / "physics.json").read_text("utf-8"))["tasks"]
+    lines = []
+    for task in DMC_TASKS:
+        if task not in kept:
+            continue
+        same, step = kept[task]["same_state"], kept[task]["control_step"]
+        errors = (same["reward"], same["observation"], step["reward"], step["velocity_median"])
+        far = f"{step['velocities_off']} of {kept[task]['states']}"
+        p = kept[task]["initial_states"]["lowest_p"]
+        lines.append([f"`{task}`", *(f"{error:.0e}" for error in errors), far, f"{p:.2g}"])
+    heads = (
+        "task",
+        "reward",
+        "observation",
+        "reward, a step on",
+        "velocity, a step on: median",
+        "beyond 0.01",
+        "lowest p",
+    )
+    return table(heads, lines)
+
+
 def plot(path: Path) -> None:
     """Return of training episodes over control steps, a line for each seed."""
     import matplotlib
@@ -89,7 +120,7 @@ def plot(path: Path) -> None:
 
 def page_tables() -> dict[str, str]:
     """All of the page's tables, by name."""
-    return {draw.__name__: f"{draw()}\n" for draw in (speed, learned)}
+    return {draw.__name__: f"{draw()}\n" for draw in (speed, physics, learned, tasks)}
 
 
 if __name__ == "__main__":
