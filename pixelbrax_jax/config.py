@@ -99,9 +99,9 @@ class EnvConfig(ProgramConfig):
     """Task, one of ``pixelbrax_jax.list_envs()``."""
     backend: str | None = None
     """Physics backend: ``spring``, ``positional``, ``generalized`` or ``mjx``; None means the
-    task's own."""
+    task's own, which is all that tasks of the DM Control Suite have."""
     reward_preset: str = "brax"
-    """``brax``, or ``paper`` for the rewards of arXiv 2502.00021."""
+    """``brax``, or ``paper`` for the rewards of arXiv 2502.00021; for Brax's tasks alone."""
     camera: str | CameraRig | Camera = "default"
     """Viewpoint: a name of ``named_rigs``, a ``CameraRig`` or a ``Camera``."""
     look: str | Look = "default"

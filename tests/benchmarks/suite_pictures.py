@@ -122,9 +122,7 @@ def main() -> None:
         }
         text = json.dumps(kept, indent=2) + "\n"
         (DOCS / "dmc" / "pictures.json").write_text(text, "utf-8")
-        # 256 colors are enough to compare by eye.
-        page = sheet(pairs).quantize(256, dither=Image.Dither.NONE)
-        page.save(DOCS / "images" / "dmc" / "beside.png", optimize=True)
+        sheet(pairs).save(DOCS / "images" / "dmc" / "beside.png", optimize=True)
     else:
         sheet(pairs).save("beside.png")
 

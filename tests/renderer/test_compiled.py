@@ -9,6 +9,8 @@ import pytest
 
 import pixelbrax_jax as pb
 from pixelbrax_gym.bench.throughput import operations
+from tests.renderer.test_lamps import LAMP
+from tests.renderer.test_planes import random_strip
 
 NUM_ENVS, SIZE = 64, 84
 PIXELS = NUM_ENVS * SIZE * SIZE
@@ -71,3 +73,20 @@ def test_pixels_are_spread_over_the_cores(program):
     drawing = [line for line in lines if "broadcast" not in line.split("=")[0]]
     assert len(drawing) == 1, drawing
     assert 'outer_dimension_partitions":["' in drawing[0]
+
+
+@pytest.mark.parametrize("shadows", [False, True])
+def test_every_shape_and_light_is_in_the_one_fusion(shadows):
+    """A root or a quotient that two operations read would be kept as an image of its own."""
+    scene = random_strip(0)
+    lamps = (LAMP, LAMP.replace(exponent=3))
+    scene = scene.replace(look=scene.look.replace(lamps=lamps, shadows=shadows))
+    scene = jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * 16), scene)
+
+    def packed(scene):
+        frame = pb.render(scene, SIZE, SIZE)
+        r, g, b = (jnp.uint32(255 * plane) for plane in (frame.r, frame.g, frame.b))
+        return r | g << 8 | b << 16
+
+    memory = jax.jit(jax.vmap(packed)).lower(scene).compile().memory_analysis()
+    assert memory.temp_size_in_bytes <= 0.25 * memory.output_size_in_bytes

@@ -107,6 +107,6 @@ def test_gradients_of_lamps_are_finite():
     # One pixel right below the lamp, where its ray has no way across.
     scene = scene.replace(camera=scene.camera.replace(pos=jnp.array([0.2, 0.1, 2.0])))
     scene = jax.tree.map(jnp.asarray, scene)
-    gradient = jax.grad(lambda s: jnp.sum(render(s, 9, 9).r))(scene)
+    gradient = jax.jit(jax.grad(lambda s: jnp.sum(render(s, 9, 9).r)))(scene)
     assert all(bool(jnp.isfinite(x).all()) for x in jax.tree.leaves(gradient))
     assert float(jnp.abs(gradient.look.lamps[0].pos).max()) > 0

@@ -15,7 +15,7 @@ from pixelbrax_jax.physics.brax.compatibility import (
     loading_silenced,
 )
 from pixelbrax_jax.physics.brax.engine import BraxPhysics
-from pixelbrax_jax.tasks import REWARD_PRESETS, TASKS
+from pixelbrax_jax.tasks import BRAX_TASKS, REWARD_PRESETS
 from pixelbrax_jax.validation import check_choice
 
 with import_silenced():
@@ -40,7 +40,7 @@ def make_physics(
     Equal arguments give equal objects, and the same one as long as few others are asked for.
 
     Args:
-        task: a name in ``TASKS``.
+        task: a name in ``BRAX_TASKS``.
         backend: a backend that the task supports; None for its default.
         reward_preset: ``"brax"`` for the rewards of the installed Brax, or ``"paper"`` for
             those of arXiv 2502.00021 where they differ: walker2d weighs forward speed ten
@@ -54,7 +54,7 @@ def make_physics(
     Raises:
         ValueError: for an unknown name; the message lists what is allowed.
     """
-    row = TASKS[check_choice("task", task, TASKS)]
+    row = BRAX_TASKS[check_choice("task", task, BRAX_TASKS)]
     check_choice("reward_preset", reward_preset, REWARD_PRESETS)
     backend = row.default_backend if backend is None else backend
     check_choice(f"backend of task {task!r}", backend, row.backends)
@@ -64,7 +64,7 @@ def make_physics(
 # Loading a model takes a second. One that is dropped and loaded again equals the first.
 @lru_cache(maxsize=16)
 def _load(task: str, backend: str, reward_preset: str) -> BraxPhysics:
-    row, paper = TASKS[task], reward_preset == "paper"
+    row, paper = BRAX_TASKS[task], reward_preset == "paper"
     reward = _PAPER_REWARDS[row.paper_reward] if paper and row.paper_reward else None
     return BraxPhysics(
         load_brax_env(task, backend, **(row.paper_options if paper else {})),

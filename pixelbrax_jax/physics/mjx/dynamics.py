@@ -165,10 +165,23 @@ class Dynamics:
 
     def touches(self, qpos: jax.Array) -> jax.Array:
         """Return () bool, whether any geoms touch at joint positions (Q,)."""
-        data = self._data(self.state(qpos))
-        data = smooth.kinematics(self._mx, data)
-        contact = collision_driver.collision(self._mx, data)._impl.contact
+        contact = self._contact(qpos)
         return jnp.any(contact.dist < contact.includemargin)
+
+    def clearance(self, qpos: jax.Array, geom: str) -> jax.Array:
+        """Return () metres between a geom and the nearest one, negative where they overlap.
+
+        Args:
+            qpos: (Q,) float32, joint positions.
+            geom: its name.
+        """
+        contact = self._contact(qpos)
+        is_of_it = jnp.any(contact.geom == self.model.geom(geom).id, axis=-1)
+        return jnp.min(jnp.where(is_of_it, contact.dist, jnp.inf))
+
+    def _contact(self, qpos: jax.Array) -> Any:
+        data = smooth.kinematics(self._mx, self._data(self.state(qpos)))
+        return collision_driver.collision(self._mx, data)._impl.contact
 
     def _data(self, state: MjxState) -> Any:
         return mjx.make_data(self._simulated, impl="jax").replace(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -25,28 +26,28 @@ class Snapshot:
     """
 
     model: mujoco.MjModel
-    data: object
+    data: Any
     target: jax.Array
 
     @property
     def qpos(self) -> jax.Array:
         """(Q,) float32, joint positions: metres, radians."""
-        return self.data.qpos  # type: ignore[attr-defined]
+        return self.data.qpos
 
     @property
     def qvel(self) -> jax.Array:
         """(V,) float32, joint velocities, per second."""
-        return self.data.qvel  # type: ignore[attr-defined]
+        return self.data.qvel
 
     @property
     def act(self) -> jax.Array:
         """Activations of actuators that have a state."""
-        return self.data.act  # type: ignore[attr-defined]
+        return self.data.act
 
     @property
     def ctrl(self) -> jax.Array:
         """(A,) float32, the controls of the last step; 0 after a reset."""
-        return self.data.ctrl  # type: ignore[attr-defined]
+        return self.data.ctrl
 
     def joint_pos(self, *names: str) -> jax.Array:
         """Return the positions of hinges and sliders."""
@@ -62,7 +63,7 @@ class Snapshot:
         for name in names:
             sensor = self.model.sensor(name)
             rows.extend(range(sensor.adr[0], sensor.adr[0] + sensor.dim[0]))
-        return self.data.sensordata[np.array(rows)]  # type: ignore[attr-defined]
+        return self.data.sensordata[np.array(rows)]
 
     def sensors_of(self, *kinds: mujoco.mjtSensor) -> jax.Array:
         """Return the readings of all sensors of some kinds, in the model's order."""
@@ -72,31 +73,31 @@ class Snapshot:
 
     def xpos(self, body: str) -> jax.Array:
         """Return (3,) metres, the origin of a body in the world frame."""
-        return self.data.xpos[self.model.body(body).id]  # type: ignore[attr-defined]
+        return self.data.xpos[self.model.body(body).id]
 
     def xipos(self, body: str) -> jax.Array:
         """Return (3,) metres, the centre of mass of a body in the world frame."""
-        return self.data.xipos[self.model.body(body).id]  # type: ignore[attr-defined]
+        return self.data.xipos[self.model.body(body).id]
 
     def xmat(self, body: str) -> jax.Array:
         """Return (3, 3), the axes of a body as columns in the world frame."""
-        return self.data.xmat[self.model.body(body).id]  # type: ignore[attr-defined]
+        return self.data.xmat[self.model.body(body).id]
 
     def xmats(self) -> jax.Array:
         """Return (L, 3, 3), the axes of all bodies but the world."""
-        return self.data.xmat[1:]  # type: ignore[attr-defined]
+        return self.data.xmat[1:]
 
     def geom_pos(self, name: str) -> jax.Array:
         """Return (3,) metres, the centre of a geom in the world frame."""
-        return self.data.geom_xpos[self.model.geom(name).id]  # type: ignore[attr-defined]
+        return self.data.geom_xpos[self.model.geom(name).id]
 
     def geom_mat(self, name: str) -> jax.Array:
         """Return (3, 3), the axes of a geom as columns in the world frame."""
-        return self.data.geom_xmat[self.model.geom(name).id]  # type: ignore[attr-defined]
+        return self.data.geom_xmat[self.model.geom(name).id]
 
     def site_pos(self, name: str) -> jax.Array:
         """Return (3,) metres, the centre of a site in the world frame."""
-        return self.data.site_xpos[self.model.site(name).id]  # type: ignore[attr-defined]
+        return self.data.site_xpos[self.model.site(name).id]
 
 
 def joined(*parts: jax.Array | float) -> jax.Array:

@@ -87,9 +87,10 @@ def initial_states(task: str, episodes: int, seed: int = 0) -> dict[str, float]:
 
 
 def _agreement(ours: np.ndarray, theirs: np.ndarray) -> float:
-    # What DM Control leaves at a constant, rounding apart.
+    # What DM Control leaves at a constant, rounding apart; forces that cancel out are tens of
+    # newtons.
     if np.ptp(theirs) < 1e-6 * max(1.0, np.abs(theirs).max()):
-        return float(np.allclose(ours, theirs[0], atol=1e-5, rtol=1e-5))
+        return float(np.allclose(ours, theirs[0], atol=1e-4, rtol=1e-5))
     return float(stats.ks_2samp(ours, theirs).pvalue)
 
 

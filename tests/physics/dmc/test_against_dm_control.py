@@ -96,12 +96,37 @@ def test_sizes_and_times(task):
     np.testing.assert_allclose(high, env.action_spec().maximum, rtol=1e-6)
 
 
-def test_rejection_leaves_no_contact():
-    physics = make_physics("dmc_ball_in_cup_catch")
-    first = jax.jit(jax.vmap(physics.reset))(jax.random.split(jax.random.key(0), measure.EPISODES))
-    model = models.load_model("ball_in_cup")
+def drawn(task: str, count: int) -> np.ndarray:
+    """(count, Q) joint positions of initial states."""
+    start, dynamics = dmc_task(task).start, make_physics(task).dynamics
+    keys = jax.random.split(jax.random.key(0), count)
+    return np.array(jax.jit(jax.vmap(lambda key: start(dynamics, key).qpos))(keys))
+
+
+def number_of_contacts(model: mujoco.MjModel, qpos: np.ndarray) -> int:
     data = mujoco.MjData(model)
-    for qpos in np.asarray(first.engine.qpos):
-        data.qpos[:] = qpos
-        mujoco.mj_forward(model, data)
-        assert data.ncon == 0
+    data.qpos[:] = qpos
+    mujoco.mj_forward(model, data)
+    return int(data.ncon)
+
+
+@pytest.mark.parametrize(
+    "task",
+    [
+        pytest.param(task, marks=() if task in FAST else pytest.mark.slow)
+        for task in ("dmc_ball_in_cup_catch", "dmc_finger_spin", "dmc_humanoid_walk")
+    ],
+)
+def test_rejection_leaves_no_contact(task):
+    model = make_physics(task)._model
+    assert not any(number_of_contacts(model, qpos) for qpos in drawn(task, 200))
+
+
+@pytest.mark.slow
+def test_the_quadruped_is_as_low_as_whole_centimetres_allow():
+    task = "dmc_quadruped_walk"
+    model = make_physics(task)._model
+    for qpos in drawn(task, 200):
+        assert number_of_contacts(model, qpos) == 0
+        qpos[2] -= 0.01
+        assert number_of_contacts(model, qpos) > 0

@@ -37,6 +37,7 @@ def _task(margin: float) -> DmcTask:
         _start,
         _observe,
         partial(_reward, margin=margin),
+        batch_last=True,
     )
 
 

@@ -18,26 +18,22 @@ from pixelbrax_jax.physics.mjx.task import DmcTask, Start
 _LIFT = 0.01
 """Metres between two heights that are tried."""
 
-_MAX_ATTEMPTS = 1000
-"""Heights tried; at 10 m nothing of the body reaches the floor."""
-
 _EPISODE = 20.0
 """Seconds of an episode, for which the floor is large enough."""
 
 
 def _start(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Draw any rotation, at the lowest height, in whole centimetres, where nothing touches."""
+    """Draw any rotation, at the lowest height, in whole centimetres, where nothing touches.
+
+    DM Control begins at height 0 and lifts until there is no contact. All distances from the floor
+    grow by what the body is lifted, so that the height is known from those at height 0.
+    """
     model = dynamics.model
     rotation = random_rotation(key)
-
-    def pose(number: jax.Array) -> jax.Array:
-        place = jnp.stack([0.0, 0.0, _LIFT * number.astype(jnp.float32)])
-        return joined(place, rotation, jnp.asarray(model.qpos0[7:], jnp.float32))
-
-    def too_low(number: jax.Array) -> jax.Array:
-        return dynamics.touches(pose(number)) & (number < _MAX_ATTEMPTS)
-
-    return Start(pose(jax.lax.while_loop(too_low, lambda number: number + 1, jnp.int32(0))))
+    joints = jnp.asarray(model.qpos0[7:], jnp.float32)
+    depth = -dynamics.clearance(joined(jnp.zeros(3), rotation, joints), "floor")
+    height = _LIFT * jnp.ceil(jnp.maximum(depth, 0.0) / _LIFT)
+    return Start(joined(jnp.zeros(2), height, rotation, joints))
 
 
 def _hinges(model: mujoco.MjModel) -> list[str]:

@@ -1,0 +1,49 @@
+"""Names of looks and rigs, and what a task's own model adds to them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pixelbrax_jax import make_look, named_rigs, rig
+from pixelbrax_jax.scene.cameras import make_rig
+
+OWN = {
+    "default": rig((0, -3, 1), (0, 0, 1), 45.0, link=2, track=(1.0, 1.0, 1.0)),
+    "side": rig((0, -2, 1), (0, 0, 1), 30.0),
+    "back": rig((-2, 0, 1), (0, 0, 1), 60.0),
+}
+
+
+def test_a_models_own_look_stands_for_dmc_alone():
+    own = make_look("dmc").replace(ambient=np.float32(0.7))
+    assert make_look("dmc", own=own) is own
+    assert make_look("default", own=own) is make_look("default")
+    assert make_look("dmc", own=own, shadows=False).ambient == np.float32(0.7)
+    assert make_look("dmc").ambient == np.float32(0.4)
+
+
+def test_dmcs_look_is_the_suites():
+    """Colors and headlight of common/materials.xml, skybox.xml and visual.xml."""
+    look = make_look("dmc")
+    np.testing.assert_allclose(look.ground_rgb * 255, [[25, 51, 76], [51, 76, 102]], atol=1)
+    assert (look.ambient, look.headlight) == (np.float32(0.4), np.float32(0.8))
+    horizon, above, below = look.sky
+    np.testing.assert_allclose(horizon, [0.2, 0.3, 0.4], atol=0.02)
+    np.testing.assert_allclose(above, [0.4, 0.6, 0.8], atol=0.04)
+    assert below.max() <= 0.05
+
+
+def test_cameras_of_a_model_are_rigs_by_name():
+    rigs = named_rigs("a task", OWN)
+    assert next(iter(rigs)) == "default"
+    assert set(rigs) == {"default", "side", "front", "top", "back"}
+    for name, own in OWN.items():
+        assert rigs[name] is own
+    assert make_rig("a task", "back", OWN) is OWN["back"]
+    with pytest.raises(ValueError, match=r"unknown camera of task 'a task': 'bakc'.*mean 'back'"):
+        make_rig("a task", "bakc", OWN)
+
+
+def test_a_row_of_a_task_comes_before_a_fallback():
+    assert named_rigs("ant", OWN["back"])["default"] is named_rigs("ant")["default"]
