@@ -115,17 +115,31 @@ class MjxPhysics(GuardedPhysics):
             non_finite=jnp.zeros((), bool),
         )
 
-    def _reset(self, key: jax.Array) -> PhysicsState:
-        """See ``Physics.reset``."""
+    def first(self, key: jax.Array) -> tuple[MjxState, jax.Array]:
+        """Draw an initial state.
+
+        Args:
+            key: PRNG key.
+
+        Returns:
+            The state, and readings of all sensors as ``observe`` takes them.
+        """
         start = self._task.start(self.dynamics, key)
         state = self.dynamics.state(start.qpos, start.qvel, start.target)
         sensors = jnp.zeros(self._model.nsensordata)
         if self._task.starts_with_forces:
             state, sensors = self.dynamics.at_rest(state)
-        return self.observe(state, sensors)
+        return state, sensors
 
-    def _step(self, state: PhysicsState, action: jax.Array) -> PhysicsState:
-        """See ``Physics.step``.
+    def move(self, state: MjxState, action: jax.Array) -> tuple[MjxState, jax.Array]:
+        """Advance by one control step, without looking at where it leads.
+
+        Args:
+            state: a state.
+            action: (A,) float32.
+
+        Returns:
+            The next state, and readings of all sensors as ``observe`` takes them.
 
         Raises:
             ValueError: when traced, if the action's shape is not ``(action_size,)``.
@@ -133,10 +147,15 @@ class MjxPhysics(GuardedPhysics):
         action = jnp.asarray(action, jnp.float32)
         if action.shape != (self.action_size,):
             raise ValueError(f"action must have shape ({self.action_size},), got {action.shape}")
-        moved, sensors = self.dynamics.step(
-            state.engine.replace(ctrl=self.control(action)), self._task.substeps
-        )
-        return self.observe(moved, sensors)
+        return self.dynamics.step(state.replace(ctrl=self.control(action)), self._task.substeps)
+
+    def _reset(self, key: jax.Array) -> PhysicsState:
+        """See ``Physics.reset``."""
+        return self.observe(*self.first(key))
+
+    def _step(self, state: PhysicsState, action: jax.Array) -> PhysicsState:
+        """See ``Physics.step``."""
+        return self.observe(*self.move(state.engine, action))
 
     def _watched(self, state: PhysicsState) -> Any:
         return state.engine, state.xpos

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -36,7 +37,7 @@ def same_state(task: str, count: int) -> dict[str, float]:
     seven digits.
     """
     states = oracle.transitions(task, count).before
-    ours = _observed(task, states)
+    ours = _observed(task, *_ours(task, states))
     return {
         "reward": _largest(ours.reward - states["reward"]),
         "observation": _largest(_relative(ours.obs, states["obs"])),
@@ -50,7 +51,9 @@ def control_step(task: str, count: int) -> dict[str, float]:
     physics = make_physics(task)
     low, high = physics._control_range
     action = jnp.asarray(2 * (drawn.action - low) / (high - low) - 1, jnp.float32)
-    after = jax.jit(jax.vmap(physics.step))(_observed(task, drawn.before), action)
+    state, _ = _ours(task, drawn.before)
+    # In two programs: the first is the same for all tasks of a domain, and so compiled once.
+    after = _observed(task, *jax.jit(jax.vmap(physics.move))(state, action))
     velocity = _relative(after.engine.qvel, drawn.after["qvel"]).max(axis=1)
     reward = np.abs(np.asarray(after.reward) - drawn.after["reward"])
     return {
@@ -71,7 +74,7 @@ def initial_states(task: str, episodes: int, seed: int = 0) -> dict[str, float]:
     """
     theirs = oracle.starts(task, episodes, seed)
     keys = jax.random.split(jax.random.key(seed), episodes)
-    ours = jax.jit(jax.vmap(make_physics(task).reset))(keys)
+    ours = _observed(task, *jax.jit(jax.vmap(make_physics(task).first))(keys))
     pairs = {
         "qpos": (ours.engine.qpos, theirs["qpos"]),
         "qvel": (ours.engine.qvel, theirs["qvel"]),
@@ -94,15 +97,23 @@ def _agreement(ours: np.ndarray, theirs: np.ndarray) -> float:
     return float(stats.ks_2samp(ours, theirs).pvalue)
 
 
-def _observed(task: str, states: dict[str, np.ndarray]) -> Any:
-    """What our side says of states, as a batch of ``PhysicsState``."""
-    physics = make_physics(task)
+def _ours(task: str, states: dict[str, np.ndarray]) -> tuple[MjxState, jax.Array]:
+    """States of DM Control as a batch of ours, and their sensors."""
     names = ("qpos", "qvel", "act", "qacc_warmstart", "ctrl", "target")
     fields = {name: jnp.asarray(states[name], jnp.float32) for name in names}
-    if "target" not in physics.link_names:
+    if "target" not in make_physics(task).link_names:
         fields["target"] = fields["target"][:, :0]
-    sensors = jnp.asarray(states["sensordata"], jnp.float32)
-    return jax.jit(jax.vmap(physics.observe))(MjxState(**fields), sensors)
+    return MjxState(**fields), jnp.asarray(states["sensordata"], jnp.float32)
+
+
+@cache
+def _look(task: str) -> Any:
+    return jax.jit(jax.vmap(make_physics(task).observe))
+
+
+def _observed(task: str, state: MjxState, sensors: jax.Array) -> Any:
+    """What our side says of states, as a batch of ``PhysicsState``."""
+    return _look(task)(state, sensors)
 
 
 def _relative(ours: Any, theirs: np.ndarray) -> np.ndarray:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -50,6 +52,19 @@ def test_one_control_step(task):
     errors = measure.control_step(task, number_of_states(task))
     assert errors["reward"] < 1e-4, errors
     assert errors["velocity"] < 1e-2, errors
+
+
+def test_a_step_is_a_move_and_a_look():
+    """What is compared here in two programs is what environments compute in one."""
+    physics = make_physics("dmc_cartpole_swingup")
+    keys = jax.random.split(jax.random.key(0), 5)
+    state = jax.jit(jax.vmap(physics.reset))(keys)
+    action = jnp.linspace(-1, 1, 5)[:, None]
+    after = jax.jit(jax.vmap(physics.step))(state, action)
+    moved, sensors = jax.jit(jax.vmap(physics.move))(state.engine, action)
+    looked = jax.jit(jax.vmap(physics.observe))(moved, sensors)
+    close = partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-6)
+    jax.tree.map(close, after, looked)
 
 
 @pytest.mark.parametrize("task", EACH)

@@ -16,7 +16,12 @@ from pixelbrax_jax.tasks import BRAX_TASKS, DMC_TASKS
 from tests.physics.dmc.test_against_dm_control import FAST
 
 EACH = [
-    pytest.param(task, marks=() if task == "dmc_cartpole_swingup" else pytest.mark.slow)
+    pytest.param(
+        task,
+        marks=()
+        if task == "dmc_cartpole_swingup"
+        else [pytest.mark.slow, pytest.mark.timeout(1800)],
+    )
     for task in DMC_TASKS
 ]
 
