@@ -37,14 +37,13 @@ def kept_runs() -> dict[str, list[dict]]:
 
 
 def learned() -> str:
-    """What the agents reach, in Markdown."""
+    """What the agents reach, in Markdown; their clocks went on while they were paused."""
     lines = []
     for name, seeds in kept_runs().items():
         algorithm, task = name.split("-")[:2]
         config = seeds[0]["config"]
         ends = [final(run) for run in seeds]
         reached = ", ".join(f"{end['return']:.0f} ± {end['standard_error']:.0f}" for end in ends)
-        minutes = np.median([run["seconds"][-1] for run in seeds]) / 60.0
         steps = f"{config['total_steps'] / 1e6:.1f}"
         lines.append(
             [
@@ -52,11 +51,10 @@ def learned() -> str:
                 algorithm.upper(),
                 config["action_repeat"],
                 steps,
-                f"{minutes:.0f}",
                 reached,
             ]
         )
-    heads = ("task", "agent", "action repeat", "million control steps", "minutes", "return")
+    heads = ("task", "agent", "action repeat", "million control steps", "return")
     return table(heads, lines)
 
 

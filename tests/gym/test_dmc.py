@@ -20,7 +20,7 @@ from tests.gym.test_vector_env import MODES
 
 pytest.importorskip("dm_control", reason="the tasks' models come with pixelbrax[dmc]")
 
-SIZE = {"height": 24, "width": 24}
+SIZE = {"height": 36, "width": 36}  # Stable-Baselines3 warns of smaller ones
 RENDER = {"render_mode": "rgb_array", "render_height": 8, "render_width": 8}
 FAST = ("dmc_cartpole_swingup", "dmc_cheetah_run", "dmc_reacher_easy")
 

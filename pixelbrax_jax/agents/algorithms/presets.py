@@ -123,7 +123,19 @@ _CPU_TASKS = {
 }
 # Tasks of the DM Control Suite; tried with PPO alone.
 _CPU_DMC_TASKS: dict[str, dict[str, Any]] = {
-    "dmc_cartpole_swingup": {"action_repeat": 8, "gamma": 0.97, "total_steps": 2_500_000},
+    "dmc_cartpole_swingup": {
+        "action_repeat": 8,
+        "frame_stack": 3,
+        "gamma": 0.98,
+        "update_epochs": 3,
+        "total_steps": 6_000_000,
+    },
+    "dmc_reacher_easy": {
+        "action_repeat": 4,
+        "gamma": 0.97,
+        "update_epochs": 3,
+        "total_steps": 3_000_000,
+    },
 }
 _CPU_SHARES = {"ppo": 1.0, "ppg": 0.7, "dcpg": 0.6}
 """Steps that an algorithm makes in the time in which PPO makes one."""
