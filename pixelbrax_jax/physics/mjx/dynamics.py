@@ -11,6 +11,7 @@ import mujoco
 from flax import struct
 
 from pixelbrax_jax.physics.brax.compatibility import import_silenced, load_onto_own_device
+from pixelbrax_jax.physics.mjx.contact_frames import aligned_with_capsules
 
 with import_silenced():
     from mujoco import mjx
@@ -119,7 +120,8 @@ class Dynamics:
         """
 
         def one(state: MjxState) -> tuple[MjxState, jax.Array]:
-            data = forward.step(self._moving, self._data(state))
+            with aligned_with_capsules():
+                data = forward.step(self._moving, self._data(state))
             moved = state.replace(
                 qpos=data.qpos, qvel=data.qvel, act=data.act, qacc_warmstart=data.qacc_warmstart
             )
@@ -140,7 +142,8 @@ class Dynamics:
         Returns:
             The state with accelerations to start the solver from, and all sensors.
         """
-        data = forward.forward(self._passive, self._data(state))
+        with aligned_with_capsules():
+            data = forward.forward(self._passive, self._data(state))
         return state.replace(qacc_warmstart=data.qacc), data.sensordata
 
     def refresh(self, state: MjxState, sensors: jax.Array) -> Any:
