@@ -105,8 +105,8 @@ class EnvConfig(ProgramConfig):
     camera: str | CameraRig | Camera = "default"
     """Viewpoint: a name of ``named_rigs``, a ``CameraRig`` or a ``Camera``."""
     look: str | Look = "default"
-    """Light, sky and ground: ``default``, ``original``, ``dmc`` or a ``Look``. The default of the
-    DM Control Suite's tasks is ``dmc``, with their model's own lights."""
+    """Light, sky and ground: ``default``, ``original``, ``dmc`` or a ``Look``. For a task of the DM
+    Control Suite ``default`` is ``dmc``, with its model's own lights."""
     shadows: bool | None = None
     """Whether geoms cast shadows; None keeps the look's own choice."""
     episode_length: int = 1000

@@ -66,7 +66,8 @@ class Geoms(struct.PyTreeNode):
         patterned: (G,) static, planes that are ground: drawn with the look's pattern, others in
             their own color. Empty where every plane is.
         strings: threads, the pieces of which are among the geoms.
-        material_name: (M,) static, the model's name of each material. Empty where none is known.
+        material_name: (M,) static, the model's name for the material of the first geom of each
+            color. Empty where none is known.
     """
 
     kind: tuple[int, ...] = struct.field(pytree_node=False)

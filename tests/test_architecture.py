@@ -65,6 +65,8 @@ HOMES: dict[str, tuple[str, ...]] = {
         "pixelbrax_gym/torchrl/",
         "pixelbrax_gym/bench/adapters.py",
     ),
+    # Its models are read as files.
+    "dm_control": (),
     "torchrl": ("pixelbrax_gym/torchrl/",),
     "tensordict": ("pixelbrax_gym/torchrl/",),
     "stable_baselines3": ("pixelbrax_gym/sb3/",),

@@ -78,6 +78,11 @@ class Color(Distractor):
         check_fraction("scale of Color", self.scale)
         if self.mode == "frame" and (self.sky or self.materials is not None):
             raise ValueError("sky and materials of Color mean something with mode='geom' alone.")
+        if self.materials is not None and not _are_names(self.materials):
+            raise ValueError(
+                f"materials of Color must be a tuple of names, as ('self', 'grid'), or None, got "
+                f"{self.materials!r}."
+            )
 
     def reset(self, key: jax.Array, params: EnvParams) -> jax.Array:
         """Return the shift: (3,) of the frame, or (M, 3) of the materials, the sky's last."""
@@ -154,6 +159,11 @@ class Color(Distractor):
             low, high = low.at[plane].set(-ground.min(0)), high.at[plane].set(1 - ground.max(0))
         names = params.geoms.material_name
         if self.materials is not None and names:
+            if not set(self.materials) & set(names):
+                raise ValueError(
+                    f"materials={self.materials!r} of Color are none of this model's: "
+                    f"{', '.join(sorted(filter(None, set(names)))) or 'it names none'}."
+                )
             moves = jnp.array([name in self.materials for name in names])[:, None]
             low, high = jnp.where(moves, low, 0.0), jnp.where(moves, high, 0.0)
         if self.sky:
@@ -169,3 +179,7 @@ def _plane_material(params: EnvParams) -> int | None:
         if params.geoms.is_ground(g):
             return material
     return None
+
+
+def _are_names(materials: object) -> bool:
+    return isinstance(materials, tuple) and all(isinstance(m, str) and m for m in materials)

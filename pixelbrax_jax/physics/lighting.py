@@ -7,6 +7,7 @@ reference (mujoco.readthedocs.io, elements ``light``, ``headlight``, ``texture``
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Collection
 from typing import Any
 
@@ -17,6 +18,7 @@ from pixelbrax_jax.physics.viewpoints import follows_tracked
 from pixelbrax_jax.types import Lamp, Look
 
 _DIRECTIONAL = int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
+_POINT = int(mujoco.mjtLightType.mjLIGHT_POINT)
 _TRACKCOM = int(mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM)
 _RGB = int(mujoco.mjtTextureRole.mjTEXROLE_RGB)
 
@@ -47,10 +49,18 @@ def read_look(
 
     Returns:
         The look. Colors of lights become shades of grey, a lamp on a body follows but does not
-        turn, and the sky's texture becomes its best fit by three colors.
+        turn, and the sky's texture becomes its best fit by three colors. Lamps that follow another
+        center of mass than the camera does are left out; so are, with a warning, directional lights
+        after the first.
     """
     active = [i for i in range(model.nlight) if model.light_active[i]]
     suns = [i for i in active if model.light_type[i] == _DIRECTIONAL]
+    if len(suns) > 1:
+        warnings.warn(
+            f"of {len(suns)} directional lights only the first, "
+            f"{model.light(suns[0]).name or suns[0]!r}, is drawn.",
+            stacklevel=2,
+        )
     headlight = model.vis.headlight
     has_headlight = bool(headlight.active)
     ambient = sum((model.light_ambient[i].mean() for i in active), 0.0)
@@ -110,10 +120,12 @@ def _lamp(model: mujoco.MjModel, light: int, com_link: int) -> Lamp | None:
         if not follows_tracked(model, body):
             return None
         link, pos = com_link, model.light_poscom0[light]
-    cutoff = float(model.light_cutoff[light])
+    cutoff, exponent = float(model.light_cutoff[light]), float(model.light_exponent[light])
+    if model.light_type[light] == _POINT:
+        cutoff, exponent = 180.0, 0.0
     return Lamp(
         link=link,
-        exponent=round(float(model.light_exponent[light])),
+        exponent=round(exponent),
         pos=_f32(pos),
         axis=_f32(axis),
         cos_cutoff=_f32(-1.0 if cutoff >= 180.0 else np.cos(np.deg2rad(cutoff))),

@@ -244,7 +244,9 @@ def _append(geoms: Geoms, rows: list[_Row]) -> Geoms:
     if not rows:
         return geoms
     rgb, names = [np.asarray(color) for color in geoms.rgb], list(geoms.material_name)
-    of_planes = {m for m, kind in zip(geoms.material, geoms.kind, strict=True) if kind == 0}
+    of_planes = {
+        m for m, kind in zip(geoms.material, geoms.kind, strict=True) if kind == GeomKind.PLANE
+    }
     materials = []
     for row in rows:
         color = np.asarray(row.rgb, np.float32)

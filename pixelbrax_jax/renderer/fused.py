@@ -249,12 +249,12 @@ def _ground_fraction(
     inv_pitch = 1.0 / look.ground_pitch
     step = -t * ray[2] * pixel * inv_pitch
     coords, widths = [], []
-    for axis, half in zip(plane.axes[:2], plane.size[:2], strict=True):
+    for number, (axis, half) in enumerate(zip(plane.axes[:2], plane.size[:2], strict=True)):
         ray_axis = dot(ray, axis)
         along = t * ray_axis - dot(plane.center, axis)
         if plane.bounded:
             # MuJoCo's textures begin at the corner of least x and greatest y.
-            along = along + half if axis is plane.axes[0] else half - along
+            along = along + half if number == 0 else half - along
         coords.append(along * inv_pitch)
         # Derivatives of the coordinate by one pixel to the right and one up.
         right = axis[0] - ray_axis * slope * normal[0]

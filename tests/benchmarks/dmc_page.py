@@ -20,14 +20,19 @@ FOLDER = Path(__file__).parents[2] / "docs" / "dmc"
 PAGE = FOLDER.with_suffix(".md")
 
 
-def speed() -> str:
-    """Each task beside dm_control, in Markdown; of the machine that was measured last."""
+def rows() -> list[dict]:
+    """Outcomes beside dm_control, of the machine that was measured last."""
     files = sorted(FOLDER.glob("cpu-*.json"))
     kept = [json.loads(file.read_text("utf-8")) for file in files]
     cases = max(
         (k["cases"] for k in kept), key=lambda found: max(c["date"] for c in found.values())
     )
-    return tables.dmc([row for row in cases.values() if row["group"] == "dmc"])
+    return [row for row in cases.values() if row["group"] == "dmc"]
+
+
+def speed() -> str:
+    """Each task beside dm_control, in Markdown."""
+    return tables.dmc(rows())
 
 
 def kept_runs() -> dict[str, list[dict]]:

@@ -19,6 +19,7 @@ from brax.training.agents.ppo import train as ppo
 from pixelbrax_jax import BraxPixelEnv, make, wrap_fresh_episodes
 from pixelbrax_jax.agents.algorithms.presets import TASK_SETTINGS, preset
 from pixelbrax_jax.agents.core.config import TrainConfig
+from pixelbrax_jax.tasks import BRAX_TASKS
 
 OUTPUT = Path(__file__).parents[2] / "docs" / "results" / "from_state.json"
 
@@ -67,7 +68,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    tasks = list(TASK_SETTINGS["cpu"]["ppo"])
+    tasks = [task for task in TASK_SETTINGS["cpu"]["ppo"] if task in BRAX_TASKS]
     parser.add_argument("--tasks", nargs="+", choices=tasks, default=tasks)
     parser.add_argument("--times", type=int, default=1, help="the preset's number of steps")
     options = parser.parse_args()

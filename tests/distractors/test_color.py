@@ -158,6 +158,13 @@ def test_only_some_materials_shift():
         assert (shifts != 0).any(axis=1).tolist() == moves
 
 
+def test_materials_that_a_model_has_not():
+    color = distractors.Color("geom", "static", 0.3, "uniform", materials=("gird",))
+    params = PARAMS.replace(geoms=PARAMS.geoms.replace(material_name=("floor", "skin")))
+    with pytest.raises(ValueError, match=r"\('gird',\) of Color are none .* model's: floor, skin"):
+        color.reset(jax.random.key(0), params)
+
+
 def test_plain_planes_are_no_ground():
     """The first plane with the pattern decides the ground's shift, not a wall before it."""
     geoms = PARAMS.geoms
@@ -190,6 +197,9 @@ def test_environments_differ():
         ({"distribution": "gauss"}, "unknown distribution of Color"),
         ({"scale": 2.0}, r"scale of Color must lie in \[0, 1\], got 2.0"),
         ({"scale": float("nan")}, r"scale of Color must lie in \[0, 1\], got nan"),
+        ({"mode": "geom", "materials": "self"}, r"must be a tuple of names, .* got 'self'"),
+        ({"mode": "geom", "materials": ["self"]}, r"must be a tuple of names, .* got \['self'\]"),
+        ({"mode": "geom", "materials": ("",)}, r"must be a tuple of names, .* got \(''"),
         ({"scale": "0.3"}, r"scale of Color must lie in \[0, 1\], got '0.3'"),
     ],
 )

@@ -147,10 +147,10 @@ TASK_SETTINGS: dict[str, dict[str, dict[str, dict[str, Any]]]] = {
             | {"backend": "spring", "total_steps": int(share * settings["total_steps"])}
             for task, settings in _CPU_TASKS.items()
         }
+        | (_CPU_DMC_TASKS if algorithm == "ppo" else {})
         for algorithm, share in _CPU_SHARES.items()
     },
 }
-TASK_SETTINGS["cpu"]["ppo"] |= _CPU_DMC_TASKS
 """Further changes, by name of the preset, of the algorithm and of the task; such a preset has no
 other tasks."""
 
