@@ -105,6 +105,8 @@ def make(task: str | EnvConfig, **options: Any) -> tuple[PixelEnv, EnvParams]:
     Raises:
         ValueError: a name is unknown or a number out of range; the message lists what is allowed.
         TypeError: there is no such option; the message lists them and names the nearest one.
+        ImportError: the task is of the DM Control Suite, and dm_control is not installed; the
+            message has the line that installs it.
         FileNotFoundError: clips are missing.
         MemoryError: the clips would take too much memory.
     """

@@ -22,6 +22,8 @@ def make_physics(task: str, *, backend: str | None = None, reward_preset: str = 
 
     Raises:
         ValueError: for an unknown name; the message lists what is allowed.
+        ImportError: the task's models come from a package that is not installed; the message has
+            the line that installs it.
     """
     engine = TASKS[check_choice("task", task, TASKS)].engine
     module = import_module(f"pixelbrax_jax.physics.{engine}.tasks")

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from brax.io import mjcf
 
-from pixelbrax_jax.physics.brax.compatibility import loading_silenced
 from pixelbrax_jax.physics.brax.engine import BraxPhysics, envs, training
 from pixelbrax_jax.physics.brax.tasks import load_brax_env
+from pixelbrax_jax.physics.mujoco_compatibility import loading_silenced
 
 SLIDER = """
 <mujoco>

@@ -14,13 +14,10 @@ import numpy as np
 from flax import struct
 
 from pixelbrax_jax.physics.base import Kinematics, RewardFn
-from pixelbrax_jax.physics.brax.compatibility import (
-    accept_old_clip,
-    import_silenced,
-    known_warnings_silenced,
-)
+from pixelbrax_jax.physics.brax.compatibility import accept_old_clip
 from pixelbrax_jax.physics.divergence import GuardedPhysics
 from pixelbrax_jax.physics.geometry import VISIBLE_GROUPS, read_geoms
+from pixelbrax_jax.physics.mujoco_compatibility import import_silenced, known_warnings_silenced
 from pixelbrax_jax.spatial import quat_normalize
 from pixelbrax_jax.tasks import Color
 from pixelbrax_jax.types import PhysicsState

@@ -13,9 +13,9 @@ import mujoco
 import numpy as np
 
 from pixelbrax_jax.physics.base import Kinematics, RewardFn
-from pixelbrax_jax.physics.brax.compatibility import import_silenced, loading_silenced
 from pixelbrax_jax.physics.brax.engine import BraxPhysics, kinematics
 from pixelbrax_jax.physics.geometry import VISIBLE_GROUPS, read_geoms
+from pixelbrax_jax.physics.mujoco_compatibility import import_silenced, loading_silenced
 from pixelbrax_jax.tasks import BRAX_BACKENDS, Color
 
 with import_silenced():

@@ -9,12 +9,12 @@ import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax.physics.base import Kinematics
-from pixelbrax_jax.physics.brax.compatibility import (
+from pixelbrax_jax.physics.brax.engine import BraxPhysics
+from pixelbrax_jax.physics.mujoco_compatibility import (
     import_silenced,
     load_onto_own_device,
     loading_silenced,
 )
-from pixelbrax_jax.physics.brax.engine import BraxPhysics
 from pixelbrax_jax.tasks import BRAX_TASKS, REWARD_PRESETS
 from pixelbrax_jax.validation import check_choice
 

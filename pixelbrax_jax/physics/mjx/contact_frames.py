@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -9,13 +10,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from pixelbrax_jax.physics.brax.compatibility import import_silenced
+from pixelbrax_jax.physics.mujoco_compatibility import import_silenced
 
 with import_silenced():
     from mujoco.mjx._src import collision_driver
     from mujoco.mjx._src.types import GeomType
 
 _PAIR = (GeomType.PLANE, GeomType.CAPSULE)
+_THEIRS = collision_driver._COLLISION_FUNC[_PAIR]
+_lock = threading.RLock()
 
 
 @contextmanager
@@ -25,26 +28,29 @@ def aligned_with_capsules() -> Iterator[None]:
     The cone of friction is a pyramid, and so it matters which way its edges point. MuJoCo points
     the first along the capsule, however steep that is; MuJoCo XLA along an axis of the world where
     the capsule is steeper than 60 degrees, which changes single control steps of the humanoid by
-    up to 0.3 rad/s. Other users of MuJoCo XLA in the process are not affected.
+    up to 0.3 rad/s. What is traced elsewhere before and after is not affected; what another thread
+    traces with MuJoCo XLA in the meantime, without this block, is aligned so too.
     """
     functions = collision_driver._COLLISION_FUNC
-    theirs = functions[_PAIR]
+    with _lock:
+        functions[_PAIR] = _aligned
+        try:
+            yield
+        finally:
+            functions[_PAIR] = _THEIRS
 
-    def aligned(model: Any, data: Any, key: Any, geom: jax.Array) -> tuple[jax.Array, ...]:
-        dist, pos, frame = theirs(model, data, key, geom)
-        normal = data.geom_xmat[geom[:, 0]][:, :, 2]
-        axis = data.geom_xmat[geom[:, 1]][:, :, 2]
-        along = axis - normal * jnp.sum(normal * axis, axis=-1, keepdims=True)
-        length = jnp.linalg.norm(along, axis=-1, keepdims=True)
-        along = along / jnp.maximum(length, 1e-6)
-        ours = jnp.stack([normal, along, jnp.cross(normal, along)], axis=1)
-        # A capsule that stands upright has no direction. Both of its ends have the same frame.
-        ours = jnp.where(length[:, :, None] > 1e-6, ours, frame[::2])
-        return dist, pos, jnp.repeat(ours, 2, axis=0)
 
-    aligned.ncon = theirs.ncon  # type: ignore[attr-defined]
-    functions[_PAIR] = aligned
-    try:
-        yield
-    finally:
-        functions[_PAIR] = theirs
+def _aligned(model: Any, data: Any, key: Any, geom: jax.Array) -> tuple[jax.Array, ...]:
+    dist, pos, frame = _THEIRS(model, data, key, geom)
+    normal = data.geom_xmat[geom[:, 0]][:, :, 2]
+    axis = data.geom_xmat[geom[:, 1]][:, :, 2]
+    along = axis - normal * jnp.sum(normal * axis, axis=-1, keepdims=True)
+    length = jnp.linalg.norm(along, axis=-1, keepdims=True)
+    along = along / jnp.maximum(length, 1e-6)
+    ours = jnp.stack([normal, along, jnp.cross(normal, along)], axis=1)
+    # A capsule that stands upright has no direction. Both of its ends have the same frame.
+    ours = jnp.where(length[:, :, None] > 1e-6, ours, frame[::2])
+    return dist, pos, jnp.repeat(ours, 2, axis=0)
+
+
+_aligned.ncon = _THEIRS.ncon  # type: ignore[attr-defined]

@@ -10,13 +10,18 @@ import jax.numpy as jnp
 import mujoco
 from flax import struct
 
-from pixelbrax_jax.physics.brax.compatibility import import_silenced, load_onto_own_device
 from pixelbrax_jax.physics.mjx.contact_frames import aligned_with_capsules
+from pixelbrax_jax.physics.mujoco_compatibility import import_silenced, load_onto_own_device
 
 with import_silenced():
     from mujoco import mjx
-    from mujoco.mjx._src import collision_driver, forward, sensor, smooth
     from mujoco.mjx._src import io as mjx_io
+
+ITERATIONS = 8
+"""Of the constraint solver, the fewest in powers of two that give DM Control's control steps."""
+
+LINE_SEARCH_ITERATIONS = 8
+"""Of the solver's line search, likewise."""
 
 
 class MjxState(struct.PyTreeNode):
@@ -47,20 +52,11 @@ class Dynamics:
         reads_forces: whether sensors of forces and accelerations are computed.
     """
 
-    def __init__(
-        self,
-        model: mujoco.MjModel,
-        *,
-        iterations: int,
-        ls_iterations: int,
-        reads_forces: bool = False,
-    ):
+    def __init__(self, model: mujoco.MjModel, *, reads_forces: bool = False):
         """Put the model on the device; compile nothing.
 
         Args:
             model: a compiled model.
-            iterations: bound on the iterations of the constraint solver.
-            ls_iterations: bound on those of its line search.
             reads_forces: whether to compute sensors of forces and accelerations.
 
         Raises:
@@ -72,8 +68,8 @@ class Dynamics:
         self._simulated = _simulated(model)
         self._mx = mjx.put_model(self._simulated, impl="jax")
         option = self._mx.opt.replace(
-            iterations=min(iterations, model.opt.iterations),
-            ls_iterations=min(ls_iterations, model.opt.ls_iterations),
+            iterations=min(ITERATIONS, model.opt.iterations),
+            ls_iterations=min(LINE_SEARCH_ITERATIONS, model.opt.ls_iterations),
         )
         self._mx = self._mx.replace(opt=option)
         self._moving = (
@@ -121,7 +117,7 @@ class Dynamics:
 
         def one(state: MjxState) -> tuple[MjxState, jax.Array]:
             with aligned_with_capsules():
-                data = forward.step(self._moving, self._data(state))
+                data = mjx.step(self._moving, self._data(state))
             moved = state.replace(
                 qpos=data.qpos, qvel=data.qvel, act=data.act, qacc_warmstart=data.qacc_warmstart
             )
@@ -143,7 +139,7 @@ class Dynamics:
             The state with accelerations to start the solver from, and all sensors.
         """
         with aligned_with_capsules():
-            data = forward.forward(self._passive, self._data(state))
+            data = mjx.forward(self._passive, self._data(state))
         return state.replace(qacc_warmstart=data.qacc), data.sensordata
 
     def refresh(self, state: MjxState, sensors: jax.Array) -> Any:
@@ -158,12 +154,12 @@ class Dynamics:
         """
         mx = self._mx
         data = self._data(state).replace(sensordata=sensors)
-        data = smooth.kinematics(mx, data)
-        data = smooth.com_pos(mx, data)
-        data = smooth.com_vel(mx, data)
+        data = mjx.kinematics(mx, data)
+        data = mjx.com_pos(mx, data)
+        data = mjx.com_vel(mx, data)
         if self.model.nsensor:
-            data = sensor.sensor_pos(mx, data)
-            data = sensor.sensor_vel(mx, data)
+            data = mjx.sensor_pos(mx, data)
+            data = mjx.sensor_vel(mx, data)
         return data
 
     def touches(self, qpos: jax.Array) -> jax.Array:
@@ -183,8 +179,8 @@ class Dynamics:
         return jnp.min(jnp.where(is_of_it, contact.dist, jnp.inf))
 
     def _contact(self, qpos: jax.Array) -> Any:
-        data = smooth.kinematics(self._mx, self._data(self.state(qpos)))
-        return collision_driver.collision(self._mx, data)._impl.contact
+        data = mjx.kinematics(self._mx, self._data(self.state(qpos)))
+        return mjx.collision(self._mx, data)._impl.contact
 
     def _data(self, state: MjxState) -> Any:
         return mjx.make_data(self._simulated, impl="jax").replace(

@@ -14,7 +14,7 @@ from pixelbrax_jax.physics.divergence import GuardedPhysics
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics, MjxState
 from pixelbrax_jax.physics.mjx.snapshot import Snapshot
 from pixelbrax_jax.physics.mjx.task import DmcTask
-from pixelbrax_jax.physics.model_scene import read_scene, tracked_body
+from pixelbrax_jax.physics.model_scene import COM_LINK, TARGET_LINK, read_scene, tracked_body
 from pixelbrax_jax.types import PhysicsState
 
 _UPRIGHT = (1.0, 0.0, 0.0, 0.0)
@@ -52,12 +52,8 @@ class MjxPhysics(GuardedPhysics):
         self.rigs = scene.rigs | {"default": scene.rig}
         bodies = [model.body(i).name or f"link/{i - 1}" for i in range(1, model.nbody)]
         self.link_names = (*bodies, *scene.links)
-        self.dynamics = Dynamics(
-            model,
-            iterations=task.iterations,
-            ls_iterations=task.ls_iterations,
-            reads_forces=task.reads_forces,
-        )
+        self.dynamics = Dynamics(model, reads_forces=task.reads_forces)
+        # The product of decimals is not the decimal: 0.0025 * 10 shall be 0.025.
         self.dt = float(f"{model.opt.timestep * task.substeps:.6g}")
         self.action_size = int(model.nu)
         self.batch_last = task.batch_last
@@ -161,7 +157,7 @@ class MjxPhysics(GuardedPhysics):
         return state.engine, state.xpos
 
     def _links(self, data: Any, target: jax.Array) -> tuple[jax.Array, jax.Array]:
-        places = {"target": target, "camera/com": data.subtree_com[self._tracked_body]}
+        places = {TARGET_LINK: target, COM_LINK: data.subtree_com[self._tracked_body]}
         rows = [places[name][None] for name in self._extra_links]
         upright = jnp.tile(jnp.array(_UPRIGHT), (len(rows), 1))
         return jnp.concatenate([data.xpos[1:], *rows]), jnp.concatenate([data.xquat[1:], upright])

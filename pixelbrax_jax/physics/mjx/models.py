@@ -14,7 +14,7 @@ from xml.etree import ElementTree
 import mujoco
 
 from pixelbrax_jax.extras import install_extra
-from pixelbrax_jax.physics.brax.compatibility import loading_silenced
+from pixelbrax_jax.physics.mujoco_compatibility import loading_silenced
 
 KNOWN_VERSION = "1.0.50"
 """The release of dm_control whose models the tests compare with."""
@@ -34,7 +34,6 @@ KNOWN_MODELS = {
     "reacher": "5eb539927a2e8933",
     "swimmer": "aab420a1503b7e2c",
     "walker": "e5efd523aa043683",
-    "manipulator": "608a06bb47623612",
 }
 """Domain -> start of the SHA-256 of its XML file and those that it includes, in that release."""
 
@@ -42,6 +41,9 @@ _NO_WHEELS = (3, 13)
 """The first Python without wheels of what dm_control requires; its models are read all the same."""
 
 _INCLUDED = ("common/materials.xml", "common/skybox.xml", "common/visual.xml")
+
+_TO_MAKE = 8
+"""Calls from a warning here up to the caller of ``pixelbrax_jax.make``."""
 
 _warned: list[str] = []
 """Warnings given in this process: one at most."""
@@ -104,13 +106,17 @@ def _warn_if_unknown(domain: str, files: dict[str, bytes]) -> None:
     if _warned or KNOWN_MODELS[domain] == digest(files):
         return
     _warned.append(domain)
+    try:
+        installed = metadata.version("dm_control")
+    except metadata.PackageNotFoundError:
+        installed = "of an unknown version"
     warnings.warn(
-        f"dm_control {metadata.version('dm_control')} has another model of {domain!r} than "
+        f"dm_control {installed} has another model of {domain!r} than "
         f"dm_control {KNOWN_VERSION}, with which the tasks of PixelBrax are compared: results may "
         f'differ from those of others. pip install "dm_control=={KNOWN_VERSION}" has the model '
         "that is known.",
         UserWarning,
-        stacklevel=2,
+        stacklevel=_TO_MAKE,
     )
 
 

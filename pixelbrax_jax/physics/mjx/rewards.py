@@ -26,7 +26,8 @@ def tolerance(
         margin: distance from the bounds at which the result is ``value_at_margin``; with 0 the
             result is 0 outside.
         sigmoid: how the result falls: ``gaussian``, ``long_tail``, ``linear`` or ``quadratic``.
-        value_at_margin: the result at that distance, in [0, 1).
+        value_at_margin: the result at that distance; in [0, 1) for ``linear`` and ``quadratic``,
+            in (0, 1) for the others, which reach 0 nowhere.
 
     Returns:
         Values in [0, 1], of the shape of ``x``.

@@ -48,9 +48,6 @@ class DmcTask:
         movable: names of the geoms, sites and lights that ``Start.target`` moves.
         reads_forces: whether observations have sensors of forces or accelerations.
         starts_with_forces: whether these read something else than 0 in an initial state.
-        iterations: iterations of the constraint solver, the fewest that reproduce DM Control's
-            control steps.
-        ls_iterations: iterations of its line search, likewise.
         batch_last: whether a CPU computes a batch faster with the environments as last axis.
     """
 
@@ -65,6 +62,4 @@ class DmcTask:
     movable: tuple[str, ...] = ()
     reads_forces: bool = False
     starts_with_forces: bool = False
-    iterations: int = 8
-    ls_iterations: int = 8
     batch_last: bool = False

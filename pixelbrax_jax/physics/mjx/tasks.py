@@ -47,8 +47,14 @@ def dmc_task(task: str) -> DmcTask:
 
     Args:
         task: a name in ``DMC_TASKS``.
+
+    Returns:
+        Its model, initial states, observation and reward.
+
+    Raises:
+        ValueError: there is no such task; the message lists those there are.
     """
-    row = DMC_TASKS[task]
+    row = DMC_TASKS[check_choice("task", task, DMC_TASKS)]
     module = import_module(f"pixelbrax_jax.physics.mjx.domains.{row.domain}")
     parts: DmcTask = module.TASKS[row.task]
     return parts

@@ -34,7 +34,7 @@ def test_steep_capsules_slide_as_in_mujoco():
     qpos = np.concatenate([np.zeros((40, 2)), height[:, None], np.stack(quat, axis=1)], axis=1)
     qvel = random.normal(size=(40, 6))
     before = dict(collision_driver._COLLISION_FUNC)
-    dynamics = Dynamics(model, iterations=8, ls_iterations=8)
+    dynamics = Dynamics(model)
     move = jax.jit(jax.vmap(lambda q, v: dynamics.step(dynamics.state(q, v), 1)[0].qvel))
     ours = move(jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32))
     assert before == collision_driver._COLLISION_FUNC
