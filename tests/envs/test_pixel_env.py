@@ -235,7 +235,7 @@ class TestMake:
             ({"task": "antt"}, "unknown task: 'antt'; allowed: ant, .* Did you mean 'ant'"),
             ({"backend": "sprng"}, "Did you mean 'spring'"),
             ({"camera": "sid"}, "unknown camera of task 'ant': 'sid'.*Did you mean 'side'"),
-            ({"look": "orginal"}, "unknown look: 'orginal'; allowed: default, original"),
+            ({"look": "orginal"}, "unknown look: 'orginal'; allowed: default, dmc, original"),
             ({"reward_preset": "papers"}, "Did you mean 'paper'"),
             ({"obs_mode": "image"}, "unknown obs_mode: 'image'; allowed: both, pixels, state"),
         ],

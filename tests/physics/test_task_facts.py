@@ -97,7 +97,7 @@ def test_equal_calls_give_equal_physics():
     [
         (
             {"task": "antt"},
-            r"unknown task: 'antt'; allowed: ant, halfcheetah, .*\. Did you mean 'ant'\?",
+            r"unknown task: 'antt'; allowed: ant, dmc_.*, halfcheetah, .*\. Did you mean 'ant'\?",
         ),
         ({"task": "Walker2d"}, "Did you mean 'walker2d'?"),
         ({"task": None}, "unknown task: None; allowed: ant"),
