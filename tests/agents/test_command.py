@@ -49,7 +49,7 @@ def test_a_preset_may_have_settings_of_a_task(algorithm, task):
 def test_a_preset_without_settings_of_the_task_is_told(capsys):
     assert main(["train", "ppo", "--preset", "cpu", "--task", "pusher"]) == 1
     told = capsys.readouterr().err
-    assert "unknown task of the preset 'cpu': 'pusher'; allowed: ant, dmc_cartpole_swingup, " in told
+    assert "unknown task of the preset 'cpu': 'pusher'; allowed: ant, dmc_cartpole" in told
     with pytest.raises(SystemExit):
         main(["train", "ppo", "--preset", "gpu"])
     assert "'cpu'" in capsys.readouterr().err
