@@ -1,4 +1,4 @@
-"""What ``pixelbrax bench`` measures: in two minutes, or in full."""
+"""What ``pixelbrax bench`` measures: in two and a half minutes, or in full."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ QUICK = {
     "environments": Group(few_environments, tables.environments, ENVIRONMENTS_NOTE),
     "adapters": Group(adapter, tables.interleaved("autoreset_mode", "adapter"), ADAPTERS_NOTE),
 }
-"""What takes two minutes on two fast cores, in the order in which it is measured."""
+"""What takes two and a half minutes on two cores, in the order in which it is measured."""
 
 FULL = {
     "renderer": Group(renderers, tables.renderer, RENDERER_NOTE),

@@ -24,9 +24,9 @@ def main(arguments: Sequence[str]) -> int:
     """
     parser = argparse.ArgumentParser(
         prog="pixelbrax bench",
-        description="Measures renderer, environments and adapters on this machine, in about two "
-        "minutes, and writes JSON, a page of tables and a plot. What has been measured is kept: a "
-        "run that was stopped goes on where it was.",
+        description="Measures renderer, environments and adapters on this machine, in two to "
+        "three minutes, and writes JSON, a page of tables and a plot. What has been measured is "
+        "kept: a run that was stopped goes on where it was.",
     )
     parser.add_argument(
         "--full",
