@@ -13,6 +13,7 @@ from pathlib import Path
 import gymnasium
 import pytest
 
+import pixelbrax_gym  # noqa: F401  # a page that registers its ids first would take them away
 from pixelbrax_jax import registry
 
 ROOT = Path(__file__).parents[1]
