@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
 import sys
 import tempfile
 import time
@@ -14,10 +13,11 @@ from typing import Any
 import numpy as np
 
 from pixelbrax_jax.tasks import TASKS
+from tests.benchmarks.startup import last_line
 
 
 def pixels(task: str, num_envs: int) -> dict[str, Any]:
-    """Measure 84 x 84 pixels, three frames, as NumPy arrays, with drawn actions.
+    """Measure 84 x 84 pixels, three frames, as NumPy arrays, with random actions.
 
     Two processes follow each other, each with its own clock from its start to the end of its first
     step. The first one finds an empty compilation cache, the second one that of the first.
@@ -46,17 +46,7 @@ def pixels(task: str, num_envs: int) -> dict[str, Any]:
 
 def _process(task: str, num_envs: int, what: str, environ: dict[str, str]) -> dict[str, Any]:
     arguments = [TASKS[task].gymnasium_id, str(num_envs), what, str(time.time())]
-    done = subprocess.run(
-        [sys.executable, "-m", __name__, *arguments],
-        env=environ,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if done.returncode:
-        raise RuntimeError(done.stderr[-2000:])
-    found: dict[str, Any] = json.loads(done.stdout.strip().splitlines()[-1])
-    return found
+    return last_line(["-m", __name__, *arguments], environ)
 
 
 def main() -> None:

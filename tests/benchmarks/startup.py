@@ -57,14 +57,21 @@ def first_frame(task: str, cache: str) -> dict[str, Any]:
             environ["JAX_COMPILATION_CACHE_DIR"] = str(Path(folder) / "programs")
             environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.3"
         for _ in range(2 if cache == "warm" else 1):
-            done = subprocess.run(
-                [sys.executable, "-c", SCRIPT.replace("TASK", TASKS[task].gymnasium_id)],
-                env=environ,
-                capture_output=True,
-                text=True,
-                check=False,
-            )
-            if done.returncode:
-                raise RuntimeError(done.stderr[-2000:])
-    marks = json.loads(done.stdout.strip().splitlines()[-1])
+            script = SCRIPT.replace("TASK", TASKS[task].gymnasium_id)
+            marks = last_line(["-c", script], environ)
     return {"peak_bytes": marks.pop("peak_bytes"), "seconds": marks}
+
+
+def last_line(arguments: list[str], environ: dict[str, str]) -> dict[str, Any]:
+    """What a Python process of its own writes in its last line, as JSON.
+
+    Raises:
+        RuntimeError: it failed; the end of what it told.
+    """
+    done = subprocess.run(
+        [sys.executable, *arguments], env=environ, capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        raise RuntimeError(done.stderr[-2000:])
+    found: dict[str, Any] = json.loads(done.stdout.strip().splitlines()[-1])
+    return found
