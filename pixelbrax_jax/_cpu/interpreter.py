@@ -132,6 +132,8 @@ def _apply(eqn: core.JaxprEqn, inputs: list[Operand], size: int) -> list[Operand
         return _evaluate(eqn.params[_CALLS[name]], inputs, size)
     if name == "scan":
         return _scan(eqn, inputs, size)
+    if name == "while":
+        return _while(eqn, inputs, size)
     outputs = RULES[name](eqn, inputs, size) if name in RULES else None
     if outputs is None:
         outputs = _by_vmap(eqn, inputs)
@@ -182,10 +184,7 @@ def _scan(eqn: core.JaxprEqn, inputs: list[Operand], size: int) -> list[Operand]
 
     def carry(operands: Sequence[Operand]) -> list[Any]:
         shapes = [row_aval(var).shape for var in closed.jaxpr.outvars[:num_carry]]
-        return [
-            spread(x, shape, size) if flag else x.value
-            for x, shape, flag in zip(operands, shapes, flags, strict=True)
-        ]
+        return _spread_where(operands, shapes, flags, size)
 
     def turn(carried: list[Any], slices: list[Any]) -> tuple[list[Any], list[Any]]:
         x_flags = [x.batched for x in xs]
@@ -196,6 +195,58 @@ def _scan(eqn: core.JaxprEqn, inputs: list[Operand], size: int) -> list[Operand]
     options = {name: params[name] for name in ("length", "reverse", "unroll")}
     last, ys = lax.scan(turn, carry(first), [x.value for x in xs], **options)
     return list(map(Operand, [*last, *ys], reached))
+
+
+def _while(eqn: core.JaxprEqn, inputs: list[Operand], size: int) -> list[Operand]:
+    """Go on until all rows have ended; those that have keep what they ended with."""
+    params = eqn.params
+    cond, body = params["cond_jaxpr"], params["body_jaxpr"]
+    split = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
+    cond_consts, body_consts, first = (
+        inputs[: split[0]],
+        inputs[split[0] : split[1]],
+        inputs[split[1] :],
+    )
+    flags = _reach_while(eqn, [x.batched for x in inputs])
+    shapes = [row_aval(var).shape for var in eqn.outvars]
+
+    def unfinished(carried: list[Any]) -> Operand:
+        return _evaluate(cond, [*cond_consts, *map(Operand, carried, flags)], size)[0]
+
+    def turn(carried: list[Any]) -> list[Any]:
+        results = _evaluate(body, [*body_consts, *map(Operand, carried, flags)], size)
+        after = _spread_where(results, shapes, flags, size)
+        going = unfinished(carried)
+        if not going.batched:
+            return after
+        return [jnp.where(going.value, x, before) for x, before in zip(after, carried, strict=True)]
+
+    start = _spread_where(first, shapes, flags, size)
+    last = lax.while_loop(lambda carried: jnp.any(unfinished(carried).value), turn, start)
+    return list(map(Operand, last, flags))
+
+
+def _reach_while(eqn: core.JaxprEqn, flags: list[bool]) -> list[bool]:
+    """Return which carries of a loop are batched: all of them if rows end at different times."""
+    params = eqn.params
+    start, stop = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
+    carried, before = flags[stop:], None
+    while carried != before:
+        before = carried
+        reached = _reach(params["body_jaxpr"], [*flags[start:stop], *carried])
+        if any(_reach(params["cond_jaxpr"], [*flags[:start], *carried])):
+            reached = [True] * len(carried)
+        carried = [a or b for a, b in zip(carried, reached, strict=True)]
+    return carried
+
+
+def _spread_where(
+    operands: Sequence[Operand], shapes: Sequence[tuple[int, ...]], flags: Sequence[bool], size: int
+) -> list[Any]:
+    return [
+        spread(x, shape, size) if flag else x.value
+        for x, shape, flag in zip(operands, shapes, flags, strict=True)
+    ]
 
 
 def _scan_sizes(params: Mapping[str, Any]) -> tuple[int, int]:
@@ -233,6 +284,8 @@ def _reach(closed: core.ClosedJaxpr, flags: Sequence[bool]) -> list[bool]:
             outputs = _reach(eqn.params[_CALLS[eqn.primitive.name]], inputs)
         elif eqn.primitive.name == "scan":
             outputs = _reach_scan(eqn, inputs)
+        elif eqn.primitive.name == "while":
+            outputs = _reach_while(eqn, inputs)
         else:
             outputs = [any(inputs)] * len(eqn.outvars)
         known.update(zip(eqn.outvars, outputs, strict=True))

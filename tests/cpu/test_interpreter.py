@@ -40,6 +40,22 @@ def until_nine(x):
     return jax.lax.while_loop(lambda y: y[0] < 9, lambda y: y + 1.5, x)
 
 
+def until_even(x):
+    """A loop with constants of a row, a counter that all rows share, and rows that end apart."""
+    return jax.lax.while_loop(
+        lambda c: (c[0] < 7) & (c[1] < x[0] + 2),
+        lambda c: (c[0] + 1, c[1] + jnp.abs(x[1]), c[2] * TABLE[0] + x),
+        (jnp.int32(0), x[2], TABLE[1]),
+    )
+
+
+def as_often_for_all(x):
+    """A loop that ends for all rows at once, with a carry that stays the same for all."""
+    return jax.lax.while_loop(
+        lambda c: c[0] < 3, lambda c: (c[0] + 1, c[1] + x, 2 * c[2]), (0, x, TABLE[1])
+    )
+
+
 def nested(x):
     def outer(carry, row):
         return jax.lax.scan(lambda c, y: (c + y * carry, c * y), carry, row)
@@ -97,6 +113,14 @@ FUNCTIONS = {
     "late in a loop": late,
     "loops within": nested,
     "a loop that ends by itself": until_nine,
+    "rows that end apart": until_even,
+    "a loop that ends for all": as_often_for_all,
+    "a loop in a loop that ends": lambda x: jax.lax.while_loop(
+        lambda y: y.sum() < 20, lambda y: until_nine(y) + 1, x
+    ),
+    "a loop that ends in a loop": lambda x: jax.lax.scan(
+        lambda c, y: (c + until_nine(y)[1], c), jnp.float32(0), jnp.outer(x, x)
+    ),
     "branches": lambda x: jax.lax.cond(x[0] > 0, jnp.sin, jnp.cos, x),
     "branches with loops": lambda x: jax.lax.cond(x[0] > 0, late, lambda y: (y[2], x[1], 1.0), x),
     "three branches": lambda x: jax.lax.switch(

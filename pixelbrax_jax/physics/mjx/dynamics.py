@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
 import jax
@@ -11,6 +13,7 @@ import mujoco
 from flax import struct
 
 from pixelbrax_jax.physics.mjx.contact_frames import aligned_with_capsules
+from pixelbrax_jax.physics.mjx.solver import is_supported, solved_by_active_sets
 from pixelbrax_jax.physics.mujoco_compatibility import import_silenced, load_onto_own_device
 
 with import_silenced():
@@ -18,7 +21,8 @@ with import_silenced():
     from mujoco.mjx._src import io as mjx_io
 
 ITERATIONS = 8
-"""Of the constraint solver, the fewest in powers of two that give DM Control's control steps."""
+"""Of MuJoCo XLA's constraint solver, the fewest in powers of two that give DM Control's control
+steps."""
 
 LINE_SEARCH_ITERATIONS = 8
 """Of the solver's line search, likewise."""
@@ -116,7 +120,7 @@ class Dynamics:
         """
 
         def one(state: MjxState) -> tuple[MjxState, jax.Array]:
-            with aligned_with_capsules():
+            with self._changes():
                 data = mjx.step(self._moving, self._data(state))
             moved = state.replace(
                 qpos=data.qpos, qvel=data.qvel, act=data.act, qacc_warmstart=data.qacc_warmstart
@@ -138,7 +142,7 @@ class Dynamics:
         Returns:
             The state with accelerations to start the solver from, and all sensors.
         """
-        with aligned_with_capsules():
+        with self._changes():
             data = mjx.forward(self._passive, self._data(state))
         return state.replace(qacc_warmstart=data.qacc), data.sensordata
 
@@ -181,6 +185,13 @@ class Dynamics:
     def _contact(self, qpos: jax.Array) -> Any:
         data = mjx.kinematics(self._mx, self._data(self.state(qpos)))
         return mjx.collision(self._mx, data)._impl.contact
+
+    @contextmanager
+    def _changes(self) -> Iterator[None]:
+        """Trace with what is ours in place of MuJoCo XLA's."""
+        solver = solved_by_active_sets() if is_supported(self.model) else nullcontext()
+        with aligned_with_capsules(), solver:
+            yield
 
     def _data(self, state: MjxState) -> Any:
         return mjx.make_data(self._simulated, impl="jax").replace(

@@ -62,4 +62,4 @@ class DmcTask:
     movable: tuple[str, ...] = ()
     reads_forces: bool = False
     starts_with_forces: bool = False
-    batch_last: bool = False
+    batch_last: bool = True

@@ -37,7 +37,6 @@ def _task(margin: float) -> DmcTask:
         _start,
         _observe,
         partial(_reward, margin=margin),
-        batch_last=True,
     )
 
 

@@ -47,12 +47,8 @@ def _reward_sparse(seen: Snapshot) -> jax.Array:
 
 
 TASKS = {
-    "balance": DmcTask("cartpole", _start_upright, _observe, _reward, batch_last=True),
-    "balance_sparse": DmcTask(
-        "cartpole", _start_upright, _observe, _reward_sparse, batch_last=True
-    ),
-    "swingup": DmcTask("cartpole", _start_hanging, _observe, _reward, batch_last=True),
-    "swingup_sparse": DmcTask(
-        "cartpole", _start_hanging, _observe, _reward_sparse, batch_last=True
-    ),
+    "balance": DmcTask("cartpole", _start_upright, _observe, _reward),
+    "balance_sparse": DmcTask("cartpole", _start_upright, _observe, _reward_sparse),
+    "swingup": DmcTask("cartpole", _start_hanging, _observe, _reward),
+    "swingup_sparse": DmcTask("cartpole", _start_hanging, _observe, _reward_sparse),
 }

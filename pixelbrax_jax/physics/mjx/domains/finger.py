@@ -96,6 +96,7 @@ def _task(
         observe,
         reward,
         substeps=2,
+        batch_last=False,
         edit=edit,
         movable=movable,
         reads_forces=True,

@@ -31,4 +31,4 @@ def _reward(seen: Snapshot) -> jax.Array:
     return tolerance(seen.xmat("pole")[2, 2], (_COSINE_BOUND, 1.0))
 
 
-TASKS = {"swingup": DmcTask("pendulum", _start, _observe, _reward, batch_last=True)}
+TASKS = {"swingup": DmcTask("pendulum", _start, _observe, _reward)}

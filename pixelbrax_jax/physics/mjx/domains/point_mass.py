@@ -30,4 +30,4 @@ def _reward(seen: Snapshot) -> jax.Array:
     return near * (jnp.mean(small) + 4) / 5
 
 
-TASKS = {"easy": DmcTask("point_mass", _start, _observe, _reward, batch_last=True)}
+TASKS = {"easy": DmcTask("point_mass", _start, _observe, _reward)}

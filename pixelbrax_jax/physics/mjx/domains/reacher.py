@@ -47,9 +47,7 @@ def _resize_target(model: mujoco.MjModel, *, radius: float) -> None:
 
 def _task(radius: float) -> DmcTask:
     edit = partial(_resize_target, radius=radius)
-    return DmcTask(
-        "reacher", _start, _observe, _reward, edit=edit, movable=("target",), batch_last=True
-    )
+    return DmcTask("reacher", _start, _observe, _reward, edit=edit, movable=("target",))
 
 
 TASKS = {"easy": _task(0.05), "hard": _task(0.015)}

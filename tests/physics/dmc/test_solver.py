@@ -1,0 +1,76 @@
+"""Constraint forces are MuJoCo's."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from mujoco.mjx._src import solver as theirs
+
+from pixelbrax_jax._cpu.interpreter import batch_last
+from pixelbrax_jax.physics.mjx.dynamics import Dynamics
+from pixelbrax_jax.physics.mjx.solver import is_supported
+
+# Two arms with dry friction, limits and a joint that follows another; a ball that slides and rolls.
+MODEL = """
+<mujoco>
+  <option solver="Newton" cone="{cone}" tolerance="1e-12" iterations="200"/>
+  <default><geom density="500"/></default>
+  <worldbody>
+    <geom type="plane" size="5 5 1"/>
+    <body pos="0 0 .32">
+      <joint name="a" axis="0 1 0" range="-40 40" limited="true" frictionloss=".4"/>
+      <geom type="capsule" size=".05" fromto="0 0 0 .4 0 0"/>
+      <body pos=".4 0 0">
+        <joint name="b" axis="0 1 0" frictionloss=".05"/>
+        <geom type="capsule" size=".05" fromto="0 0 0 .3 0 0"/>
+      </body>
+    </body>
+    <body pos="0 1 1"><joint name="c" axis="0 0 1"/><geom type="box" size=".1 .2 .05"/></body>
+    <body pos="1 1 .1"><freejoint/><geom type="sphere" size=".1" condim="{condim}"/></body>
+  </worldbody>
+  <equality><joint joint1="c" joint2="a" polycoef="0 2 0 0 0"/></equality>
+</mujoco>
+"""
+NUM_STATES = 64
+
+
+def states(model):
+    """States with any mixture of constraints at work."""
+    random = np.random.RandomState(0)
+    qpos = np.tile(model.qpos0, (NUM_STATES, 1))
+    qpos[:, :3] += random.uniform(-0.8, 0.8, (NUM_STATES, 3))
+    qpos[:, 5] += random.uniform(-0.004, 0.002, NUM_STATES)
+    return qpos, random.normal(size=(NUM_STATES, model.nv))
+
+
+@pytest.mark.parametrize(
+    "batch", [jax.vmap, lambda f: batch_last(f, (0, 0))], ids=["first", "last"]
+)
+@pytest.mark.parametrize("condim", [1, 3])
+def test_forces_are_those_of_mujoco(condim, batch):
+    model = mujoco.MjModel.from_xml_string(MODEL.format(cone="pyramidal", condim=condim))
+    assert is_supported(model)
+    qpos, qvel = states(model)
+    before = theirs.solve
+    dynamics = Dynamics(model)
+    move = batch(lambda q, v: dynamics.step(dynamics.state(q, v), 1)[0].qacc_warmstart)
+    ours = jax.jit(move)(jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32))
+    assert theirs.solve is before
+    numbers = set()
+    for i in range(NUM_STATES):
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:] = qpos[i], qvel[i]
+        mujoco.mj_forward(model, data)
+        numbers.add((data.ne, data.nf, data.nl, data.ncon))
+        scale = np.maximum(1.0, np.abs(data.qacc).max())
+        np.testing.assert_allclose(ours[i] / scale, data.qacc / scale, atol=1e-4)
+    # All kinds of constraints were there, and not always the same ones.
+    assert np.max(list(numbers), axis=0).min() > 0
+    assert len(numbers) > 4
+
+
+def test_elliptic_cones_are_left_to_mujoco_xla():
+    assert not is_supported(mujoco.MjModel.from_xml_string(MODEL.format(cone="elliptic", condim=3)))
