@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pixelbrax_jax.envs import autoreset, observe
-from tests.envs.test_vector import ACTIONS, N, PARAMS, make
+from tests.envs.test_vector import ACTIONS, PARAMS, N, make
 
 
 def lowered_for(platform: str, fn, *args) -> str:
