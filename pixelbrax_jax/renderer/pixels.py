@@ -13,6 +13,7 @@ the same code is traced into a program of XLA's and into a kernel, to which arra
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -83,15 +84,23 @@ class Seen(NamedTuple):
     ground: jax.Array
 
 
-def view_of(scene: Scene, height: int) -> View:
-    """Return a scene in its camera's frame, for images of ``height`` pixels."""
+def view_of(
+    scene: Scene, height: int, einsum: Callable[[str, Any, Any], jax.Array] = jnp.einsum
+) -> View:
+    """Return a scene in its camera's frame, for images of ``height`` pixels.
+
+    Args:
+        scene: the scene.
+        height: pixels.
+        einsum: how products over an axis of length 3 are computed, as ``jnp.einsum``.
+    """
     geoms, look = scene.geoms, scene.look
     to_camera = scene.camera.xmat
-    light = None if look.light is None else spatial.unit(look.light) @ to_camera
+    light = None if look.light is None else einsum("i,ij->j", spatial.unit(look.light), to_camera)
     lamps = tuple(
         lamp.replace(
-            pos=(lamp.pos - scene.camera.pos) @ to_camera,
-            axis=lamp.axis @ to_camera,
+            pos=einsum("i,ij->j", lamp.pos - scene.camera.pos, to_camera),
+            axis=einsum("i,ij->j", lamp.axis, to_camera),
         )
         for lamp in look.lamps
     )
@@ -103,8 +112,8 @@ def view_of(scene: Scene, height: int) -> View:
         material=tuple(geoms.material[g] for g in order),
         bounded=tuple(geoms.is_bounded(g) for g in order),
         ground=tuple(geoms.is_ground(g) for g in order),
-        pos=(scene.pos - scene.camera.pos) @ to_camera,
-        xmat=jnp.einsum("ji,gjk->gik", to_camera, scene.xmat),
+        pos=einsum("gi,ij->gj", scene.pos - scene.camera.pos, to_camera),
+        xmat=einsum("ji,gjk->gik", to_camera, scene.xmat),
         size=geoms.size,
         rgb=geoms.rgb,
         look=look.replace(light=light, lamps=lamps),
