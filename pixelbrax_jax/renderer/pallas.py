@@ -8,7 +8,7 @@ asked to, and writes each of them once.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -151,17 +151,22 @@ def _call(
     height, width, first_row, num_rows = band
     numbers, numbers_tree = jax.tree.flatten((view, state, first_row))
     numbers = [jax.lax.stop_gradient(jnp.asarray(x)) for x in numbers]
+    packed = [x.ndim <= 1 and x.dtype == jnp.float32 for x in numbers]
+    few, arrays = _parted(numbers, packed)
+    # In one array, or XLA would compute them in launches of their own.
+    arrays = [jnp.concatenate([x.ravel() for x in few]), *arrays]
     images, images_tree = jax.tree.flatten(backdrops)
     num_pixels = num_rows * width
 
     def kernel(*refs: Any) -> None:
-        of_numbers, of_images = refs[: len(numbers)], refs[len(numbers) : -len(dtypes)]
+        of_few, *of_arrays = refs[: len(arrays)]
+        of_images = refs[len(arrays) : -len(dtypes)]
         index = pl.program_id(0) * BLOCK + jnp.arange(BLOCK, dtype=jnp.int32)
         # The last block has more pixels than are left.
         inside = index < num_pixels
-        view, state, first_row = jax.tree.unflatten(
-            numbers_tree, [ref if ref.shape else ref[()] for ref in of_numbers]
-        )
+        read, rest = iter(_unpacked(of_few, few)), iter(of_arrays)
+        leaves = [next(read) if is_packed else _scalar(next(rest)) for is_packed in packed]
+        view, state, first_row = jax.tree.unflatten(numbers_tree, leaves)
         backdrops = jax.tree.unflatten(
             images_tree, [triton.load(ref.at[:], mask=inside, other=0) for ref in of_images]
         )
@@ -173,7 +178,7 @@ def _call(
             triton.store(ref.at[:], result, mask=inside)
 
     block = pl.BlockSpec((BLOCK,), lambda i: (i,))
-    whole = [pl.BlockSpec(x.shape, lambda i, x=x: (0,) * x.ndim) for x in numbers]
+    whole = [pl.BlockSpec(x.shape, lambda i, x=x: (0,) * x.ndim) for x in arrays]
     outputs = pl.pallas_call(
         kernel,
         grid=(pl.cdiv(num_pixels, BLOCK),),
@@ -183,5 +188,25 @@ def _call(
         interpret=interpret,
         compiler_params=None if interpret else triton.CompilerParams(num_warps=_WARPS, num_stages=1),
         name="pixelbrax_draw",
-    )(*numbers, *[image.reshape(num_pixels) for image in images])
+    )(*arrays, *[image.reshape(num_pixels) for image in images])
     return [output.reshape(num_rows, width) for output in outputs]
+
+
+def _parted(items: Sequence[Any], flags: Sequence[bool]) -> tuple[list[Any], list[Any]]:
+    """Return the items with a flag, and those without."""
+    pairs = list(zip(items, flags, strict=True))
+    return [x for x, flag in pairs if flag], [x for x, flag in pairs if not flag]
+
+
+def _unpacked(ref: Any, arrays: Sequence[jax.Array]) -> Iterator[Any]:
+    """Yield the numbers of arrays that are one after the other in ``ref``: tuples, and scalars."""
+    start = 0
+    for array in arrays:
+        numbers = tuple(ref[start + i] for i in range(array.size))
+        yield numbers if array.ndim else numbers[0]
+        start += array.size
+
+
+def _scalar(ref: Any) -> Any:
+    """Return the number that a reference to a scalar is to; other references as they are."""
+    return ref if ref.shape else ref[()]
