@@ -44,8 +44,8 @@ class ProgramConfig:
     action_repeat: int = 1
     """Control steps per step; one frame is drawn at their end."""
     renderer: str = "auto"
-    """``auto``, the fastest for the device; ``fused``, that of all devices; ``pallas``, the kernel
-    for NVIDIA GPUs that ``auto`` has there; ``pallas-interpret``, that kernel on any device, slowly;
+    """``auto``, the fastest for the device; ``fused``, for all devices; ``pallas``, the kernel for
+    NVIDIA GPUs that ``auto`` takes there; ``pallas-interpret``, that kernel on any device, slowly;
     or ``reference``, the slow one that the others are tested against."""
     distractors: Distractors = ()
     """What changes the image: a distractor, the name of a preset, or several of them."""

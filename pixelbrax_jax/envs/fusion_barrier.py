@@ -52,7 +52,5 @@ def fusion_barrier(
         return image.reshape(height, width)
 
     forms = {} if kernel is None else {"cuda": kernel}
-    image: jax.Array = jax.lax.platform_dependent(
-        cpu=draw_at_once, default=draw_in_bands, **forms
-    )
+    image: jax.Array = jax.lax.platform_dependent(cpu=draw_at_once, default=draw_in_bands, **forms)
     return image

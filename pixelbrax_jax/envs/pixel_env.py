@@ -310,9 +310,7 @@ class PixelEnv(ProgramConfig):
                 frame = pallas.render(scene, height, width, interpret=interpret)
                 return finish(states, frame, backdrops)
             kept = self.chain.frame_states(states)
-            return pallas.draw(
-                scene, height, width, finish, kept, backdrops, interpret=interpret
-            )
+            return pallas.draw(scene, height, width, finish, kept, backdrops, interpret=interpret)
 
         if self.renderer.startswith("pallas"):
             return by_kernel()

@@ -10,52 +10,60 @@ import jax
 _CAPABILITY = 8.0
 """Least compute capability for which XLA compiles such kernels: Ampere's."""
 
-_PLUGINS = ("jax_cuda12_plugin", "jax_cuda13_plugin")
+
+def obstacle() -> str | None:
+    """Return why programs for CUDA, as traced here, do without the kernel; None if they have it.
+
+    Starts a device. What JAX computes on need not be a GPU: where its plugin for CUDA is installed,
+    programs may be compiled for one ahead of time. From jax 0.11 on the card must then be named,
+    see `docs/renderer.md`.
+    """
+    backend = jax.default_backend()
+    # Without a plugin nothing is imported or traced that only a GPU needs.
+    if backend != "gpu" and not _has_plugin():
+        return f"JAX computes on a {backend}"
+    try:
+        from jax.experimental.pallas import triton
+
+        # Of an abstract or a real card, from jax 0.11 on; an earlier one lowers for any.
+        info = triton.get_gpu_info() if hasattr(triton, "get_gpu_info") else None
+    except ImportError:
+        return f"jax {jax.__version__} has no Pallas for Triton"
+    except ValueError as error:
+        return f"Pallas does not know the card: {error}"
+    if info is not None:
+        return _too_old("the card", info.compute_capability / 10)
+    return _about(jax.devices()[0]) if backend == "gpu" else None
+
+
+def auto_renderer() -> tuple[str, str]:
+    """Return the renderer that ``"auto"`` stands for on JAX's default device, and why."""
+    backend = jax.default_backend()
+    if backend != "gpu":
+        return "fused", f"JAX computes on a {backend}, and the kernel is for NVIDIA GPUs"
+    why = obstacle()
+    if why is not None:
+        return "fused", f"not by one kernel: {why}"
+    return "pallas", f"by one kernel, on {jax.devices()[0].device_kind}"
+
+
+def _about(device: jax.Device) -> str | None:
+    """Return what a GPU lacks."""
+    capability = str(getattr(device, "compute_capability", ""))
+    if "rocm" in getattr(device.client, "platform_version", "").lower():
+        return "JAX computes on ROCm, and the kernel is for NVIDIA GPUs"
+    try:
+        return _too_old(device.device_kind, float(capability))
+    except ValueError:
+        return f"the compute capability of {device.device_kind} is unknown: {capability!r}"
+
+
+def _too_old(card: str, capability: float) -> str | None:
+    if capability >= _CAPABILITY:
+        return None
+    return f"{card} has compute capability {capability}, and the kernel needs {_CAPABILITY}"
 
 
 @cache
-def obstacle() -> str | None:
-    """Return why programs for CUDA, as lowered here, do without the kernel; None if they have it.
-
-    Starts a device. What JAX computes on need not be a GPU: programs may be compiled for one ahead
-    of time, where JAX's plugin for CUDA is installed.
-    """
-    if not _has_pallas():
-        return f"jax {jax.__version__} has no Pallas for Triton"
-    if jax.default_backend() != "gpu":
-        if not any(map(find_spec, _PLUGINS)):
-            return "JAX has no plugin for CUDA"
-        return None
-    device = jax.devices()[0]
-    if "rocm" in getattr(device.client, "platform_version", "").lower():
-        return "it is for CUDA, and JAX computes on ROCm"
-    capability = str(getattr(device, "compute_capability", ""))
-    try:
-        fits = float(capability) >= _CAPABILITY
-    except ValueError:
-        fits = False
-    if not fits:
-        return (
-            f"{device.device_kind} has compute capability {capability or 'unknown'}, and the kernel "
-            f"needs {_CAPABILITY}"
-        )
-    return _unknown_card()
-
-
-def _has_pallas() -> bool:
-    try:
-        from jax.experimental.pallas import triton
-    except ImportError:
-        return False
-    return all(hasattr(triton, name) for name in ("CompilerParams", "load", "store"))
-
-
-def _unknown_card() -> str | None:
-    """Return what JAX's Pallas has against the card, from jax 0.12 on."""
-    from jax.experimental.pallas import triton
-
-    try:
-        getattr(triton, "get_gpu_info", lambda: None)()
-    except ValueError as error:
-        return f"Pallas does not know the card: {error}"
-    return None
+def _has_plugin() -> bool:
+    return any(map(find_spec, ("jax_cuda12_plugin", "jax_cuda13_plugin")))

@@ -178,7 +178,7 @@ def _call(
             triton.store(ref.at[:], result, mask=inside)
 
     block = pl.BlockSpec((BLOCK,), lambda i: (i,))
-    whole = [pl.BlockSpec(x.shape, lambda i, x=x: (0,) * x.ndim) for x in arrays]
+    whole = [pl.BlockSpec(x.shape, lambda _, x=x: (0,) * x.ndim) for x in arrays]
     outputs = pl.pallas_call(
         kernel,
         grid=(pl.cdiv(num_pixels, BLOCK),),
@@ -186,7 +186,9 @@ def _call(
         out_specs=[block] * len(dtypes),
         out_shape=[jax.ShapeDtypeStruct((num_pixels,), dtype) for dtype in dtypes],
         interpret=interpret,
-        compiler_params=None if interpret else triton.CompilerParams(num_warps=_WARPS, num_stages=1),
+        compiler_params=None
+        if interpret
+        else triton.CompilerParams(num_warps=_WARPS, num_stages=1),
         name="pixelbrax_draw",
     )(*arrays, *[image.reshape(num_pixels) for image in images])
     return [output.reshape(num_rows, width) for output in outputs]

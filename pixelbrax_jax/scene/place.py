@@ -30,7 +30,7 @@ def place(geoms: Geoms, rig: CameraRig, look: Look, xpos: jax.Array, xquat: jax.
         # Not by one more row that stands for the world: a GPU would write the rows anew.
         in_world = (link < 0)[:, None]
         link_pos = jnp.where(in_world, 0.0, xpos[link])
-        link_quat = jnp.where(in_world, np.float32([1.0, 0.0, 0.0, 0.0]), xquat[link])
+        link_quat = jnp.where(in_world, jnp.array([1.0, 0.0, 0.0, 0.0]), xquat[link])
     else:
         link_pos = jnp.zeros((len(link), 3))
         link_quat = jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0]), (len(link), 1))
