@@ -17,12 +17,13 @@ import numpy as np
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton
 
-from pixelbrax_jax.renderer.pixels import Seen, View, rays, see, view_of
-from pixelbrax_jax.types import Frame, Scene
+from pixelbrax_jax.renderer.culling import may_see, window_of
+from pixelbrax_jax.renderer.pixels import Near, Seen, View, rays, see, view_of
+from pixelbrax_jax.types import Frame, GeomKind, Scene
 
 BLOCK = 256
-"""Pixels of a block: 128 had a third more instructions a pixel, 512 have more numbers at a time
-than there are registers."""
+"""Pixels of a block, some rows of a small image: fewer share the work that is done once a block,
+more see more geoms."""
 
 _WARPS = 4
 
@@ -100,6 +101,26 @@ class _Band(NamedTuple):
     num_rows: int
 
 
+def _near(view: View, band: _Band, start: jax.Array, last: jax.Array) -> Near:
+    """Return the argument of ``see`` for the pixels from ``start`` to ``last`` of a band."""
+    width = np.int32(band.width)
+    top, bottom = (jax.lax.div(i, width) + band.first_row for i in (start, last))
+    columns = None
+    if band.width >= BLOCK:
+        # The block ends in the row in which it begins, or in the next one.
+        first, end = (jax.lax.rem(i, width) for i in (start, last))
+        one_row = top == bottom
+        columns = (jnp.where(one_row, first, 0), jnp.where(one_row, end, width - 1))
+    seen = may_see(view, window_of(view, (top, bottom), columns, band.height, band.width))
+
+    def near(rank: int, update: Callable[[Any], Any], value: Any) -> Any:
+        if view.kind[rank] == GeomKind.PLANE:
+            return update(value)
+        return jax.lax.cond(seen(rank), update, lambda value: value, value)
+
+    return near
+
+
 def _einsum(subscripts: str, a: Any, b: Any) -> jax.Array:
     """Return ``jnp.einsum`` over one axis as a sum, which XLA fuses: products it launches apart."""
     inputs, output = subscripts.split("->")
@@ -161,7 +182,8 @@ def _call(
     def kernel(*refs: Any) -> None:
         of_few, *of_arrays = refs[: len(arrays)]
         of_images = refs[len(arrays) : -len(dtypes)]
-        index = pl.program_id(0) * BLOCK + jnp.arange(BLOCK, dtype=jnp.int32)
+        start = pl.program_id(0) * BLOCK
+        index = start + jnp.arange(BLOCK, dtype=jnp.int32)
         # The last block has more pixels than are left.
         inside = index < num_pixels
         read, rest = iter(_unpacked(of_few, few)), iter(of_arrays)
@@ -172,7 +194,9 @@ def _call(
         )
         row = jax.lax.div(index, np.int32(width)) + first_row
         column = jax.lax.rem(index, np.int32(width))
-        seen = see(view, rays(view, height, width, row, column))
+        last = jnp.minimum(start + BLOCK, num_pixels) - 1
+        near = _near(view, band._replace(first_row=first_row), start, last)
+        seen = see(view, rays(view, height, width, row, column), near)
         results = compute(view, state, backdrops, seen)
         for ref, result in zip(refs[-len(dtypes) :], results, strict=True):
             triton.store(ref.at[:], result, mask=inside)

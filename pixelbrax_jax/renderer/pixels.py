@@ -14,6 +14,7 @@ the same code is traced into a program of XLA's and into a kernel, to which arra
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from typing import Any, NamedTuple
 
 import jax
@@ -138,52 +139,85 @@ def rays(view: View, height: int, width: int, row: jax.Array, column: jax.Array)
     return x * inv_length, y * inv_length, -inv_length
 
 
-def see(view: View, ray: Vector) -> Seen:
+Near = Callable[[int, Callable[[Any], Any], Any], Any]
+"""``near(rank, update, value)``: ``update(value)`` where some of a block's pixels may see the geom
+of that rank; where none does, it may be ``value``."""
+
+
+def see(
+    view: View,
+    ray: Vector,
+    near: Near | None = None,
+) -> Seen:
     """Return what pixels see.
 
     Args:
         view: the scene.
         ray: unit directions of their rays, three arrays of one shape.
+        near: leaves out geoms that none of the pixels sees; None for no such thing.
     """
     look, shape = view.look, ray[0].shape
-    solids = [_solid(view, rank) for rank in range(len(view.kind))]
-    hits = [solid.hit(ray, solid.center) for solid in solids]
+    ranks, count = range(len(view.kind)), len(view.kind)
 
-    t, winner = _nearest(hits, shape)
-    seen = [winner == rank for rank in range(len(solids))]
-    sky = winner == len(solids)
+    def solid(rank: int) -> _Solid:
+        return _solid(view, rank)
+
+    def hit(rank: int) -> Hit:
+        return solid(rank).hit(ray, solid(rank).center)
+
+    if near is None:
+        # Of branches, none knows what another one has computed.
+        solid, hit = cache(solid), cache(hit)
+
+    to_light = None if look.light is None else _vector(look.light)
+    along = _directions(ray, to_light, bool(look.lamps))
+    key, products = _no_hit(count, shape), [jnp.zeros(shape)] * len(along)
+    for rank in ranks:
+
+        def update(best: tuple[Any, list[Any]], rank: int = rank) -> tuple[Any, list[Any]]:
+            entry = hit(rank)
+            key = _nearer(best[0], entry, rank, count)
+            return key, _normal_products(entry, along, key != best[0], best[1])
+
+        if near is None:
+            key = _nearer(key, hit(rank), rank, count)
+        else:
+            key, products = near(rank, update, (key, products))
+    t, winner = _distance(key, count), _rank(key, count)
+    seen = [winner == rank for rank in ranks]
+    if near is None:
+        # Of the winner alone: XLA on a CPU is faster where no choice waits for another.
+        for rank in ranks:
+            products = _normal_products(hit(rank), along, seen[rank], products)
+    n_z, n_l, *n_xy = products
+    sky = winner == count
     points = tuple(t * component for component in ray)
 
     color = _surface_colors(view, winner)
-    for rank, solid in enumerate(solids):
-        if solid.ground:
-            fraction = _ground_fraction(look, ray, hits[rank].t, view.pixel, solid)
+    for rank in ranks:
+        if view.ground[rank]:
+            fraction = _ground_fraction(look, ray, hit(rank).t, view.pixel, solid(rank))
             for c in range(3):
                 first, second = look.ground_rgb[0, c], look.ground_rgb[1, c]
                 color[c] = jnp.where(seen[rank], first + fraction * (second - first), color[c])
 
-    normal = _Normal(hits, seen, ray)
-    n_z = normal.dot((0.0, 0.0, 1.0), ray[2])
-    components = (normal.dot((1.0, 0.0, 0.0), ray[0]), normal.dot((0.0, 1.0, 0.0), ray[1]), n_z)
     shade: jax.Array = look.ambient
     gleam: jax.Array | float = 0.0
     on_ground = jnp.zeros(shape, bool)
-    for rank, solid in enumerate(solids):
-        if solid.ground:
+    for rank in ranks:
+        if view.ground[rank]:
             on_ground |= seen[rank]
     if look.headlight is not None:
         shade += look.headlight * at_least(n_z, 0.0)
         shade = jnp.where(on_ground, at_most(shade, 1.0), shade)
-    if look.light is not None:
-        to_light = _vector(look.light)
-        n_l = normal.dot(to_light, dot(ray, to_light))
+    if to_light is not None:
         lit = jnp.ones(shape, bool)
         if look.shadows:
-            for rank, solid in enumerate(solids):
-                if solid.kind != GeomKind.PLANE:
+            for rank in ranks:
+                if view.kind[rank] != GeomKind.PLANE:
                     # A convex geom cannot shade a point of itself that faces the light.
-                    there = tuple(c - p for c, p in zip(solid.center, points, strict=True))
-                    blocked = solid.hit(to_light, there).t > SHADOW_BIAS
+                    there = tuple(c - p for c, p in zip(solid(rank).center, points, strict=True))
+                    blocked = solid(rank).hit(to_light, there).t > SHADOW_BIAS
                     lit &= ~(blocked & ~seen[rank])
         gloss = shading.gloss(n_l, n_z, to_light[2], look.shininess)
         gloss = jnp.where(lit & (n_l > 0.0), gloss, 0.0)
@@ -191,7 +225,7 @@ def see(view: View, ray: Vector) -> Seen:
         shade = shade + look.diffuse * diffuse + look.specular * gloss
         gleam = look.highlight * gloss
     for lamp in look.lamps:
-        more, glitter = _lamplight(lamp, look, points, components, seen, solids)
+        more, glitter = _lamplight(lamp, view, points, (*n_xy, n_z), seen, solid)
         shade, gleam = shade + more, gleam + glitter
     if look.headlight is not None:
         # A texture dims the highlight too.
@@ -240,55 +274,75 @@ def _vector(array: Any) -> Vector:
     return array[0], array[1], array[2]
 
 
-class _Normal(NamedTuple):
-    """The outer unit normal of what each pixel sees; 0 where that is the sky."""
+def _directions(ray: Vector, to_light: Vector | None, lamps: bool) -> list[tuple[Vector, Any]]:
+    """Return vectors with which products of normals are needed, each with the ray's product.
 
-    hits: list[Hit]
-    seen: list[jax.Array]
-    ray: Vector
+    They are the camera's z axis and the direction to the light, or zero; for lamps also x and y.
+    """
+    zero = (0.0, 0.0, 0.0)
+    along: list[tuple[Vector, Any]] = [((0.0, 0.0, 1.0), ray[2])]
+    along.append((zero, 0.0) if to_light is None else (to_light, dot(ray, to_light)))
+    if lamps:
+        along += [((1.0, 0.0, 0.0), ray[0]), ((0.0, 1.0, 0.0), ray[1])]
+    return along
 
-    def dot(self, v: Vector, ray_v: jax.Array) -> jax.Array:
-        """Return its product with ``v``, given the ray's."""
-        product = jnp.zeros(self.ray[0].shape)
-        for hit, here in zip(self.hits, self.seen, strict=True):
-            product = jnp.where(here, hit.normal_dot(v, ray_v), product)
-        return product
+
+def _normal_products(
+    hit: Hit, along: list[tuple[Vector, Any]], here: jax.Array, products: list[jax.Array]
+) -> list[jax.Array]:
+    """Return products of the outer unit normal, those of ``hit`` in place of others ``here``."""
+    return [
+        jnp.where(here, hit.normal_dot(v, ray_v), product)
+        for (v, ray_v), product in zip(along, products, strict=True)
+    ]
 
 
 def _lamplight(
     lamp: Lamp,
-    look: Look,
+    view: View,
     points: Vector,
     normal: Vector,
     seen: list[jax.Array],
-    solids: list[_Solid],
+    solid: Callable[[int], _Solid],
 ) -> tuple[jax.Array, jax.Array]:
     """Return what a lamp adds to the factor of colors, and to colors themselves."""
-    pos = _vector(lamp.pos)
+    look, pos = view.look, _vector(lamp.pos)
     ray, inv_distance, strength = shading.beam(lamp, pos, _vector(lamp.axis), points)
     to_lamp = tuple(-component for component in ray)
     n_l = dot(normal, to_lamp)
     strength = jnp.where(n_l > 0.0, strength, 0.0)
     if look.shadows:
-        for rank, solid in enumerate(solids):
-            if solid.kind != GeomKind.PLANE:
-                there = tuple(c - p for c, p in zip(solid.center, pos, strict=True))
-                way = solid.hit(ray, there).t
+        for rank, kind in enumerate(view.kind):
+            if kind != GeomKind.PLANE:
+                there = tuple(c - p for c, p in zip(solid(rank).center, pos, strict=True))
+                way = solid(rank).hit(ray, there).t
                 blocked = (way > 0.0) & ((way + SHADOW_BIAS) * inv_distance < 1.0)
                 strength = jnp.where(blocked & ~seen[rank], 0.0, strength)
     shine = shading.gloss(n_l, normal[2], to_lamp[2], look.shininess)
     return strength * lamp.diffuse * n_l, strength * lamp.highlight * shine
 
 
-def _nearest(hits: list[Hit], shape: tuple[int, ...]) -> tuple[jax.Array, jax.Array]:
-    """Return distance and rank of the nearest hit; the rank of the sky is ``len(hits)``."""
-    rank_bits = np.uint32((1 << len(hits).bit_length()) - 1)
-    key = jnp.full(shape, (_INF_BITS & ~rank_bits) | np.uint32(len(hits)), jnp.uint32)
-    for rank, hit in enumerate(hits):
-        bits = jax.lax.bitcast_convert_type(hit.t, jnp.uint32)
-        key = jnp.minimum(key, (bits & ~rank_bits) | np.uint32(rank))
-    t = jax.lax.bitcast_convert_type(key & ~rank_bits, jnp.float32)
-    return t, (key & rank_bits).astype(jnp.int32)
+def _rank_bits(count: int) -> np.uint32:
+    """Return the bits of a key that hold a rank; that of the sky is ``count``."""
+    return np.uint32((1 << count.bit_length()) - 1)
+
+
+def _no_hit(count: int, shape: tuple[int, ...]) -> jax.Array:
+    return jnp.full(shape, (_INF_BITS & ~_rank_bits(count)) | np.uint32(count), jnp.uint32)
+
+
+def _nearer(key: jax.Array, hit: Hit, rank: int, count: int) -> jax.Array:
+    """Return the key of the nearest hit, given that of the nearest one so far."""
+    bits = jax.lax.bitcast_convert_type(hit.t, jnp.uint32)
+    return jnp.minimum(key, (bits & ~_rank_bits(count)) | np.uint32(rank))
+
+
+def _distance(key: jax.Array, count: int) -> jax.Array:
+    return jax.lax.bitcast_convert_type(key & ~_rank_bits(count), jnp.float32)
+
+
+def _rank(key: jax.Array, count: int) -> jax.Array:
+    return (key & _rank_bits(count)).astype(jnp.int32)
 
 
 def _surface_colors(view: View, winner: jax.Array) -> list[jax.Array]:

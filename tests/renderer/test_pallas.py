@@ -13,9 +13,11 @@ import numpy as np
 import pytest
 
 import pixelbrax_jax as pb
-from pixelbrax_jax import make_look, render
+from pixelbrax_jax import GeomKind, make_look, render
 from pixelbrax_jax.distractors import Color, Distractor
 from pixelbrax_jax.renderer import base, kernel
+from pixelbrax_jax.renderer.culling import may_see, window_of
+from pixelbrax_jax.renderer.pixels import view_of
 from pixelbrax_jax.tasks import BRAX_TASKS
 from tests.renderer import scenes
 from tests.renderer.test_lamps import LAMP
@@ -86,7 +88,7 @@ def test_it_draws_every_task_in_every_look(task, look):
 
 
 @pytest.mark.parametrize("lamps", [0, 2])
-@pytest.mark.parametrize("size", [(HEIGHT, WIDTH), (1, 1)])
+@pytest.mark.parametrize("size", [(HEIGHT, WIDTH), (1, 1), (3, 300)])
 def test_depth_and_geoms_are_those_of_the_plain_one(size, lamps):
     """All primitives, planes that end, lamps, and a size that is no multiple of a block."""
     look = make_look("dmc", shadows=True).replace(lamps=(LAMP, LAMP.replace(exponent=3))[:lamps])
@@ -112,6 +114,70 @@ def test_every_primitive():
     assert len(np.unique(plain.seg)) >= 5
     np.testing.assert_array_equal(other.seg, plain.seg)
     np.testing.assert_allclose(other.depth, plain.depth, rtol=1e-5)
+
+
+def test_many_geoms():
+    """More than a word has bits."""
+    count, rng = 70, np.random.default_rng(0)
+    one = scenes.one_geom(GeomKind.SPHERE, (0.12, 0, 0), (0.0, -4.0, 0.0))
+    repeated = {name: getattr(one.geoms, name) * count for name in ("kind", "link", "name")}
+    geoms = one.geoms.replace(
+        **repeated,
+        material=(0,) * count,
+        size=jnp.tile(one.geoms.size, (count, 1)),
+    )
+    pos = jnp.asarray(rng.uniform(-1, 1, (count, 3)), jnp.float32)
+    scene = one.replace(geoms=geoms, pos=pos, xmat=jnp.tile(jnp.eye(3), (count, 1, 1)))
+    plain, other = (render(scene, 40, 40, name) for name in ("fused", "pallas-interpret"))
+    assert len(np.unique(plain.seg)) > 40
+    np.testing.assert_array_equal(other.seg, plain.seg)
+
+
+def test_no_geom_is_left_out_that_is_seen():
+    """Random poses, some around the camera and some behind it, and random blocks of pixels."""
+    height, width, num_scenes = 24, 32, 100
+    rng = np.random.default_rng(0)
+
+    def scene(seed):
+        scene = scenes.random_scene(seed)
+        eye = scene.camera.pos * jnp.float32(rng.uniform(0.0, 1.0))
+        return scene.replace(camera=scene.camera.replace(pos=eye))
+
+    rows = np.sort(rng.integers(0, height, (num_scenes, 2)), axis=1)
+    columns = np.sort(rng.integers(0, width, (num_scenes, 2)), axis=1)
+    batch = jax.tree.map(lambda *x: jnp.stack(x), *[scene(s) for s in range(num_scenes)])
+
+    @jax.jit
+    @jax.vmap
+    def look(scene, rows, columns):
+        view = view_of(scene, height)
+        seen = may_see(view, window_of(view, tuple(rows), tuple(columns), height, width))
+        by_rows = may_see(view, window_of(view, tuple(rows), None, height, width))
+        alone, flags = [], []
+        for g in range(1, len(scene.geoms.kind)):
+            geoms = scene.geoms.replace(
+                **{k: (getattr(scene.geoms, k)[g],) for k in ("kind", "link", "name")},
+                material=(0,),
+                size=scene.geoms.size[g : g + 1],
+            )
+            one = scene.replace(geoms=geoms, pos=scene.pos[g : g + 1], xmat=scene.xmat[g : g + 1])
+            alone.append(render(one, height, width, "fused").seg == 0)
+            rank = view.geom.index(g)
+            flags.append(jnp.stack([seen(rank), by_rows(rank)]))
+        return jnp.stack(alone), jnp.stack(flags)
+
+    alone, flags = map(np.asarray, look(batch, rows, columns))
+    left_out = 0
+    for scene_alone, scene_flags, (top, bottom), (left, right) in zip(
+        alone, flags, rows, columns, strict=True
+    ):
+        of_rows = scene_alone[:, top : bottom + 1]
+        window = of_rows[:, :, left : right + 1].any((1, 2))
+        assert scene_flags[window, 0].all()
+        assert scene_flags[of_rows.any((1, 2)), 1].all()
+        left_out += (~scene_flags[~window, 0]).sum()
+    # Most of those that are not seen.
+    assert left_out > 0.6 * num_scenes
 
 
 def test_a_band_is_a_part_of_the_picture():
