@@ -111,7 +111,9 @@ def test_the_most_of_several_kernels_is_told(monkeypatch, tmp_path):
         )
     )
     monkeypatch.setattr(registers, "find_assembler", lambda: "ptxas")
-    monkeypatch.setattr(subprocess, "run", lambda *_, **__: SimpleNamespace(stderr=next(told)))
+    monkeypatch.setattr(
+        subprocess, "run", lambda *_, **__: SimpleNamespace(stderr=next(told), returncode=0)
+    )
     found = registers.assemble([tmp_path / "a.ptx", tmp_path / "b.ptx"], "sm_90a")
     assert found == {"registers": 90, "spilled": 12}
 

@@ -1,4 +1,4 @@
-"""Draws the tables of performance.md, measurements.md and accelerators.md from results that are kept.
+"""Draws tables of performance.md, measurements.md and accelerators.md from what is kept.
 
 python -m tests.benchmarks.performance
 """

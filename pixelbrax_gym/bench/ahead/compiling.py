@@ -94,13 +94,14 @@ def tpu(task: str, program: str, num_envs: int, **options: Any) -> dict[str, Any
     topology = topologies.get_topology_desc(platform="tpu", topology_name=TPU_TOPOLOGY)
     compiled, seconds = _compile(topology, "tpu", *make_program(program, task, num_envs, **options))
     memory, cost = compiled.memory_analysis(), compiled.cost_analysis() or {}
+    estimate = cost.get("optimal_seconds", -1.0)
     return {
         "temporary_bytes": memory.temp_size_in_bytes,
         "output_bytes": memory.output_size_in_bytes,
         "accessed_bytes": cost.get("bytes accessed"),
-        "unknown_loops": sum(loop.trips is None for loop in of.loops(parse(compiled.as_text()))),
         "compile_seconds": seconds,
-        "model_seconds": {"xla": cost.get("optimal_seconds")},
+        # Less than 0 where XLA has no estimate of some operation.
+        "model_seconds": {"xla": estimate if estimate >= 0 else None},
     }
 
 

@@ -44,6 +44,8 @@ def assemble(sources: list[Path], architecture: str) -> dict[str, int] | None:
     for source in sources if assembler else ():
         command = [str(assembler), "-v", f"-arch={architecture}", "-o", "/dev/null", str(source)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode:
+            return None
         for stores, loads, registers in _USED.findall(done.stderr):
             most = most or {"registers": 0, "spilled": 0}
             most["registers"] = max(most["registers"], int(registers))

@@ -51,10 +51,9 @@ def tpu(rows: list[Row]) -> str:
         yield from _about(row, "v5e")
         for name in ("temporary_bytes", "output_bytes", "accessed_bytes"):
             yield number(values[name] / 1e6 if values[name] is not None else None)
-        yield _count(values["unknown_loops"])
         yield number(values["compile_seconds"])
         model = values["model_seconds"]["xla"]
-        yield number(model * 1e3 if model is not None else None)
+        yield number(model * 1e3) if model is not None else "not known"
 
     heads = (
         "TPU",
@@ -64,7 +63,6 @@ def tpu(rows: list[Row]) -> str:
         "temporaries, MB",
         "output, MB",
         "accessed, MB",
-        "loops of unknown length",
         "compilation, s",
         "by XLA's model, ms",
     )
