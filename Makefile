@@ -17,7 +17,7 @@ WORKERS := -n 2 --dist worksteal
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-slow test-newest test-oldest test-clients lint format bench golden docs docs-serve clean
+.PHONY: help demo test test-slow test-newest test-oldest test-gpu test-programs test-clients bench-gpu lint format bench golden docs docs-serve clean
 
 help: ## show this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1|/' | \
@@ -35,9 +35,11 @@ find_python = $(firstword $(shell for python in python$(1) $(HOME)/.pyenv/versio
 NEWEST_PYTHON ?= $(call find_python,3.13)
 OLDEST_PYTHON ?= $(call find_python,3.11)
 SPEED ?= not slow
+# Or cuda13, as the GPU's driver wants.
+CUDA ?= cuda12
 
 test: $(VENV)/.installed-dev ## run the tests that take minutes at most
-	$(RUN) -m pytest $(WORKERS) -m "not slow and not gpu" $(ARGS)
+	$(RUN) -m pytest $(WORKERS) -m "not slow and not gpu and not gpu_program" $(ARGS)
 
 test-slow: $(VENV)/.installed-dev ## run the tests that take longer
 	PIXELBRAX_TESTS_OPTIMIZE=1 $(RUN) -m pytest $(WORKERS) -m "slow and not gpu" $(ARGS)
@@ -47,6 +49,22 @@ test-newest: .venv-newest/.installed ## run those that need no torch with the ne
 
 test-oldest: .venv-oldest/.installed ## run those that need no torch with the oldest releases
 	.venv-oldest/bin/python -m pytest $(WORKERS) -m "$(SPEED) and not gpu" $(TORCHLESS) $(ARGS)
+
+test-gpu: $(VENV)/.installed-dev ## run the tests that need an NVIDIA GPU, on a machine that has one
+	$(PIP) "jax[$(CUDA)]"
+	PIXELBRAX_TESTS_OPTIMIZE=1 PIXELBRAX_TESTS_DEVICE=cuda XLA_CLIENT_MEM_FRACTION=0.3 \
+		XLA_FLAGS="--xla_gpu_deterministic_ops=true" \
+		$(RUN) -m pytest -m gpu tests/gpu $(ARGS)
+
+bench-gpu: $(VENV)/.installed-dev ## measure on an NVIDIA GPU; JSON, tables and plot in runs/gpu
+	$(PIP) "jax[$(CUDA)]"
+	$(RUN) -m pixelbrax_jax.cli bench --full --output-dir runs/gpu $(ARGS)
+	XLA_FLAGS="--xla_gpu_enable_command_buffer=+WHILE" \
+		$(RUN) -m pixelbrax_jax.cli bench --full --only environments --output-dir runs/gpu/graphs $(ARGS)
+
+test-programs: $(VENV)/.installed-dev .venv-newest/.installed ## compile for an H100 and a TPU that need not be here
+	$(RUN) -m pytest -m gpu_program tests/test_gpu_program.py $(ARGS)
+	.venv-newest/bin/python -m pytest -m gpu_program tests/test_gpu_program.py $(ARGS)
 
 test-clients: .venv-clients/.installed ## run third-party agents and wrappers on the environments
 	.venv-clients/bin/python -m pytest $(WORKERS) tests/clients $(ARGS)

@@ -47,6 +47,7 @@ class Machine:
         to_torch: whether an array of JAX's became a tensor on the same memory; None without
             torch, or an explanation where it failed.
         to_jax: the same, from a tensor to an array.
+        renderer: what ``renderer="auto"`` stands for, and why; None where JAX has no device.
         gl_libraries: OpenGL libraries loaded into this process; None where that is unknown.
         environ: environment variables.
     """
@@ -59,6 +60,7 @@ class Machine:
     torch_cuda: bool | str | None
     to_torch: bool | str | None
     to_jax: bool | str | None
+    renderer: tuple[str, str] | None
     gl_libraries: tuple[str, ...] | None
     environ: dict[str, str]
 
@@ -81,12 +83,15 @@ class Finding:
 def inspect() -> Machine:
     """Look at this machine. Starts JAX; takes a second or two."""
     versions = {name: _version(name) for name in (*_PACKAGES, *_OPTIONAL)}
-    device = jax_platform = jax_error = None
+    device = jax_platform = jax_error = renderer = None
     try:
         import jax
 
+        import pixelbrax_jax
+
         first = jax.devices()[0]
         device, jax_platform = str(first), first.platform
+        renderer = pixelbrax_jax.auto_renderer()
     except Exception as error:  # whatever it is, it shall be reported and not raised
         jax_error = f"{type(error).__name__}: {error}"
     torch_cuda: bool | str | None = None
@@ -106,6 +111,7 @@ def inspect() -> Machine:
         torch_cuda=torch_cuda,
         to_torch=to_torch,
         to_jax=to_jax,
+        renderer=renderer,
         gl_libraries=_gl_libraries(),
         environ=dict(os.environ),
     )
@@ -123,6 +129,7 @@ def diagnose(machine: Machine) -> list[Finding]:
     return [
         *_about_packages(machine),
         *_about_devices(machine),
+        *_about_renderer(machine),
         *_about_sharing(machine),
         *_about_memory(machine),
         *_about_gl(machine),
@@ -200,6 +207,14 @@ def _about_devices(machine: Machine) -> Iterator[Finding]:
         )
     else:
         yield Finding("ok", "JAX and torch see the same device")
+
+
+def _about_renderer(machine: Machine) -> Iterator[Finding]:
+    if machine.renderer is not None:
+        name, why = machine.renderer
+        on_nvidia = machine.jax_platform in _GPUS and machine.has_nvidia
+        level = "note" if on_nvidia and name != "pallas" else "ok"
+        yield Finding(level, f"images are drawn by renderer={name!r}: {why}")
 
 
 def _about_sharing(machine: Machine) -> Iterator[Finding]:

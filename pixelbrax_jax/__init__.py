@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from pixelbrax_jax.registry import make as make
     from pixelbrax_jax.registry import register as register
     from pixelbrax_jax.renderer.base import render as render
+    from pixelbrax_jax.renderer.kernel import auto_renderer as auto_renderer
     from pixelbrax_jax.scene.cameras import named_rigs as named_rigs
     from pixelbrax_jax.scene.cameras import rig as rig
     from pixelbrax_jax.scene.look import make_look as make_look
@@ -65,6 +66,7 @@ _PUBLIC = {
     "policy": "list_pretrained load_policy",
     "registry": "list_envs make register",
     "renderer.base": "render",
+    "renderer.kernel": "auto_renderer",
     "scene.cameras": "named_rigs rig",
     "scene.look": "make_look",
     "scene.place": "place",

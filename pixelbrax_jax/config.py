@@ -12,7 +12,7 @@ import jax
 from pixelbrax_jax.distractors.base import Distractor
 from pixelbrax_jax.distractors.clips import ClipBank
 from pixelbrax_jax.distractors.presets import as_tuple
-from pixelbrax_jax.renderer.base import RENDERERS
+from pixelbrax_jax.renderer.base import check_renderer
 from pixelbrax_jax.scene.look import make_look
 from pixelbrax_jax.tasks import REWARD_PRESETS
 from pixelbrax_jax.types import Camera, CameraRig, Look
@@ -43,8 +43,10 @@ class ProgramConfig:
     """What an observation is: ``pixels``, ``state`` (nothing is rendered) or ``both``."""
     action_repeat: int = 1
     """Control steps per step; one frame is drawn at their end."""
-    renderer: str = "fused"
-    """``fused``, or ``reference`` for the slow one that the others are tested against."""
+    renderer: str = "auto"
+    """``auto``, the fastest for the device; ``fused``, for all devices; ``pallas``, the kernel for
+    NVIDIA GPUs that ``auto`` takes there; ``pallas-interpret``, that kernel on any device, slowly;
+    or ``reference``, the slow one that the others are tested against."""
     distractors: Distractors = ()
     """What changes the image: a distractor, the name of a preset, or several of them."""
     physics_batching: str = "auto"
@@ -56,10 +58,10 @@ class ProgramConfig:
             self._store(name, check_positive_int(name, self._static(name)))
         for name, allowed in (
             ("obs_mode", OBS_MODES),
-            ("renderer", RENDERERS),
             ("physics_batching", PHYSICS_BATCHING),
         ):
             check_choice(name, self._static(name), allowed)
+        check_renderer(self._static("renderer"))
         self._store("distractors", as_tuple(self.distractors))
 
     def _static(self, name: str) -> Any:

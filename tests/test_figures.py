@@ -260,6 +260,11 @@ def test_tables_of_measurements_are_those_of_the_results(name):
     assert drawn(performance.FORMS_PAGE, name) == performance.forms_tables()[name]
 
 
+@pytest.mark.parametrize("name", ["gpu-programs", "tpu-programs"])
+def test_tables_of_programs_are_those_of_the_report(name):
+    assert drawn(performance.PROGRAMS_PAGE, name) == performance.programs_tables()[name]
+
+
 @pytest.mark.parametrize("name", ["speed", "physics", "learned", "tasks"])
 def test_tables_of_dm_control_are_those_of_the_results(name):
     assert drawn(dmc_page.PAGE, name) == dmc_page.page_tables()[name]

@@ -64,8 +64,10 @@ class Group:
         cases: what is measured.
         table: the outcomes in Markdown.
         note: what it shows and what it does not.
+        measured: whether its programs run; else they are compiled alone.
     """
 
     cases: Callable[[], Iterator[Case]]
     table: Callable[[list[Row]], str]
     note: str = ""
+    measured: bool = True

@@ -5,10 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from pixelbrax_gym.bench import tables
+from pixelbrax_gym.bench.ahead import tables as compiled
+from pixelbrax_gym.bench.ahead.case import AheadCase
+from pixelbrax_gym.bench.ahead.targets import CARDS
 from pixelbrax_gym.bench.case import Case, Group
 
 TASKS = ("halfcheetah", "walker2d", "ant", "humanoid")
 BATCHES = (1, 10, 100, 1000, 4096, 8192)
+PROGRAMS = ("renderer", "step", "state step", "scan")
 
 
 def renderer() -> Iterator[Case]:
@@ -73,6 +77,24 @@ def distractors() -> Iterator[Case]:
         yield Case("distractors", "distractors.compare", where)
 
 
+def gpu_programs() -> Iterator[Case]:
+    """Programs for NVIDIA GPUs, of which none need be here."""
+    for card in CARDS:
+        for num_envs in (1024, 8192):
+            for task in TASKS:
+                for program in PROGRAMS:
+                    where = {"task": task, "program": program, "num_envs": num_envs, "card": card}
+                    yield AheadCase("gpu-program", "compiling.gpu", where)
+
+
+def tpu_programs() -> Iterator[Case]:
+    """Programs for a TPU, likewise."""
+    for task in ("inverted_pendulum", *TASKS):
+        for program in ("renderer", "step"):
+            where = {"task": task, "program": program, "num_envs": 1024}
+            yield AheadCase("tpu-program", "compiling.tpu", where, platform="tpu")
+
+
 RENDERER_NOTE = "From link poses to packed pixels, without physics."
 ADAPTERS_NOTE = (
     "The ratio is that to the JAX loop with the same autoreset mode, which waits for each step: "
@@ -103,3 +125,23 @@ FULL = {
     "environments": Group(environments, tables.environments, ENVIRONMENTS_NOTE),
 }
 """What ``--full`` measures; it takes hours on a CPU."""
+
+COMPILED = {
+    "gpu-program": Group(
+        gpu_programs,
+        compiled.gpu,
+        "Compiled, not run. A loop of unknown length counts as one turn, and makes the host wait "
+        "for the card. Parts for the host are launched one after the other, counted loops among "
+        "them; 1 is one CUDA graph. Bytes count what every kernel reads and writes once. The model "
+        "takes a kernel's bytes at the bandwidth of the card's data sheet, and 1.5 us at least: it "
+        "compares forms of a program, and is no measurement.",
+        measured=False,
+    ),
+    "tpu-program": Group(
+        tpu_programs,
+        compiled.tpu,
+        "Compiled for a chip of a TPU v5e, not run. Bytes and times are the estimates of XLA.",
+        measured=False,
+    ),
+}
+"""What is compiled for accelerators that need not be here; half an hour for the first."""

@@ -10,7 +10,7 @@ from pathlib import Path
 from subprocess import SubprocessError
 
 from pixelbrax_gym.bench.case import Case, Group
-from pixelbrax_gym.bench.cases import FULL, QUICK, TASKS
+from pixelbrax_gym.bench.cases import COMPILED, FULL, QUICK, TASKS
 from pixelbrax_gym.bench.runner import measure_all
 from pixelbrax_jax.extras import install_extra
 
@@ -33,10 +33,16 @@ def main(arguments: Sequence[str]) -> int:
         action="store_true",
         help="more tasks, batches and repetitions, and distractors; hours on a CPU",
     )
-    add_options(parser, list(FULL), "runs/bench")
+    tasks = ("inverted_pendulum", *TASKS)
+    add_options(parser, [*FULL, *COMPILED], "runs/bench", tasks)
     options = parser.parse_args(arguments)
     groups = FULL if options.full else QUICK
-    if options.full:
+    if compiled := set(COMPILED).intersection(options.only or ()):
+        if others := set(options.only).difference(compiled):
+            parser.error(f"{' '.join(sorted(compiled))} runs nothing: leave out {' '.join(others)}")
+        groups = COMPILED
+        options.output_dir /= "compiled"
+    elif options.full:
         options.output_dir /= "full"
     if lacking := [name for name in options.only or () if name not in groups]:
         parser.error(f"--only {' '.join(lacking)} is measured by --full alone; add it")

@@ -11,6 +11,18 @@ from pixelbrax_gym.bench.case import Group, Row
 from pixelbrax_gym.bench.plot import plot
 from pixelbrax_gym.bench.tables import table
 
+_MEASURED = (
+    "# Measurements",
+    "Medians of at least five repetitions of half a second or more, unless a part says "
+    "otherwise; compilation is apart, every call is waited for, actions are drawn, and "
+    "episodes begin anew. Each case has a process of its own.",
+)
+_COMPILED = (
+    "# Compiled, not run",
+    "Programs compiled ahead of time for accelerators that need not be here, and what the compiler "
+    "made of them. Compiled on:",
+)
+
 
 def write(file: Path, groups: Mapping[str, Group]) -> None:
     """Write the page, and with matplotlib the plot, that belong to the results in ``file``."""
@@ -32,11 +44,9 @@ def page(
 ) -> str:
     """The page, in Markdown."""
     used = {row["machine"] for row in rows}
+    measured = any(group.measured for group in groups.values())
     parts = [
-        "# Measurements",
-        "Medians of at least five repetitions of half a second or more, unless a part says "
-        "otherwise; compilation is apart, every call is waited for, actions are drawn, and "
-        "episodes begin anew. Each case has a process of its own.",
+        *(_MEASURED if measured else _COMPILED),
         *(_machine(machine) for name, machine in machines.items() if name in used),
     ]
     if plot:

@@ -24,10 +24,14 @@ class Distractor:
     Attributes:
         kind: name of the distractor; an environment has at most one of a kind.
         stream: name of its random stream, folded into an episode's key; its own for each kind.
+        by_pixel: whether ``change_frame`` works element by element, in any shape of the planes, and
+            of the arrays in its state reads single numbers, as ``state.shift[0]``. A GPU then
+            computes it within the kernel that draws; else in passes of its own over the image.
     """
 
     kind: ClassVar[str]
     stream: ClassVar[int]
+    by_pixel: ClassVar[bool] = False
 
     def reset(self, key: jax.Array, params: EnvParams) -> Any:
         """Sample the state at the first frame of an episode.
@@ -176,6 +180,18 @@ class Chain:
             frame = link.change_frame(state, frame, backdrop)
         return frame
 
+    @property
+    def by_pixel(self) -> bool:
+        """Whether all that change the frame do so by pixel; see ``Distractor``."""
+        return all(link.by_pixel or not _changes_frame(link) for link in self.links)
+
+    def frame_states(self, states: tuple[Any, ...]) -> tuple[Any, ...]:
+        """Return the states, with None in place of those that ``change_frame`` does not read."""
+        return tuple(
+            state if _changes_frame(link) else None
+            for link, state in zip(self.links, states, strict=True)
+        )
+
     def info(self, states: tuple[Any, ...]) -> dict[str, jax.Array]:
         """Return what all of them add to ``Timestep.info``."""
         info: dict[str, jax.Array] = {}
@@ -186,6 +202,10 @@ class Chain:
     @staticmethod
     def _key(key: jax.Array, link: Distractor, frame: jax.Array | int) -> jax.Array:
         return jax.random.fold_in(jax.random.fold_in(key, link.stream), frame)
+
+
+def _changes_frame(link: Distractor) -> bool:
+    return type(link).change_frame is not Distractor.change_frame
 
 
 def _checked(distractor: object) -> Distractor:

@@ -65,6 +65,7 @@ class Color(Distractor):
 
     kind: ClassVar[str] = "color"
     stream: ClassVar[int] = 1
+    by_pixel: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         """Check the options.

@@ -75,6 +75,7 @@ class Video(Distractor):
 
     kind: ClassVar[str] = "video"
     stream: ClassVar[int] = 2
+    by_pixel: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         """Check the options.

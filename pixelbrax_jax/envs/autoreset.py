@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -12,6 +13,34 @@ AUTORESET_MODES = ("next_step", "same_step", "disabled")
 
 _BLOCK = 32
 """Environments that are reset together; their number is rounded up to a multiple."""
+
+
+def reset_rows(
+    fn: Callable[..., Any], arguments: tuple[Any, ...], mask: jax.Array, rows: Any
+) -> Any:
+    """Return ``rows`` with those where ``mask`` reset, as fits the device that it is lowered for.
+
+    A CPU resets the masked rows alone, in a loop whose turns depend on the mask. An accelerator
+    would wait for the host to read in every step whether the loop goes on: it resets all rows and
+    selects, which is less than one turn of the loop. A reset that itself tries until it succeeds
+    waits in any case, and is done for masked rows alone.
+
+    Args:
+        fn: the reset of one row, otherwise as in ``replace_rows``.
+        arguments: as there.
+        mask: as there.
+        rows: as there.
+    """
+    row = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), arguments)
+    if _ends_by_itself(jax.make_jaxpr(fn)(*row).jaxpr):
+        return replace_rows(fn, arguments, mask, rows)
+    return jax.lax.platform_dependent(
+        arguments,
+        mask,
+        rows,
+        cpu=partial(replace_rows, fn),
+        default=partial(_select_rows, fn),
+    )
 
 
 def replace_rows(
@@ -44,3 +73,26 @@ def replace_rows(
         return left.at[index].set(False, mode="drop"), rows
 
     return jax.lax.while_loop(lambda carry: jnp.any(carry[0]), put, (mask, rows))[1]
+
+
+def _select_rows(
+    fn: Callable[..., Any], arguments: tuple[Any, ...], mask: jax.Array, rows: Any
+) -> Any:
+    """Return what ``replace_rows`` does, from ``fn`` of all rows."""
+
+    def select(new: jax.Array, old: jax.Array) -> jax.Array:
+        return jnp.where(mask.reshape(-1, *(1,) * (old.ndim - 1)), new, old)
+
+    return jax.tree.map(select, jax.vmap(fn)(*arguments), rows)
+
+
+def _ends_by_itself(jaxpr: Any) -> bool:
+    """Return whether a program has a loop whose number of turns is not known beforehand."""
+    for eqn in jaxpr.eqns:
+        parts = [
+            getattr(part, "jaxpr", part) for part in jax.tree.leaves(list(eqn.params.values()))
+        ]
+        inner = (part for part in parts if hasattr(part, "eqns"))
+        if eqn.primitive.name == "while" or any(map(_ends_by_itself, inner)):
+            return True
+    return False

@@ -17,6 +17,7 @@ from pixelbrax_jax.envs import observe
 from pixelbrax_jax.envs.fusion_barrier import fusion_barrier
 from pixelbrax_jax.memory import check_fits
 from pixelbrax_jax.physics.base import Physics
+from pixelbrax_jax.renderer import kernel
 from pixelbrax_jax.renderer.base import render
 from pixelbrax_jax.scene.place import place
 from pixelbrax_jax.types import EnvParams, EnvState, Frame, Scene, SimState, Timestep
@@ -289,17 +290,33 @@ class PixelEnv(ProgramConfig):
     ) -> jax.Array:
         """Return the image of a state, (height, width) uint32 packed pixels."""
         height, width = self._size(height, width)
-        scene = self._scene(sim, params)
+        scene, states = self._scene(sim, params), sim.distractor_state
+
+        def finish(states: Any, frame: Frame, backdrops: Any) -> jax.Array:
+            return observe.pack(self.chain.change_frame(states, frame, backdrops))
 
         def draw_rows(first_row: jax.Array, num_rows: int) -> jax.Array:
-            frame = render(
-                scene, height, width, self.renderer, first_row=first_row, num_rows=num_rows
-            )
+            frame = render(scene, height, width, plain, first_row=first_row, num_rows=num_rows)
             rows = jnp.minimum(first_row + jnp.arange(num_rows), height - 1)
-            backdrops = self.chain.backdrops(sim.distractor_state, params, rows, height, width)
-            return observe.pack(self.chain.change_frame(sim.distractor_state, frame, backdrops))
+            backdrops = self.chain.backdrops(states, params, rows, height, width)
+            return finish(states, frame, backdrops)
 
-        return fusion_barrier(draw_rows, height, width)
+        def by_kernel() -> jax.Array:
+            from pixelbrax_jax.renderer import pallas
+
+            backdrops = self.chain.backdrops(states, params, jnp.arange(height), height, width)
+            interpret = self.renderer == "pallas-interpret"
+            if not self.chain.by_pixel:
+                frame = pallas.render(scene, height, width, interpret=interpret)
+                return finish(states, frame, backdrops)
+            kept = self.chain.frame_states(states)
+            return pallas.draw(scene, height, width, finish, kept, backdrops, interpret=interpret)
+
+        if self.renderer.startswith("pallas"):
+            return by_kernel()
+        plain = "fused" if self.renderer == "auto" else self.renderer
+        has_kernel = self.renderer == "auto" and kernel.obstacle() is None
+        return fusion_barrier(draw_rows, height, width, by_kernel if has_kernel else None)
 
     def blank_frames(self) -> jax.Array:
         """Return a black frame stack; an empty one without pixels."""

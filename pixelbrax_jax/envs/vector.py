@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from pixelbrax_jax._cpu.chunks import step_rows
 from pixelbrax_jax.envs import observe
-from pixelbrax_jax.envs.autoreset import AUTORESET_MODES, replace_rows
+from pixelbrax_jax.envs.autoreset import AUTORESET_MODES, replace_rows, reset_rows
 from pixelbrax_jax.envs.pixel_env import PixelEnv, check_key
 from pixelbrax_jax.types import EnvParams, EnvState, SimState, Timestep
 from pixelbrax_jax.validation import check_choice, check_positive_int
@@ -193,8 +193,7 @@ class VectorPixelEnv:
             key, action = rows
             return self.env.advance(sim, key, action, params)
 
-        # Not left to the lowering: a program for an accelerator never traces what is for CPUs.
-        if self.env.physics_batching == "auto" and jax.default_backend() == "cpu":
+        if self._is_for_a_cpu():
             last = getattr(self.env.physics, "batch_last", True)
             return step_rows(step, sim, (keys, action), params, last=last)
         return jax.vmap(step, in_axes=(0, 0, None))(sim, (keys, action), params)
@@ -221,8 +220,16 @@ class VectorPixelEnv:
         def reset(key: jax.Array, episode: jax.Array) -> SimState:
             return self.env.reset_sim(key, episode, params)
 
-        sim: SimState = replace_rows(reset, (state.key, episode), mask, state.sim)
+        replace = replace_rows if self._is_for_a_cpu() else reset_rows
+        sim: SimState = replace(reset, (state.key, episode), mask, state.sim)
         return sim
+
+    def _is_for_a_cpu(self) -> bool:
+        """Return whether programs are for CPUs alone.
+
+        Not left to the lowering: neither traces what is for the other.
+        """
+        return self.env.physics_batching == "auto" and jax.default_backend() == "cpu"
 
     def _reset_and_draw(
         self, state: EnvState, mask: jax.Array, episode: jax.Array, params: EnvParams

@@ -7,19 +7,40 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
-from pixelbrax_jax.renderer import fused, reference
+from pixelbrax_jax.renderer import fused, kernel, reference
 from pixelbrax_jax.types import Frame, Scene
 from pixelbrax_jax.validation import check_choice
 
-RENDERERS = ("fused", "reference")
+RENDERERS = ("auto", "fused", "pallas", "pallas-interpret", "reference")
+
+
+def check_renderer(renderer: object) -> str:
+    """Return ``renderer`` if it can draw here.
+
+    Raises:
+        ValueError: it is unknown, or the default device cannot run it; the message says what can.
+    """
+    name = check_choice("renderer", renderer, RENDERERS)
+    if name == "pallas":
+        why = kernel.obstacle()
+        if why is None and jax.default_backend() != "gpu":
+            why = f"JAX computes on a {jax.default_backend()}"
+        if why is not None:
+            raise ValueError(
+                f"renderer='pallas' is a kernel for NVIDIA GPUs, and {why}. Use 'auto' (the "
+                "fastest on every device, this kernel in programs compiled for CUDA), 'fused', or "
+                "'pallas-interpret', which computes the kernel on any device, slowly."
+            )
+    return name
 
 
 def render(
     scene: Scene,
     height: int,
     width: int,
-    renderer: str = "fused",
+    renderer: str = "auto",
     *,
     first_row: jax.Array | int = 0,
     num_rows: int | None = None,
@@ -36,7 +57,7 @@ def render(
         scene: what to draw, in the world frame.
         height: pixels, at least 1.
         width: pixels, at least 1.
-        renderer: ``"fused"`` or ``"reference"``; same image, other speed.
+        renderer: one of ``RENDERERS``; same image, other speed. See ``ProgramConfig``.
         first_row: () int, may be traced: first row of the band to draw.
         num_rows: rows of the band; None draws all rows.
 
@@ -44,26 +65,42 @@ def render(
         The frame, or its band of rows.
 
     Raises:
-        ValueError: a size below 1 or an unknown renderer.
+        ValueError: a size below 1, or a renderer that is unknown or cannot draw here.
     """
     for name, value in (("height", height), ("width", width)):
         if value < 1:
             raise ValueError(f"{name} must be at least 1 pixel, got {value}.")
     rows = height if num_rows is None else num_rows
     first_row = jnp.asarray(first_row, jnp.int32)
-    if check_choice("renderer", renderer, RENDERERS) == "reference":
+    if check_renderer(renderer) == "reference":
         return reference.render(scene, height, width, first_row, rows)
-    return _fused(scene, first_row, height, width, rows)
+    return _fast(scene, first_row, height, width, rows, renderer)
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(2, 3, 4))
-def _fused(scene: Scene, first_row: jax.Array, height: int, width: int, num_rows: int) -> Frame:
-    return fused.render(scene, height, width, first_row, num_rows)
+@partial(jax.custom_jvp, nondiff_argnums=(2, 3, 4, 5))
+def _fast(
+    scene: Scene, first_row: jax.Array, height: int, width: int, num_rows: int, renderer: str
+) -> Frame:
+    def plain() -> Frame:
+        return fused.render(scene, height, width, first_row, num_rows)
+
+    def by_kernel() -> Frame:
+        from pixelbrax_jax.renderer import pallas
+
+        interpret = renderer == "pallas-interpret"
+        return pallas.render(scene, height, width, first_row, num_rows, interpret=interpret)
+
+    if renderer == "fused" or (renderer == "auto" and kernel.obstacle() is not None):
+        return plain()
+    if renderer == "auto":
+        frame: Frame = lax.platform_dependent(cuda=by_kernel, default=plain)
+        return frame
+    return by_kernel()
 
 
-@_fused.defjvp
-def _fused_jvp(
-    height: int, width: int, num_rows: int, primals: tuple, tangents: tuple
+@_fast.defjvp
+def _fast_jvp(
+    height: int, width: int, num_rows: int, renderer: str, primals: tuple, tangents: tuple
 ) -> tuple[Frame, Frame]:
     scene, first_row = primals
 
@@ -73,6 +110,6 @@ def _fused_jvp(
         )
 
     _, tangent = jax.jvp(floats, (scene,), tangents[:1])
-    frame = fused.render(scene, height, width, first_row, num_rows)
+    frame = _fast(scene, first_row, height, width, num_rows, renderer)
     none = np.zeros(frame.seg.shape, jax.dtypes.float0)
     return frame, tangent.replace(seg=none, ground=none)

@@ -25,12 +25,15 @@ def place(geoms: Geoms, rig: CameraRig, look: Look, xpos: jax.Array, xquat: jax.
     Returns:
         The scene in the world frame.
     """
-    # One more row stands for the world, so that index -1 selects it.
-    origin = jnp.zeros((1, 3), xpos.dtype)
-    upright = jnp.array([[1.0, 0.0, 0.0, 0.0]], xquat.dtype)
     link = np.array(geoms.link, np.int32)
-    link_pos = jnp.concatenate([xpos, origin])[link]
-    link_quat = jnp.concatenate([xquat, upright])[link]
+    if len(xpos):
+        # Not by one more row that stands for the world: a GPU would write the rows anew.
+        in_world = (link < 0)[:, None]
+        link_pos = jnp.where(in_world, 0.0, xpos[link])
+        link_quat = jnp.where(in_world, jnp.array([1.0, 0.0, 0.0, 0.0]), xquat[link])
+    else:
+        link_pos = jnp.zeros((len(link), 3))
+        link_quat = jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0]), (len(link), 1))
     pos = link_pos + spatial.rotate(link_quat, geoms.pos)
     xmat = spatial.quat_to_mat(spatial.quat_multiply(link_quat, geoms.quat))
     for string in geoms.strings:

@@ -1,4 +1,4 @@
-"""Draws the tables of docs/performance.md and docs/measurements.md from results that are kept.
+"""Draws tables of performance.md, measurements.md and accelerators.md from what is kept.
 
 python -m tests.benchmarks.performance
 """
@@ -8,13 +8,15 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from pixelbrax_gym.bench.cases import TASKS
+from pixelbrax_gym.bench.ahead import tables as compiled
+from pixelbrax_gym.bench.cases import PROGRAMS, TASKS
 from pixelbrax_gym.bench.tables import cell, find, number, ratio, table, title, value
 from tests.benchmarks.pages import redraw
 
 DOCS = Path(__file__).parents[2] / "docs"
 PAGE = DOCS / "performance.md"
 FORMS_PAGE = DOCS / "measurements.md"
+PROGRAMS_PAGE = DOCS / "accelerators.md"
 ADAPTERS = {
     "Gymnasium, jax": '`gymnasium.make_vec`, `output="jax"`',
     "Gymnasium, numpy": '`gymnasium.make_vec`, `output="numpy"`',
@@ -118,6 +120,25 @@ def forms_tables() -> dict[str, str]:
     return {area: f"{forms(area)}\n" for area in ("physics", "renderer")}
 
 
+def programs_tables() -> dict[str, str]:
+    """Tables of programs that are compiled and not run, by name; of the GPUs the H100 alone."""
+    cards = [
+        row for row in rows_of("programs", "gpu-program") if row["arguments"]["card"] == "H100"
+    ]
+    cards.sort(key=_place)
+    chips = sorted(rows_of("programs", "tpu-program"), key=_place)
+    return {
+        "gpu-programs": f"{compiled.gpu(cards)}\n",
+        "tpu-programs": f"{compiled.tpu(chips)}\n",
+    }
+
+
+def _place(row: dict) -> tuple[int, int, int]:
+    about = row["arguments"]
+    tasks = ("inverted_pendulum", *TASKS)
+    return about["num_envs"], tasks.index(about["task"]), PROGRAMS.index(about["program"])
+
+
 def tables() -> dict[str, str]:
     """All of the page's tables, by name."""
     drawings = (environments, peers, adapters, distractors)
@@ -127,3 +148,4 @@ def tables() -> dict[str, str]:
 if __name__ == "__main__":
     redraw(PAGE, tables())
     redraw(FORMS_PAGE, forms_tables())
+    redraw(PROGRAMS_PAGE, programs_tables())

@@ -21,6 +21,7 @@ HEALTHY = doctor.Machine(
     torch_cuda=True,
     to_torch=True,
     to_jax=True,
+    renderer=("pallas", "by one kernel, on NVIDIA H100"),
     gl_libraries=(),
     environ={"XLA_CLIENT_MEM_FRACTION": "0.4"},
 )

@@ -189,5 +189,7 @@ def test_bad_sizes_and_names():
     scene = scenes.random_scene(0)
     with pytest.raises(ValueError, match="height must be at least 1 pixel, got 0"):
         render(scene, 0, 4)
-    with pytest.raises(ValueError, match="unknown renderer: 'fast'; allowed: fused, reference"):
+    with pytest.raises(
+        ValueError, match="unknown renderer: 'fast'; allowed: auto, fused, pallas, "
+    ):
         render(scene, 4, 4, "fast")

@@ -1,0 +1,150 @@
+"""Compiles one program ahead of time, and tells what XLA made of it.
+
+Runs in a process with what `environment.py` installs, under the variables of its ``AheadCase``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import shutil
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+from jax.experimental import topologies
+
+from pixelbrax_gym.bench.ahead import kernels as of
+from pixelbrax_gym.bench.ahead.hlo import parse
+from pixelbrax_gym.bench.ahead.programs import make_program
+from pixelbrax_gym.bench.ahead.registers import assemble
+from pixelbrax_gym.bench.ahead.targets import CARDS, LAUNCH_SECONDS, TPU_TOPOLOGY, Card
+
+_ASSEMBLED = 8
+"""Kernels that are assembled: those of most code, among which are all that could spill."""
+
+
+def gpu(
+    task: str, program: str, num_envs: int, card: str = "H100", **options: Any
+) -> dict[str, Any]:
+    """Compile a program for an NVIDIA GPU.
+
+    Args:
+        task: the task.
+        program: one of ``programs.PROGRAMS``.
+        num_envs: environments.
+        card: one of ``targets.CARDS``.
+        **options: further ones of ``pixelbrax_jax.make``.
+
+    Returns:
+        What the table shows. Bytes read and written count every kernel's operands and results
+        once; ``large_kernels`` are those that write at least a tenth of the output;
+        ``host_steps`` is what the host does one after the other: 1 is one CUDA graph.
+    """
+    try:
+        return _gpu(CARDS[card], *make_program(program, task, num_envs, **options))
+    finally:
+        shutil.rmtree(dump_folder(), ignore_errors=True)
+
+
+def _gpu(about: Card, function: Any, arguments: Any) -> dict[str, Any]:
+    topology = topologies.get_topology_desc(
+        platform="cuda", target_config=about.target_config(), topology="1x1x1"
+    )
+    with _abstract_device(about):
+        compiled, seconds = _compile(topology, "cuda", function, arguments)
+    parsed = parse(compiled.as_text())
+    memory = compiled.memory_analysis()
+    found = of.kernels(parsed)
+    launches = sum(kernel.launches for kernel in found)
+    read, written = (
+        sum(kernel.launches * getattr(kernel, name) for kernel in found)
+        for name in ("read", "written")
+    )
+    large = [k for k in found if k.written >= 0.1 * memory.output_size_in_bytes]
+    return {
+        "kernels": len(found),
+        "launches": launches,
+        "longest_chain": of.longest_chain(parsed),
+        "unknown_loops": sum(loop.trips is None for loop in of.loops(parsed)),
+        "large_kernels": sum(kernel.launches for kernel in large),
+        "temporary_bytes": memory.temp_size_in_bytes,
+        "output_bytes": memory.output_size_in_bytes,
+        "argument_bytes": memory.argument_size_in_bytes,
+        "read_bytes": read,
+        "written_bytes": written,
+        "host_steps": _host_steps(),
+        "compile_seconds": seconds,
+        "model_seconds": {
+            "memory": (read + written) / about.bandwidth,
+            "graph": sum(
+                k.launches * max((k.read + k.written) / about.bandwidth, LAUNCH_SECONDS)
+                for k in found
+            ),
+        },
+        **_registers(about),
+    }
+
+
+def tpu(task: str, program: str, num_envs: int, **options: Any) -> dict[str, Any]:
+    """Compile a program for a TPU v5e; see ``gpu``. Seconds and bytes are XLA's own estimates."""
+    topology = topologies.get_topology_desc(platform="tpu", topology_name=TPU_TOPOLOGY)
+    compiled, seconds = _compile(topology, "tpu", *make_program(program, task, num_envs, **options))
+    memory, cost = compiled.memory_analysis(), compiled.cost_analysis() or {}
+    estimate = cost.get("optimal_seconds", -1.0)
+    return {
+        "temporary_bytes": memory.temp_size_in_bytes,
+        "output_bytes": memory.output_size_in_bytes,
+        "accessed_bytes": cost.get("bytes accessed"),
+        "compile_seconds": seconds,
+        # Less than 0 where XLA has no estimate of some operation.
+        "model_seconds": {"xla": estimate if estimate >= 0 else None},
+    }
+
+
+def _compile(topology: Any, platform: str, function: Any, arguments: Any) -> tuple[Any, float]:
+    where = jax.sharding.SingleDeviceSharding(topology.devices[0])
+
+    def ahead(*args: Any) -> Any:
+        return function(*args)
+
+    started = time.perf_counter()
+    traced = jax.jit(ahead, in_shardings=where, out_shardings=where).trace(*arguments)
+    compiled = traced.lower(lowering_platforms=(platform,)).compile()
+    return compiled, round(time.perf_counter() - started, 1)
+
+
+def _abstract_device(card: Card) -> contextlib.AbstractContextManager[Any]:
+    """Tell Pallas what it compiles for, which jax 0.12 asks for where there is no GPU."""
+    sharding: Any = jax.sharding
+    if not hasattr(sharding, "AbstractDevice"):
+        return contextlib.nullcontext()
+    kind = card.kind.split("-")[0].removesuffix(" 80GB HBM3")
+    device = sharding.AbstractDevice(kind, card.cores, "gpu")
+    mesh: contextlib.AbstractContextManager[Any] = sharding.use_abstract_mesh(
+        sharding.AbstractMesh((), (), abstract_device=device)
+    )
+    return mesh
+
+
+def dump_folder() -> Path:
+    """Return where XLA writes what it compiles: into the folder of its flag."""
+    named = re.search(r"--xla_dump_to=(\S+)", os.environ.get("XLA_FLAGS", ""))
+    return Path(named[1]) if named else Path(tempfile.gettempdir()) / "no-dump"
+
+
+def _host_steps() -> int | None:
+    """Return how many parts the host launches one after the other; None if XLA does not tell."""
+    files = sorted(dump_folder().glob("*jit_ahead*.thunk_sequence_after_thunk_passes.txt"))
+    if not files:
+        return None
+    return len(re.findall(r"^\d+: k\w+", files[-1].read_text("utf-8"), re.M))
+
+
+def _registers(card: Card) -> dict[str, int | None]:
+    sources = sorted(dump_folder().glob("*jit_ahead*.ptx"), key=lambda file: -file.stat().st_size)
+    most = assemble(sources[:_ASSEMBLED], card.architecture)
+    return dict(most) if most else {"registers": None, "spilled": None}

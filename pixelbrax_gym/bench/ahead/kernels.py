@@ -1,0 +1,153 @@
+"""What a program of XLA has a GPU do: kernels, launches, loops, traffic."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from pixelbrax_gym.bench.ahead.hlo import Computation, Instruction, Program
+
+FREE = frozenset(
+    (
+        "parameter",
+        "constant",
+        "tuple",
+        "get-tuple-element",
+        "bitcast",
+        "after-all",
+        "opt-barrier",
+        "copy-done",
+        "async-done",
+        "partition-id",
+    )
+)
+"""Operations that launch nothing."""
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """A kernel of the program.
+
+    Attributes:
+        name: of the instruction.
+        op: its operation.
+        launches: how often a call of the program launches it; loops of an unknown number of turns
+            count once.
+        read: bytes that a launch reads at least, each once.
+        written: bytes that a launch writes.
+    """
+
+    name: str
+    op: str
+    launches: int
+    read: int
+    written: int
+
+
+@dataclass(frozen=True)
+class Loop:
+    """A loop of the program; ``trips`` is None where only the data tell when it ends."""
+
+    name: str
+    trips: int | None
+
+
+def kernels(program: Program) -> list[Kernel]:
+    """Return the kernels of a program, those of branches too."""
+    return list(_kernels(program, program.entry, 1))
+
+
+def loops(program: Program) -> list[Loop]:
+    """Return the loops of a program."""
+    return [
+        Loop(line.name, line.trips)
+        for computation in program.computations.values()
+        for line in computation.values()
+        if line.op == "while"
+    ]
+
+
+def longest_chain(program: Program) -> int:
+    """Return how many launches wait for one another at least, however many run side by side."""
+    return _chain(program, program.entry)
+
+
+def _kernels(program: Program, name: str, times: int) -> Iterator[Kernel]:
+    computation = program.computations[name]
+    for line in computation.values():
+        if line.op in FREE:
+            continue
+        inner = _inner(line)
+        if not inner:
+            read, written = _traffic(program, computation, line)
+            yield Kernel(line.name, line.op, times, read, written)
+        for part in inner:
+            yield from _kernels(program, part, times * _turns(line))
+
+
+def _inner(line: Instruction) -> list[str]:
+    """Names of the computations whose kernels an instruction launches."""
+    if line.op == "while":
+        # The condition of a counted loop is not evaluated.
+        return line.called("body") if line.trips is not None else line.called("body", "condition")
+    if line.op == "conditional":
+        return line.branches()
+    if line.op == "call":
+        return line.called("to_apply")
+    if line.op.endswith("-start"):
+        return line.called("calls")
+    return []
+
+
+def _turns(line: Instruction) -> int:
+    return line.trips if line.op == "while" and line.trips is not None else 1
+
+
+def _chain(program: Program, name: str) -> int:
+    depth: dict[str, int] = {}
+    for line in program.computations[name].values():
+        before = max((depth.get(operand, 0) for operand in line.operands), default=0)
+        inner = _inner(line)
+        if inner:
+            own = _turns(line) * max(_chain(program, part) for part in inner)
+        else:
+            own = 0 if line.op in FREE else 1
+        depth[line.name] = before + own
+    return max(depth.values(), default=0)
+
+
+def _traffic(program: Program, computation: Computation, line: Instruction) -> tuple[int, int]:
+    """Bytes that a kernel reads and writes; slices of an array count as what they take."""
+    if line.op != "fusion":
+        operands = (computation[name] for name in line.operands if name in computation)
+        return sum(operand.num_bytes for operand in operands), line.num_bytes
+    body = program.computations[line.called("calls")[0]]
+    users: dict[str, list[tuple[Instruction, int]]] = defaultdict(list)
+    for part in body.values():
+        for position, name in enumerate(part.operands):
+            users[name].append((part, position))
+
+    def read(part: Instruction, whole: int) -> int:
+        total = 0
+        for user, position in users[part.name]:
+            if user.op in ("slice", "dynamic-slice", "gather") and position == 0:
+                total += user.num_bytes
+            elif user.op == "bitcast":
+                total += read(user, whole)
+            elif user.op != "dynamic-update-slice" or position > 0:
+                return whole
+        return min(total, whole)
+
+    def written(part: Instruction) -> int:
+        if part.op == "bitcast":
+            return written(body[part.operands[0]])
+        if part.op == "dynamic-update-slice":
+            return body[part.operands[1]].num_bytes
+        if part.op == "tuple":
+            return sum(written(body[name]) for name in part.operands)
+        return part.num_bytes
+
+    inputs = (part for part in body.values() if part.op == "parameter")
+    root = next(part for part in body.values() if part.is_root)
+    return sum(read(part, part.num_bytes) for part in inputs), written(root)

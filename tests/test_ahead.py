@@ -1,0 +1,164 @@
+"""Programs of XLA are read as they are written; a small one is counted by hand."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from pixelbrax_gym.bench import cases, command
+from pixelbrax_gym.bench.ahead import environment, kernels, registers, tables
+from pixelbrax_gym.bench.ahead.hlo import parse
+from pixelbrax_gym.bench.ahead.programs import PROGRAMS, make_program
+from pixelbrax_gym.bench.case import AbsentError
+
+PROGRAM = """HloModule jit_ahead, is_scheduled=true
+
+%fused_slice (p.0: f32[64,8], p.1: s32[]) -> f32[1,8] {
+  %p.0 = f32[64,8]{1,0} parameter(0)
+  %p.1 = s32[] parameter(1)
+  %zero = s32[] constant(0)
+  ROOT %row = f32[1,8]{1,0} dynamic-slice(%p.0, %p.1, %zero), dynamic_slice_sizes={1,8}
+}
+
+%body (carry: (s32[], f32[64,8])) -> (s32[], f32[64,8]) {
+  %carry = (s32[], f32[64,8]{1,0}) parameter(0)
+  %i = s32[] get-tuple-element(%carry), index=0
+  %x = f32[64,8]{1,0} get-tuple-element(%carry), index=1
+  %one = f32[1,8]{1,0} fusion(%x, %i), kind=kLoop, calls=%fused_slice
+  %copied = f32[64,8]{1,0} copy(%x)
+  ROOT %next = (s32[], /*index=1*/f32[64,8]{1,0}) tuple(%i, %copied)
+}
+
+%condition (carry.1: (s32[], f32[64,8])) -> pred[] {
+  %carry.1 = (s32[], f32[64,8]{1,0}) parameter(0)
+  %j = s32[] get-tuple-element(%carry.1), index=0
+  ROOT %less = pred[] compare(%j, %j), direction=LT
+}
+
+ENTRY %main (a: f32[64,8]) -> f32[64,8] {
+  %a = f32[64,8]{1,0} parameter(0)
+  %first = f32[64,8]{1,0} copy(%a)
+  %side = f32[64,8]{1,0} copy(%a)
+  %start = s32[] constant(0)
+  %both = (s32[], f32[64,8]{1,0}) tuple(%start, %first)
+  %loop = (s32[], f32[64,8]{1,0}) while(%both), condition=%condition, body=%body COUNTED
+  ROOT %out = f32[64,8]{1,0} get-tuple-element(%loop), index=1
+}
+"""
+COUNTED = ', backend_config={"known_trip_count":{"n":"5"}}'
+
+
+def test_a_counted_loop_multiplies_its_kernels():
+    program = parse(PROGRAM.replace(" COUNTED", COUNTED))
+    found = {kernel.name: kernel for kernel in kernels.kernels(program)}
+    assert {name: kernel.launches for name, kernel in found.items()} == {
+        "first": 1,
+        "side": 1,
+        "one": 5,
+        "copied": 5,
+    }
+    assert [loop.trips for loop in kernels.loops(program)] == [5]
+    # A copy, then five turns in which the two kernels may run side by side.
+    assert kernels.longest_chain(program) == 6
+
+
+def test_a_slice_reads_what_it_takes():
+    found = {kernel.name: kernel for kernel in kernels.kernels(parse(PROGRAM))}
+    assert (found["one"].read, found["one"].written) == (32 + 4, 32)
+    assert (found["copied"].read, found["copied"].written) == (2048, 2048)
+
+
+def test_a_loop_of_unknown_length_counts_once_with_its_condition():
+    program = parse(PROGRAM.replace(" COUNTED", ""))
+    assert [loop.trips for loop in kernels.loops(program)] == [None]
+    assert sum(kernel.launches for kernel in kernels.kernels(program)) == 5
+
+
+def test_a_program_of_this_machine_is_read():
+    compiled = jax.jit(lambda x: jax.lax.fori_loop(0, 3, lambda _, x: x @ x, x)).lower(
+        jnp.ones((8, 8))
+    )
+    program = parse(compiled.compile().as_text())
+    assert sum(kernel.launches for kernel in kernels.kernels(program)) >= 3
+
+
+def test_another_text_is_refused():
+    with pytest.raises(ValueError, match="no program of XLA"):
+        parse("a poem")
+
+
+def test_the_programs_can_be_traced():
+    for name in PROGRAMS:
+        function, arguments = make_program(name, "inverted_pendulum", 2, backend="spring")
+        assert jax.tree.leaves(jax.eval_shape(function, *arguments))
+
+
+def test_registers_are_not_known_without_an_assembler(monkeypatch, tmp_path):
+    monkeypatch.setattr(registers, "find_assembler", lambda: None)
+    assert registers.assemble([tmp_path / "kernel.ptx"], "sm_90a") is None
+
+
+def test_the_most_of_several_kernels_is_told(monkeypatch, tmp_path):
+    told = iter(
+        (
+            "0 bytes stack frame, 8 bytes spill stores, 4 bytes spill loads\nUsed 40 registers",
+            "0 bytes stack frame, 0 bytes spill stores, 0 bytes spill loads\nUsed 90 registers",
+        )
+    )
+    monkeypatch.setattr(registers, "find_assembler", lambda: "ptxas")
+    monkeypatch.setattr(
+        subprocess, "run", lambda *_, **__: SimpleNamespace(stderr=next(told), returncode=0)
+    )
+    found = registers.assemble([tmp_path / "a.ptx", tmp_path / "b.ptx"], "sm_90a")
+    assert found == {"registers": 90, "spilled": 12}
+
+
+def test_a_compiler_that_cannot_be_installed_is_absent(monkeypatch, tmp_path):
+    monkeypatch.setenv("PIXELBRAX_CACHE", str(tmp_path))
+    monkeypatch.setattr(environment, "packages", lambda _: ("no package of this name",))
+    environment._install.cache_clear()
+    with pytest.raises(AbsentError, match="cannot be installed"):
+        environment.install("cuda")
+    environment._install.cache_clear()
+
+
+def test_the_compiler_is_that_of_the_running_jax():
+    release = f"=={jax.__version__}"
+    assert all(name.endswith(release) for name in environment.packages("cuda")[:2])
+    assert release[2:] in environment.folder("cuda").name
+
+
+def test_what_is_not_known_is_told_so():
+    values = dict.fromkeys(
+        (
+            *("kernels", "launches", "longest_chain", "host_steps", "unknown_loops"),
+            *("temporary_bytes", "output_bytes", "read_bytes", "written_bytes"),
+        ),
+        1,
+    )
+    values |= {"registers": None, "spilled": None, "model_seconds": {"graph": 2e-5}}
+    about = {"task": "ant", "num_envs": 1024, "program": "renderer"}
+    row = {"status": "ok", "arguments": about, "values": values}
+    assert "| not known |" in tables.gpu([row])
+
+
+def test_what_runs_is_not_mixed_with_what_does_not(capsys):
+    with pytest.raises(SystemExit):
+        command.main(["--only", "gpu-program", "renderer"])
+    assert "gpu-program runs nothing: leave out renderer" in capsys.readouterr().err
+    assert command.main(["--only", "gpu-program", "--task", "ant", "--list"]) == 0
+    assert len(capsys.readouterr().out.splitlines()) == 16
+    assert not set(cases.COMPILED) & {*cases.QUICK, *cases.FULL}
+
+
+def test_importing_the_cases_imports_no_compiler():
+    code = (
+        "import sys, pixelbrax_gym.bench.cases; print('jax.experimental.topologies' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"

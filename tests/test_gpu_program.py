@@ -1,0 +1,83 @@
+"""Programs for an H100 and a TPU v5e stay as good as they were; run with `make test-programs`.
+
+Compiled, not run. The compilers are installed at the first time: 300 MB for the H100, 150 MB for
+the TPU.
+"""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import jax
+import pytest
+
+from pixelbrax_gym.bench import runner
+from pixelbrax_gym.bench.ahead.case import AheadCase
+
+pytestmark = [pytest.mark.gpu_program, pytest.mark.timeout(900)]
+
+KEPT = Path(__file__).parents[1] / "docs" / "benchmarks" / "programs.json"
+N = 1024
+
+
+@cache
+def compiled(task: str, program: str, platform: str = "cuda") -> dict[str, Any]:
+    """What the compiler made of a program."""
+    measure = "compiling.gpu" if platform == "cuda" else "compiling.tpu"
+    where = {"task": task, "program": program, "num_envs": N}
+    if platform == "cuda":
+        where["card"] = "H100"
+    with pytest.MonkeyPatch.context() as patch:
+        # The tests' own compile without optimisation.
+        patch.delenv("XLA_FLAGS", raising=False)
+        outcome = runner.measure(AheadCase("guard", measure, where, platform=platform), 600.0)
+    if outcome["status"] == "absent":
+        pytest.skip(outcome["why"])
+    assert outcome["status"] == "ok", outcome.get("why")
+    return outcome["values"]
+
+
+def kept(task: str, program: str) -> dict[str, Any] | None:
+    """The same of the kept report; None if that is of another JAX."""
+    report = json.loads(KEPT.read_text("utf-8"))
+    where = {"task": task, "program": program, "num_envs": N, "card": "H100"}
+    for row in report["cases"].values():
+        release = report["machines"][row["machine"]]["versions"]["jax"]
+        if row["arguments"] == where and release == jax.__version__:
+            return row["values"]
+    return None
+
+
+@pytest.mark.parametrize("task", ["ant", "halfcheetah"])
+def test_the_renderer_is_one_large_kernel(task):
+    values = compiled(task, "renderer")
+    assert values["large_kernels"] == 1
+    assert values["launches"] <= 8
+    assert values["temporary_bytes"] <= 0.3 * values["output_bytes"]
+    assert values["read_bytes"] + values["written_bytes"] <= 1.2 * values["output_bytes"]
+    assert not values["spilled"]
+
+
+@pytest.mark.parametrize("program", ["state step", "step"])
+def test_a_step_launches_no_more_than_it_did(program):
+    values = compiled("ant", program)
+    assert values["unknown_loops"] == 0
+    before = kept("ant", program)
+    if before is None:
+        pytest.skip(f"no report of jax {jax.__version__} is kept")
+    assert values["launches"] <= 1.1 * before["launches"]
+    assert values["longest_chain"] <= 1.1 * before["longest_chain"]
+
+
+def test_pixels_add_few_launches_to_a_step():
+    pixels, state = compiled("ant", "step"), compiled("ant", "state step")
+    assert pixels["launches"] <= state["launches"] + 12
+    assert pixels["temporary_bytes"] <= 0.3 * pixels["output_bytes"]
+
+
+def test_a_tpu_has_its_program():
+    values = compiled("inverted_pendulum", "renderer", "tpu")
+    assert values["temporary_bytes"] <= 0.3 * values["output_bytes"]
