@@ -25,7 +25,7 @@ LINE_SEARCH_ITERATIONS = 6
 """Steps along a direction at most, of those that change active constraints."""
 
 _ROWS = 16
-"""Rows of a product of matrices that are added up at a time."""
+"""Rows of a product of matrices that are added up at a time, if it has no more columns."""
 
 _EQUALITY, _FRICTION, _ONE_SIDED = range(3)
 
@@ -114,7 +114,7 @@ def solve(model: Any, data: Any) -> Any:
 
     def pad(x: jax.Array) -> jax.Array:
         """Add constraints that are never active, up to a multiple of the rows added at a time."""
-        return jnp.pad(x, [(0, -len(x) % min(_ROWS, len(x))), *[(0, 0)] * (x.ndim - 1)])
+        return jnp.pad(x, [(0, -len(x) % _rows(impl.efc_J)), *[(0, 0)] * (x.ndim - 1)])
 
     problem = _Problem(
         inertia=support.full_m(model, data),
@@ -164,13 +164,20 @@ def _counts(impl: Any) -> list[int]:
     return [impl.ne, impl.nf, impl.nefc - impl.ne - impl.nf]
 
 
+def _rows(jacobian: jax.Array) -> int:
+    length, columns = jacobian.shape
+    return min(_ROWS, length) if columns <= _ROWS else length
+
+
 def _over_rows(left: jax.Array, right: jax.Array) -> jax.Array:
     """Return ``left.T @ right``, some rows at a time: CPUs write short products out as sums."""
 
     def add(total: jax.Array, pieces: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
         return total + pieces[0].T @ pieces[1], None
 
-    rows = min(_ROWS, len(left))
+    rows = _rows(left)
+    if rows == len(left):
+        return left.T @ right
     pieces = left.reshape(-1, rows, left.shape[1]), right.reshape(-1, rows, right.shape[1])
     return jax.lax.scan(add, jnp.zeros((left.shape[1], right.shape[1])), pieces)[0]
 

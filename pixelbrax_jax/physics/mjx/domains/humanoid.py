@@ -62,7 +62,9 @@ def _reward(seen: Snapshot, *, speed: float) -> jax.Array:
 
 
 def _task(speed: float) -> DmcTask:
-    return DmcTask("humanoid", _start, _observe, partial(_reward, speed=speed), substeps=5)
+    return DmcTask(
+        "humanoid", _start, _observe, partial(_reward, speed=speed), batch_last=False, substeps=5
+    )
 
 
 TASKS = {"stand": _task(0.0), "walk": _task(1.0), "run": _task(10.0)}

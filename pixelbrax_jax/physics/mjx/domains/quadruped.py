@@ -80,6 +80,7 @@ def _task(speed: float) -> DmcTask:
         _start,
         _observe,
         partial(_reward, speed=speed),
+        batch_last=False,
         substeps=4,
         options={"floor_size": _EPISODE * speed},
         camera=2,
