@@ -12,42 +12,30 @@ import jax
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
 
-_OPTIONS: dict[str, int | str] = {
-    "xla_cpu_prefer_vector_width": 512,
-    # No kind of operation.
-    "xla_cpu_experimental_ynn_fusion_type": "",
-}
+_WIDTH = "xla_cpu_prefer_vector_width"
 
 
-def compiler_options() -> dict[str, int | str]:
+def compiler_options() -> dict[str, int]:
     """Return options of ``jax.jit`` that make images fast on the default device.
 
     XLA holds back on CPUs with AVX-512 and computes with vectors of 256 bits; with 512 the
-    ray-caster is up to twice as fast there. Other CPUs have no such vectors and are not affected.
-    Sums that XLA hands over to a library of kernels take several times as long as its own in the
-    small batches of a constraint solver, and so are left to XLA. Other devices need no options.
-
-    Whatever PixelBrax compiles by itself for the Gymnasium, TorchRL and Stable-Baselines3
-    environments and for its agents has these options. A program of your own gets them at its
-    outermost ``jax.jit``, the only one that takes options:
+    ray-caster is up to twice as fast there. Other CPUs have no such vectors and are not affected;
+    other devices need no options. Whatever PixelBrax compiles by itself for the Gymnasium, TorchRL
+    and Stable-Baselines3 environments and for its agents has these options. A program of your own
+    gets them at its outermost ``jax.jit``, the only one that takes options:
 
         step = jax.jit(env.step, compiler_options=pixelbrax_jax.compiler_options())
 
     Options change how XLA rounds: the same program with and without them agrees to rounding
-    errors, not to the bit. What ``XLA_FLAGS`` names is kept, for every program alike.
+    errors, not to the bit. A width that ``XLA_FLAGS`` names is kept, for every program alike.
 
     Returns:
-        The options, without those that ``XLA_FLAGS`` names and those that this XLA does not know;
-        empty on other devices than CPUs.
+        The options; empty on other devices than CPUs, with a width in ``XLA_FLAGS``, and with an
+        XLA that does not know them.
     """
-    if jax.default_backend() != "cpu":
+    if jax.default_backend() != "cpu" or _WIDTH in os.environ.get("XLA_FLAGS", ""):
         return {}
-    flags = os.environ.get("XLA_FLAGS", "")
-    return {
-        name: value
-        for name, value in _OPTIONS.items()
-        if name not in flags and _is_known(name, value)
-    }
+    return {_WIDTH: 512} if _is_known(_WIDTH) else {}
 
 
 def jit(**options: Any) -> Callable[[Callable[_P, _T]], Callable[_P, _T]]:
@@ -74,9 +62,9 @@ def jit(**options: Any) -> Callable[[Callable[_P, _T]], Callable[_P, _T]]:
 
 
 @cache
-def _is_known(option: str, value: int | str) -> bool:
+def _is_known(option: str) -> bool:
     try:
-        jax.jit(lambda x: x, compiler_options={option: value}).lower(0).compile()
+        jax.jit(lambda x: x, compiler_options={option: 512}).lower(0).compile()
     except jax.errors.JaxRuntimeError:
         return False
     return True
