@@ -201,8 +201,8 @@ STATEMENTS = {
         ("{} on HalfCheetah", [mean_end("ppo-halfcheetah")]),
         ("{} on Ant", [mean_end("ppo-ant")]),
         ("{} on Humanoid", [mean_end("ppo-humanoid")]),
-        ("and {} on HalfCheetah in a run", [mean_end("ppo-halfcheetah-long")]),
-        ("which is what no action earns, {}", [without_action("ant")]),
+        ("encoder, {} on HalfCheetah in a run", [mean_end("ppo-halfcheetah-long")]),
+        ("more than no action does, {}", [without_action("ant")]),
         (
             "which sees the state, ends at {} after",
             [f"{read('results/from_state.json')['walker2d x 1']['return'][-1]:,.0f}"],
