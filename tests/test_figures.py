@@ -158,7 +158,7 @@ STATEMENTS = {
     "README.md": (
         ("cheetah run make {} steps", [number(suite_speed("dmc_cheetah_run")[0])]),
         ("{} times as many as dm_control", [f"{suite_ratio('dmc_cheetah_run'):.0f}"]),
-        ("it is {} (walker walk)", [f"{suite_ratio('dmc_walker_walk'):.0f}"]),
+        ("it is {} (finger spin)", [f"{suite_ratio('dmc_finger_spin'):.0f}"]),
         ("to {} times (reacher easy)", [f"{suite_ratio('dmc_reacher_easy'):.0f}"]),
         ("256 of Brax's Ants make {}", [number(ant())]),
         ("Ant keeps {} to {} of its speed", span(distractor_ratios())),
