@@ -26,9 +26,9 @@ _LANES = 16
 def batch_last(fn: Callable[..., Any], in_axes: Sequence[int | None]) -> Callable[..., Any]:
     """Return ``jax.vmap(fn, in_axes)``, computed with the batch as last axis.
 
-    Results differ from those of ``jax.vmap`` by rounding. What has no rule here, among it loops
-    that end by themselves and functions with derivatives of their own, is computed by
-    ``jax.vmap``, as is everything within ``jax.shard_map`` if that keeps track of what varies.
+    Results differ from those of ``jax.vmap`` by rounding. What has no rule here, among it
+    functions with derivatives of their own, is computed by ``jax.vmap``, as is everything within
+    ``jax.shard_map`` if that keeps track of what varies.
     More than a few rows are padded by copies of the last one, whose side effects happen too.
 
     The parameters of JAX's primitives, which are read here, are not public. With a release whose
@@ -201,12 +201,8 @@ def _while(eqn: core.JaxprEqn, inputs: list[Operand], size: int) -> list[Operand
     """Go on until all rows have ended; those that have keep what they ended with."""
     params = eqn.params
     cond, body = params["cond_jaxpr"], params["body_jaxpr"]
-    split = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
-    cond_consts, body_consts, first = (
-        inputs[: split[0]],
-        inputs[split[0] : split[1]],
-        inputs[split[1] :],
-    )
+    start, stop = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
+    cond_consts, body_consts, first = inputs[:start], inputs[start:stop], inputs[stop:]
     flags = _reach_while(eqn, [x.batched for x in inputs])
     shapes = [row_aval(var).shape for var in eqn.outvars]
 
@@ -221,8 +217,8 @@ def _while(eqn: core.JaxprEqn, inputs: list[Operand], size: int) -> list[Operand
             return after
         return [jnp.where(going.value, x, before) for x, before in zip(after, carried, strict=True)]
 
-    start = _spread_where(first, shapes, flags, size)
-    last = lax.while_loop(lambda carried: jnp.any(unfinished(carried).value), turn, start)
+    carry = _spread_where(first, shapes, flags, size)
+    last = lax.while_loop(lambda carried: jnp.any(unfinished(carried).value), turn, carry)
     return list(map(Operand, last, flags))
 
 

@@ -108,9 +108,10 @@ def solve(model: Any, data: Any) -> Any:
         ``data`` with ``qacc``, ``qfrc_constraint`` and ``efc_force``.
     """
     impl = data._impl
-    kind = np.repeat([_EQUALITY, _FRICTION, _ONE_SIDED], _counts(impl))
+    # MuJoCo's order: equalities, dry friction, then limits and contacts.
+    counts = [impl.ne, impl.nf, impl.nefc - impl.ne - impl.nf]
+    kind = np.repeat([_EQUALITY, _FRICTION, _ONE_SIDED], counts)
     friction = jnp.where(kind == _FRICTION, impl.efc_frictionloss, jnp.inf)
-    zero = jnp.zeros(impl.nefc)
 
     def pad(x: jax.Array) -> jax.Array:
         """Add constraints that are never active, up to a multiple of the rows added at a time."""
@@ -123,7 +124,7 @@ def solve(model: Any, data: Any) -> Any:
         reference=pad(impl.efc_aref),
         stiffness=pad(impl.efc_D),
         low=pad(-friction),
-        high=pad(jnp.where(kind == _ONE_SIDED, zero, friction)),
+        high=pad(jnp.where(kind == _ONE_SIDED, 0.0, friction)),
     )
     warm, smooth = data.qacc_warmstart, data.qacc_smooth
     start = jnp.where(problem.cost(warm) < problem.cost(smooth), warm, smooth)
@@ -157,11 +158,6 @@ def solve(model: Any, data: Any) -> Any:
             "_impl.efc_force": force[: impl.nefc],
         }
     )
-
-
-def _counts(impl: Any) -> list[int]:
-    """Return numbers of equalities, of dry friction, of limits and contacts: MuJoCo's order."""
-    return [impl.ne, impl.nf, impl.nefc - impl.ne - impl.nf]
 
 
 def _rows(jacobian: jax.Array) -> int:
