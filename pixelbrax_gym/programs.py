@@ -17,6 +17,10 @@ Array = jax.Array | np.ndarray
 Stepped = tuple[EnvState, dict[str, Any]]
 
 
+def _env(programs: Programs) -> PixelEnv:
+    return programs.vector.env
+
+
 @dataclass(frozen=True)
 class Programs:
     """The compiled programs of one set of options, which all environments with equal ones share.
@@ -32,13 +36,13 @@ class Programs:
     vector: VectorPixelEnv
     single: bool
 
-    @compilation.jit(static_argnums=0)
+    @compilation.jit(_env, static_argnums=0)
     def reset(self, seeds: Array, params: EnvParams) -> Stepped:
         """Reset all environments to episode 0 of their (N,) uint32 seeds."""
         state, timestep = self.vector.reset(jax.vmap(jax.random.key)(seeds), params)
         return state, self._outputs(timestep, jnp.ones(self.vector.num_envs, bool))
 
-    @compilation.jit(static_argnums=0, donate_argnums=1)
+    @compilation.jit(_env, static_argnums=0, donate_argnums=1)
     def reset_where(
         self,
         state: EnvState,
@@ -52,12 +56,12 @@ class Programs:
         state, timestep = self.vector.reset_where(state, mask, params, key)
         return state, self._outputs(timestep, reported)
 
-    @compilation.jit(static_argnums=0, donate_argnums=1)
+    @compilation.jit(_env, static_argnums=0, donate_argnums=1)
     def step(self, state: EnvState, action: Array, params: EnvParams) -> Stepped:
         """Step all environments."""
         return self._step(state, action, params)
 
-    @compilation.jit(static_argnums=0, donate_argnums=1)
+    @compilation.jit(_env, static_argnums=0, donate_argnums=1)
     def step_where(self, state: EnvState, mask: Array, action: Array, params: EnvParams) -> Stepped:
         """Step some environments; the others repeat their observation, with ``done`` False."""
         stepped, outputs = self._step(state, action, params)
@@ -103,7 +107,7 @@ def _with_masks(info: Mapping[str, Any], mask: Array) -> dict[str, Any]:
     return {**info, **{f"_{name}": mask for name in info}}
 
 
-@compilation.jit(static_argnums=(0, 3, 4))
+@compilation.jit(lambda env: env, static_argnums=(0, 3, 4))
 def draw_images(
     env: PixelEnv, state: EnvState, params: EnvParams, height: int, width: int
 ) -> jax.Array:

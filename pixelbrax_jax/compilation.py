@@ -14,47 +14,60 @@ _T = TypeVar("_T")
 
 _WIDTH = "xla_cpu_prefer_vector_width"
 
+XlaOptions = dict[str, Any]
 
-def compiler_options() -> dict[str, int]:
-    """Return options of ``jax.jit`` that make images fast on the default device.
+
+def compiler_options(env: Any = None) -> XlaOptions:
+    """Return options of ``jax.jit`` that make an environment fast on the default device.
 
     XLA holds back on CPUs with AVX-512 and computes with vectors of 256 bits; with 512 the
     ray-caster is up to twice as fast there. Other CPUs have no such vectors and are not affected;
-    other devices need no options. Whatever PixelBrax compiles by itself for the Gymnasium, TorchRL
-    and Stable-Baselines3 environments and for its agents has these options. A program of your own
-    gets them at its outermost ``jax.jit``, the only one that takes options:
+    other devices need no options. Some physics is faster with options of its own. Whatever
+    PixelBrax compiles by itself for the Gymnasium, TorchRL and Stable-Baselines3 environments and
+    for its agents has these options. A program of your own gets them at its outermost ``jax.jit``,
+    the only one that takes options:
 
-        step = jax.jit(env.step, compiler_options=pixelbrax_jax.compiler_options())
+        step = jax.jit(env.step, compiler_options=pixelbrax_jax.compiler_options(env))
 
     Options change how XLA rounds: the same program with and without them agrees to rounding
-    errors, not to the bit. A width that ``XLA_FLAGS`` names is kept, for every program alike.
+    errors, not to the bit.
+
+    Args:
+        env: a ``PixelEnv`` or ``VectorPixelEnv``; None for the options of the renderer alone,
+            which are all that Brax's tasks have.
 
     Returns:
-        The options; empty on other devices than CPUs, with a width in ``XLA_FLAGS``, and with an
-        XLA that does not know them.
+        The options; empty on other devices than CPUs and with a width of vectors in ``XLA_FLAGS``.
+        What the installed XLA does not know is left out.
     """
     if jax.default_backend() != "cpu" or _WIDTH in os.environ.get("XLA_FLAGS", ""):
         return {}
-    return {_WIDTH: 512} if _is_known(_WIDTH) else {}
+    physics = getattr(getattr(env, "env", env), "physics", None)
+    options = {_WIDTH: 512, **getattr(physics, "compiler_options", {})}
+    return {name: value for name, value in options.items() if _is_known(name, value)}
 
 
-def jit(**options: Any) -> Callable[[Callable[_P, _T]], Callable[_P, _T]]:
+def jit(
+    env_of: Callable[[Any], Any], **options: Any
+) -> Callable[[Callable[_P, _T]], Callable[_P, _T]]:
     """Decorate as ``jax.jit`` does, with ``compiler_options``.
 
     They are asked for at the first call: importing a package must not start a device.
 
     Args:
+        env_of: gives the environment of the function's first argument, which is static.
         **options: of ``jax.jit``.
     """
 
     def decorate(function: Callable[_P, _T]) -> Callable[_P, _T]:
         @cache
-        def program() -> Any:
-            return jax.jit(function, compiler_options=compiler_options(), **options)
+        def program(names_and_values: tuple[tuple[str, Any], ...]) -> Any:
+            return jax.jit(function, compiler_options=dict(names_and_values), **options)
 
         @wraps(function)
         def call(*args: _P.args, **kwargs: _P.kwargs) -> _T:
-            return program()(*args, **kwargs)
+            asked = compiler_options(env_of(args[0]))
+            return program(tuple(asked.items()))(*args, **kwargs)
 
         return call
 
@@ -62,9 +75,9 @@ def jit(**options: Any) -> Callable[[Callable[_P, _T]], Callable[_P, _T]]:
 
 
 @cache
-def _is_known(option: str) -> bool:
+def _is_known(option: str, value: Any) -> bool:
     try:
-        jax.jit(lambda x: x, compiler_options={option: 512}).lower(0).compile()
+        jax.jit(lambda x: x, compiler_options={option: value}).lower(0).compile()
     except jax.errors.JaxRuntimeError:
         return False
     return True

@@ -28,6 +28,24 @@ def test_vectors_are_wide_unless_the_user_says_otherwise(monkeypatch, flags, wid
     assert done.stdout.split() == [width, "128.0"]
 
 
+DMC = """
+import pixelbrax_jax as pb
+env, _ = pb.make("dmc_cartpole_swingup")
+brax, _ = pb.make("inverted_pendulum")
+own = pb.compiler_options(env).items() - pb.compiler_options().items()
+assert own == {("xla_cpu_experimental_ynn_fusion_type", "")}, own
+assert pb.compiler_options(env) == pb.compiler_options(pb.VectorPixelEnv(env, 2))
+assert pb.compiler_options(brax) == pb.compiler_options()
+"""
+
+
+def test_options_are_those_of_the_environment(monkeypatch):
+    pytest.importorskip("dm_control")
+    monkeypatch.setenv("XLA_FLAGS", "")
+    monkeypatch.setenv("JAX_PLATFORMS", "cpu")
+    subprocess.run([sys.executable, "-W", "ignore", "-c", DMC], check=True, timeout=120)
+
+
 def test_an_xla_without_the_option_is_left_alone(monkeypatch):
     import pixelbrax_jax.compilation as compilation
 

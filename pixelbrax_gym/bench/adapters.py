@@ -74,7 +74,7 @@ def scan(task: str, num_envs: int, actions: np.ndarray) -> Callable[[], Any]:
 
         return jax.lax.scan(step, state, actions)
 
-    program = jax.jit(steps, donate_argnums=0, compiler_options=pb.compiler_options())
+    program = jax.jit(steps, donate_argnums=0, compiler_options=pb.compiler_options(venv))
     keys = jax.vmap(jax.random.key)(jnp.arange(num_envs))
     carry = {"state": venv.reset(keys, params)[0]}
     params, own = jax.device_put((params, actions))
@@ -93,7 +93,7 @@ def _jax_loops(
     env, params = pb.make(task)
     params = jax.device_put(params)
     venv = pb.VectorPixelEnv(env, num_envs, mode)
-    step = jax.jit(venv.step, donate_argnums=0, compiler_options=pb.compiler_options())
+    step = jax.jit(venv.step, donate_argnums=0, compiler_options=pb.compiler_options(venv))
     keys = jax.vmap(jax.random.key)(jnp.arange(num_envs))
     carry = {"state": venv.reset(keys, params)[0]}
     own = [jax.device_put(action) for action in actions]

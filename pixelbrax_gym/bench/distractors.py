@@ -71,7 +71,7 @@ def compare(task: str, num_envs: int, seconds: float = SECONDS) -> list[dict[str
 
 def _stepper(env: Any, params: Any, num_envs: int, calls: int) -> Callable[[], Any]:
     venv = pb.VectorPixelEnv(env, num_envs)
-    step = jax.jit(venv.step, donate_argnums=0, compiler_options=pb.compiler_options())
+    step = jax.jit(venv.step, donate_argnums=0, compiler_options=pb.compiler_options(venv))
     shape = (calls, num_envs, env.action_size)
     actions = list(jax.random.uniform(jax.random.key(1), shape, minval=-1.0, maxval=1.0))
     carry = {"state": venv.reset(jax.random.key(0), params)[0]}

@@ -26,7 +26,7 @@ def renderer(
         task, look=look, shadows=shadows, height=size, width=size, renderer=renderer
     )
     states = first_states(env, params, num_envs)
-    program, compile_seconds = compiled(jax.vmap(env.draw, in_axes=(0, None)), states, params)
+    program, compile_seconds = compiled(env, jax.vmap(env.draw, in_axes=(0, None)), states, params)
 
     def run(calls: int) -> Any:
         for _ in range(calls):
@@ -88,7 +88,9 @@ def scan(
         return jax.lax.fori_loop(0, count, step, (state, key, jnp.float32(0.0)))
 
     key = jax.random.key(1)
-    program, compile_seconds = compiled(steps, state, key, params, jnp.int32(1), donate_argnums=0)
+    program, compile_seconds = compiled(
+        env, steps, state, key, params, jnp.int32(1), donate_argnums=0
+    )
     held = sum(leaf.nbytes for leaf in jax.tree.leaves((state, timestep)) if leaf.ndim)
     carry = {"state": state, "key": key}
     del state, timestep

@@ -20,10 +20,12 @@ REPETITION_SECONDS = 0.5
 Name = TypeVar("Name")
 
 
-def compiled(function: Callable, *arguments: Any, **jit_options: Any) -> tuple[Any, float]:
-    """The compiled program and the seconds it took to trace and compile."""
+def compiled(
+    env: Any, function: Callable, *arguments: Any, **jit_options: Any
+) -> tuple[Any, float]:
+    """An environment's compiled program and the seconds it took to trace and compile."""
     started = time.perf_counter()
-    jitted = jax.jit(function, compiler_options=compiler_options(), **jit_options)
+    jitted = jax.jit(function, compiler_options=compiler_options(env), **jit_options)
     program = jitted.lower(*arguments).compile()
     return program, time.perf_counter() - started
 

@@ -43,8 +43,9 @@ class Physics(Protocol):
     equal only to what computes the same.
 
     An engine may have more attributes: ``rigs``, cameras by name, of which ``default`` is the
-    task's own; ``look``, the lights, sky and ground of its model; and ``batch_last``, False where a
-    CPU computes a batch faster with the environments as first axis.
+    task's own; ``look``, the lights, sky and ground of its model; ``batch_last``, False where a
+    CPU computes a batch faster with the environments as first axis; and ``compiler_options``, which
+    XLA needs on a CPU to make its programs fast.
 
     Attributes:
         geoms: the visible shapes, each fixed in a link's frame.

@@ -26,7 +26,7 @@ def stepping(task: str, num_devices: int, num_envs: int) -> dict[str, Any]:
         sys.exit(ABSENT)
     env, params = pb.make(task)
     venv = ShardedVectorEnv(env, num_envs, make_env_mesh(num_devices))
-    step = jax.jit(venv.step, donate_argnums=0, compiler_options=pb.compiler_options())
+    step = jax.jit(venv.step, donate_argnums=0, compiler_options=pb.compiler_options(venv))
     state, timestep = venv.reset(jax.random.key(0), params)
     shape = (num_envs, env.action_size)
     action = jax.random.uniform(jax.random.key(1), shape, minval=-1.0, maxval=1.0)
@@ -73,7 +73,7 @@ def training(task: str, num_devices: int, cores: int, num_envs: int) -> dict[str
     shardings = state_shardings(mesh, jax.eval_shape(algorithm.init, key, params))
     init = jax.jit(lambda params: algorithm.init(key, params), out_shardings=shardings)
     state = init(params)
-    iterate, compile_seconds = compiled(algorithm.iterate, state, params, donate_argnums=0)
+    iterate, compile_seconds = compiled(env, algorithm.iterate, state, params, donate_argnums=0)
     carry = {"state": state}
     del state
 

@@ -54,7 +54,7 @@ def measure(encoder: str, num_envs: int, num_steps: int) -> dict[str, Any]:
     programs, compile_seconds, times = {}, {}, {"train": [], "play": []}
     for name, function in (("train", algorithm.iterate), ("play", play)):
         started = time.perf_counter()
-        compiled = jax.jit(function, compiler_options=compiler_options())
+        compiled = jax.jit(function, compiler_options=compiler_options(env))
         programs[name] = compiled.lower(carry[name], params).compile()
         compile_seconds[name] = time.perf_counter() - started
         jax.block_until_ready(programs[name](carry[name], params))

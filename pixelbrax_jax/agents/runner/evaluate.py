@@ -124,7 +124,7 @@ class Evaluator:
             deterministic: whether the mean action is played, or a sampled one.
         """
         envs = VectorPixelEnv(env, num_episodes, "disabled")
-        self._play = partial(_play, algorithm, envs, deterministic)
+        self._play = partial(_play, envs, algorithm, deterministic)
         self._key = jax.random.key(seed)
         self._params = env_params
 
@@ -135,10 +135,10 @@ class Evaluator:
         return Result(returns=returns.astype(np.float64), lengths=lengths)
 
 
-@jit(static_argnums=(0, 1, 2))
+@jit(lambda envs: envs.env, static_argnums=(0, 1, 2))
 def _play(
-    algorithm: Player,
     envs: VectorPixelEnv,
+    algorithm: Player,
     deterministic: bool,
     networks: Networks,
     key: jax.Array,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 
 from pixelbrax_jax.agents.core.losses import Metrics
@@ -12,7 +14,11 @@ from pixelbrax_jax.compilation import jit
 from pixelbrax_jax.types import EnvParams
 
 
-@jit(static_argnums=0)
+def _env(runs: Runs) -> Any:
+    return runs.algorithm.envs.env
+
+
+@jit(_env, static_argnums=0)
 def init(runs: Runs, seed: jax.Array, env_params: EnvParams) -> TrainState:
     """As ``Runs.init``."""
     return _spread(runs, runs.init(seed, env_params), {})[0]
@@ -21,13 +27,13 @@ def init(runs: Runs, seed: jax.Array, env_params: EnvParams) -> TrainState:
 # The state before an iteration is not needed after it: its memory is used again.
 
 
-@jit(static_argnums=0, donate_argnums=1)
+@jit(_env, static_argnums=0, donate_argnums=1)
 def iterate(runs: Runs, state: TrainState, env_params: EnvParams) -> tuple[TrainState, Metrics]:
     """As ``Runs.iterate``."""
     return _spread(runs, *runs.iterate(state, env_params))
 
 
-@jit(static_argnums=0, donate_argnums=1)
+@jit(_env, static_argnums=0, donate_argnums=1)
 def auxiliary(runs: Runs, state: TrainState) -> tuple[TrainState, Metrics]:
     """As ``Runs.auxiliary``."""
     return _spread(runs, *runs.auxiliary(state))

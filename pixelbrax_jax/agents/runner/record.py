@@ -84,7 +84,7 @@ def write_video(
     env, params = make_split(algorithm.config, split)
     envs = VectorPixelEnv(env, grid * grid)
 
-    @partial(jax.jit, compiler_options=compiler_options())
+    @partial(jax.jit, compiler_options=compiler_options(env))
     def step(state: Any, params: Any) -> tuple[Any, jax.Array]:
         action = algorithm.act(networks, envs.obs(state))
         state, _ = envs.step(state, action, params)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -27,11 +27,14 @@ class MjxPhysics(GuardedPhysics):
     cameras and lights follow, and ``target``, this episode's target, where a task has them.
 
     Beyond the interface it has ``rigs``, the model's cameras by name, with the task's own as
-    ``default``; ``look``, the model's lights, sky and ground; and ``batch_last``, whether a CPU
-    computes a batch faster with the environments as last axis.
+    ``default``; ``look``, the model's lights, sky and ground; ``batch_last``, whether a CPU
+    computes a batch faster with the environments as last axis; and ``compiler_options``.
     """
 
     backend = "mjx"
+    compiler_options: ClassVar = {"xla_cpu_experimental_ynn_fusion_type": ""}
+    """For XLA on a CPU: its library for sums and products, YNNPACK, takes longer for the small
+    ones of these models than the loops that XLA writes itself."""
 
     def __init__(self, task: DmcTask, model: mujoco.MjModel, *, identity: Hashable):
         """Put the model on the device and read what is drawn; compile nothing.
