@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, nullcontext
 from typing import Any
 
@@ -56,12 +56,19 @@ class Dynamics:
         reads_forces: whether sensors of forces and accelerations are computed.
     """
 
-    def __init__(self, model: mujoco.MjModel, *, reads_forces: bool = False):
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        *,
+        reads_forces: bool = False,
+        out_of_reach: Iterable[str] = (),
+    ):
         """Put the model on the device; compile nothing.
 
         Args:
             model: a compiled model.
             reads_forces: whether to compute sensors of forces and accelerations.
+            out_of_reach: names of geoms that nothing ever touches, which are not tried.
 
         Raises:
             NotImplementedError: the model has features that MuJoCo XLA lacks.
@@ -69,7 +76,7 @@ class Dynamics:
         load_onto_own_device(mjx_io)
         self.model = model
         self.reads_forces = reads_forces
-        self._simulated = _simulated(model)
+        self._simulated = _simulated(model, out_of_reach)
         self._mx = mjx.put_model(self._simulated, impl="jax")
         option = self._mx.opt.replace(
             iterations=min(ITERATIONS, model.opt.iterations),
@@ -203,15 +210,18 @@ class Dynamics:
         )
 
 
-def _simulated(model: mujoco.MjModel) -> mujoco.MjModel:
-    """Return the model without what MuJoCo XLA refuses and no step depends on.
+def _simulated(model: mujoco.MjModel, out_of_reach: Iterable[str]) -> mujoco.MjModel:
+    """Return the model without what no step depends on.
 
-    That is the energy, which is only reported, and contacts where they are off anyway: it refuses
-    pairs of shapes that it cannot collide all the same.
+    That is the energy, which is only reported, and which MuJoCo XLA refuses; contacts where they
+    are off, for it refuses pairs of shapes that it cannot collide all the same; and those out of
+    reach, for which it takes as long as for others.
     """
     model = copy.copy(model)
     model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_ENERGY)
     off = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     if model.opt.disableflags & off:
         model.geom_contype[:] = model.geom_conaffinity[:] = 0
+    for name in out_of_reach:
+        model.geom(name).contype[:] = model.geom(name).conaffinity[:] = 0
     return model

@@ -48,6 +48,7 @@ class DmcTask:
         movable: names of the geoms, sites and lights that ``Start.target`` moves.
         reads_forces: whether observations have sensors of forces or accelerations.
         starts_with_forces: whether these read something else than 0 in an initial state.
+        out_of_reach: names of the geoms that nothing ever touches, in any pose.
         batch_last: whether a CPU computes a batch faster with the environments as last axis.
     """
 
@@ -62,4 +63,5 @@ class DmcTask:
     movable: tuple[str, ...] = ()
     reads_forces: bool = False
     starts_with_forces: bool = False
+    out_of_reach: tuple[str, ...] = ()
     batch_last: bool = True

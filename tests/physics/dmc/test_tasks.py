@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import importlib.util
+import itertools
 from importlib import metadata
 
 import jax
 import jax.numpy as jnp
+import mujoco
+import numpy as np
 import pytest
+from mujoco.mjx._src import collision_driver
 
 import pixelbrax_jax as pb
 from pixelbrax_jax.physics import make_physics
 from pixelbrax_jax.physics.mjx import models
 from pixelbrax_jax.tasks import BRAX_TASKS, DMC_TASKS
+from tests.physics.dmc import oracle
 from tests.physics.dmc.test_against_dm_control import FAST
 
 EACH = [
@@ -113,3 +118,25 @@ def test_episodes_are_truncated_after_1000_control_steps(task):
     _, (terminated, truncated) = jax.jit(lambda s: jax.lax.scan(step, s, actions))(state)
     assert not jnp.any(terminated)
     assert int(jnp.argmax(truncated)) == 999
+
+
+@needs_models
+@pytest.mark.parametrize("task", [task for task in DMC_TASKS if "finger" in task])
+def test_what_the_finger_cannot_reach_is_not_tried(task):
+    theirs = oracle.load(task).physics.model
+    ours = make_physics(task).dynamics._simulated
+    pairs = set(geom_pairs(theirs.ptr)) - set(geom_pairs(ours))
+    assert len(geom_pairs(ours)) == 2
+    data = mujoco.MjData(theirs.ptr)
+    nearest = np.inf
+    for qpos in itertools.product(np.linspace(-np.pi, np.pi, 17), repeat=3):
+        data.qpos = qpos
+        mujoco.mj_kinematics(theirs.ptr, data)
+        for one, other in pairs:
+            apart = mujoco.mj_geomDistance(theirs.ptr, data, one, other, 1.0, None)
+            nearest = min(nearest, apart)
+    assert nearest > 0.0089  # metres: between the tip and the axle of what it turns
+
+
+def geom_pairs(model):
+    return [(int(a), int(b)) for a, b, _ in collision_driver.geom_pairs(model)]

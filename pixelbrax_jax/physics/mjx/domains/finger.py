@@ -16,6 +16,10 @@ from pixelbrax_jax.physics.mjx.task import DmcTask, Start
 
 _SPIN_VELOCITY = 15.0
 
+_OUT_OF_REACH = ("ground", "proximal_decoration", "proximal", "spinner_decoration")
+"""The finger is 37.1 cm long, and its hinge 40 cm from the ground and from the spinner's: all that
+meets is the fingertip and the spinner's caps."""
+
 
 def _pose(dynamics: Dynamics, key: jax.Array) -> jax.Array:
     """Draw joints that let nothing touch."""
@@ -96,7 +100,7 @@ def _task(
         observe,
         reward,
         substeps=2,
-        batch_last=False,
+        out_of_reach=_OUT_OF_REACH,
         edit=edit,
         movable=movable,
         reads_forces=True,
