@@ -216,12 +216,19 @@ def _simulated(model: mujoco.MjModel, out_of_reach: Iterable[str]) -> mujoco.MjM
     That is the energy, which is only reported, and which MuJoCo XLA refuses; contacts where they
     are off, for it refuses pairs of shapes that it cannot collide all the same; and those out of
     reach, for which it takes as long as for others.
+
+    On a CPU inertia matrices are factorised as sparse ones, without LAPACK: jaxlib 0.10.0 to 0.11.0
+    share a batch of factorisations out among the threads of XLA, and wait for ever once as many of
+    them have begun as there are threads. A step then factorises one other matrix at a time, that of
+    the constraint solver.
     """
     model = copy.copy(model)
     model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_ENERGY)
     off = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     if model.opt.disableflags & off:
         model.geom_contype[:] = model.geom_conaffinity[:] = 0
+    if jax.default_backend() == "cpu":
+        model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
     for name in out_of_reach:
         model.geom(name).contype[:] = model.geom(name).conaffinity[:] = 0
     return model

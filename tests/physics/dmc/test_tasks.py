@@ -16,7 +16,9 @@ from mujoco.mjx._src import collision_driver
 import pixelbrax_jax as pb
 from pixelbrax_jax.physics import make_physics
 from pixelbrax_jax.physics.mjx import models
+from pixelbrax_jax.physics.mjx.solver import is_supported
 from pixelbrax_jax.tasks import BRAX_TASKS, DMC_TASKS
+from tests.cpu.equations import equations
 from tests.physics.dmc import oracle
 from tests.physics.dmc.test_against_dm_control import FAST
 
@@ -140,3 +142,24 @@ def test_what_the_finger_cannot_reach_is_not_tried(task):
 
 def geom_pairs(model):
     return [(int(a), int(b)) for a, b, _ in collision_driver.geom_pairs(model)]
+
+
+@needs_models
+@pytest.mark.parametrize(
+    "task",
+    [
+        pytest.param(task, marks=() if row.domain in ("humanoid", "finger") else pytest.mark.slow)
+        for task, row in {row.domain: (task, row) for task, row in DMC_TASKS.items()}.values()
+    ],
+)
+def test_a_step_factorises_one_matrix_at_a_time(task):
+    """Threads of jaxlib 0.10 wait for each other otherwise: 128 humanoids never moved."""
+    dynamics = make_physics(task).dynamics
+    state = jax.eval_shape(dynamics.state, jax.ShapeDtypeStruct((dynamics.model.nq,), jnp.float32))
+    step = jax.make_jaxpr(lambda state: dynamics.step(state, 1))(state)
+    names = [eqn.primitive.name for eqn in equations(step.jaxpr)]
+    # The solver's, before its loop and in it with elliptic cones; of each stage of Runge and Kutta.
+    is_rk4 = dynamics.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
+    solver = 1 if is_supported(dynamics.model) else 2
+    assert names.count("cholesky") <= solver * (4 if is_rk4 else 1)
+    assert not {"lu", "qr", "eigh", "svd"} & set(names)
