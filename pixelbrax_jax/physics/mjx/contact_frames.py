@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import jax
@@ -16,32 +13,32 @@ with import_silenced():
     from mujoco.mjx._src import collision_driver
     from mujoco.mjx._src.types import GeomType
 
-_PAIR = (GeomType.PLANE, GeomType.CAPSULE)
-_THEIRS = collision_driver._COLLISION_FUNC[_PAIR]
-_lock = threading.RLock()
+PAIR = (GeomType.PLANE, GeomType.CAPSULE)
+"""Of shapes, by which MuJoCo XLA finds its function."""
+
+_theirs = collision_driver._COLLISION_FUNC[PAIR]
 
 
-@contextmanager
-def aligned_with_capsules() -> Iterator[None]:
-    """Align contacts of capsules with planes as MuJoCo does, in what is traced in the block.
+def aligned_with_capsules(
+    model: Any, data: Any, key: Any, geom: jax.Array
+) -> tuple[jax.Array, ...]:
+    """Collide planes with capsules as MuJoCo XLA does, in the frames that MuJoCo has.
 
     The cone of friction is a pyramid, and so it matters which way its edges point. MuJoCo points
     the first along the capsule, however steep that is; MuJoCo XLA along an axis of the world where
     the capsule is steeper than 60 degrees, which changes single control steps of the humanoid by
-    up to 0.3 rad/s. What is traced elsewhere before and after is not affected; what another thread
-    traces with MuJoCo XLA in the meantime, without this block, is aligned so too.
+    up to 0.3 rad/s.
+
+    Args:
+        model: ``mujoco.mjx.Model``.
+        data: ``mujoco.mjx.Data`` with the places of geoms.
+        key: the kind of collision.
+        geom: (G, 2) int, pairs of a plane and a capsule.
+
+    Returns:
+        Distances (2 G,) and places (2 G, 3) in metres, and frames (2 G, 3, 3), the normal first.
     """
-    functions = collision_driver._COLLISION_FUNC
-    with _lock:
-        functions[_PAIR] = _aligned
-        try:
-            yield
-        finally:
-            functions[_PAIR] = _THEIRS
-
-
-def _aligned(model: Any, data: Any, key: Any, geom: jax.Array) -> tuple[jax.Array, ...]:
-    dist, pos, frame = _THEIRS(model, data, key, geom)
+    dist, pos, frame = _theirs(model, data, key, geom)
     normal = data.geom_xmat[geom[:, 0]][:, :, 2]
     axis = data.geom_xmat[geom[:, 1]][:, :, 2]
     along = axis - normal * jnp.sum(normal * axis, axis=-1, keepdims=True)
@@ -53,4 +50,4 @@ def _aligned(model: Any, data: Any, key: Any, geom: jax.Array) -> tuple[jax.Arra
     return dist, pos, jnp.repeat(ours, 2, axis=0)
 
 
-_aligned.ncon = _THEIRS.ncon  # type: ignore[attr-defined]
+aligned_with_capsules.ncon = _theirs.ncon  # type: ignore[attr-defined]

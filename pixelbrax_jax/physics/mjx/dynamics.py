@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, nullcontext
+from collections.abc import Iterable
 from typing import Any
 
 import jax
@@ -12,8 +11,7 @@ import jax.numpy as jnp
 import mujoco
 from flax import struct
 
-from pixelbrax_jax.physics.mjx.contact_frames import aligned_with_capsules
-from pixelbrax_jax.physics.mjx.solver import is_supported, solved_by_active_sets
+from pixelbrax_jax.physics.mjx.substitutes import substituted
 from pixelbrax_jax.physics.mujoco_compatibility import import_silenced, load_onto_own_device
 
 with import_silenced():
@@ -127,7 +125,7 @@ class Dynamics:
         """
 
         def one(state: MjxState) -> tuple[MjxState, jax.Array]:
-            with self._changes():
+            with substituted(self.model):
                 data = mjx.step(self._moving, self._data(state))
             moved = state.replace(
                 qpos=data.qpos, qvel=data.qvel, act=data.act, qacc_warmstart=data.qacc_warmstart
@@ -149,7 +147,7 @@ class Dynamics:
         Returns:
             The state with accelerations to start the solver from, and all sensors.
         """
-        with self._changes():
+        with substituted(self.model):
             data = mjx.forward(self._passive, self._data(state))
         return state.replace(qacc_warmstart=data.qacc), data.sensordata
 
@@ -193,13 +191,6 @@ class Dynamics:
         data = mjx.kinematics(self._mx, self._data(self.state(qpos)))
         return mjx.collision(self._mx, data)._impl.contact
 
-    @contextmanager
-    def _changes(self) -> Iterator[None]:
-        """Trace with what is ours in place of MuJoCo XLA's."""
-        solver = solved_by_active_sets() if is_supported(self.model) else nullcontext()
-        with aligned_with_capsules(), solver:
-            yield
-
     def _data(self, state: MjxState) -> Any:
         return mjx.make_data(self._simulated, impl="jax").replace(
             qpos=state.qpos,
@@ -216,19 +207,12 @@ def _simulated(model: mujoco.MjModel, out_of_reach: Iterable[str]) -> mujoco.MjM
     That is the energy, which is only reported, and which MuJoCo XLA refuses; contacts where they
     are off, for it refuses pairs of shapes that it cannot collide all the same; and those out of
     reach, for which it takes as long as for others.
-
-    On a CPU inertia matrices are factorised as sparse ones, without LAPACK: jaxlib 0.10.0 to 0.11.0
-    share a batch of factorisations out among the threads of XLA, and wait for ever once as many of
-    them have begun as there are threads. A step then factorises one other matrix at a time, that of
-    the constraint solver.
     """
     model = copy.copy(model)
     model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_ENERGY)
     off = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     if model.opt.disableflags & off:
         model.geom_contype[:] = model.geom_conaffinity[:] = 0
-    if jax.default_backend() == "cpu":
-        model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
     for name in out_of_reach:
         model.geom(name).contype[:] = model.geom(name).conaffinity[:] = 0
     return model

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import jax
@@ -15,7 +12,6 @@ import numpy as np
 from pixelbrax_jax.physics.mujoco_compatibility import import_silenced
 
 with import_silenced():
-    from mujoco.mjx._src import solver as mjx_solver
     from mujoco.mjx._src import support
 
 ITERATIONS = 16
@@ -30,8 +26,6 @@ _ROWS = 16
 _EQUALITY, _FRICTION, _ONE_SIDED = range(3)
 
 _Carry = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
-_THEIRS = mjx_solver.solve
-_lock = threading.RLock()
 
 
 def is_supported(model: mujoco.MjModel) -> bool:
@@ -40,21 +34,6 @@ def is_supported(model: mujoco.MjModel) -> bool:
         model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
         and model.opt.solver == mujoco.mjtSolver.mjSOL_NEWTON
     )
-
-
-@contextmanager
-def solved_by_active_sets() -> Iterator[None]:
-    """Solve for constraint forces by ``solve`` in what is traced in the block.
-
-    What is traced elsewhere before and after is not affected; what another thread traces with
-    MuJoCo XLA in the meantime, without this block, is solved so too.
-    """
-    with _lock:
-        mjx_solver.solve = solve
-        try:
-            yield
-        finally:
-            mjx_solver.solve = _THEIRS
 
 
 class _Problem(NamedTuple):

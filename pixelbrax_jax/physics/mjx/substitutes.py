@@ -1,0 +1,59 @@
+"""What stands in for functions of MuJoCo XLA while our programs are traced."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import mujoco
+
+from pixelbrax_jax.physics.mjx.contact_frames import PAIR, aligned_with_capsules
+from pixelbrax_jax.physics.mjx.solver import is_supported, solve
+from pixelbrax_jax.physics.mujoco_compatibility import import_silenced
+
+with import_silenced():
+    from mujoco.mjx._src import collision_driver, smooth
+    from mujoco.mjx._src import solver as mjx_solver
+
+_factor_m = smooth.factor_m
+_lock = threading.RLock()
+
+
+@contextmanager
+def substituted(model: mujoco.MjModel) -> Iterator[None]:
+    """Trace with contact frames, factorisation and, for models it supports, solver of our own.
+
+    What is traced elsewhere before and after is not affected; what another thread traces with
+    MuJoCo XLA in the meantime, without this block, has them too.
+
+    Args:
+        model: whose steps are traced.
+    """
+    changes: list[tuple[dict[Any, Any], Any, Any]] = [
+        (collision_driver._COLLISION_FUNC, PAIR, aligned_with_capsules),
+        (vars(smooth), "factor_m", factor_in_turn),
+    ]
+    if is_supported(model):
+        changes.append((vars(mjx_solver), "solve", solve))
+    with _lock:
+        before = [functions[name] for functions, name, _ in changes]
+        for functions, name, ours in changes:
+            functions[name] = ours
+        try:
+            yield
+        finally:
+            for (functions, name, _), theirs in zip(changes, before, strict=True):
+                functions[name] = theirs
+
+
+def factor_in_turn(model: Any, data: Any) -> Any:
+    """Factorise inertia as ``mujoco.mjx._src.smooth.factor_m`` does, after what came before it.
+
+    On a CPU jaxlib 0.10.0 to 0.11.0 share a batch of factorisations out among the threads of XLA,
+    and wait for ever once as many batches are at it as there are threads. Euler's method factorises
+    inertia with damping, which XLA would do beside the solver's; here it needs its accelerations.
+    """
+    nothing = (0 * data.qacc).sum()  # XLA does not know: it might be NaN.
+    return _factor_m(model, data.tree_replace({"_impl.M": data._impl.M + nothing}))
