@@ -70,19 +70,30 @@ def tasks() -> str:
 
 
 def physics() -> str:
-    """How far each task is from dm_control's, in Markdown."""
+    """How far each domain is from dm_control's, the worst of its tasks, in Markdown."""
     kept = json.loads((FOLDER / "physics.json").read_text("utf-8"))["tasks"]
+    domains: dict[str, list[dict]] = {}
+    for name, row in DMC_TASKS.items():
+        domains.setdefault(row.domain, []).append(kept[name])
     lines = []
-    for task in DMC_TASKS:
-        if task not in kept:
-            continue
-        same, step = kept[task]["same_state"], kept[task]["control_step"]
-        errors = (same["reward"], same["observation"], step["reward"], step["velocity_median"])
-        far = f"{step['velocities_off']} of {kept[task]['states']}"
-        p = kept[task]["initial_states"]["lowest_p"]
-        lines.append([f"`{task}`", *(f"{error:.0e}" for error in errors), far, f"{p:.2g}"])
+    for domain, tasks in domains.items():
+        errors = [
+            max(task[part][name] for task in tasks)
+            for part, name in (
+                ("same_state", "reward"),
+                ("same_state", "observation"),
+                ("control_step", "reward"),
+                ("control_step", "velocity_median"),
+            )
+        ]
+        off = sum(task["control_step"]["velocities_off"] for task in tasks)
+        states = sum(task["states"] for task in tasks)
+        p = min(task["initial_states"]["lowest_p"] for task in tasks)
+        shown = [f"{error:.0e}" for error in errors]
+        lines.append([domain, len(tasks), *shown, f"{off} of {states}", f"{p:.2g}"])
     heads = (
-        "task",
+        "domain",
+        "tasks",
         "reward",
         "observation",
         "reward, a step on",
