@@ -121,10 +121,8 @@ def test_the_most_of_several_kernels_is_told(monkeypatch, tmp_path):
 def test_a_compiler_that_cannot_be_installed_is_absent(monkeypatch, tmp_path):
     monkeypatch.setenv("PIXELBRAX_CACHE", str(tmp_path))
     monkeypatch.setattr(environment, "packages", lambda _: ("no package of this name",))
-    environment._install.cache_clear()
     with pytest.raises(AbsentError, match="cannot be installed"):
         environment.install("cuda")
-    environment._install.cache_clear()
 
 
 def test_the_compiler_is_that_of_the_running_jax():
