@@ -11,9 +11,10 @@ import jax.numpy as jnp
 import pytest
 
 from pixelbrax_gym.bench import cases, command
-from pixelbrax_gym.bench.ahead import environment, kernels, registers, tables
+from pixelbrax_gym.bench.ahead import compiling, environment, kernels, registers, tables
+from pixelbrax_gym.bench.ahead.case import DUMP, PROGRAMS
 from pixelbrax_gym.bench.ahead.hlo import parse
-from pixelbrax_gym.bench.ahead.programs import PROGRAMS, make_program
+from pixelbrax_gym.bench.ahead.programs import make_program
 from pixelbrax_gym.bench.case import AbsentError
 
 PROGRAM = """HloModule jit_ahead, is_scheduled=true
@@ -96,6 +97,22 @@ def test_the_programs_can_be_traced():
     for name in PROGRAMS:
         function, arguments = make_program(name, "inverted_pendulum", 2, backend="spring")
         assert jax.tree.leaves(jax.eval_shape(function, *arguments))
+
+
+def test_an_unknown_program_is_refused():
+    with pytest.raises(ValueError, match="Did you mean 'state step'"):
+        make_program("state-step", "inverted_pendulum", 2)
+
+
+def test_a_dump_that_the_user_asked_for_is_kept(monkeypatch, tmp_path):
+    theirs, ours = tmp_path / "theirs", tmp_path / "ours"
+    theirs.mkdir(), ours.mkdir()
+    monkeypatch.setenv("XLA_FLAGS", f"--xla_dump_to={theirs} --xla_dump_to={ours}")
+    monkeypatch.setenv(DUMP, str(ours))
+    with pytest.raises(KeyError):
+        compiling.gpu("ant", "renderer", 1, card="a card of another name")
+    assert theirs.exists()
+    assert not ours.exists()
 
 
 def test_registers_are_not_known_without_an_assembler(monkeypatch, tmp_path):

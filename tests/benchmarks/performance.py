@@ -9,7 +9,8 @@ import json
 from pathlib import Path
 
 from pixelbrax_gym.bench.ahead import tables as compiled
-from pixelbrax_gym.bench.cases import PROGRAMS, TASKS
+from pixelbrax_gym.bench.ahead.case import PROGRAMS
+from pixelbrax_gym.bench.cases import TASKS
 from pixelbrax_gym.bench.tables import cell, find, number, ratio, table, title, value
 from tests.benchmarks.pages import redraw
 
