@@ -14,7 +14,7 @@ the same code is traced into a program of XLA's and into a kernel, to which arra
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -144,11 +144,7 @@ Near = Callable[[int, Callable[[Any], Any], Any], Any]
 of that rank; where none does, it may be ``value``."""
 
 
-def see(
-    view: View,
-    ray: Vector,
-    near: Near | None = None,
-) -> Seen:
+def see(view: View, ray: Vector, near: Near | None = None) -> Seen:
     """Return what pixels see.
 
     Args:
@@ -172,17 +168,17 @@ def see(
     to_light = None if look.light is None else _vector(look.light)
     along = _directions(ray, to_light, bool(look.lamps))
     key, products = _no_hit(count, shape), [jnp.zeros(shape)] * len(along)
+
+    def update(rank: int, best: tuple[Any, list[Any]]) -> tuple[Any, list[Any]]:
+        entry = hit(rank)
+        key = _nearer(best[0], entry, rank, count)
+        return key, _normal_products(entry, along, key != best[0], best[1])
+
     for rank in ranks:
-
-        def update(best: tuple[Any, list[Any]], rank: int = rank) -> tuple[Any, list[Any]]:
-            entry = hit(rank)
-            key = _nearer(best[0], entry, rank, count)
-            return key, _normal_products(entry, along, key != best[0], best[1])
-
         if near is None:
             key = _nearer(key, hit(rank), rank, count)
         else:
-            key, products = near(rank, update, (key, products))
+            key, products = near(rank, partial(update, rank), (key, products))
     t, winner = _distance(key, count), _rank(key, count)
     seen = [winner == rank for rank in ranks]
     if near is None:
@@ -242,14 +238,13 @@ def see(
 
 
 class _Solid(NamedTuple):
-    """One geom in the camera's frame; fields as in ``intersect``, and whether it is ground."""
+    """One geom in the camera's frame; fields as in ``intersect``."""
 
     kind: int
     center: Vector
     axes: Axes
     size: Vector
     bounded: bool
-    ground: bool
 
     def hit(self, ray: Vector, center: Vector) -> Hit:
         """Return where rays enter it, with its center at another place."""
@@ -265,7 +260,6 @@ def _solid(view: View, rank: int) -> _Solid:
         axes=(axes[0], axes[1], axes[2]),
         size=tuple(view.size[g, k] for k in range(3)),
         bounded=view.bounded[rank],
-        ground=view.ground[rank],
     )
 
 
