@@ -8,7 +8,7 @@ unsigned integers. Only the winner is shaded, from two products of its normal.
 
 Numbers of a scene are read one by one, ``array[i, j]``, and pixels are computed element by element:
 the same code is traced into a program of XLA's and into a kernel, to which arrays are references.
-`docs/renderer.md` has the measurements behind it.
+`docs/renderer.md` tells why.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from pixelbrax_jax.renderer import ground, shading
 from pixelbrax_jax.renderer.bounds import at_least, at_most, between
 from pixelbrax_jax.renderer.intersect import Axes, Hit, Vector, dot, intersect
 from pixelbrax_jax.renderer.shading import SHADOW_BIAS
-from pixelbrax_jax.types import GeomKind, Lamp, Look, Scene
+from pixelbrax_jax.types import Frame, GeomKind, Lamp, Look, Scene
 
 _INF_BITS = np.uint32(0x7F800000)
 
@@ -83,6 +83,10 @@ class Seen(NamedTuple):
     depth: jax.Array
     rank: jax.Array
     ground: jax.Array
+
+    def frame(self, seg: jax.Array) -> Frame:
+        """Return the frame, given the geom of each pixel; see ``Frame.seg``."""
+        return Frame(r=self.r, g=self.g, b=self.b, depth=self.depth, seg=seg, ground=self.ground)
 
 
 def view_of(
