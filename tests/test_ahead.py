@@ -78,6 +78,8 @@ def test_a_loop_of_unknown_length_counts_once_with_its_condition():
     program = parse(PROGRAM.replace(" COUNTED", ""))
     assert [loop.trips for loop in kernels.loops(program)] == [None]
     assert sum(kernel.launches for kernel in kernels.kernels(program)) == 5
+    # A copy, two kernels side by side, and the condition.
+    assert kernels.longest_chain(program) == 3
 
 
 def test_a_program_of_this_machine_is_read():
