@@ -11,9 +11,10 @@ import jax.numpy as jnp
 import pytest
 
 from pixelbrax_gym.bench import cases, command
-from pixelbrax_gym.bench.ahead import environment, kernels, registers, tables
+from pixelbrax_gym.bench.ahead import compiling, environment, kernels, registers, tables
+from pixelbrax_gym.bench.ahead.case import DUMP, PROGRAMS
 from pixelbrax_gym.bench.ahead.hlo import parse
-from pixelbrax_gym.bench.ahead.programs import PROGRAMS, make_program
+from pixelbrax_gym.bench.ahead.programs import make_program
 from pixelbrax_gym.bench.case import AbsentError
 
 PROGRAM = """HloModule jit_ahead, is_scheduled=true
@@ -77,6 +78,8 @@ def test_a_loop_of_unknown_length_counts_once_with_its_condition():
     program = parse(PROGRAM.replace(" COUNTED", ""))
     assert [loop.trips for loop in kernels.loops(program)] == [None]
     assert sum(kernel.launches for kernel in kernels.kernels(program)) == 5
+    # A copy, two kernels side by side, and the condition.
+    assert kernels.longest_chain(program) == 3
 
 
 def test_a_program_of_this_machine_is_read():
@@ -96,6 +99,22 @@ def test_the_programs_can_be_traced():
     for name in PROGRAMS:
         function, arguments = make_program(name, "inverted_pendulum", 2, backend="spring")
         assert jax.tree.leaves(jax.eval_shape(function, *arguments))
+
+
+def test_an_unknown_program_is_refused():
+    with pytest.raises(ValueError, match="Did you mean 'state step'"):
+        make_program("state-step", "inverted_pendulum", 2)
+
+
+def test_a_dump_that_the_user_asked_for_is_kept(monkeypatch, tmp_path):
+    theirs, ours = tmp_path / "theirs", tmp_path / "ours"
+    theirs.mkdir(), ours.mkdir()
+    monkeypatch.setenv("XLA_FLAGS", f"--xla_dump_to={theirs} --xla_dump_to={ours}")
+    monkeypatch.setenv(DUMP, str(ours))
+    with pytest.raises(KeyError):
+        compiling.gpu("ant", "renderer", 1, card="a card of another name")
+    assert theirs.exists()
+    assert not ours.exists()
 
 
 def test_registers_are_not_known_without_an_assembler(monkeypatch, tmp_path):
@@ -121,10 +140,8 @@ def test_the_most_of_several_kernels_is_told(monkeypatch, tmp_path):
 def test_a_compiler_that_cannot_be_installed_is_absent(monkeypatch, tmp_path):
     monkeypatch.setenv("PIXELBRAX_CACHE", str(tmp_path))
     monkeypatch.setattr(environment, "packages", lambda _: ("no package of this name",))
-    environment._install.cache_clear()
     with pytest.raises(AbsentError, match="cannot be installed"):
         environment.install("cuda")
-    environment._install.cache_clear()
 
 
 def test_the_compiler_is_that_of_the_running_jax():

@@ -14,6 +14,7 @@ import pytest
 
 from pixelbrax_gym.bench import adapters, cases, command, report, runner
 from pixelbrax_gym.bench.case import AbsentError, Case
+from pixelbrax_gym.bench.packages import install_packages
 from tests.benchmarks import cases as all_cases
 from tests.benchmarks import run
 from tests.benchmarks.cases import GROUPS
@@ -254,17 +255,27 @@ def test_a_failure_is_recorded_and_told(workers, tmp_path):
 
 def test_a_peer_that_cannot_be_installed_is_absent_and_not_zero(workers, tmp_path, monkeypatch):
     monkeypatch.setattr(install, "HOME", tmp_path / "peers")
-    install._install.cache_clear()
     monkeypatch.setattr(install.sys, "executable", str(tmp_path / "no-such-python"))
     assert run.main(["--only", "peers", "--task", "ant", "--output-dir", str(tmp_path)]) == 0
     statuses = outcomes(tmp_path)
-    install._install.cache_clear()
     assert {"ok", "absent"} == set(statuses)
     assert "| DM Control quadruped, alone | 1 | | absent | - | |" in page_of(tmp_path)
     page = page_of(tmp_path)
     assert "absent" in page
     assert "cannot be installed" in page
     assert "| 0 |" not in page
+
+
+def test_packages_are_installed_once_and_anew_after_a_failure(tmp_path):
+    folder = tmp_path / "folder"
+    create = (sys.executable, "-c", f"import os; os.mkdir({str(folder)!r})")
+    fail = (sys.executable, "-c", "raise SystemExit('no such package')")
+    install_packages(folder, ("a==1",), create)
+    install_packages(folder, ("a==1",), fail)
+    with pytest.raises(AbsentError, match="cannot be installed: no such package"):
+        install_packages(folder, ("a==2",), fail)
+    with pytest.raises(AbsentError):
+        install_packages(folder, ("a==1",), ("no such program",))
 
 
 JAX_ERROR = """

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from pixelbrax_gym.bench.ahead.targets import LAUNCH_SECONDS
 from pixelbrax_gym.bench.cases import TASKS
 from pixelbrax_gym.bench.tables import find, number
 from pixelbrax_jax.tasks import DMC_TASKS
@@ -27,6 +28,7 @@ PAGES = (
     "docs/results.md",
     "docs/measurements.md",
     "docs/dmc.md",
+    "docs/accelerators.md",
 )
 """Those that report measurements."""
 
@@ -149,6 +151,32 @@ def adapter(name: str, num_envs: int = 256, value: str = "steps_per_second") -> 
     return next(row[value] for row in rows if row["adapter"] == name)
 
 
+def compiled(task: str, program: str, num_envs: int = 1024) -> dict[str, Any]:
+    """What the compiler for an H100 made of a program."""
+    rows = performance.rows_of("programs", "gpu-program")
+    where = {"task": task, "program": program, "num_envs": num_envs, "card": "H100"}
+    return find(rows, "compiling.gpu", **where)["values"]
+
+
+def traffic_of_frames() -> list[float]:
+    drawn = [compiled(task, "renderer") for task in TASKS]
+    return [(row["read_bytes"] + row["written_bytes"]) / row["output_bytes"] for row in drawn]
+
+
+def launches_of_pixels() -> list[float]:
+    return [
+        compiled(task, "step")["launches"] - compiled(task, "state step")["launches"]
+        for task in TASKS
+    ]
+
+
+def tpu_frames() -> list[str]:
+    """MB that drawing Ants moves on a TPU, and MB of the frames."""
+    rows = performance.rows_of("programs", "tpu-program")
+    values = find(rows, "compiling.tpu", task="ant", program="renderer")["values"]
+    return [f"{values[name] / 1e6:.0f}" for name in ("accessed_bytes", "output_bytes")]
+
+
 @cache
 def groups() -> dict[str, list[dict]]:
     return results.groups(results.kept_runs())
@@ -210,6 +238,12 @@ STATEMENTS = {
     ),
     "docs/measurements.md": (),
     "docs/dmc.md": (),
+    "docs/accelerators.md": (
+        ("moves {} to {} times the bytes of the frames", span(traffic_of_frames())),
+        ("add {} or {} launches to a step", span(launches_of_pixels(), "{:.0f}")),
+        ("at least {} us a kernel", [f"{LAUNCH_SECONDS * 1e6:.1f}"]),
+        ("moves {} MB for {} MB of frames", tpu_frames()),
+    ),
     "docs/results.md": (
         ("{} on HalfCheetah", [mean_end("ppo-halfcheetah")]),
         ("{} on Ant", [mean_end("ppo-ant")]),
@@ -229,6 +263,7 @@ FROM_OTHERS = {
     "docs/performance.md": (),
     "docs/measurements.md": ("JAX 0.10.2",),
     "docs/dmc.md": ("on MuJoCo 3.17", "differ by more than 0.01 in a velocity"),
+    "docs/accelerators.md": ("JAX 0.10.2",),
     "docs/results.md": (
         "which earns up to 1,000",
         "took 0.5 from its pixels",

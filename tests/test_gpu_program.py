@@ -1,6 +1,6 @@
 """Programs for an H100 and a TPU v5e stay as good as they were; run with `make test-programs`.
 
-Compiled, not run. The compilers are installed at the first time: 300 MB for the H100, 150 MB for
+Compiled, not run. The compilers are installed at the first time: 600 MB for the H100, 500 MB for
 the TPU.
 """
 

@@ -6,13 +6,12 @@ from collections.abc import Iterator
 
 from pixelbrax_gym.bench import tables
 from pixelbrax_gym.bench.ahead import tables as compiled
-from pixelbrax_gym.bench.ahead.case import AheadCase
+from pixelbrax_gym.bench.ahead.case import PROGRAMS, AheadCase
 from pixelbrax_gym.bench.ahead.targets import CARDS
 from pixelbrax_gym.bench.case import Case, Group
 
 TASKS = ("halfcheetah", "walker2d", "ant", "humanoid")
 BATCHES = (1, 10, 100, 1000, 4096, 8192)
-PROGRAMS = ("renderer", "step", "state step", "scan")
 
 
 def renderer() -> Iterator[Case]:

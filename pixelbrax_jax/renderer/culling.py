@@ -56,7 +56,7 @@ def window_of(
 def may_see(view: View, window: Window) -> Callable[[int], jax.Array]:
     """Return a function that tells of the geom of a rank whether rays of a window may hit it.
 
-    All geoms are looked at in one vector, as is right for a GPU.
+    32 geoms are looked at in one vector, as is right for a GPU.
     """
     count = len(view.geom)
     kinds = [view.kind[view.geom.index(g)] for g in range(count)]

@@ -1,7 +1,7 @@
 """The fast ray-caster as a program of XLA's: one fused loop over pixels, every geom unrolled.
 
-What is computed for a pixel is in `pixels.py`; `docs/renderer.md` has the measurements behind the
-form of the loop. It draws the image of `reference.py`; it has no useful derivative of its own (see
+What is computed for a pixel is in `pixels.py`; `docs/renderer.md` tells why the loop has its form.
+It draws the image of `reference.py`; it has no useful derivative of its own (see
 `base.py`).
 """
 
@@ -39,12 +39,5 @@ def render(
     column = jax.lax.rem(index, np.int32(width))
     seen = see(view, rays(view, height, width, row, column))
     geom_of_rank = jnp.array([*view.geom, -1], jnp.int32)
-    frame = Frame(
-        r=seen.r,
-        g=seen.g,
-        b=seen.b,
-        depth=seen.depth,
-        seg=geom_of_rank[seen.rank],
-        ground=seen.ground,
-    )
+    frame = seen.frame(geom_of_rank[seen.rank])
     return jax.tree.map(lambda plane: plane.reshape(num_rows, width), frame)

@@ -15,17 +15,19 @@ def obstacle() -> str | None:
     """Return why programs for CUDA, as traced here, do without the kernel; None if they have it.
 
     Starts a device. What JAX computes on need not be a GPU: where its plugin for CUDA is installed,
-    programs may be compiled for one ahead of time. From jax 0.11 on the card must then be named,
-    see `docs/renderer.md`.
+    programs may be compiled for one ahead of time. jax 0.12.0.1 must then be told which, and
+    0.10.2 need not; see `docs/renderer.md`.
     """
     backend = jax.default_backend()
     # Without a plugin nothing is imported or traced that only a GPU needs.
     if backend != "gpu" and not _has_plugin():
         return f"JAX computes on a {backend}"
+    if backend == "gpu" and _is_rocm(jax.devices()[0]):
+        return "JAX computes on ROCm, and the kernel is for NVIDIA GPUs"
     try:
         from jax.experimental.pallas import triton
 
-        # Of an abstract or a real card, from jax 0.11 on; an earlier one lowers for any.
+        # jax 0.12.0.1 tells of an abstract or a real card; 0.10.2 has no such function.
         info = triton.get_gpu_info() if hasattr(triton, "get_gpu_info") else None
     except ImportError:
         return f"jax {jax.__version__} has no Pallas for Triton"
@@ -47,11 +49,13 @@ def auto_renderer() -> tuple[str, str]:
     return "pallas", f"by one kernel, on {jax.devices()[0].device_kind}"
 
 
+def _is_rocm(device: jax.Device) -> bool:
+    return "rocm" in getattr(device.client, "platform_version", "").lower()
+
+
 def _about(device: jax.Device) -> str | None:
-    """Return what a GPU lacks."""
+    """Return what an NVIDIA GPU lacks."""
     capability = str(getattr(device, "compute_capability", ""))
-    if "rocm" in getattr(device.client, "platform_version", "").lower():
-        return "JAX computes on ROCm, and the kernel is for NVIDIA GPUs"
     try:
         return _too_old(device.device_kind, float(capability))
     except ValueError:

@@ -58,7 +58,7 @@ def draw(
     """
 
     def pack(view: View, state: Any, backdrops: Any, seen: Seen) -> list[jax.Array]:
-        return [finish(state, _frame(view, seen), backdrops)]
+        return [finish(state, seen.frame(_geom(view, seen)), backdrops)]
 
     view = view_of(scene, height, _einsum)
     band = _Band(height, width, 0, height)
@@ -133,12 +133,6 @@ def _einsum(subscripts: str, a: Any, b: Any) -> jax.Array:
         for axes, x in zip(inputs.split(","), (a, b), strict=True)
     ]
     return jnp.sum(terms[0] * terms[1], axis=-1)
-
-
-def _frame(view: View, seen: Seen) -> Frame:
-    return Frame(
-        r=seen.r, g=seen.g, b=seen.b, depth=seen.depth, seg=_geom(view, seen), ground=seen.ground
-    )
 
 
 def _geom(view: View, seen: Seen) -> jax.Array:

@@ -8,13 +8,13 @@ unsigned integers. Only the winner is shaded, from two products of its normal.
 
 Numbers of a scene are read one by one, ``array[i, j]``, and pixels are computed element by element:
 the same code is traced into a program of XLA's and into a kernel, to which arrays are references.
-`docs/renderer.md` has the measurements behind it.
+`docs/renderer.md` tells why.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -27,7 +27,7 @@ from pixelbrax_jax.renderer import ground, shading
 from pixelbrax_jax.renderer.bounds import at_least, at_most, between
 from pixelbrax_jax.renderer.intersect import Axes, Hit, Vector, dot, intersect
 from pixelbrax_jax.renderer.shading import SHADOW_BIAS
-from pixelbrax_jax.types import GeomKind, Lamp, Look, Scene
+from pixelbrax_jax.types import Frame, GeomKind, Lamp, Look, Scene
 
 _INF_BITS = np.uint32(0x7F800000)
 
@@ -83,6 +83,10 @@ class Seen(NamedTuple):
     depth: jax.Array
     rank: jax.Array
     ground: jax.Array
+
+    def frame(self, seg: jax.Array) -> Frame:
+        """Return the frame, given the geom of each pixel; see ``Frame.seg``."""
+        return Frame(r=self.r, g=self.g, b=self.b, depth=self.depth, seg=seg, ground=self.ground)
 
 
 def view_of(
@@ -144,11 +148,7 @@ Near = Callable[[int, Callable[[Any], Any], Any], Any]
 of that rank; where none does, it may be ``value``."""
 
 
-def see(
-    view: View,
-    ray: Vector,
-    near: Near | None = None,
-) -> Seen:
+def see(view: View, ray: Vector, near: Near | None = None) -> Seen:
     """Return what pixels see.
 
     Args:
@@ -172,17 +172,17 @@ def see(
     to_light = None if look.light is None else _vector(look.light)
     along = _directions(ray, to_light, bool(look.lamps))
     key, products = _no_hit(count, shape), [jnp.zeros(shape)] * len(along)
+
+    def update(rank: int, best: tuple[Any, list[Any]]) -> tuple[Any, list[Any]]:
+        entry = hit(rank)
+        key = _nearer(best[0], entry, rank, count)
+        return key, _normal_products(entry, along, key != best[0], best[1])
+
     for rank in ranks:
-
-        def update(best: tuple[Any, list[Any]], rank: int = rank) -> tuple[Any, list[Any]]:
-            entry = hit(rank)
-            key = _nearer(best[0], entry, rank, count)
-            return key, _normal_products(entry, along, key != best[0], best[1])
-
         if near is None:
             key = _nearer(key, hit(rank), rank, count)
         else:
-            key, products = near(rank, update, (key, products))
+            key, products = near(rank, partial(update, rank), (key, products))
     t, winner = _distance(key, count), _rank(key, count)
     seen = [winner == rank for rank in ranks]
     if near is None:
@@ -242,14 +242,13 @@ def see(
 
 
 class _Solid(NamedTuple):
-    """One geom in the camera's frame; fields as in ``intersect``, and whether it is ground."""
+    """One geom in the camera's frame; fields as in ``intersect``."""
 
     kind: int
     center: Vector
     axes: Axes
     size: Vector
     bounded: bool
-    ground: bool
 
     def hit(self, ray: Vector, center: Vector) -> Hit:
         """Return where rays enter it, with its center at another place."""
@@ -265,7 +264,6 @@ def _solid(view: View, rank: int) -> _Solid:
         axes=(axes[0], axes[1], axes[2]),
         size=tuple(view.size[g, k] for k in range(3)),
         bounded=view.bounded[rank],
-        ground=view.ground[rank],
     )
 
 

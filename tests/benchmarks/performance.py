@@ -9,7 +9,8 @@ import json
 from pathlib import Path
 
 from pixelbrax_gym.bench.ahead import tables as compiled
-from pixelbrax_gym.bench.cases import PROGRAMS, TASKS
+from pixelbrax_gym.bench.ahead.case import PROGRAMS
+from pixelbrax_gym.bench.cases import TASKS
 from pixelbrax_gym.bench.tables import cell, find, number, ratio, table, title, value
 from tests.benchmarks.pages import redraw
 
@@ -121,9 +122,14 @@ def forms_tables() -> dict[str, str]:
 
 
 def programs_tables() -> dict[str, str]:
-    """Tables of programs that are compiled and not run, by name; of the GPUs the H100 alone."""
+    """Tables of programs that are compiled and not run, by name.
+
+    Of the GPUs the H100 alone, and no steps in a loop.
+    """
     cards = [
-        row for row in rows_of("programs", "gpu-program") if row["arguments"]["card"] == "H100"
+        row
+        for row in rows_of("programs", "gpu-program")
+        if row["arguments"]["card"] == "H100" and row["arguments"]["program"] != "scan"
     ]
     cards.sort(key=_place)
     chips = sorted(rows_of("programs", "tpu-program"), key=_place)

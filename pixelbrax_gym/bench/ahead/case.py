@@ -11,6 +11,12 @@ from pixelbrax_gym.bench.ahead.environment import install
 from pixelbrax_gym.bench.ahead.targets import TPU_ENVIRON
 from pixelbrax_gym.bench.case import Case
 
+DUMP = "PIXELBRAX_PROGRAMS_DUMP"
+"""Variable that names the folder for what XLA writes of a program, which is removed afterwards."""
+
+PROGRAMS = ("renderer", "step", "state step", "scan")
+"""Programs that are compiled; `programs.py` makes them."""
+
 
 @dataclass(frozen=True)
 class AheadCase(Case):
@@ -46,4 +52,4 @@ class AheadCase(Case):
             "--xla_gpu_autotune_level=0",
             f"--xla_dump_to={dump} --xla_dump_hlo_as_text --xla_dump_hlo_module_re=.*ahead.*",
         )
-        return environ | {"XLA_FLAGS": " ".join(filter(None, flags))}
+        return environ | {DUMP: str(dump), "XLA_FLAGS": " ".join(filter(None, flags))}

@@ -5,11 +5,9 @@ Runs in a process with what `environment.py` installs, under the variables of it
 
 from __future__ import annotations
 
-import contextlib
 import os
 import re
 import shutil
-import tempfile
 import time
 from pathlib import Path
 from typing import Any
@@ -17,14 +15,15 @@ from typing import Any
 import jax
 from jax.experimental import topologies
 
-from pixelbrax_gym.bench.ahead import kernels as of
+from pixelbrax_gym.bench.ahead.case import DUMP
 from pixelbrax_gym.bench.ahead.hlo import parse
+from pixelbrax_gym.bench.ahead.kernels import kernels, longest_chain, loops
 from pixelbrax_gym.bench.ahead.programs import make_program
 from pixelbrax_gym.bench.ahead.registers import assemble
 from pixelbrax_gym.bench.ahead.targets import CARDS, LAUNCH_SECONDS, TPU_TOPOLOGY, Card
 
 _ASSEMBLED = 8
-"""Kernels that are assembled: those of most code, among which are all that could spill."""
+"""Files of kernels that are assembled, those of most code: they need the most registers."""
 
 
 def gpu(
@@ -47,18 +46,22 @@ def gpu(
     try:
         return _gpu(CARDS[card], *make_program(program, task, num_envs, **options))
     finally:
-        shutil.rmtree(dump_folder(), ignore_errors=True)
+        if folder := os.environ.get(DUMP):
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def _gpu(about: Card, function: Any, arguments: Any) -> dict[str, Any]:
     topology = topologies.get_topology_desc(
         platform="cuda", target_config=about.target_config(), topology="1x1x1"
     )
-    with _abstract_device(about):
+    # Pallas of jax 0.12 asks what it compiles for where there is no GPU.
+    device = jax.sharding.AbstractDevice(about.kind, about.cores, "gpu")
+    mesh = jax.sharding.AbstractMesh((), (), abstract_device=device)
+    with jax.sharding.use_abstract_mesh(mesh):
         compiled, seconds = _compile(topology, "cuda", function, arguments)
     parsed = parse(compiled.as_text())
     memory = compiled.memory_analysis()
-    found = of.kernels(parsed)
+    found = kernels(parsed)
     launches = sum(kernel.launches for kernel in found)
     read, written = (
         sum(kernel.launches * getattr(kernel, name) for kernel in found)
@@ -68,8 +71,8 @@ def _gpu(about: Card, function: Any, arguments: Any) -> dict[str, Any]:
     return {
         "kernels": len(found),
         "launches": launches,
-        "longest_chain": of.longest_chain(parsed),
-        "unknown_loops": sum(loop.trips is None for loop in of.loops(parsed)),
+        "longest_chain": longest_chain(parsed),
+        "unknown_loops": sum(loop.trips is None for loop in loops(parsed)),
         "large_kernels": sum(kernel.launches for kernel in large),
         "temporary_bytes": memory.temp_size_in_bytes,
         "output_bytes": memory.output_size_in_bytes,
@@ -117,34 +120,21 @@ def _compile(topology: Any, platform: str, function: Any, arguments: Any) -> tup
     return compiled, round(time.perf_counter() - started, 1)
 
 
-def _abstract_device(card: Card) -> contextlib.AbstractContextManager[Any]:
-    """Tell Pallas what it compiles for, which jax 0.12 asks for where there is no GPU."""
-    sharding: Any = jax.sharding
-    if not hasattr(sharding, "AbstractDevice"):
-        return contextlib.nullcontext()
-    kind = card.kind.split("-")[0].removesuffix(" 80GB HBM3")
-    device = sharding.AbstractDevice(kind, card.cores, "gpu")
-    mesh: contextlib.AbstractContextManager[Any] = sharding.use_abstract_mesh(
-        sharding.AbstractMesh((), (), abstract_device=device)
-    )
-    return mesh
-
-
-def dump_folder() -> Path:
-    """Return where XLA writes what it compiles: into the folder of its flag."""
-    named = re.search(r"--xla_dump_to=(\S+)", os.environ.get("XLA_FLAGS", ""))
-    return Path(named[1]) if named else Path(tempfile.gettempdir()) / "no-dump"
+def _dumped(ending: str) -> list[Path]:
+    """Return what XLA wrote of the program, by name; nothing without a folder for it."""
+    folder = os.environ.get(DUMP)
+    return sorted(Path(folder).glob(f"*jit_ahead*.{ending}")) if folder else []
 
 
 def _host_steps() -> int | None:
     """Return how many parts the host launches one after the other; None if XLA does not tell."""
-    files = sorted(dump_folder().glob("*jit_ahead*.thunk_sequence_after_thunk_passes.txt"))
+    files = _dumped("thunk_sequence_after_thunk_passes.txt")
     if not files:
         return None
     return len(re.findall(r"^\d+: k\w+", files[-1].read_text("utf-8"), re.M))
 
 
 def _registers(card: Card) -> dict[str, int | None]:
-    sources = sorted(dump_folder().glob("*jit_ahead*.ptx"), key=lambda file: -file.stat().st_size)
+    sources = sorted(_dumped("ptx"), key=lambda file: -file.stat().st_size)
     most = assemble(sources[:_ASSEMBLED], card.architecture)
     return dict(most) if most else {"registers": None, "spilled": None}

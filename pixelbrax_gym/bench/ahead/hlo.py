@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 _HEAD = re.compile(r"^(ENTRY )?%?([\w.\-]+) \(.*\) -> .* \{$")
@@ -111,17 +110,11 @@ def _instruction(name: str, text: str, is_root: bool) -> Instruction:
 def _closing(text: str) -> int:
     """Return where the first parenthesis is closed."""
     depth = 0
-    for position, depth in _depths(text):
-        if depth == 0:
-            return position
-    return len(text) - 1
-
-
-def _depths(text: str) -> Iterator[tuple[int, int]]:
-    depth = 0
     for match in re.finditer(r"[()]", text):
         depth += 1 if match[0] == "(" else -1
-        yield match.start(), depth
+        if depth == 0:
+            return match.start()
+    return len(text) - 1
 
 
 def _num_bytes(kind: str, dimensions: str) -> int:

@@ -69,7 +69,10 @@ def loops(program: Program) -> list[Loop]:
 
 
 def longest_chain(program: Program) -> int:
-    """Return how many launches wait for one another at least, however many run side by side."""
+    """Return how many launches wait for one another, however many run side by side.
+
+    Loops of an unknown number of turns count once, and of branches the longest.
+    """
     return _chain(program, program.entry)
 
 
@@ -108,11 +111,13 @@ def _chain(program: Program, name: str) -> int:
     depth: dict[str, int] = {}
     for line in program.computations[name].values():
         before = max((depth.get(operand, 0) for operand in line.operands), default=0)
-        inner = _inner(line)
-        if inner:
-            own = _turns(line) * max(_chain(program, part) for part in inner)
-        else:
+        parts = [_chain(program, part) for part in _inner(line)]
+        if not parts:
             own = 0 if line.op in FREE else 1
+        elif line.op == "conditional":
+            own = max(parts)
+        else:
+            own = _turns(line) * sum(parts)
         depth[line.name] = before + own
     return max(depth.values(), default=0)
 

@@ -9,8 +9,9 @@ import jax
 import jax.numpy as jnp
 
 import pixelbrax_jax as pb
+from pixelbrax_gym.bench.ahead.case import PROGRAMS
+from pixelbrax_jax.validation import check_choice
 
-PROGRAMS = ("renderer", "step", "state step", "scan")
 SCAN_LENGTH = 16
 
 
@@ -28,7 +29,11 @@ def make_program(
 
     Returns:
         The function and its arguments, as trees of ``jax.ShapeDtypeStruct``.
+
+    Raises:
+        ValueError: there is no such program.
     """
+    check_choice("program", name, PROGRAMS)
     obs_mode = "state" if name == "state step" else "pixels"
     # The batch as for any device: "auto" is for the one that JAX computes on.
     env, params = pb.make(task, obs_mode=obs_mode, physics_batching="vmap", **options)
@@ -39,9 +44,9 @@ def make_program(
     )
     action = jax.ShapeDtypeStruct((num_envs, env.action_size), jnp.float32)
     if name == "renderer":
-        return lambda sim, p: jax.vmap(env.draw, in_axes=(0, None))(sim, p), (state.sim, params)
+        return jax.vmap(env.draw, in_axes=(0, None)), (state.sim, params)
     if name != "scan":
-        return lambda state, x, p: envs.step(state, x, p), (state, action, params)
+        return envs.step, (state, action, params)
 
     def scan(state: Any, x: jax.Array, p: Any) -> Any:
         def step(state: Any, _: None) -> tuple[Any, jax.Array]:

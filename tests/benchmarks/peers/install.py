@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
-from functools import cache
 from pathlib import Path
 
-from pixelbrax_gym.bench.case import AbsentError
+from pixelbrax_gym.bench.packages import install_packages
 
 HOME = Path(__file__).parents[3] / ".venv-peers"
-
 
 PEERS: dict[str, tuple[str, ...]] = {
     "dm_control": (
@@ -28,7 +25,7 @@ PEERS: dict[str, tuple[str, ...]] = {
 
 
 def peer_python(peer: str) -> str:
-    """The Python that has the peer; what cannot be installed is tried once.
+    """The Python that has the peer.
 
     Args:
         peer: a key of ``PEERS``.
@@ -39,31 +36,8 @@ def peer_python(peer: str) -> str:
     Raises:
         AbsentError: the peer cannot be installed.
     """
-    found = _install(peer)
-    if isinstance(found, AbsentError):
-        raise found
-    return found
-
-
-@cache
-def _install(peer: str) -> str | AbsentError:
-    home = HOME / peer
-    python = home / "bin" / "python"
-    mark = home / ".installed"
-    wanted = "\n".join(PEERS[peer])
-    if mark.exists() and mark.read_text() == wanted:
-        return str(python)
-    print(f"Installing {peer} into {home} ...", flush=True)
-    try:
-        subprocess.run([sys.executable, "-m", "venv", str(home)], check=True, capture_output=True)
-        subprocess.run(
-            [str(python), "-m", "pip", "install", "--quiet", *PEERS[peer]],
-            check=True,
-            capture_output=True,
-            text=True,
-        )
-    except (OSError, subprocess.CalledProcessError) as error:
-        lines = str(getattr(error, "stderr", "") or error).strip().splitlines()
-        return AbsentError(f"cannot be installed: {lines[-1] if lines else error}")
-    mark.write_text(wanted)
-    return str(python)
+    home, wanted = HOME / peer, PEERS[peer]
+    python = str(home / "bin" / "python")
+    make = (sys.executable, "-m", "venv", str(home))
+    install_packages(home, wanted, make, (python, "-m", "pip", "install", "--quiet", *wanted))
+    return python
