@@ -14,10 +14,8 @@ _T = TypeVar("_T")
 
 _WIDTH = "xla_cpu_prefer_vector_width"
 
-XlaOptions = dict[str, Any]
 
-
-def compiler_options(env: Any = None) -> XlaOptions:
+def compiler_options(env: Any = None) -> dict[str, Any]:
     """Return options of ``jax.jit`` that make an environment fast on the default device.
 
     XLA holds back on CPUs with AVX-512 and computes with vectors of 256 bits; with 512 the
@@ -40,11 +38,7 @@ def compiler_options(env: Any = None) -> XlaOptions:
         The options; empty on other devices than CPUs and with a width of vectors in ``XLA_FLAGS``.
         What the installed XLA does not know is left out.
     """
-    if jax.default_backend() != "cpu" or _WIDTH in os.environ.get("XLA_FLAGS", ""):
-        return {}
-    physics = getattr(getattr(env, "env", env), "physics", None)
-    options = {_WIDTH: 512, **getattr(physics, "compiler_options", {})}
-    return {name: value for name, value in options.items() if _is_known(name, value)}
+    return _options(_physics(env))
 
 
 def jit(
@@ -52,7 +46,8 @@ def jit(
 ) -> Callable[[Callable[_P, _T]], Callable[_P, _T]]:
     """Decorate as ``jax.jit`` does, with ``compiler_options``.
 
-    They are asked for at the first call: importing a package must not start a device.
+    They are asked for at the first call for a physics: importing a package must not start a device,
+    and the step of an environment not ask again.
 
     Args:
         env_of: gives the environment of the function's first argument, which is static.
@@ -61,17 +56,27 @@ def jit(
 
     def decorate(function: Callable[_P, _T]) -> Callable[_P, _T]:
         @cache
-        def program(names_and_values: tuple[tuple[str, Any], ...]) -> Any:
-            return jax.jit(function, compiler_options=dict(names_and_values), **options)
+        def program(physics: Any) -> Any:
+            return jax.jit(function, compiler_options=_options(physics), **options)
 
         @wraps(function)
         def call(*args: _P.args, **kwargs: _P.kwargs) -> _T:
-            asked = compiler_options(env_of(args[0]))
-            return program(tuple(asked.items()))(*args, **kwargs)
+            return program(_physics(env_of(args[0])))(*args, **kwargs)
 
         return call
 
     return decorate
+
+
+def _physics(env: Any) -> Any:
+    return getattr(getattr(env, "env", env), "physics", None)
+
+
+def _options(physics: Any) -> dict[str, Any]:
+    if jax.default_backend() != "cpu" or _WIDTH in os.environ.get("XLA_FLAGS", ""):
+        return {}
+    options = {_WIDTH: 512, **getattr(physics, "compiler_options", {})}
+    return {name: value for name, value in options.items() if _is_known(name, value)}
 
 
 @cache
