@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from pixelbrax_jax.physics.mjx import elimination
 from pixelbrax_jax.physics.mujoco_compatibility import import_silenced
 
 with import_silenced():
@@ -120,7 +121,7 @@ def solve(model: Any, data: Any) -> Any:
         total = _over_rows(problem.jacobian, jnp.concatenate([weighted, slope], axis=1))
         hessian = problem.inertia + total[:, :-1]
         gradient = problem.inertia @ (acceleration - problem.smooth) + total[:, -1]
-        step = -jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(hessian), gradient)
+        step = -elimination.solve(hessian, gradient)
         change = problem.jacobian @ step
         done = jnp.all(problem.piece(residual + change) == piece)
         factor = jnp.where(done, 1.0, _line_search(problem, acceleration, residual, step, change))

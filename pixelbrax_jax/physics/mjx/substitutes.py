@@ -9,15 +9,16 @@ from typing import Any
 
 import mujoco
 
+from pixelbrax_jax.physics.mjx import elimination
 from pixelbrax_jax.physics.mjx.contact_frames import PAIR, aligned_with_capsules
 from pixelbrax_jax.physics.mjx.solver import is_supported, solve
 from pixelbrax_jax.physics.mujoco_compatibility import import_silenced
 
 with import_silenced():
-    from mujoco.mjx._src import collision_driver, smooth
+    from mujoco.mjx._src import collision_driver, smooth, support
     from mujoco.mjx._src import solver as mjx_solver
 
-_factor_m = smooth.factor_m
+_factor_m, _solve_m = smooth.factor_m, smooth.solve_m
 _lock = threading.RLock()
 
 
@@ -34,6 +35,7 @@ def substituted(model: mujoco.MjModel) -> Iterator[None]:
     changes: list[tuple[dict[Any, Any], Any, Any]] = [
         (collision_driver._COLLISION_FUNC, PAIR, aligned_with_capsules),
         (vars(smooth), "factor_m", factor_in_turn),
+        (vars(smooth), "solve_m", solve_with_inertia),
     ]
     if is_supported(model):
         changes.append((vars(mjx_solver), "solve", solve))
@@ -57,3 +59,10 @@ def factor_in_turn(model: Any, data: Any) -> Any:
     """
     nothing = (0 * data.qacc).sum()  # XLA does not know: it might be NaN.
     return _factor_m(model, data.tree_replace({"_impl.M": data._impl.M + nothing}))
+
+
+def solve_with_inertia(model: Any, data: Any, right: Any) -> Any:
+    """Solve for inertia as ``mujoco.mjx._src.smooth.solve_m`` does, without factors if faster."""
+    if support.is_sparse(model) or not elimination.is_faster(model.nv):
+        return _solve_m(model, data, right)
+    return elimination.solve(data._impl.M, right)
