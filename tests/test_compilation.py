@@ -36,6 +36,10 @@ own = pb.compiler_options(env).items() - pb.compiler_options().items()
 assert own == {("xla_cpu_experimental_ynn_fusion_type", "")}, own
 assert pb.compiler_options(env) == pb.compiler_options(pb.VectorPixelEnv(env, 2))
 assert pb.compiler_options(brax) == pb.compiler_options()
+emitters = "xla_cpu_use_fusion_emitters"
+using = [task for task in pb.list_envs(suite="dmc")
+         if emitters in pb.compiler_options(pb.make(task)[0])]
+assert using == ["dmc_swimmer_swimmer15"], using
 """
 
 

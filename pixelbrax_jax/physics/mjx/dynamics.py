@@ -163,12 +163,13 @@ class Dynamics:
         """
         mx = self._mx
         data = self._data(state).replace(sensordata=sensors)
-        data = mjx.kinematics(mx, data)
-        data = mjx.com_pos(mx, data)
-        data = mjx.com_vel(mx, data)
-        if self.model.nsensor:
-            data = mjx.sensor_pos(mx, data)
-            data = mjx.sensor_vel(mx, data)
+        with substituted(self.model):
+            data = mjx.kinematics(mx, data)
+            data = mjx.com_pos(mx, data)
+            data = mjx.com_vel(mx, data)
+            if self.model.nsensor:
+                data = mjx.sensor_pos(mx, data)
+                data = mjx.sensor_vel(mx, data)
         return data
 
     def touches(self, qpos: jax.Array) -> jax.Array:
@@ -188,8 +189,9 @@ class Dynamics:
         return jnp.min(jnp.where(is_of_it, contact.dist, jnp.inf))
 
     def _contact(self, qpos: jax.Array) -> Any:
-        data = mjx.kinematics(self._mx, self._data(self.state(qpos)))
-        return mjx.collision(self._mx, data)._impl.contact
+        with substituted(self.model):
+            data = mjx.kinematics(self._mx, self._data(self.state(qpos)))
+            return mjx.collision(self._mx, data)._impl.contact
 
     def _data(self, state: MjxState) -> Any:
         return mjx.make_data(self._simulated, impl="jax").replace(

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+import jax
 import mujoco
 
 from pixelbrax_jax.physics.mjx import elimination
@@ -15,16 +16,21 @@ from pixelbrax_jax.physics.mjx.solver import is_supported, solve
 from pixelbrax_jax.physics.mujoco_compatibility import import_silenced
 
 with import_silenced():
-    from mujoco.mjx._src import collision_driver, smooth, support
+    from mujoco.mjx._src import collision_driver, scan, smooth, support
     from mujoco.mjx._src import solver as mjx_solver
 
 _factor_m, _solve_m = smooth.factor_m, smooth.solve_m
+_body_tree = scan.body_tree
+
+_SHORT = 5
+"""Bodies in a row whose positions XLA may compute in one loop."""
+
 _lock = threading.RLock()
 
 
 @contextmanager
 def substituted(model: mujoco.MjModel) -> Iterator[None]:
-    """Trace with contact frames, factorisation and, for models it supports, solver of our own.
+    """Trace with contact frames, small equations, scans of long chains and solver of our own.
 
     What is traced elsewhere before and after is not affected; what another thread traces with
     MuJoCo XLA in the meantime, without this block, has them too.
@@ -34,9 +40,11 @@ def substituted(model: mujoco.MjModel) -> Iterator[None]:
     """
     changes: list[tuple[dict[Any, Any], Any, Any]] = [
         (collision_driver._COLLISION_FUNC, PAIR, aligned_with_capsules),
-        (vars(smooth), "factor_m", factor_in_turn),
-        (vars(smooth), "solve_m", solve_with_inertia),
+        (vars(smooth), "factor_m", factor_m),
+        (vars(smooth), "solve_m", solve_m),
     ]
+    if _longest_chain(model) > _SHORT:
+        changes.append((vars(scan), "body_tree", body_tree))
     if is_supported(model):
         changes.append((vars(mjx_solver), "solve", solve))
     with _lock:
@@ -50,19 +58,46 @@ def substituted(model: mujoco.MjModel) -> Iterator[None]:
                 functions[name] = theirs
 
 
-def factor_in_turn(model: Any, data: Any) -> Any:
+def body_tree(model: Any, of_body: Any, *args: Any, **options: Any) -> Any:
+    """Scan bodies as ``mujoco.mjx._src.scan.body_tree`` does, one level of the tree after another.
+
+    XLA on a CPU would fuse the levels into one loop, in which each body's parents are computed
+    anew, several times over: of fifteen bodies in a row that takes ten thousand times as long.
+    """
+
+    def level(*values: Any) -> Any:
+        return jax.lax.optimization_barrier(of_body(*values))
+
+    return _body_tree(model, level, *args, **options)
+
+
+def _longest_chain(model: mujoco.MjModel) -> int:
+    """Return the number of bodies from the world to the one that is farthest from it."""
+    depth = [0]
+    for parent in model.body_parentid[1:]:
+        depth.append(depth[parent] + 1)
+    return max(depth)
+
+
+def factor_m(model: Any, data: Any) -> Any:
     """Factorise inertia as ``mujoco.mjx._src.smooth.factor_m`` does, after what came before it.
 
     On a CPU jaxlib 0.10.0 to 0.11.0 share a batch of factorisations out among the threads of XLA,
     and wait for ever once as many batches are at it as there are threads. Euler's method factorises
     inertia with damping, which XLA would do beside the solver's; here it needs its accelerations.
     """
+    if _is_eliminated(model):
+        return data
     nothing = (0 * data.qacc).sum()  # XLA does not know: it might be NaN.
     return _factor_m(model, data.tree_replace({"_impl.M": data._impl.M + nothing}))
 
 
-def solve_with_inertia(model: Any, data: Any, right: Any) -> Any:
+def solve_m(model: Any, data: Any, right: Any) -> Any:
     """Solve for inertia as ``mujoco.mjx._src.smooth.solve_m`` does, without factors if faster."""
-    if support.is_sparse(model) or not elimination.is_faster(model.nv):
-        return _solve_m(model, data, right)
-    return elimination.solve(data._impl.M, right)
+    if _is_eliminated(model):
+        return elimination.solve(data._impl.M, right)
+    return _solve_m(model, data, right)
+
+
+def _is_eliminated(model: Any) -> bool:
+    return not support.is_sparse(model) and elimination.is_faster(model.nv)
