@@ -107,7 +107,7 @@ def solve(model: Any, data: Any) -> Any:
         high=pad(jnp.where(kind == _ONE_SIDED, 0.0, friction)),
     )
     warm, smooth = data.qacc_warmstart, data.qacc_smooth
-    start = jnp.where(problem.cost(warm) < problem.cost(smooth), warm, smooth)
+    start = _once(jnp.where(problem.cost(warm) < problem.cost(smooth), warm, smooth))
 
     def going_on(carry: _Carry) -> jax.Array:
         count, done = carry[0], carry[1]
@@ -123,8 +123,9 @@ def solve(model: Any, data: Any) -> Any:
         gradient = problem.inertia @ (acceleration - problem.smooth) + total[:, -1]
         step = -elimination.solve(hessian, gradient)
         change = problem.jacobian @ step
-        done = jnp.all(problem.piece(residual + change) == piece)
-        factor = jnp.where(done, 1.0, _line_search(problem, acceleration, residual, step, change))
+        done = _once(jnp.all(problem.piece(residual + change) == piece))
+        found = _line_search(problem, acceleration, residual, step, change)
+        factor = _once(jnp.where(done, 1.0, found))
         return count + 1, done, acceleration + factor * step, residual + factor * change
 
     carry = (jnp.zeros((), jnp.int32), jnp.zeros((), bool), start, problem.residual(start))
@@ -138,6 +139,11 @@ def solve(model: Any, data: Any) -> Any:
             "_impl.efc_force": force[: impl.nefc],
         }
     )
+
+
+def _once(decision: jax.Array) -> jax.Array:
+    """Have XLA compute a value once: computed anew for another reader, rounding may decide else."""
+    return jax.lax.optimization_barrier(decision)
 
 
 def _rows(jacobian: jax.Array) -> int:
@@ -184,8 +190,8 @@ def _line_search(
         high = jnp.where(first > 0, factor, high)
         next_factor = factor - first / second
         halfway = jnp.where(jnp.isfinite(high), 0.5 * (low + high), 2 * factor)
-        inside = (next_factor > low) & (next_factor < high)
-        return jnp.where(inside | (first == 0), next_factor, halfway), low, high
+        inside = (next_factor >= low) & (next_factor <= high)
+        return jnp.where(inside, next_factor, halfway), low, high
 
     carry = (jnp.ones(()), jnp.zeros(()), jnp.full((), jnp.inf))
     return jax.lax.fori_loop(0, LINE_SEARCH_ITERATIONS, narrow, carry, unroll=True)[0]
