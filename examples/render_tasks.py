@@ -2,6 +2,7 @@
 
     python examples/render_tasks.py --output-dir docs/images
     python examples/render_tasks.py --output-dir runs/images --num-frames 8 --only ant reacher
+    python examples/render_tasks.py --output-dir docs/images --suite dmc
 
 Tasks for which a policy comes with the package are played by it, the others by random actions.
 Under distractors the policy sees the clean observation, for it was trained on that.
@@ -35,6 +36,7 @@ VIEWS = {
     "top": {"camera": "top"},
 }
 """Looks and cameras, and the options that they take."""
+SHADOWS = pb.make_look("default", shadows=True)
 COLORS = 128  # one palette for all frames: small files that do not flicker
 FPS = 20
 WARM_UP = 20  # frames before the first that is shown: by then agents are under way
@@ -52,6 +54,25 @@ TILES: tuple[tuple[str, str | None], ...] = (
     ("walker2d", "paper-video"),
 )
 """Task and distractors of each tile, row by row."""
+
+DMC_TILES: tuple[tuple[str, str | None], ...] = (
+    ("dmc_acrobot_swingup", None),
+    ("dmc_ball_in_cup_catch", None),
+    ("dmc_cartpole_swingup", None),
+    ("dmc_cheetah_run", None),
+    ("dmc_finger_spin", None),
+    ("dmc_fish_swim", None),
+    ("dmc_hopper_hop", None),
+    ("dmc_humanoid_walk", None),
+    ("dmc_point_mass_easy", None),
+    ("dmc_quadruped_walk", None),
+    ("dmc_reacher_easy", None),
+    ("dmc_swimmer_swimmer6", None),
+    ("dmc_walker_walk", None),
+    ("dmc_walker_walk", "dcs-medium"),
+    ("dmc_cheetah_run", "video-hard"),
+)
+"""The same of the DM Control Suite."""
 
 
 def episode(task: str, num_frames: int) -> Any:
@@ -86,7 +107,7 @@ def tile(task: str, distractors: str | None, states: Any, seed: int) -> np.ndarr
         task,
         height=SIZE,
         width=SIZE,
-        look=pb.make_look("default", shadows=True),
+        look="default" if task in pb.list_envs(suite="dmc") else SHADOWS,
         distractors=links,
         clips="procedural" if plays else None,
     )
@@ -140,13 +161,20 @@ def save(frames: np.ndarray, path: Path) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Writes ``wall.gif``, ``tasks/<task>.gif`` and ``views.png``."""
+    """Writes ``wall.gif``, ``tasks/<task>.gif`` and ``views.png``, or ``dmc/wall.gif``."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--output-dir", type=Path, default=Path("docs/images"))
     parser.add_argument("--num-frames", type=int, default=60)
-    tasks = pb.list_envs()
-    parser.add_argument("--only", nargs="+", default=tasks, choices=tasks, help="these tasks")
+    tasks = pb.list_envs(suite="brax")
+    parser.add_argument("--suite", choices=("brax", "dmc"), default="brax")
+    parser.add_argument("--only", nargs="+", default=tasks, choices=tasks, help="tasks of Brax")
     options = parser.parse_args(arguments)
+    if options.suite == "dmc":
+        (options.output_dir / "dmc").mkdir(parents=True, exist_ok=True)
+        states = {task: episode(task, options.num_frames) for task, _ in DMC_TILES}
+        tiles = [tile(task, behind, states[task], 0) for task, behind in DMC_TILES]
+        save(wall(tiles), options.output_dir / "dmc" / "wall.gif")
+        return
     (options.output_dir / "tasks").mkdir(parents=True, exist_ok=True)
     states = {task: episode(task, options.num_frames) for task in options.only}
     clean = {task: tile(task, None, states[task], 0) for task in states}
