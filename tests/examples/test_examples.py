@@ -91,6 +91,18 @@ def test_render_tasks(tmp_path):
         assert np.abs(first.astype(int) - second).mean() > 1
 
 
+@pytest.mark.slow
+def test_render_tasks_of_dm_control(tmp_path, monkeypatch):
+    pytest.importorskip("dm_control")
+    example = load("render_tasks")
+    tiles = [("dmc_pendulum_swingup", None), ("dmc_pendulum_swingup", "color")]
+    monkeypatch.setattr(example, "DMC_TILES", tiles)
+    example.main(["--output-dir", str(tmp_path), "--num-frames", "3", "--suite", "dmc"])
+    moving = pictures_in(tmp_path / "dmc" / "wall.gif")
+    assert moving.shape == (3, 120, 2 * 120 + 4, 3)
+    assert np.abs(moving[:, :, :120].astype(int) - moving[:, :, 124:]).mean() > 1
+
+
 def test_skrl_ppo(tmp_path):
     agent = load("skrl_ppo").main(
         ["--output-dir", str(tmp_path), "--num-envs", "4", "--timesteps", "64"]
