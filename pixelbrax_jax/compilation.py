@@ -35,7 +35,8 @@ def compiler_options(env: Any = None) -> dict[str, Any]:
             which are all that Brax's tasks have.
 
     Returns:
-        The options; empty on other devices than CPUs and with a width of vectors in ``XLA_FLAGS``.
+        The options; empty on other devices than CPUs and with a width of vectors in ``XLA_FLAGS``,
+        where those of the physics are yours to give too.
         What the installed XLA does not know is left out.
     """
     return _options(_physics(env))

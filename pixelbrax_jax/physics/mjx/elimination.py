@@ -10,7 +10,7 @@ LARGEST = 17
 
 
 def is_faster(unknowns: int) -> bool:
-    """Return whether elimination is faster than factorisation, on the device of programs."""
+    """Return whether elimination is faster than factorisation, on JAX's default device."""
     return unknowns <= LARGEST and jax.default_backend() == "cpu"
 
 
@@ -22,13 +22,14 @@ def solve(matrix: jax.Array, right: jax.Array) -> jax.Array:
         right: (V,) float32.
 
     Returns:
-        x, (V,) float32.
+        x, (V,) float32; NaN for a matrix of another kind.
     """
     if not is_faster(len(matrix)):
         return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(matrix), right)
 
     def eliminate(i: jax.Array, rows: jax.Array) -> jax.Array:
-        pivot = rows[i] / rows[i, i]
+        # As Cholesky's factors are: a state that has diverged shall be seen as such.
+        pivot = rows[i] / jnp.where(rows[i, i] > 0, rows[i, i], jnp.nan)
         is_pivot = (jnp.arange(len(rows)) == i)[:, None]
         return jnp.where(is_pivot, pivot, rows - rows[:, i][:, None] * pivot)
 

@@ -18,7 +18,8 @@ from pixelbrax_jax.physics.model_scene import COM_LINK, TARGET_LINK, read_scene,
 from pixelbrax_jax.types import PhysicsState
 
 _MOST_CROSSINGS = 50
-"""Geoms, for as many lamps as there are and the camera, that XLA fuses into one fast loop."""
+"""Geoms times rays of a pixel, one to the camera and one to each of the model's lamps, which XLA's
+newer emitters still make one fast loop of."""
 
 _UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 

@@ -141,9 +141,9 @@ def solve(model: Any, data: Any) -> Any:
     )
 
 
-def _once(decision: jax.Array) -> jax.Array:
-    """Have XLA compute a value once: computed anew for another reader, rounding may decide else."""
-    return jax.lax.optimization_barrier(decision)
+def _once(value: jax.Array) -> jax.Array:
+    """Have XLA compute a value once: a copy may round differently, and so decide otherwise."""
+    return jax.lax.optimization_barrier(value)
 
 
 def _rows(jacobian: jax.Array) -> int:
@@ -190,6 +190,7 @@ def _line_search(
         high = jnp.where(first > 0, factor, high)
         next_factor = factor - first / second
         halfway = jnp.where(jnp.isfinite(high), 0.5 * (low + high), 2 * factor)
+        # Bounds included: at the least cost Newton's step is zero, and the factor stays.
         inside = (next_factor >= low) & (next_factor <= high)
         return jnp.where(inside, next_factor, halfway), low, high
 

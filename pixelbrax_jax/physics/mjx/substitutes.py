@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import mujoco
 
 from pixelbrax_jax.physics.mjx import elimination
@@ -23,7 +24,7 @@ _factor_m, _solve_m = smooth.factor_m, smooth.solve_m
 _body_tree = scan.body_tree
 
 _SHORT = 5
-"""Bodies in a row whose positions XLA may compute in one loop."""
+"""Most bodies in a row whose positions XLA may compute in one loop."""
 
 _lock = threading.RLock()
 
@@ -43,7 +44,7 @@ def substituted(model: mujoco.MjModel) -> Iterator[None]:
         (vars(smooth), "factor_m", factor_m),
         (vars(smooth), "solve_m", solve_m),
     ]
-    if _longest_chain(model) > _SHORT:
+    if _longest_chain(model) > _SHORT and jax.default_backend() == "cpu":
         changes.append((vars(scan), "body_tree", body_tree))
     if is_supported(model):
         changes.append((vars(mjx_solver), "solve", solve))
@@ -72,7 +73,7 @@ def body_tree(model: Any, of_body: Any, *args: Any, **options: Any) -> Any:
 
 
 def _longest_chain(model: mujoco.MjModel) -> int:
-    """Return the number of bodies from the world to the one that is farthest from it."""
+    """Return the number of bodies in the longest chain that hangs on the world."""
     depth = [0]
     for parent in model.body_parentid[1:]:
         depth.append(depth[parent] + 1)
@@ -87,7 +88,8 @@ def factor_m(model: Any, data: Any) -> Any:
     inertia with damping, which XLA would do beside the solver's; here it needs its accelerations.
     """
     if _is_eliminated(model):
-        return data
+        # What another thread traces meanwhile might read factors: not those of another state.
+        return data.tree_replace({"_impl.qLD": jnp.full_like(data._impl.M, jnp.nan)})
     nothing = (0 * data.qacc).sum()  # XLA does not know: it might be NaN.
     return _factor_m(model, data.tree_replace({"_impl.M": data._impl.M + nothing}))
 

@@ -28,3 +28,9 @@ def test_solutions_are_numpys(unknowns, batch):
     error = np.abs(found - expected).max(axis=1) / np.abs(expected).max(axis=1)
     assert error.max() < 1e-3
     assert np.median(error) < 1e-5
+
+
+@pytest.mark.parametrize("unknowns", [2, elimination.LARGEST + 1])
+def test_matrices_of_other_kinds_have_no_solution(unknowns):
+    matrix = jnp.diag(jnp.ones(unknowns).at[1].set(-1.0))
+    assert jnp.isnan(elimination.solve(matrix, jnp.ones(unknowns))).all()
