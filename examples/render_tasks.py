@@ -169,9 +169,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--suite", choices=("brax", "dmc"), default="brax")
     parser.add_argument("--only", nargs="+", default=tasks, choices=tasks, help="tasks of Brax")
     options = parser.parse_args(arguments)
-    if options.suite == "dmc" and options.only is not tasks:
-        parser.error("--only is for --suite brax")
     if options.suite == "dmc":
+        if options.only is not tasks:
+            parser.error("--only is for --suite brax")
         (options.output_dir / "dmc").mkdir(parents=True, exist_ok=True)
         states = {task: episode(task, options.num_frames) for task, _ in DMC_TILES}
         tiles = [tile(task, behind, states[task], 0) for task, behind in DMC_TILES]
