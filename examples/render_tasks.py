@@ -153,7 +153,8 @@ def views(task: str, states: Any) -> np.ndarray:
 def save(frames: np.ndarray, path: Path) -> None:
     """Write a GIF whose frames have one palette."""
     sample = Image.fromarray(np.concatenate(frames[:: max(1, len(frames) // 6)]))
-    palette = sample.quantize(COLORS)
+    # Octrees keep rare colors, such as the red of targets.
+    palette = sample.quantize(COLORS, method=Image.Quantize.FASTOCTREE)
     images = [
         Image.fromarray(f).quantize(palette=palette, dither=Image.Dither.NONE) for f in frames
     ]
