@@ -64,6 +64,7 @@ DMC_TILES: tuple[tuple[str, str | None], ...] = (
     ("dmc_fish_swim", None),
     ("dmc_hopper_hop", None),
     ("dmc_humanoid_walk", None),
+    ("dmc_manipulator_bring_ball", None),
     ("dmc_point_mass_easy", None),
     ("dmc_quadruped_walk", None),
     ("dmc_reacher_easy", None),

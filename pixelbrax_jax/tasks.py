@@ -241,6 +241,7 @@ _DMC_ROWS = (
     _dmc("humanoid", "stand", "A humanoid stands still."),
     _dmc("humanoid", "walk", "A humanoid walks in any direction."),
     _dmc("humanoid", "run", "A humanoid runs in any direction."),
+    _dmc("manipulator", "bring_ball", "An arm with two fingers brings a ball to a target."),
     _dmc("pendulum", "swingup", "A pendulum swings up, rewarded near upright alone."),
     _dmc("point_mass", "easy", "A point is pushed to the middle of an arena."),
     _dmc("quadruped", "walk", "A four-legged body walks forward."),

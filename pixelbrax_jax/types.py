@@ -65,6 +65,8 @@ class Geoms(struct.PyTreeNode):
             0 is no end. Empty where no plane ends, whatever its size.
         patterned: (G,) static, planes that are ground: drawn with the look's pattern, others in
             their own color. Empty where every plane is.
+        distant: static, whether cameras are so far away, a thousand radii of spheres and capsules,
+            that float32 needs the longer formulas of ``renderer.intersect``.
         strings: threads, the pieces of which are among the geoms.
         material_name: (M,) static, the model's name for the material of the first geom of each
             color. Empty where none is known.
@@ -80,6 +82,7 @@ class Geoms(struct.PyTreeNode):
     rgb: jax.Array
     bounded: tuple[bool, ...] = struct.field(pytree_node=False, default=())
     patterned: tuple[bool, ...] = struct.field(pytree_node=False, default=())
+    distant: bool = struct.field(pytree_node=False, default=False)
     strings: tuple[String, ...] = ()
     material_name: tuple[str, ...] = struct.field(pytree_node=False, default=())
 

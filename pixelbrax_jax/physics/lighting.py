@@ -14,6 +14,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from pixelbrax_jax.physics.geometry import resolve_rgba
 from pixelbrax_jax.physics.viewpoints import follows_tracked
 from pixelbrax_jax.types import Lamp, Look
 
@@ -63,11 +64,7 @@ def read_look(
         )
     headlight = model.vis.headlight
     has_headlight = bool(headlight.active)
-    ambient = sum((model.light_ambient[i].mean() for i in active), 0.0)
-    if has_headlight:
-        ambient += headlight.ambient.mean()
-    elif not active:
-        ambient = 0.3  # MuJoCo's own, where there is no light at all
+    ambient = _ambient(model)
     sun = suns[0] if suns else None
     lamps = []
     for i in active:
@@ -95,10 +92,19 @@ def read_look(
     )
 
 
+def _ambient(model: mujoco.MjModel) -> float:
+    active = np.flatnonzero(model.light_active)
+    ambient = float(sum((model.light_ambient[i].mean() for i in active), 0.0))
+    if model.vis.headlight.active:
+        ambient += float(model.vis.headlight.ambient.mean())
+    elif not len(active):
+        ambient = 0.3  # MuJoCo's own, where there is no light at all
+    return ambient
+
+
 def checker(model: mujoco.MjModel, geom: int) -> np.ndarray | None:
     """Return the two colors of a geom's checkered texture, (2, 3) in [0, 1]; None for none."""
-    material = int(model.geom_matid[geom])
-    texture = int(model.mat_texid[material, _RGB]) if material >= 0 else -1
+    texture = _texture(model, geom)
     if texture < 0 or model.tex_type[texture] != int(mujoco.mjtTexture.mjTEXTURE_2D):
         return None
     pixels = _pixels(model, texture)
@@ -107,7 +113,30 @@ def checker(model: mujoco.MjModel, geom: int) -> np.ndarray | None:
     (a, b), (c, d) = pixels[np.ix_(rows, columns)]
     if not ((a == d).all() and (b == c).all() and (a != b).any()):
         return None
-    return np.stack([a, b]) / 255.0 * model.mat_rgba[material, :3]
+    return np.stack([a, b]) / 255.0 * model.mat_rgba[model.geom_matid[geom], :3]
+
+
+def mean_color(model: mujoco.MjModel, geom: int) -> tuple[float, float, float] | None:
+    """Return the mean color of a geom's texture, red, green, blue in [0, 1]; None for none.
+
+    MuJoCo's light on a texture is never more than 1. The color is darker by what ambience and
+    headlight cast beyond that on what faces the camera.
+    """
+    texture = _texture(model, geom)
+    if texture < 0:
+        return None
+    rgba = resolve_rgba(model, model.geom_rgba[geom], int(model.geom_matid[geom]))
+    headlight = model.vis.headlight
+    light = _ambient(model) + (float(headlight.diffuse.mean()) if headlight.active else 0.0)
+    mean = _pixels(model, texture).reshape(-1, 3).mean(0) / 255.0 * rgba[:3]
+    red, green, blue = mean / max(light, 1.0)
+    return float(red), float(green), float(blue)
+
+
+def _texture(model: mujoco.MjModel, geom: int) -> int:
+    """Return the index of a geom's texture, -1 for none."""
+    material = int(model.geom_matid[geom])
+    return int(model.mat_texid[material, _RGB]) if material >= 0 else -1
 
 
 def _lamp(model: mujoco.MjModel, light: int, com_link: int) -> Lamp | None:

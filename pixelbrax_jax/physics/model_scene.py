@@ -17,7 +17,7 @@ from pixelbrax_jax.physics.geometry import (
     resolve_rgba,
     shown_geoms,
 )
-from pixelbrax_jax.physics.lighting import checker, read_look
+from pixelbrax_jax.physics.lighting import checker, mean_color, read_look
 from pixelbrax_jax.physics.viewpoints import read_rigs
 from pixelbrax_jax.physics.viewpoints import tracked_body as tracked_body
 from pixelbrax_jax.types import CameraRig, GeomKind, Geoms, Look, String
@@ -28,6 +28,9 @@ TARGET_LINK = "target"
 
 _PIECES = 6
 """Capsules of a string that hangs."""
+
+_DISTANT = 1000
+"""Radii of a sphere or capsule: farther away, float32 moves its edge by some hundredths of one."""
 
 _SITE = int(mujoco.mjtWrap.mjWRAP_SITE)
 _JOINT = int(mujoco.mjtWrap.mjWRAP_JOINT)
@@ -94,7 +97,18 @@ def read_scene(
         target_link=target if moved else -1,
         anchor=anchor,
     )
-    return ModelScene(geoms, rigs[_camera_name(model, camera, rigs)], rigs, look, tuple(links))
+    name = _camera_name(model, camera, rigs)
+    geoms = geoms.replace(distant=_is_distant(model, geoms, name))
+    return ModelScene(geoms, rigs[name], rigs, look, tuple(links))
+
+
+def _is_distant(model: mujoco.MjModel, geoms: Geoms, camera: str) -> bool:
+    """Return whether a camera is far from what it turns to, by the size of what is drawn."""
+    round_ones = [kind in (GeomKind.SPHERE, GeomKind.CAPSULE) for kind in geoms.kind]
+    radii = np.asarray(geoms.size)[round_ones, 0]
+    cameras = [_name_of_camera(model, i) for i in range(model.ncam)]
+    away = np.linalg.norm(model.cam_pos[cameras.index(camera)])
+    return bool(len(radii) and away > _DISTANT * radii.min())
 
 
 def _camera_name(model: mujoco.MjModel, camera: int | str, rigs: dict[str, CameraRig]) -> str:
@@ -102,7 +116,11 @@ def _camera_name(model: mujoco.MjModel, camera: int | str, rigs: dict[str, Camer
         return check_choice("camera", camera, rigs)
     if not 0 <= camera < model.ncam:
         raise ValueError(f"the model has no camera {camera}; it has {model.ncam}.")
-    return check_choice("camera", model.camera(camera).name or f"camera/{camera}", rigs)
+    return check_choice("camera", _name_of_camera(model, camera), rigs)
+
+
+def _name_of_camera(model: mujoco.MjModel, camera: int) -> str:
+    return model.camera(camera).name or f"camera/{camera}"
 
 
 def _check_movable(model: mujoco.MjModel, movable: Collection[str]) -> None:
@@ -120,9 +138,14 @@ def _check_movable(model: mujoco.MjModel, movable: Collection[str]) -> None:
 
 
 def _with_planes(model: mujoco.MjModel) -> Geoms:
-    """Return the geoms, with bounds of planes and whether they are checkered."""
+    """Return the geoms, with bounds of planes and whether they are checkered.
+
+    Any other texture, and that of another shape, becomes its mean color.
+    """
     geoms = read_geoms(model)
     rows = shown_geoms(model)
+    means = {name: mean_color(model, i) for name, i in zip(geoms.name, rows, strict=True)}
+    geoms = read_geoms(model, colors={name: mean for name, mean in means.items() if mean})
     first = [geoms.material.index(m) for m in range(len(geoms.rgb))]
     return geoms.replace(
         material_name=tuple(_material(model, model.geom_matid[rows[g]]) for g in first),

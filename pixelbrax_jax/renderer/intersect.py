@@ -69,6 +69,33 @@ def _rectangle(ray: Vector, pos: Vector, axes: Axes, size: Vector) -> Hit:
     return Hit(jnp.where(inside, t, -1.0), normal_dot)
 
 
+def _distant_sphere(ray: Vector, pos: Vector, axes: Axes, size: Vector) -> Hit:
+    b = dot(ray, pos)
+    apart = [p - b * r for p, r in zip(pos, ray, strict=True)]
+    t = b - jnp.sqrt(size[0] * size[0] - dot(apart, apart))
+    inv_radius = 1.0 / size[0]
+    return Hit(t, lambda v, ray_v: (t * ray_v - dot(pos, v)) * inv_radius)
+
+
+def _distant_capsule(ray: Vector, pos: Vector, axes: Axes, size: Vector) -> Hit:
+    # As below, but distances between lines are products of small numbers, not differences of great
+    # ones: those lose what is smaller than a three thousandth of the distance.
+    radius, half, axis = size[0], size[1], axes[2]
+    pos_axis = dot(pos, axis)
+    ray_axis, ray_pos = dot(ray, axis), dot(ray, pos)
+    a = at_least(1.0 - ray_axis * ray_axis, _TINY)
+    b = ray_pos - ray_axis * pos_axis
+    apart = dot(ray, _cross(axis, pos))
+    y = (b - jnp.sqrt(a * (radius * radius) - apart * apart)) / a * ray_axis - pos_axis
+    y = between(-half, y, half)
+    center = [p + y * along for p, along in zip(pos, axis, strict=True)]
+    return _distant_sphere(ray, center, axes, size)
+
+
+def _cross(a: Vector, b: Vector) -> Vector:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
 def _sphere(ray: Vector, pos: Vector, axes: Axes, size: Vector) -> Hit:
     b = dot(ray, pos)
     t = b - jnp.sqrt(b * b - (dot(pos, pos) - size[0] * size[0]))
@@ -155,6 +182,8 @@ def _box(ray: Vector, pos: Vector, axes: Axes, size: Vector) -> Hit:
     return Hit(t, normal_dot)
 
 
+_DISTANT = {GeomKind.SPHERE: _distant_sphere, GeomKind.CAPSULE: _distant_capsule}
+
 _BY_KIND = {
     GeomKind.PLANE: _plane,
     GeomKind.SPHERE: _sphere,
@@ -166,7 +195,13 @@ _BY_KIND = {
 
 
 def intersect(
-    kind: int, ray: Vector, pos: Vector, axes: Axes, size: Vector, bounded: bool = False
+    kind: int,
+    ray: Vector,
+    pos: Vector,
+    axes: Axes,
+    size: Vector,
+    bounded: bool = False,
+    distant: bool = False,
 ) -> Hit:
     """Return where unit rays from the origin enter a geom.
 
@@ -177,10 +212,12 @@ def intersect(
         axes: the geom's x, y and z directions in the rays' frame.
         size: the geom's three size numbers, as in ``Geoms.size``.
         bounded: whether a plane ends at its size; see ``Geoms.bounded``.
+        distant: whether spheres and capsules are far away; see ``Geoms.distant``.
 
     Returns:
         The hit, in the shape to which ``ray`` and ``pos`` broadcast.
     """
     if bounded and kind == GeomKind.PLANE:
         return _rectangle(ray, pos, axes, size)
-    return _BY_KIND[GeomKind(kind)](ray, pos, axes, size)
+    formulas = _BY_KIND | _DISTANT if distant else _BY_KIND
+    return formulas[GeomKind(kind)](ray, pos, axes, size)

@@ -43,6 +43,7 @@ class View(struct.PyTreeNode):
         material: (G,) static, row of ``rgb``.
         bounded: (G,) static, planes that end.
         ground: (G,) static, planes with the ground's pattern.
+        distant: static, whether geoms are far away; see ``Geoms.distant``.
         pos: (G, 3) float32, metres, the scene's geoms' centers, in the scene's order.
         xmat: (G, 3, 3) float32, their orientations, likewise.
         size: (G, 3) float32, metres, likewise.
@@ -57,6 +58,7 @@ class View(struct.PyTreeNode):
     material: tuple[int, ...] = struct.field(pytree_node=False)
     bounded: tuple[bool, ...] = struct.field(pytree_node=False)
     ground: tuple[bool, ...] = struct.field(pytree_node=False)
+    distant: bool = struct.field(pytree_node=False)
     pos: jax.Array
     xmat: jax.Array
     size: jax.Array
@@ -117,6 +119,7 @@ def view_of(
         material=tuple(geoms.material[g] for g in order),
         bounded=tuple(geoms.is_bounded(g) for g in order),
         ground=tuple(geoms.is_ground(g) for g in order),
+        distant=geoms.distant,
         pos=einsum("gi,ij->gj", scene.pos - scene.camera.pos, to_camera),
         xmat=einsum("ji,gjk->gik", to_camera, scene.xmat),
         size=geoms.size,
@@ -249,10 +252,11 @@ class _Solid(NamedTuple):
     axes: Axes
     size: Vector
     bounded: bool
+    distant: bool
 
     def hit(self, ray: Vector, center: Vector) -> Hit:
         """Return where rays enter it, with its center at another place."""
-        return intersect(self.kind, ray, center, self.axes, self.size, self.bounded)
+        return intersect(self.kind, ray, center, self.axes, self.size, self.bounded, self.distant)
 
 
 def _solid(view: View, rank: int) -> _Solid:
@@ -264,6 +268,7 @@ def _solid(view: View, rank: int) -> _Solid:
         axes=(axes[0], axes[1], axes[2]),
         size=tuple(view.size[g, k] for k in range(3)),
         bounded=view.bounded[rank],
+        distant=view.distant,
     )
 
 

@@ -21,6 +21,7 @@ MODELS = {
     "fish": ("swim", 0, ("target",)),
     "hopper": ("hop", 0, ()),
     "humanoid": ("walk", 0, ()),
+    "manipulator": ("bring_ball", 0, ()),
     "pendulum": ("swingup", 0, ()),
     "point_mass": ("easy", 0, ()),
     "quadruped": ("walk", 2, ()),

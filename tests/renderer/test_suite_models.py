@@ -11,8 +11,8 @@ from tests.renderer import suite_models
 from tests.renderer.mujoco_scene import cast
 
 SIZE = 48
-FAST = ("ball_in_cup", "finger", "walker")
-"""A hanging string, a target that moves, and a camera that tracks."""
+FAST = ("ball_in_cup", "finger", "manipulator", "walker")
+"""A hanging string, a target that moves, a camera 16 m from fingers of 7 mm, one that tracks."""
 
 
 def compare(domain: str, num_poses: int) -> None:

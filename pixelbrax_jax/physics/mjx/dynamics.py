@@ -35,7 +35,8 @@ class MjxState(struct.PyTreeNode):
         act: activations of actuators that have a state.
         qacc_warmstart: (V,) float32, accelerations from which the solver starts.
         ctrl: (A,) float32, the last controls, which rewards read.
-        target: (3,) float32, metres, this episode's target; (0,) for tasks without.
+        target: (3,) float32, metres, this episode's target; (7,) with its unit quaternion, where it
+            is a body; (0,) for tasks without.
     """
 
     qpos: jax.Array
@@ -60,6 +61,7 @@ class Dynamics:
         *,
         reads_forces: bool = False,
         out_of_reach: Iterable[str] = (),
+        target_body: str = "",
     ):
         """Put the model on the device; compile nothing.
 
@@ -67,6 +69,7 @@ class Dynamics:
             model: a compiled model.
             reads_forces: whether to compute sensors of forces and accelerations.
             out_of_reach: names of geoms that nothing ever touches, which are not tried.
+            target_body: name of a body, fixed to the world, that is where the target is.
 
         Raises:
             NotImplementedError: the model has features that MuJoCo XLA lacks.
@@ -74,6 +77,7 @@ class Dynamics:
         load_onto_own_device(mjx_io)
         self.model = model
         self.reads_forces = reads_forces
+        self._target_body = model.body(target_body).id if target_body else None
         self._simulated = _simulated(model, out_of_reach)
         self._mx = mjx.put_model(self._simulated, impl="jax")
         option = self._mx.opt.replace(
@@ -101,7 +105,7 @@ class Dynamics:
         Args:
             qpos: (Q,) float32, joint positions.
             qvel: (V,) float32, joint velocities; None means at rest.
-            target: (3,) float32, metres; None for tasks without.
+            target: (3,) or (7,) float32, as in the state; None for tasks without.
         """
         model = self.model
         return MjxState(
@@ -162,6 +166,12 @@ class Dynamics:
             ``mujoco.mjx.Data``, of which forces and accelerations mean nothing.
         """
         mx = self._mx
+        if self._target_body is not None:
+            at = self._target_body
+            mx = mx.replace(
+                body_pos=mx.body_pos.at[at].set(state.target[:3]),
+                body_quat=mx.body_quat.at[at].set(state.target[3:]),
+            )
         data = self._data(state).replace(sensordata=sensors)
         with substituted(self.model):
             data = mjx.kinematics(mx, data)
@@ -176,6 +186,13 @@ class Dynamics:
         """Return () bool, whether any geoms touch at joint positions (Q,)."""
         contact = self._contact(qpos)
         return jnp.any(contact.dist < contact.includemargin)
+
+    def site(self, qpos: jax.Array, name: str) -> tuple[jax.Array, jax.Array]:
+        """Return (3,) metres and (3, 3), place and axes of a site at joint positions (Q,)."""
+        with substituted(self.model):
+            data = mjx.kinematics(self._mx, self._data(self.state(qpos)))
+        row = self.model.site(name).id
+        return data.site_xpos[row], data.site_xmat[row]
 
     def clearance(self, qpos: jax.Array, geom: str) -> jax.Array:
         """Return () metres between a geom and the nearest one, negative where they overlap.

@@ -57,7 +57,10 @@ class MjxPhysics(GuardedPhysics):
         bodies = [model.body(i).name or f"link/{i - 1}" for i in range(1, model.nbody)]
         self.link_names = (*bodies, *scene.links)
         self.dynamics = Dynamics(
-            model, reads_forces=task.reads_forces, out_of_reach=task.out_of_reach
+            model,
+            reads_forces=task.reads_forces,
+            out_of_reach=task.out_of_reach,
+            target_body=task.target_body,
         )
         # The product of decimals is not the decimal: 0.0025 * 10 shall be 0.025.
         self.dt = float(f"{model.opt.timestep * task.substeps:.6g}")

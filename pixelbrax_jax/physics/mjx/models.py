@@ -28,6 +28,7 @@ KNOWN_MODELS = {
     "fish": "82214f68b3ec4770",
     "hopper": "c14ce94c4bc108d7",
     "humanoid": "f18638be4e464429",
+    "manipulator": "608a06bb47623612",
     "pendulum": "c5c4b0342074bbdb",
     "point_mass": "a9b36a3581197253",
     "quadruped": "0fb169bde60fc592",
@@ -54,8 +55,8 @@ def load_model(domain: str, **options: float) -> mujoco.MjModel:
 
     Args:
         domain: file name in DM Control's suite, without ending.
-        **options: what the domain's generator takes: ``num_bodies`` of the swimmer, ``floor_size``
-            of the quadruped, metres.
+        **options: what the domain's generator takes: ``max_contacts`` of the manipulator,
+            ``num_bodies`` of the swimmer, ``floor_size`` of the quadruped, metres.
 
     Returns:
         The model, which the caller may change.
@@ -175,7 +176,22 @@ def _strip_quadruped(root: ElementTree.Element, *, floor_size: float) -> None:
         sensor.remove(rangefinder)
 
 
+def _keep_ball(root: ElementTree.Element, *, max_contacts: int) -> None:
+    """Take away the things that bringing the ball does not need, as DM Control does.
+
+    Args:
+        root: the XML of the manipulator; changed in place.
+        max_contacts: how many contacts MuJoCo XLA takes into account, the deepest.
+    """
+    world = _find(root, "./worldbody")
+    for name in ("cup", "peg", "slot", "target_peg"):
+        world.remove(_find(world, f"body[@name='{name}']"))
+    custom = ElementTree.SubElement(root, "custom")
+    ElementTree.SubElement(custom, "numeric", name="max_contact_points", data=str(max_contacts))
+
+
 _GENERATORS: dict[str, Callable[..., None]] = {
+    "manipulator": _keep_ball,
     "quadruped": _strip_quadruped,
     "swimmer": _grow_swimmer,
 }

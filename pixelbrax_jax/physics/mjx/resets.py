@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics
+from pixelbrax_jax.physics.mjx.task import Start
 
 MAX_ATTEMPTS = 1000
 """Draws of a pose after which one that touches something is taken."""
@@ -57,29 +58,30 @@ def random_rotation(key: jax.Array) -> jax.Array:
 
 
 def free_of_contact(
-    dynamics: Dynamics, key: jax.Array, draw: Callable[[jax.Array], jax.Array]
-) -> jax.Array:
-    """Draw joint positions until no geoms touch.
+    dynamics: Dynamics, key: jax.Array, draw: Callable[[jax.Array, Start], Start]
+) -> Start:
+    """Draw initial states until no geoms touch.
 
     Args:
         dynamics: the model's motion.
         key: PRNG key.
-        draw: returns (Q,) joint positions for a key.
+        draw: returns an initial state for a key and the state drawn before, at first all zeros.
 
     Returns:
-        (Q,) float32; after ``MAX_ATTEMPTS`` draws the last one, whatever it touches.
+        The state; after ``MAX_ATTEMPTS`` draws the last one, whatever it touches.
     """
 
-    def again(carry: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
+    def again(carry: tuple[jax.Array, Start, jax.Array]) -> jax.Array:
         attempt, _, touches = carry
         return touches & (attempt < MAX_ATTEMPTS)
 
     def attempt(
-        carry: tuple[jax.Array, jax.Array, jax.Array],
-    ) -> tuple[jax.Array, jax.Array, jax.Array]:
-        number, _, _ = carry
-        qpos = draw(jax.random.fold_in(key, number))
-        return number + 1, qpos, dynamics.touches(qpos)
+        carry: tuple[jax.Array, Start, jax.Array],
+    ) -> tuple[jax.Array, Start, jax.Array]:
+        number, before, _ = carry
+        start = draw(jax.random.fold_in(key, number), before)
+        return number + 1, start, dynamics.touches(start.qpos)
 
-    nothing = jnp.zeros(dynamics.model.nq, jnp.float32)
+    shapes = jax.eval_shape(draw, key, Start(jnp.zeros(dynamics.model.nq)))
+    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
     return jax.lax.while_loop(again, attempt, (jnp.int32(0), nothing, jnp.bool_(True)))[1]

@@ -22,7 +22,8 @@ class Snapshot:
     Attributes:
         model: the compiled model.
         data: ``mujoco.mjx.Data`` of the state.
-        target: (3,) float32, metres, where this episode's target is; (0,) for tasks without.
+        target: (3,) float32, metres, where this episode's target is; (7,) with its unit quaternion,
+            where it is a body; (0,) for tasks without.
     """
 
     model: mujoco.MjModel
@@ -82,6 +83,10 @@ class Snapshot:
     def xmat(self, body: str) -> jax.Array:
         """Return (3, 3), the axes of a body as columns in the world frame."""
         return self.data.xmat[self.model.body(body).id]
+
+    def xquat(self, body: str) -> jax.Array:
+        """Return (4,), the unit quaternion (w, x, y, z) of a body in the world frame."""
+        return self.data.xquat[self.model.body(body).id]
 
     def xmats(self) -> jax.Array:
         """Return (L, 3, 3), the axes of all bodies but the world."""

@@ -20,7 +20,8 @@ class Start(struct.PyTreeNode):
     Attributes:
         qpos: (Q,) float32, joint positions: metres, radians, unit quaternions.
         qvel: (V,) float32, joint velocities, per second; None means at rest.
-        target: (3,) float32, metres, this episode's target; None for tasks without.
+        target: (3,) float32, metres, this episode's target; (7,) with its unit quaternion, where it
+            is a body; None for tasks without.
     """
 
     qpos: jax.Array
@@ -46,6 +47,7 @@ class DmcTask:
         options: arguments of the model's generator.
         camera: index of the model's camera that is the task's own.
         movable: names of the geoms, sites and lights that ``Start.target`` moves.
+        target_body: name of the body, fixed to the world, that it moves; empty for none.
         reads_forces: whether observations have sensors of forces or accelerations.
         starts_with_forces: whether these read something else than 0 in an initial state.
         out_of_reach: names of the geoms that nothing ever touches, in any pose.
@@ -61,6 +63,7 @@ class DmcTask:
     options: Mapping[str, Any] = field(default_factory=dict)
     camera: int = 0
     movable: tuple[str, ...] = ()
+    target_body: str = ""
     reads_forces: bool = False
     starts_with_forces: bool = False
     out_of_reach: tuple[str, ...] = ()

@@ -108,8 +108,9 @@ def _ours(task: str, states: dict[str, np.ndarray]) -> tuple[MjxState, jax.Array
     """States of DM Control as a batch of ours, and their sensors."""
     names = ("qpos", "qvel", "act", "qacc_warmstart", "ctrl", "target")
     fields = {name: jnp.asarray(states[name], jnp.float32) for name in names}
-    if "target" not in make_physics(task).link_names:
-        fields["target"] = fields["target"][:, :0]
+    physics = make_physics(task)
+    start = jax.eval_shape(physics.first, jax.random.key(0))[0]
+    fields["target"] = fields["target"][:, : start.target.size]
     return MjxState(**fields), jnp.asarray(states["sensordata"], jnp.float32)
 
 

@@ -45,8 +45,11 @@ def load(task: str, seed: int = 0) -> Any:
 
 
 def target_of(physics: Any) -> np.ndarray:
-    """(3,) where the model has its target; (0,) without one."""
+    """(3,) where the model has its target, (7,) the pose of one that is a body; (0,) without."""
     model = physics.model
+    if "target_ball" in [model.body(i).name for i in range(model.nbody)]:
+        body = model.body("target_ball")
+        return np.concatenate([body.pos, body.quat])
     for kind, count, places in (
         ("geom", model.ngeom, model.geom_pos),
         ("site", model.nsite, model.site_pos),

@@ -43,7 +43,7 @@ needs_models = pytest.mark.skipif(
 def test_suites_are_listed_apart():
     assert pb.list_envs(suite="dmc") == tuple(sorted(DMC_TASKS))
     assert pb.list_envs(suite="brax") == tuple(sorted(BRAX_TASKS))
-    assert len(DMC_TASKS) == 29
+    assert len(DMC_TASKS) == 30
     with pytest.raises(ValueError, match="allowed: brax, dmc"):
         pb.list_envs(suite="dm_control")
 

@@ -16,13 +16,14 @@ def _start(dynamics: Dynamics, key: jax.Array) -> Start:
     model = dynamics.model
     x, z = (int(model.joint(name).qposadr[0]) for name in ("ball_x", "ball_z"))
 
-    def draw(key: jax.Array) -> jax.Array:
+    def draw(key: jax.Array, before: Start) -> Start:
+        del before
         place = jax.random.uniform(
             key, (2,), minval=jnp.array([-0.2, 0.2]), maxval=jnp.array([0.2, 0.5])
         )
-        return jnp.asarray(model.qpos0, jnp.float32).at[jnp.array([x, z])].set(place)
+        return Start(jnp.asarray(model.qpos0, jnp.float32).at[jnp.array([x, z])].set(place))
 
-    return Start(free_of_contact(dynamics, key, draw))
+    return free_of_contact(dynamics, key, draw)
 
 
 def _observe(seen: Snapshot) -> jax.Array:

@@ -21,13 +21,9 @@ _OUT_OF_REACH = ("ground", "proximal_decoration", "proximal", "spinner_decoratio
 meets is the fingertip and the spinner's caps."""
 
 
-def _pose(dynamics: Dynamics, key: jax.Array) -> jax.Array:
-    """Draw joints that let nothing touch."""
-    return free_of_contact(dynamics, key, partial(random_joints, dynamics.model))
-
-
 def _start_spin(dynamics: Dynamics, key: jax.Array) -> Start:
-    return Start(_pose(dynamics, key))
+    """Draw joints that let nothing touch."""
+    return free_of_contact(dynamics, key, lambda key, _: Start(random_joints(dynamics.model, key)))
 
 
 def _start_turn(dynamics: Dynamics, key: jax.Array) -> Start:
@@ -38,7 +34,7 @@ def _start_turn(dynamics: Dynamics, key: jax.Array) -> Start:
     radius = float(model.geom("cap1").size.sum())
     direction = jnp.stack([jnp.sin(angle), 0.0, jnp.cos(angle)])
     place = jnp.asarray(model.body("spinner").pos, jnp.float32) + radius * direction
-    return Start(_pose(dynamics, pose_key), target=place)
+    return _start_spin(dynamics, pose_key).replace(target=place)
 
 
 def _in_plane(seen: Snapshot, place: jax.Array) -> jax.Array:

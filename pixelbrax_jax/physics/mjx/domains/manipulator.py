@@ -1,0 +1,134 @@
+"""A planar arm with a hand of two fingers that brings a ball to a target."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from pixelbrax_jax.physics.mjx.dynamics import Dynamics
+from pixelbrax_jax.physics.mjx.resets import free_of_contact
+from pixelbrax_jax.physics.mjx.rewards import tolerance
+from pixelbrax_jax.physics.mjx.snapshot import Snapshot, joined
+from pixelbrax_jax.physics.mjx.task import DmcTask, Start
+
+_ARM = (
+    "arm_root",
+    "arm_shoulder",
+    "arm_elbow",
+    "arm_wrist",
+    "finger",
+    "fingertip",
+    "thumb",
+    "thumbtip",
+)
+_BALL = ("ball_x", "ball_z", "ball_y")
+_TOUCH = ("palm_touch", "finger_touch", "thumb_touch", "fingertip_touch", "thumbtip_touch")
+_TARGET = "target_ball"
+
+_IN_HAND, _AT_TARGET = 0.1, 0.1
+"""Probabilities of where the ball is in a draw; else it is anywhere."""
+
+_MAX_CONTACTS = 16
+"""Of 148 that there can be: random actions make 10 at most, and all take twenty times as long."""
+
+_NEAR = 0.01
+"""Metres between ball and target that are as good as none."""
+
+
+def _start(dynamics: Dynamics, key: jax.Array) -> Start:
+    """Draw joints, target and ball until nothing touches."""
+    return free_of_contact(dynamics, key, lambda key, before: _draw(dynamics, key, before))
+
+
+def _draw(dynamics: Dynamics, key: jax.Array, before: Start) -> Start:
+    """Draw the arm, a target, and a ball in the hand, at the target or anywhere, and then moving.
+
+    A ball in the hand or at the target is as fast as the one of the draw ``before``: DM Control
+    starts again without stopping it.
+    """
+    model = dynamics.model
+    keys = jax.random.split(key, 5)
+    qpos = jnp.asarray(model.qpos0, jnp.float32)
+    qpos = qpos.at[_positions(model, *_ARM)].set(_arm(model, keys[0]))
+    qpos = qpos.at[_positions(model, "finger")].set(qpos[_positions(model, "thumb")])
+
+    low, high = jnp.array([-0.4, 0.1, -jnp.pi]), jnp.array([0.4, 0.4, jnp.pi])
+    target = jax.random.uniform(keys[1], (3,), minval=low, maxval=high)
+    low, high = jnp.array([-0.5, 0.0, 0.0]), jnp.array([0.5, 0.7, 2 * jnp.pi])
+    anywhere = jax.random.uniform(keys[2], (3,), minval=low, maxval=high)
+    place, axes = dynamics.site(qpos, "grasp")
+    in_hand = jnp.stack([place[0], place[2], jnp.pi - jnp.arctan2(axes[2, 0], axes[0, 0])])
+
+    where = jax.random.uniform(keys[3])
+    is_in_hand, is_fixed = where < _IN_HAND, where < _IN_HAND + _AT_TARGET
+    ball = jnp.where(is_in_hand, in_hand, jnp.where(is_fixed, target, anywhere))
+    qpos = qpos.at[_positions(model, *_BALL)].set(ball)
+
+    x = int(model.joint("ball_x").dofadr[0])
+    speed = jax.random.uniform(keys[4], minval=-5.0, maxval=5.0)
+    qvel = jnp.zeros(model.nv) if before.qvel is None else before.qvel
+    qvel = qvel.at[x].set(jnp.where(is_fixed, qvel[x], speed))
+    return Start(qpos, qvel, _pose(model, target))
+
+
+def _positions(model: mujoco.MjModel, *joints: str) -> np.ndarray:
+    return np.array([int(model.joint(name).qposadr[0]) for name in joints])
+
+
+def _arm(model: mujoco.MjModel, key: jax.Array) -> jax.Array:
+    """Draw the arm's joints, uniformly in their range or all round, radians."""
+    rows = [model.joint(name).id for name in _ARM]
+    limited = model.jnt_limited[rows].astype(bool)[:, None]
+    low, high = np.where(limited, model.jnt_range[rows], [-np.pi, np.pi]).T.astype(np.float32)
+    return jax.random.uniform(key, (len(rows),), minval=low, maxval=high)
+
+
+def _pose(model: mujoco.MjModel, planar: jax.Array) -> jax.Array:
+    """Return (7,), place and quaternion of the target for its x, z and angle about y."""
+    x, z, angle = planar
+    depth = float(model.body(_TARGET).pos[1])
+    return jnp.stack([x, depth, z, jnp.cos(angle / 2), 0.0, jnp.sin(angle / 2), 0.0])
+
+
+def _in_plane(seen: Snapshot, body: str) -> jax.Array:
+    """Return (4,), x and z of a body, metres, and w and y of its quaternion."""
+    return joined(seen.xpos(body)[np.array([0, 2])], seen.xquat(body)[np.array([0, 2])])
+
+
+def _observe(seen: Snapshot) -> jax.Array:
+    """Return sines and cosines of the arm, its velocities, touch, hand, ball and target."""
+    arm = seen.joint_pos(*_ARM)
+    return joined(
+        jnp.stack([jnp.sin(arm), jnp.cos(arm)], axis=-1),
+        seen.joint_vel(*_ARM),
+        jnp.log1p(seen.sensor(*_TOUCH)),
+        _in_plane(seen, "hand"),
+        _in_plane(seen, "ball"),
+        seen.joint_vel(*_BALL),
+        _in_plane(seen, _TARGET),
+    )
+
+
+def _reward(seen: Snapshot) -> jax.Array:
+    """Return how near the ball is to the target."""
+    apart = jnp.linalg.norm(seen.site_pos("ball") - seen.site_pos(_TARGET))
+    return tolerance(apart, (0.0, _NEAR), margin=2 * _NEAR)
+
+
+TASKS = {
+    "bring_ball": DmcTask(
+        "manipulator",
+        _start,
+        _observe,
+        _reward,
+        substeps=10,
+        options={"max_contacts": _MAX_CONTACTS},
+        target_body=_TARGET,
+        reads_forces=True,
+        # All moves in the plane y = 0, and this is the wall behind it.
+        out_of_reach=("background",),
+        batch_last=False,
+    )
+}
