@@ -2,8 +2,11 @@
 
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
+
+from pixelbrax_jax.types import GeomKind
 
 SCRIPT = """
 import jax
@@ -51,6 +54,17 @@ def test_options_are_those_of_the_environment(monkeypatch):
     subprocess.run([sys.executable, "-W", "ignore", "-c", DMC], check=True, timeout=120)
 
 
+def test_scenes_of_many_geoms_have_the_older_emitters(monkeypatch):
+    import pixelbrax_jax.compilation as compilation
+
+    monkeypatch.setenv("XLA_FLAGS", "")
+    monkeypatch.setattr(compilation, "_is_known", lambda option, value: True)
+    for number, expected in ((50, None), (51, False)):
+        geoms = SimpleNamespace(kind=(GeomKind.SPHERE,) * number)
+        options = compilation._options(SimpleNamespace(geoms=geoms))
+        assert options.get("xla_cpu_use_fusion_emitters") is expected
+
+
 def test_an_xla_without_the_option_is_left_alone(monkeypatch):
     import pixelbrax_jax.compilation as compilation
 
@@ -61,6 +75,7 @@ def test_an_xla_without_the_option_is_left_alone(monkeypatch):
 
 EVERYTHING = """
 import sys
+from types import SimpleNamespace
 import gymnasium, numpy as np, torch
 import pixelbrax_gym
 import pixelbrax_jax as pb

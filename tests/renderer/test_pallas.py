@@ -23,8 +23,8 @@ from tests.renderer.test_lamps import LAMP
 from tests.renderer.test_planes import random_strip
 
 HEIGHT, WIDTH = 22, 29
-"""638 pixels: two blocks of the kernel, and a part of a third. The height is even: of an odd one the
-middle row of a level camera looks along the ground, and rounding decides whether it meets it."""
+"""638 pixels: two blocks of the kernel, and a part of a third. The height is even: of an odd one
+the middle row of a level camera looks along the ground, and rounding decides if it meets it."""
 
 NUM_POSES = 5
 

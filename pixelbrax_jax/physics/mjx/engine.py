@@ -17,9 +17,9 @@ from pixelbrax_jax.physics.mjx.task import DmcTask
 from pixelbrax_jax.physics.model_scene import COM_LINK, TARGET_LINK, read_scene, tracked_body
 from pixelbrax_jax.types import PhysicsState
 
-_MOST_CROSSINGS = 50
-"""Geoms times rays of a pixel, one to the camera and one to each of the model's lamps, which XLA's
-newer emitters still make one fast loop of."""
+# XLA's library for sums and products on a CPU, YNNPACK, takes longer for the small ones of these
+# models than the loops that XLA writes itself.
+_COMPILER_OPTIONS = {"xla_cpu_experimental_ynn_fusion_type": ""}
 
 _UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 
@@ -66,7 +66,7 @@ class MjxPhysics(GuardedPhysics):
         self.dt = float(f"{model.opt.timestep * task.substeps:.6g}")
         self.action_size = int(model.nu)
         self.batch_last = task.batch_last
-        self.compiler_options = _compiler_options(len(self.geoms.kind), len(self.look.lamps))
+        self.compiler_options = _COMPILER_OPTIONS
         self._task = task
         self._model = model
         self._tracked_body = tracked_body(model)
@@ -171,17 +171,3 @@ class MjxPhysics(GuardedPhysics):
         rows = [places[name][None] for name in self._extra_links]
         upright = jnp.tile(jnp.array(_UPRIGHT), (len(rows), 1))
         return jnp.concatenate([data.xpos[1:], *rows]), jnp.concatenate([data.xquat[1:], upright])
-
-
-def _compiler_options(num_geoms: int, num_lamps: int) -> dict[str, Any]:
-    """Return options for XLA on a CPU.
-
-    Its library for sums and products, YNNPACK, takes longer for the small ones of these models than
-    the loops that XLA writes itself. Its newer emitters of such loops cut long ones up, and compute
-    what the parts share again in each of them: drawing swimmer15 takes 250 times as long as with
-    the older ones.
-    """
-    options: dict[str, Any] = {"xla_cpu_experimental_ynn_fusion_type": ""}
-    if num_geoms * (1 + num_lamps) > _MOST_CROSSINGS:
-        options["xla_cpu_use_fusion_emitters"] = False
-    return options

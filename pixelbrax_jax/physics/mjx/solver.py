@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 
 from pixelbrax_jax.physics.mjx import elimination
+from pixelbrax_jax.physics.mjx.cones import Cones
 from pixelbrax_jax.physics.mujoco_compatibility import import_silenced
 
 with import_silenced():
@@ -21,19 +22,26 @@ ITERATIONS = 16
 LINE_SEARCH_ITERATIONS = 6
 """Steps along a direction at most, of those that change active constraints."""
 
+CONE_LINE_SEARCH_ITERATIONS = 8
+"""The same with elliptic cones."""
+
 _ROWS = 16
 """Rows of a product of matrices that are added up at a time, if it has no more columns."""
 
-_EQUALITY, _FRICTION, _ONE_SIDED = range(3)
+_EQUALITY, _FRICTION, _ONE_SIDED, _CONE = range(4)
 
 _Carry = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
 
 
 def is_supported(model: mujoco.MjModel) -> bool:
-    """Return whether the model asks for what this solver does: pyramids and Newton's method."""
+    """Return whether the model asks for what this solver does.
+
+    That is Newton's method, with pyramids or with elliptic cones of one dimension.
+    """
+    dimensions = {*model.geom_condim.tolist(), *model.pair_dim.tolist()}
     return bool(
-        model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
-        and model.opt.solver == mujoco.mjtSolver.mjSOL_NEWTON
+        model.opt.solver == mujoco.mjtSolver.mjSOL_NEWTON
+        and (model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL or len(dimensions) == 1)
     )
 
 
@@ -41,7 +49,8 @@ class _Problem(NamedTuple):
     """Minimise ``(a - smooth) M (a - smooth) / 2 + sum(cost(J a - reference))`` over ``a``.
 
     The derivative of a constraint's cost is ``clip(stiffness * x, low, high)``: of an equality
-    without bounds, of dry friction with those of its force, of limits and contacts at most 0.
+    without bounds, of dry friction with those of its force, of limits and contacts at most 0. The
+    constraints of ``cones``, from row ``first`` on, have a stiffness of 0 and costs of their own.
     """
 
     inertia: jax.Array
@@ -51,12 +60,17 @@ class _Problem(NamedTuple):
     stiffness: jax.Array
     low: jax.Array
     high: jax.Array
+    first: int = 0
+    cones: Cones | None = None
 
     def residual(self, acceleration: jax.Array) -> jax.Array:
         return self.jacobian @ acceleration - self.reference
 
     def slope(self, residual: jax.Array) -> jax.Array:
-        return jnp.clip(self.stiffness * residual, self.low, self.high)
+        slope = self._clipped(residual)
+        if self.cones is None:
+            return slope
+        return self._with_cones(slope, self.cones.slope(self._of_cones(residual)))
 
     def piece(self, residual: jax.Array) -> jax.Array:
         """Return where costs are: 0 where they are quadratic, -1 and 1 at bounds of the slope."""
@@ -66,22 +80,55 @@ class _Problem(NamedTuple):
     def curvature(self, piece: jax.Array) -> jax.Array:
         return jnp.where(piece == 0, self.stiffness, 0.0)
 
+    def curvature_times(self, residual: jax.Array, rows: jax.Array) -> jax.Array:
+        """Return second derivatives times (R, V) rows."""
+        weighted = self.curvature(self.piece(residual))[:, None] * rows
+        if self.cones is None:
+            return weighted
+        own = self.cones.curvature_times(self._of_cones(residual), self._of_cones(rows))
+        return self._with_cones(weighted, own)
+
+    def stays(self, residual: jax.Array, change: jax.Array) -> jax.Array:
+        """Return whether costs are, up to the end of a step, what Newton took them for."""
+        same = jnp.all(self.piece(residual + change) == self.piece(residual))
+        if self.cones is None:
+            return same
+        at, by = self._of_cones(residual), self._of_cones(change)
+        return same & self.cones.stay(at, by)
+
+    def _clipped(self, residual: jax.Array) -> jax.Array:
+        return jnp.clip(self.stiffness * residual, self.low, self.high)
+
+    def _of_cones(self, rows: jax.Array) -> jax.Array:
+        assert self.cones is not None
+        shape = self.cones.scale.shape
+        own = rows[self.first : self.first + shape[0] * shape[1]]
+        return own.reshape(*shape, *rows.shape[1:])
+
+    def _with_cones(self, rows: jax.Array, own: jax.Array) -> jax.Array:
+        own = own.reshape(-1, *rows.shape[1:])
+        return jnp.concatenate([rows[: self.first], own, rows[self.first + len(own) :]])
+
     def cost(self, acceleration: jax.Array) -> jax.Array:
         residual = self.residual(acceleration)
-        slope = self.slope(residual)
+        slope = self._clipped(residual)
         away = acceleration - self.smooth
         least = slope * slope / jnp.maximum(2 * self.stiffness, mujoco.mjMINVAL)
-        return 0.5 * away @ (self.inertia @ away) + jnp.sum(slope * residual - least)
+        cost = 0.5 * away @ (self.inertia @ away) + jnp.sum(slope * residual - least)
+        if self.cones is None:
+            return cost
+        return cost + self.cones.cost(self._of_cones(residual))
 
 
 def solve(model: Any, data: Any) -> Any:
     """Find accelerations and constraint forces, as ``mujoco.mjx._src.solver.solve`` does.
 
-    Every cost is quadratic between kinks, so that Newton's step is exact once the right
-    constraints are active: the loop ends where a whole step leaves them as they are.
+    Every cost is quadratic between kinks, but for those of elliptic cones, so that Newton's step is
+    exact once the right constraints are active: the loop ends where a whole step leaves them as
+    they are.
 
     Args:
-        model: ``mujoco.mjx.Model`` with pyramidal cones.
+        model: ``mujoco.mjx.Model`` that ``is_supported``.
         data: ``mujoco.mjx.Data`` with constraints and accelerations without them.
 
     Returns:
@@ -89,8 +136,10 @@ def solve(model: Any, data: Any) -> Any:
     """
     impl = data._impl
     # MuJoCo's order: equalities, dry friction, then limits and contacts.
-    counts = [impl.ne, impl.nf, impl.nefc - impl.ne - impl.nf]
-    kind = np.repeat([_EQUALITY, _FRICTION, _ONE_SIDED], counts)
+    cones = _cones(model, data)
+    num_cones = 0 if cones is None else cones.scale.size
+    counts = [impl.ne, impl.nf, impl.nefc - impl.ne - impl.nf - num_cones, num_cones]
+    kind = np.repeat([_EQUALITY, _FRICTION, _ONE_SIDED, _CONE], counts)
     friction = jnp.where(kind == _FRICTION, impl.efc_frictionloss, jnp.inf)
 
     def pad(x: jax.Array) -> jax.Array:
@@ -102,9 +151,11 @@ def solve(model: Any, data: Any) -> Any:
         smooth=data.qacc_smooth,
         jacobian=pad(impl.efc_J),
         reference=pad(impl.efc_aref),
-        stiffness=pad(impl.efc_D),
+        stiffness=pad(jnp.where(kind == _CONE, 0.0, impl.efc_D)),
         low=pad(-friction),
         high=pad(jnp.where(kind == _ONE_SIDED, 0.0, friction)),
+        first=impl.nefc - num_cones,
+        cones=cones,
     )
     warm, smooth = data.qacc_warmstart, data.qacc_smooth
     start = _once(jnp.where(problem.cost(warm) < problem.cost(smooth), warm, smooth))
@@ -115,15 +166,14 @@ def solve(model: Any, data: Any) -> Any:
 
     def newton(carry: _Carry) -> _Carry:
         count, _, acceleration, residual = carry
-        piece = problem.piece(residual)
-        weighted = problem.curvature(piece)[:, None] * problem.jacobian
+        weighted = problem.curvature_times(residual, problem.jacobian)
         slope = problem.slope(residual)[:, None]
         total = _over_rows(problem.jacobian, jnp.concatenate([weighted, slope], axis=1))
         hessian = problem.inertia + total[:, :-1]
         gradient = problem.inertia @ (acceleration - problem.smooth) + total[:, -1]
         step = -elimination.solve(hessian, gradient)
         change = problem.jacobian @ step
-        done = _once(jnp.all(problem.piece(residual + change) == piece))
+        done = _once(problem.stays(residual, change))
         found = _line_search(problem, acceleration, residual, step, change)
         factor = _once(jnp.where(done, 1.0, found))
         return count + 1, done, acceleration + factor * step, residual + factor * change
@@ -138,6 +188,21 @@ def solve(model: Any, data: Any) -> Any:
             "qfrc_constraint": pull,
             "_impl.efc_force": force[: impl.nefc],
         }
+    )
+
+
+def _cones(model: Any, data: Any) -> Cones | None:
+    """Return the contacts, if their friction cones are elliptic; they are the last constraints."""
+    contact = data._impl.contact
+    if model.opt.cone != mujoco.mjtCone.mjCONE_ELLIPTIC or not len(contact.dim):
+        return None
+    dimension = int(contact.dim[0])
+    friction = jnp.maximum(contact.friction[:, : dimension - 1], mujoco.mjMINMU)
+    mu = friction[:, :1] / jnp.sqrt(model.opt.impratio)
+    stiffness = data._impl.efc_D[-len(contact.dim) * dimension :]
+    return Cones(
+        stiffness=stiffness.reshape(-1, dimension),
+        scale=jnp.concatenate([mu, friction], axis=1),
     )
 
 
@@ -179,7 +244,7 @@ def _line_search(
     def derivatives(factor: jax.Array) -> tuple[jax.Array, jax.Array]:
         at = residual + factor * change
         first = linear + factor * quadratic + jnp.sum(problem.slope(at) * change)
-        second = jnp.sum(problem.curvature(problem.piece(at)) * change * change)
+        second = jnp.sum(problem.curvature_times(at, change[:, None])[:, 0] * change)
         return first, quadratic + second
 
     def narrow(_: Any, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
@@ -195,4 +260,5 @@ def _line_search(
         return jnp.where(inside, next_factor, halfway), low, high
 
     carry = (jnp.ones(()), jnp.zeros(()), jnp.full((), jnp.inf))
-    return jax.lax.fori_loop(0, LINE_SEARCH_ITERATIONS, narrow, carry, unroll=True)[0]
+    count = LINE_SEARCH_ITERATIONS if problem.cones is None else CONE_LINE_SEARCH_ITERATIONS
+    return jax.lax.fori_loop(0, count, narrow, carry, unroll=True)[0]

@@ -30,8 +30,8 @@ _TARGET = "target_ball"
 _IN_HAND, _AT_TARGET = 0.1, 0.1
 """Probabilities of where the ball is in a draw; else it is anywhere."""
 
-_MAX_CONTACTS = 16
-"""Of 148 that there can be: random actions make 10 at most, and all take twenty times as long."""
+_MAX_CONTACTS = 24
+"""Of 148 that there can be: random actions make 10 at most, and all take three times as long."""
 
 _NEAR = 0.01
 """Metres between ball and target that are as good as none."""
@@ -129,6 +129,5 @@ TASKS = {
         reads_forces=True,
         # All moves in the plane y = 0, and this is the wall behind it.
         out_of_reach=("background",),
-        batch_last=False,
     )
 }

@@ -1,0 +1,108 @@
+"""Costs of contacts whose friction stays within an elliptic cone.
+
+The formulas are those of MuJoCo's documentation, "Computation", section "Constraint model": of the
+normal and tangential parts N and T of a scaled residual, contacts with N >= mu T are free, those
+with mu N + T <= 0 stick, where the cost is quadratic, and the others slip, where it is that of the
+distance to the cone, D_0 (N - mu T)^2 / (2 mu^2 (1 + mu^2)).
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+
+FREE, STICKING, SLIPPING = range(3)
+
+_TURN = 1e-3
+"""Radians by which a slipping contact's friction may turn in a last step of Newton's method, which
+neglects the square of it."""
+
+
+class Cones(NamedTuple):
+    """C contacts of k constraints each: one along the normal, then tangential ones.
+
+    Attributes:
+        stiffness: (C, k) float32, D of each constraint.
+        scale: (C, k) float32, what turns the elliptic cone into a round one: mu, then friction.
+    """
+
+    stiffness: jax.Array
+    scale: jax.Array
+
+    def _parts(self, residual: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Return N (C,), T (C,), and the unit tangents (C, k - 1)."""
+        scaled = residual * self.scale
+        square = jnp.sum(scaled[:, 1:] ** 2, axis=1)
+        length = jnp.sqrt(square)
+        tangent = scaled[:, 1:] / jnp.where(square > 0, length, 1.0)[:, None]
+        return scaled[:, 0], length, tangent
+
+    @property
+    def _mu(self) -> jax.Array:
+        return self.scale[:, 0]
+
+    @property
+    def _slip_stiffness(self) -> jax.Array:
+        square = self._mu**2
+        return self.stiffness[:, 0] / jnp.maximum(square * (1 + square), mujoco.mjMINVAL)
+
+    def zone(self, residual: jax.Array) -> jax.Array:
+        """Return (C,) int32: ``FREE``, ``STICKING`` or ``SLIPPING``, of residuals (C, k)."""
+        normal, length, _ = self._parts(residual)
+        slips = jnp.where(self._mu * normal + length <= 0, STICKING, SLIPPING)
+        return jnp.where(normal >= self._mu * length, FREE, slips).astype(jnp.int32)
+
+    def cost(self, residual: jax.Array) -> jax.Array:
+        """Return the sum of all costs at residuals (C, k)."""
+        normal, length, _ = self._parts(residual)
+        sticking = 0.5 * jnp.sum(self.stiffness * residual**2, axis=1)
+        slipping = 0.5 * self._slip_stiffness * (normal - self._mu * length) ** 2
+        return jnp.sum(_by_zone(self.zone(residual), sticking, slipping))
+
+    def slope(self, residual: jax.Array) -> jax.Array:
+        """Return derivatives (C, k) of the cost by residuals (C, k)."""
+        normal, length, tangent = self._parts(residual)
+        outward = self._outward(tangent)
+        slipping = self._slip_stiffness * (normal - self._mu * length)
+        return _by_zone(
+            self.zone(residual)[:, None], self.stiffness * residual, slipping[:, None] * outward
+        )
+
+    def curvature_times(self, residual: jax.Array, rows: jax.Array) -> jax.Array:
+        """Return second derivatives at residuals (C, k) times rows (C, k, V)."""
+        normal, length, tangent = self._parts(residual)
+        outward = self._outward(tangent)[..., None]
+        gap = normal - self._mu * length
+        # The cone is curved across the tangent: 1 / T (1 - t t').
+        turning = -self._mu * gap / jnp.where(length > 0, length, 1.0)
+        across = self.scale[:, 1:, None] * rows[:, 1:]
+        along = jnp.sum(tangent[..., None] * across, axis=1, keepdims=True)
+        across = self.scale[:, 1:, None] * (across - tangent[..., None] * along)
+        curved = jnp.pad(turning[:, None, None] * across, [(0, 0), (1, 0), (0, 0)])
+        straight = outward * jnp.sum(outward * rows, axis=1, keepdims=True)
+        return _by_zone(
+            self.zone(residual)[:, None, None],
+            self.stiffness[..., None] * rows,
+            self._slip_stiffness[:, None, None] * (straight + curved),
+        )
+
+    def stay(self, residual: jax.Array, change: jax.Array) -> jax.Array:
+        """Return () bool, whether costs are as good as quadratic from residuals (C, k) on."""
+        zone, (_, _, tangent) = self.zone(residual), self._parts(residual)
+        _, _, turned = self._parts(residual + change)
+        straight = jnp.all(jnp.abs(turned - tangent) < _TURN, axis=1)
+        same = self.zone(residual + change) == zone
+        return jnp.all(same & (straight | (zone != SLIPPING)))
+
+    def _outward(self, tangent: jax.Array) -> jax.Array:
+        """Return (C, k), the derivative of N - mu T by the residual."""
+        return self.scale * jnp.concatenate(
+            [jnp.ones_like(self._mu)[:, None], -self._mu[:, None] * tangent], axis=1
+        )
+
+
+def _by_zone(zone: jax.Array, sticking: Any, slipping: Any) -> jax.Array:
+    return jnp.where(zone == STICKING, sticking, jnp.where(zone == SLIPPING, slipping, 0.0))
