@@ -65,7 +65,6 @@ DMC_TILES: tuple[tuple[str, str | None], ...] = (
     ("dmc_hopper_hop", None),
     ("dmc_humanoid_walk", None),
     ("dmc_manipulator_bring_ball", None),
-    ("dmc_point_mass_easy", None),
     ("dmc_quadruped_walk", None),
     ("dmc_reacher_easy", None),
     ("dmc_swimmer_swimmer6", None),

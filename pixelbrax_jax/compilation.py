@@ -26,10 +26,9 @@ def compiler_options(env: Any = None) -> dict[str, Any]:
     XLA holds back on CPUs with AVX-512 and computes with vectors of 256 bits; with 512 the
     ray-caster is up to twice as fast there. Other CPUs have no such vectors and are not affected;
     other devices need no options. Some physics is faster with options of its own, and scenes of
-    many geoms are drawn faster with XLA's older emitters. Whatever
-    PixelBrax compiles by itself for the Gymnasium, TorchRL and Stable-Baselines3 environments and
-    for its agents has these options. A program of your own gets them at its outermost ``jax.jit``,
-    the only one that takes options:
+    many geoms are drawn faster with XLA's older emitters. Whatever PixelBrax compiles by itself for
+    the Gymnasium, TorchRL and Stable-Baselines3 environments and for its agents has these options.
+    A program of your own gets them at its outermost ``jax.jit``, the only one that takes options:
 
         step = jax.jit(env.step, compiler_options=pixelbrax_jax.compiler_options(env))
 

@@ -20,7 +20,7 @@ from pixelbrax_jax.distractors.video import Video
 from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.physics import make_physics
 from pixelbrax_jax.physics.base import Physics
-from pixelbrax_jax.scene.cameras import make_rig, rig_around
+from pixelbrax_jax.scene.cameras import make_rig, rig_around, seen_from
 from pixelbrax_jax.scene.look import make_look
 from pixelbrax_jax.tasks import DMC_TASKS, SUITES, TASKS
 from pixelbrax_jax.types import Camera, CameraRig, Clips, EnvParams, GeomKind, Look
@@ -122,7 +122,7 @@ def make(task: str | EnvConfig, **options: Any) -> tuple[PixelEnv, EnvParams]:
             f"{len(physics.link_names)} links: {', '.join(physics.link_names)}."
         )
     return env, EnvParams(
-        geoms=physics.geoms,
+        geoms=seen_from(physics.geoms, rig),
         rig=rig,
         look=_look(config, physics),
         clips=_clips(config, env),

@@ -65,7 +65,7 @@ class Geoms(struct.PyTreeNode):
             0 is no end. Empty where no plane ends, whatever its size.
         patterned: (G,) static, planes that are ground: drawn with the look's pattern, others in
             their own color. Empty where every plane is.
-        distant: static, whether cameras are so far away, a thousand radii of spheres and capsules,
+        distant: static, whether the camera is so far away, a thousand radii of a sphere or capsule,
             that float32 needs the longer formulas of ``renderer.intersect``.
         strings: threads, the pieces of which are among the geoms.
         material_name: (M,) static, the model's name for the material of the first geom of each

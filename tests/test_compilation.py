@@ -59,10 +59,15 @@ def test_scenes_of_many_geoms_have_the_older_emitters(monkeypatch):
 
     monkeypatch.setenv("XLA_FLAGS", "")
     monkeypatch.setattr(compilation, "_is_known", lambda option, value: True)
-    for number, expected in ((50, None), (51, False)):
-        geoms = SimpleNamespace(kind=(GeomKind.SPHERE,) * number)
-        options = compilation._options(SimpleNamespace(geoms=geoms))
+    for geoms, lamps, expected in ((50, 0, None), (51, 0, False), (25, 1, None), (26, 1, False)):
+        physics = SimpleNamespace(
+            geoms=SimpleNamespace(kind=(GeomKind.SPHERE,) * geoms),
+            look=SimpleNamespace(lamps=(None,) * lamps),
+        )
+        options = compilation._options(physics)
         assert options.get("xla_cpu_use_fusion_emitters") is expected
+    del physics.look  # only some physics has one
+    assert compilation._options(physics).get("xla_cpu_use_fusion_emitters") is None
 
 
 def test_an_xla_without_the_option_is_left_alone(monkeypatch):
@@ -75,7 +80,6 @@ def test_an_xla_without_the_option_is_left_alone(monkeypatch):
 
 EVERYTHING = """
 import sys
-from types import SimpleNamespace
 import gymnasium, numpy as np, torch
 import pixelbrax_gym
 import pixelbrax_jax as pb

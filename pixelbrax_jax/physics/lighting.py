@@ -128,7 +128,7 @@ def mean_color(model: mujoco.MjModel, geom: int) -> tuple[float, float, float] |
     rgba = resolve_rgba(model, model.geom_rgba[geom], int(model.geom_matid[geom]))
     headlight = model.vis.headlight
     light = _ambient(model) + (float(headlight.diffuse.mean()) if headlight.active else 0.0)
-    mean = _pixels(model, texture).reshape(-1, 3).mean(0) / 255.0 * rgba[:3]
+    mean = _pixels(model, texture).mean((0, 1)) / 255.0 * rgba[:3]
     red, green, blue = mean / max(light, 1.0)
     return float(red), float(green), float(blue)
 

@@ -20,6 +20,7 @@ from pixelbrax_jax.physics.geometry import (
 from pixelbrax_jax.physics.lighting import checker, mean_color, read_look
 from pixelbrax_jax.physics.viewpoints import read_rigs
 from pixelbrax_jax.physics.viewpoints import tracked_body as tracked_body
+from pixelbrax_jax.scene.cameras import seen_from
 from pixelbrax_jax.types import CameraRig, GeomKind, Geoms, Look, String
 from pixelbrax_jax.validation import check_choice
 
@@ -28,9 +29,6 @@ TARGET_LINK = "target"
 
 _PIECES = 6
 """Capsules of a string that hangs."""
-
-_DISTANT = 1000
-"""Radii of a sphere or capsule: farther away, float32 moves its edge by some hundredths of one."""
 
 _SITE = int(mujoco.mjtWrap.mjWRAP_SITE)
 _JOINT = int(mujoco.mjtWrap.mjWRAP_JOINT)
@@ -98,17 +96,7 @@ def read_scene(
         anchor=anchor,
     )
     name = _camera_name(model, camera, rigs)
-    geoms = geoms.replace(distant=_is_distant(model, geoms, name))
-    return ModelScene(geoms, rigs[name], rigs, look, tuple(links))
-
-
-def _is_distant(model: mujoco.MjModel, geoms: Geoms, camera: str) -> bool:
-    """Return whether a camera is far from what it turns to, by the size of what is drawn."""
-    round_ones = [kind in (GeomKind.SPHERE, GeomKind.CAPSULE) for kind in geoms.kind]
-    radii = np.asarray(geoms.size)[round_ones, 0]
-    cameras = [_name_of_camera(model, i) for i in range(model.ncam)]
-    away = np.linalg.norm(model.cam_pos[cameras.index(camera)])
-    return bool(len(radii) and away > _DISTANT * radii.min())
+    return ModelScene(seen_from(geoms, rigs[name]), rigs[name], rigs, look, tuple(links))
 
 
 def _camera_name(model: mujoco.MjModel, camera: int | str, rigs: dict[str, CameraRig]) -> str:
@@ -116,11 +104,7 @@ def _camera_name(model: mujoco.MjModel, camera: int | str, rigs: dict[str, Camer
         return check_choice("camera", camera, rigs)
     if not 0 <= camera < model.ncam:
         raise ValueError(f"the model has no camera {camera}; it has {model.ncam}.")
-    return check_choice("camera", _name_of_camera(model, camera), rigs)
-
-
-def _name_of_camera(model: mujoco.MjModel, camera: int) -> str:
-    return model.camera(camera).name or f"camera/{camera}"
+    return check_choice("camera", model.camera(camera).name or f"camera/{camera}", rigs)
 
 
 def _check_movable(model: mujoco.MjModel, movable: Collection[str]) -> None:

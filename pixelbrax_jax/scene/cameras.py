@@ -12,8 +12,11 @@ import numpy as np
 
 from pixelbrax_jax import spatial
 from pixelbrax_jax.tasks import TASKS, Vector, View
-from pixelbrax_jax.types import Camera, CameraRig
+from pixelbrax_jax.types import Camera, CameraRig, GeomKind, Geoms
 from pixelbrax_jax.validation import check_choice
+
+_DISTANT = 1000
+"""Radii of a sphere or capsule: farther away, float32 moves its edge by some hundredths of one."""
 
 
 def _f32(values: Any) -> Any:
@@ -176,6 +179,19 @@ def aim(rig: CameraRig, xpos: jax.Array) -> Camera:
     follow = rig.track * xpos[rig.link] if rig.link >= 0 else jnp.zeros(3)
     eye, target = rig.eye + follow, rig.target + follow
     return Camera(pos=eye, xmat=spatial.look_at(eye, target, rig.up), fovy=jnp.asarray(rig.fovy))
+
+
+def seen_from(geoms: Geoms, rig: CameraRig) -> Geoms:
+    """Return the geoms as a camera needs them, which may be very far away: see ``Geoms.distant``.
+
+    Args:
+        geoms: the shapes.
+        rig: the camera; its distance is taken from the link that it follows, or from the origin.
+    """
+    round_ones = [kind in (GeomKind.SPHERE, GeomKind.CAPSULE) for kind in geoms.kind]
+    radii = np.asarray(geoms.size)[round_ones, 0]
+    away = np.linalg.norm(np.asarray(rig.eye))
+    return geoms.replace(distant=bool(len(radii) and away > _DISTANT * radii.min()))
 
 
 def rig_around(points: np.ndarray, link: int = 0) -> CameraRig:

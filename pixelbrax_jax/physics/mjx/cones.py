@@ -16,9 +16,8 @@ import mujoco
 
 FREE, STICKING, SLIPPING = range(3)
 
-_TURN = 1e-3
-"""Radians by which a slipping contact's friction may turn in a last step of Newton's method, which
-neglects the square of it."""
+_NEGLECTED = 1e-5
+"""Part of a contact's force by which Newton's last step may be wrong."""
 
 
 class Cones(NamedTuple):
@@ -90,12 +89,11 @@ class Cones(NamedTuple):
         )
 
     def stay(self, residual: jax.Array, change: jax.Array) -> jax.Array:
-        """Return () bool, whether costs are as good as quadratic from residuals (C, k) on."""
-        zone, (_, _, tangent) = self.zone(residual), self._parts(residual)
-        _, _, turned = self._parts(residual + change)
-        straight = jnp.all(jnp.abs(turned - tangent) < _TURN, axis=1)
-        same = self.zone(residual + change) == zone
-        return jnp.all(same & (straight | (zone != SLIPPING)))
+        """Return () bool, whether slopes change from residuals (C, k) on as curvatures say."""
+        before, after = self.slope(residual), self.slope(residual + change)
+        expected = before + self.curvature_times(residual, change[..., None])[..., 0]
+        largest = jnp.max(jnp.abs(after), axis=1)
+        return jnp.all(jnp.max(jnp.abs(after - expected), axis=1) <= _NEGLECTED * largest)
 
     def _outward(self, tangent: jax.Array) -> jax.Array:
         """Return (C, k), the derivative of N - mu T by the residual."""

@@ -18,13 +18,6 @@ with import_silenced():
     from mujoco import mjx
     from mujoco.mjx._src import io as mjx_io
 
-ITERATIONS = 8
-"""Of MuJoCo XLA's constraint solver, the fewest in powers of two that give DM Control's control
-steps."""
-
-LINE_SEARCH_ITERATIONS = 8
-"""Of the solver's line search, likewise."""
-
 
 class MjxState(struct.PyTreeNode):
     """The integration state: everything that the next step depends on.
@@ -80,11 +73,6 @@ class Dynamics:
         self._target_body = model.body(target_body).id if target_body else None
         self._simulated = _simulated(model, out_of_reach)
         self._mx = mjx.put_model(self._simulated, impl="jax")
-        option = self._mx.opt.replace(
-            iterations=min(ITERATIONS, model.opt.iterations),
-            ls_iterations=min(LINE_SEARCH_ITERATIONS, model.opt.ls_iterations),
-        )
-        self._mx = self._mx.replace(opt=option)
         self._moving = (
             self._mx if reads_forces else self._without(mujoco.mjtDisableBit.mjDSBL_SENSOR)
         )

@@ -82,6 +82,7 @@ def free_of_contact(
         start = draw(jax.random.fold_in(key, number), before)
         return number + 1, start, dynamics.touches(start.qpos)
 
-    shapes = jax.eval_shape(draw, key, Start(jnp.zeros(dynamics.model.nq)))
+    zeros = Start(jnp.zeros(dynamics.model.nq), jnp.zeros(dynamics.model.nv))
+    shapes = jax.eval_shape(draw, key, zeros)
     nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
     return jax.lax.while_loop(again, attempt, (jnp.int32(0), nothing, jnp.bool_(True)))[1]

@@ -17,7 +17,7 @@ with import_silenced():
     from mujoco.mjx._src import support
 
 ITERATIONS = 16
-"""Newton's steps at most; those that change no active constraint are the last."""
+"""Newton's steps at most; one after which costs are what it took them for is the last."""
 
 LINE_SEARCH_ITERATIONS = 6
 """Steps along a direction at most, of those that change active constraints."""
@@ -36,7 +36,7 @@ _Carry = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
 def is_supported(model: mujoco.MjModel) -> bool:
     """Return whether the model asks for what this solver does.
 
-    That is Newton's method, with pyramids or with elliptic cones of one dimension.
+    That is Newton's method, with pyramids or with elliptic cones if all contacts have one condim.
     """
     dimensions = {*model.geom_condim.tolist(), *model.pair_dim.tolist()}
     return bool(
@@ -123,9 +123,9 @@ class _Problem(NamedTuple):
 def solve(model: Any, data: Any) -> Any:
     """Find accelerations and constraint forces, as ``mujoco.mjx._src.solver.solve`` does.
 
-    Every cost is quadratic between kinks, but for those of elliptic cones, so that Newton's step is
-    exact once the right constraints are active: the loop ends where a whole step leaves them as
-    they are.
+    Costs are quadratic between kinks, so that Newton's step is exact once the right constraints are
+    active: the loop ends where a whole step leaves them as they are. Those of elliptic cones are
+    not where contacts slip: there it ends where forces are as expected after a whole step.
 
     Args:
         model: ``mujoco.mjx.Model`` that ``is_supported``.
@@ -197,7 +197,7 @@ def _cones(model: Any, data: Any) -> Cones | None:
     if model.opt.cone != mujoco.mjtCone.mjCONE_ELLIPTIC or not len(contact.dim):
         return None
     dimension = int(contact.dim[0])
-    friction = jnp.maximum(contact.friction[:, : dimension - 1], mujoco.mjMINMU)
+    friction = contact.friction[:, : dimension - 1]
     mu = friction[:, :1] / jnp.sqrt(model.opt.impratio)
     stiffness = data._impl.efc_D[-len(contact.dim) * dimension :]
     return Cones(

@@ -17,7 +17,7 @@ from pixelbrax_jax.physics.mjx.solver import is_supported
 MODEL = """
 <mujoco>
   <option solver="Newton" cone="{cone}" tolerance="1e-12" iterations="200"/>
-  <default><geom density="500"/></default>
+  <default><geom density="500" condim="{arms}"/></default>
   <worldbody>
     <geom type="plane" size="5 5 1"/>
     <body pos="0 0 .32">
@@ -37,6 +37,11 @@ MODEL = """
 NUM_STATES = 64
 
 
+def model_of(cone, condim, *, arms):
+    xml = MODEL.format(cone=cone, condim=condim, arms=arms)
+    return mujoco.MjModel.from_xml_string(xml)
+
+
 def states(model):
     """States with any mixture of constraints at work."""
     random = np.random.RandomState(0)
@@ -49,9 +54,12 @@ def states(model):
 @pytest.mark.parametrize(
     "batch", [jax.vmap, lambda f: batch_last(f, (0, 0))], ids=["first", "last"]
 )
-@pytest.mark.parametrize(("cone", "condim"), [("pyramidal", 1), ("pyramidal", 3), ("elliptic", 3)])
+@pytest.mark.parametrize(
+    ("cone", "condim"),
+    [("pyramidal", 1), ("pyramidal", 3), ("elliptic", 3), ("elliptic", 4), ("elliptic", 6)],
+)
 def test_forces_are_those_of_mujoco(cone, condim, batch):
-    model = mujoco.MjModel.from_xml_string(MODEL.format(cone=cone, condim=condim))
+    model = model_of(cone, condim, arms=max(condim, 3))
     assert is_supported(model)
     qpos, qvel = states(model)
     before = theirs.solve
@@ -76,4 +84,4 @@ def test_forces_are_those_of_mujoco(cone, condim, batch):
 
 
 def test_cones_of_several_dimensions_are_left_to_mujoco_xla():
-    assert not is_supported(mujoco.MjModel.from_xml_string(MODEL.format(cone="elliptic", condim=4)))
+    assert not is_supported(model_of("elliptic", 4, arms=3))

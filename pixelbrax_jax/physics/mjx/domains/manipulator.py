@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -39,7 +41,7 @@ _NEAR = 0.01
 
 def _start(dynamics: Dynamics, key: jax.Array) -> Start:
     """Draw joints, target and ball until nothing touches."""
-    return free_of_contact(dynamics, key, lambda key, before: _draw(dynamics, key, before))
+    return free_of_contact(dynamics, key, partial(_draw, dynamics))
 
 
 def _draw(dynamics: Dynamics, key: jax.Array, before: Start) -> Start:
@@ -68,8 +70,8 @@ def _draw(dynamics: Dynamics, key: jax.Array, before: Start) -> Start:
 
     x = int(model.joint("ball_x").dofadr[0])
     speed = jax.random.uniform(keys[4], minval=-5.0, maxval=5.0)
-    qvel = jnp.zeros(model.nv) if before.qvel is None else before.qvel
-    qvel = qvel.at[x].set(jnp.where(is_fixed, qvel[x], speed))
+    assert before.qvel is not None
+    qvel = before.qvel.at[x].set(jnp.where(is_fixed, before.qvel[x], speed))
     return Start(qpos, qvel, _pose(model, target))
 
 
