@@ -20,7 +20,6 @@ from pixelbrax_jax.physics.geometry import (
 from pixelbrax_jax.physics.lighting import checker, mean_color, read_look
 from pixelbrax_jax.physics.viewpoints import read_rigs
 from pixelbrax_jax.physics.viewpoints import tracked_body as tracked_body
-from pixelbrax_jax.scene.cameras import seen_from
 from pixelbrax_jax.types import CameraRig, GeomKind, Geoms, Look, String
 from pixelbrax_jax.validation import check_choice
 
@@ -95,8 +94,7 @@ def read_scene(
         target_link=target if moved else -1,
         anchor=anchor,
     )
-    name = _camera_name(model, camera, rigs)
-    return ModelScene(seen_from(geoms, rigs[name]), rigs[name], rigs, look, tuple(links))
+    return ModelScene(geoms, rigs[_camera_name(model, camera, rigs)], rigs, look, tuple(links))
 
 
 def _camera_name(model: mujoco.MjModel, camera: int | str, rigs: dict[str, CameraRig]) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from pixelbrax_jax.physics.model_scene import ModelScene, read_scene, tracked_body
+from pixelbrax_jax.scene.cameras import seen_from
 
 MODELS = {
     "acrobot": ("swingup", 0, ()),
@@ -103,4 +104,6 @@ def load(domain: str) -> Suite:
 
 def of(domain: str, model: mujoco.MjModel, camera: int, movable: tuple[str, ...]) -> Suite:
     """Read a model as it is now."""
-    return Suite(domain, model, camera, read_scene(model, camera, movable=movable), movable)
+    scene = read_scene(model, camera, movable=movable)
+    scene = scene._replace(geoms=seen_from(scene.geoms, scene.rig))
+    return Suite(domain, model, camera, scene, movable)
