@@ -32,15 +32,18 @@ def play(options: argparse.Namespace) -> int:
     Returns:
         The exit status: 130 after Ctrl-C, which leaves a whole file.
     """
-    written = options.gif
     try:
         check_positive_int("size", options.size)
         check_positive_int("num_frames", options.num_frames)
         env, act = _make(options)
-        if written is None and (lacking := _no_window()):
-            written = f"{options.task}.gif"
+        lacking = "" if options.gif else _no_window()
+        written = options.gif or (f"{options.task}.gif" if lacking else None)
+        if written and find_spec("imageio") is None:
+            fix = f"a video needs imageio; try: {install_extra('video')}"
+            raise ImportError(f"{lacking}; {fix}" if lacking else fix)
+        if lacking:
             sys.stderr.write(f"pixelbrax play: {lacking}; writing {written} in its place\n")
-        sys.stderr.write("pixelbrax play: compiling, which takes up to a minute\n")
+        sys.stderr.write("pixelbrax play: compiling, which takes a minute or two\n")
         shown = images(env, act, options.seed, options.size if options.observation else None)
         if written is None:
             _show(shown, env.metadata["render_fps"], f"PixelBrax {options.task}")

@@ -28,10 +28,10 @@ if TYPE_CHECKING:
     from pixelbrax_jax.policy import load_policy as load_policy
     from pixelbrax_jax.registry import list_envs as list_envs
     from pixelbrax_jax.registry import make as make
+    from pixelbrax_jax.registry import named_rigs as named_rigs
     from pixelbrax_jax.registry import register as register
     from pixelbrax_jax.renderer.base import render as render
     from pixelbrax_jax.renderer.kernel import auto_renderer as auto_renderer
-    from pixelbrax_jax.scene.cameras import named_rigs as named_rigs
     from pixelbrax_jax.scene.cameras import rig as rig
     from pixelbrax_jax.scene.look import make_look as make_look
     from pixelbrax_jax.scene.place import place as place
@@ -64,10 +64,10 @@ _PUBLIC = {
     "physics.brax.engine": "BraxPhysics",
     "physics.brax.mjcf": "mjcf_physics",
     "policy": "list_pretrained load_policy",
-    "registry": "list_envs make register",
+    "registry": "list_envs make named_rigs register",
     "renderer.base": "render",
     "renderer.kernel": "auto_renderer",
-    "scene.cameras": "named_rigs rig",
+    "scene.cameras": "rig",
     "scene.look": "make_look",
     "scene.place": "place",
     "types": (

@@ -7,6 +7,7 @@ import signal
 import sys
 from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
 from typing import Any
 
 from pixelbrax_jax.extras import install_extra
@@ -58,6 +59,10 @@ def _tasks(options: argparse.Namespace) -> int:
     width = max(map(len, TASKS))
     for name, row in TASKS.items():
         sys.stdout.write(f"{name:{width}}  {row.gymnasium_id}: {row.summary}\n")
+    if find_spec("dm_control") is None:
+        sys.stderr.write(
+            f"pixelbrax tasks: those named dmc need dm_control: {install_extra('dmc')}\n"
+        )
     return 0
 
 
@@ -76,8 +81,8 @@ def _add_play(commands: Any) -> None:
         help="who acts; pretrained comes with the package for some tasks (default: random)",
     )
     command.add_argument("--backend", help="of the physics")
-    command.add_argument("--camera", help="default, side, front, top or original")
-    command.add_argument("--look", help="default or original")
+    command.add_argument("--camera", help="as top; an unknown one lists those of the task")
+    command.add_argument("--look", help="default, original or dmc")
     command.add_argument("--shadows", action="store_true", default=None)
     command.add_argument("--distractors", nargs="+", help="such as dcs-easy, or paper-color")
     command.add_argument("--clips", help="of videos: procedural, or a folder")

@@ -9,25 +9,32 @@ from typing import Any, ParamSpec, TypeVar
 
 import jax
 
+from pixelbrax_jax.validation import check_choice
+
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
 
 _WIDTH = "xla_cpu_prefer_vector_width"
 _EMITTERS = "xla_cpu_use_fusion_emitters"
+_COMMANDS = "xla_gpu_enable_command_buffer"
+_CAPTURED = "FUSION,CUBLAS,CUBLASLT,CUDNN,CUSTOM_CALL,DYNAMIC_SLICE_FUSION,CONDITIONAL,WHILE"
+"""What a GPU may have in a CUDA graph: XLA's default and loops, without which a step is cut into
+parts that the host launches one after the other. XLA leaves out what a driver does not know."""
 
 _MOST_CROSSINGS = 50
 """Geoms times rays of a pixel, one to the camera and one to each of the model's lamps, which XLA's
 newer emitters still make one fast loop of."""
 
 
-def compiler_options(env: Any = None) -> dict[str, Any]:
-    """Return options of ``jax.jit`` that make an environment fast on the default device.
+def compiler_options(env: Any = None, platform: str | None = None) -> dict[str, Any]:
+    """Return options of ``jax.jit`` that make an environment fast.
 
-    XLA holds back on CPUs with AVX-512 and computes with vectors of 256 bits; with 512 the
-    ray-caster is up to twice as fast there. Other CPUs have no such vectors and are not affected;
-    other devices need no options. Some physics is faster with options of its own, and scenes of
-    many geoms are drawn faster with XLA's older emitters. Whatever PixelBrax compiles by itself for
-    the Gymnasium, TorchRL and Stable-Baselines3 environments and for its agents has these options.
+    On a CPU: XLA holds back where there is AVX-512 and computes with vectors of 256 bits; with 512
+    the ray-caster is up to twice as fast. CPUs without such vectors are not affected. Some physics
+    is faster with options of its own, and scenes of many geoms are drawn faster with XLA's older
+    emitters. On a GPU: loops may be part of a CUDA graph, so that the host launches a step at once.
+    A TPU needs none. Whatever PixelBrax compiles by itself for the Gymnasium, TorchRL and
+    Stable-Baselines3 environments and for its agents has these options.
     A program of your own gets them at its outermost ``jax.jit``, the only one that takes options:
 
         step = jax.jit(env.step, compiler_options=pixelbrax_jax.compiler_options(env))
@@ -38,13 +45,16 @@ def compiler_options(env: Any = None) -> dict[str, Any]:
     Args:
         env: a ``PixelEnv`` or ``VectorPixelEnv``; None for the options of the renderer alone,
             which are all that Brax's tasks have.
+        platform: ``cpu``, ``gpu`` or ``tpu``, which the program is compiled for; None for that of
+            the default device.
 
     Returns:
-        The options; empty on other devices than CPUs and with a width of vectors in ``XLA_FLAGS``,
-        where those of the physics are yours to give too.
-        What the installed XLA does not know is left out.
+        The options. None of them if ``XLA_FLAGS`` name the width of vectors on a CPU
+        (``xla_cpu_prefer_vector_width``; those of the physics are then yours to give too) or what
+        is captured on a GPU (``xla_gpu_enable_command_buffer``). What the installed XLA does not
+        know is left out.
     """
-    return _options(_physics(env))
+    return _options(_physics(env), platform)
 
 
 def jit(
@@ -78,15 +88,21 @@ def _physics(env: Any) -> Any:
     return getattr(getattr(env, "env", env), "physics", None)
 
 
-def _options(physics: Any) -> dict[str, Any]:
-    if jax.default_backend() != "cpu" or _WIDTH in os.environ.get("XLA_FLAGS", ""):
+def _options(physics: Any, platform: str | None = None) -> dict[str, Any]:
+    if platform is not None:
+        check_choice("platform", platform, ("cpu", "gpu", "tpu"))
+    platform, flags = platform or jax.default_backend(), os.environ.get("XLA_FLAGS", "")
+    if platform == "gpu" and _COMMANDS not in flags:
+        chosen: dict[str, Any] = {_COMMANDS: _CAPTURED}
+    elif platform == "cpu" and _WIDTH not in flags:
+        chosen = {_WIDTH: 512, **getattr(physics, "compiler_options", {})}
+        if _crossings(physics) > _MOST_CROSSINGS:
+            # The newer ones cut long loops up, and compute what the parts share again in each of
+            # them: drawing DM Control's swimmer15 takes 250 times as long.
+            chosen.setdefault(_EMITTERS, False)
+    else:
         return {}
-    options = {_WIDTH: 512, **getattr(physics, "compiler_options", {})}
-    if _crossings(physics) > _MOST_CROSSINGS:
-        # The newer ones cut long loops up, and compute what the parts share again in each of them:
-        # drawing DM Control's swimmer15 takes 250 times as long.
-        options.setdefault(_EMITTERS, False)
-    return {name: value for name, value in options.items() if _is_known(name, value)}
+    return {name: value for name, value in chosen.items() if _is_known(name, value)}
 
 
 def _crossings(physics: Any) -> int:

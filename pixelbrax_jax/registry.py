@@ -20,7 +20,7 @@ from pixelbrax_jax.distractors.video import Video
 from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.physics import make_physics
 from pixelbrax_jax.physics.base import Physics
-from pixelbrax_jax.scene.cameras import make_rig, rig_around, seen_from
+from pixelbrax_jax.scene.cameras import make_rig, rig_around, rigs_of, seen_from
 from pixelbrax_jax.scene.look import make_look
 from pixelbrax_jax.tasks import DMC_TASKS, SUITES, TASKS
 from pixelbrax_jax.types import Camera, CameraRig, Clips, EnvParams, GeomKind, Look
@@ -130,6 +130,24 @@ def make(task: str | EnvConfig, **options: Any) -> tuple[PixelEnv, EnvParams]:
     )
 
 
+def named_rigs(task: str) -> dict[str, CameraRig]:
+    """Return the viewpoints of a task by name, which ``camera=`` takes.
+
+    Args:
+        task: one of ``list_envs()``.
+
+    Returns:
+        ``default``, ``side`` (seen along +y), ``front`` (along -x), ``top`` (from above, +y up in
+        the image); ``original`` where the paper has the task; of the DM Control Suite the model's
+        own cameras that keep their orientation.
+
+    Raises:
+        ValueError: the task is unknown.
+        ImportError: as in ``make``.
+    """
+    return rigs_of(task, _own_rigs(task, _physics(env_config(task, {}))))
+
+
 _parameters = [
     inspect.Parameter(
         field.name,
@@ -160,7 +178,10 @@ def _physics(config: EnvConfig) -> Physics:
 
 
 def _meant(task: object) -> str | None:
-    """Return the task of the DM Control Suite that is meant by its name in other libraries."""
+    """Return the task that is meant by Gymnasium's name, or by DM Control's in other libraries."""
+    for full, row in TASKS.items():
+        if task == row.gymnasium_id:
+            return full
     name = str(task).lower().replace("-", "_").removeprefix("dmc_")
     found = [full for full, row in DMC_TASKS.items() if name in (full, full[4:], row.task)]
     return found[0] if len(found) == 1 else None

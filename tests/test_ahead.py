@@ -169,7 +169,7 @@ def test_what_runs_is_not_mixed_with_what_does_not(capsys):
         command.main(["--only", "gpu-program", "renderer"])
     assert "gpu-program runs nothing: leave out renderer" in capsys.readouterr().err
     assert command.main(["--only", "gpu-program", "--task", "ant", "--list"]) == 0
-    assert len(capsys.readouterr().out.splitlines()) == 16
+    assert len(capsys.readouterr().out.splitlines()) == 20
     assert not set(cases.COMPILED) & {*cases.QUICK, *cases.FULL}
 
 

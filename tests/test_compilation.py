@@ -78,6 +78,24 @@ def test_an_xla_without_the_option_is_left_alone(monkeypatch):
     assert compilation.compiler_options() == {}
 
 
+def test_on_a_gpu_loops_are_captured_unless_the_user_says_otherwise(monkeypatch):
+    from pixelbrax_jax.compilation import compiler_options
+
+    commands = "xla_gpu_enable_command_buffer"
+    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_prefer_vector_width=128")
+    assert "WHILE" in compiler_options(platform="gpu")[commands].split(",")
+    monkeypatch.setenv("XLA_FLAGS", f"--{commands}=-WHILE")
+    assert compiler_options(platform="gpu") == {}
+    assert compiler_options(platform="tpu") == {}
+
+
+def test_an_unknown_platform_is_named():
+    from pixelbrax_jax.compilation import compiler_options
+
+    with pytest.raises(ValueError, match=r"platform.*'cuda'.*gpu"):
+        compiler_options(platform="cuda")
+
+
 EVERYTHING = """
 import sys
 import gymnasium, numpy as np, torch

@@ -24,10 +24,10 @@ N = 1024
 
 
 @cache
-def compiled(task: str, program: str, platform: str = "cuda") -> dict[str, Any]:
+def compiled(task: str, program: str, platform: str = "cuda", **options: Any) -> dict[str, Any]:
     """What the compiler made of a program."""
     measure = "compiling.gpu" if platform == "cuda" else "compiling.tpu"
-    where = {"task": task, "program": program, "num_envs": N}
+    where = {"task": task, "program": program, "num_envs": N, **options}
     if platform == "cuda":
         where["card"] = "H100"
     with pytest.MonkeyPatch.context() as patch:
@@ -61,10 +61,27 @@ def test_the_renderer_is_one_large_kernel(task):
     assert not values["spilled"]
 
 
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"shadows": True},
+        {"distractors": "paper-video", "clips": "procedural"},
+        {"distractors": "dcs-hard", "clips": "procedural", "shadows": True},
+    ],
+    ids=["shadows", "video over all", "all distractors and shadows"],
+)
+def test_distractors_and_shadows_are_part_of_that_kernel(options):
+    values = compiled("ant", "renderer", **options)
+    assert values["large_kernels"] <= 2
+    assert values["temporary_bytes"] <= 0.3 * values["output_bytes"]
+    assert not values["spilled"]
+
+
 @pytest.mark.parametrize("program", ["state step", "step"])
 def test_a_step_launches_no_more_than_it_did(program):
     values = compiled("ant", program)
     assert values["unknown_loops"] == 0
+    assert values["host_steps"] == 1
     before = kept("ant", program)
     if before is None:
         pytest.skip(f"no report of jax {jax.__version__} is kept")

@@ -86,7 +86,7 @@ def _around(base: CameraRig, direction: Vector, up: Vector) -> CameraRig:
     return dataclasses.replace(base, eye=eye, up=_f32(up))
 
 
-def named_rigs(
+def rigs_of(
     task: str, fallback: CameraRig | Mapping[str, CameraRig] | None = None
 ) -> dict[str, CameraRig]:
     """Return all rigs of a task by name.
@@ -129,7 +129,7 @@ def make_rig(
 
     Args:
         task: the task's name.
-        camera: a name of ``named_rigs``, a ``CameraRig`` or a ``Camera``.
+        camera: a name of ``rigs_of``, a ``CameraRig`` or a ``Camera``.
         fallback: default rig of a task that has no row of its own, or several by name.
 
     Returns:
@@ -146,9 +146,9 @@ def make_rig(
     if not isinstance(camera, str):
         raise TypeError(
             "camera must be a name, a pixelbrax_jax.CameraRig or a pixelbrax_jax.Camera, "
-            f"got {type(camera).__name__}."
+            f"got {camera!r}; names: pixelbrax_jax.named_rigs({task!r})."
         )
-    rigs = named_rigs(task, fallback)
+    rigs = rigs_of(task, fallback)
     return rigs[check_choice(f"camera of task {task!r}", camera, rigs)]
 
 

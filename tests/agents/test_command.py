@@ -108,6 +108,14 @@ def test_tasks_are_listed(capsys):
     assert listed == list(TASKS)
 
 
+def test_tasks_tell_what_is_missing(capsys, monkeypatch):
+    monkeypatch.setattr("pixelbrax_jax.cli.find_spec", lambda name: None)
+    assert main(["tasks"]) == 0
+    told = capsys.readouterr()
+    assert [line.split()[0] for line in told.out.splitlines()] == list(TASKS)
+    assert 'dmc need dm_control: pip install "pixelbrax[dmc]"' in told.err
+
+
 @pytest.mark.slow
 def test_a_task_of_the_dm_control_suite_from_training_to_the_film(capsys, tmp_path):
     pytest.importorskip("dm_control", reason="has no release for the newest Python")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pixelbrax_jax import distractors, make, place
-from pixelbrax_jax.scene.cameras import aim, named_rigs, rig
+from pixelbrax_jax.scene.cameras import aim, rig, rigs_of
 from pixelbrax_jax.tasks import BRAX_TASKS
 from tests.distractors.conftest import walk
 from tests.envs.toy import PARAMS
@@ -150,7 +150,7 @@ def test_a_camera_that_looks_straight_down():
     ],
 )
 def test_rigs_of_all_kinds_yield_sound_cameras(task, name):
-    base = named_rigs(task)[name]
+    base = rigs_of(task)[name]
     params = PARAMS.replace(rig=base)
     camera = distractors.Camera(scale=0.3)
     states = walk(camera, params, 200, num=4)

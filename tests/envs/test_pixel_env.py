@@ -233,6 +233,7 @@ class TestMake:
         ("options", "message"),
         [
             ({"task": "antt"}, "unknown task: 'antt'; allowed: ant, .* Did you mean 'ant'"),
+            ({"task": "PixelBrax/Ant-v0"}, "unknown task: .* Did you mean 'ant'"),
             ({"backend": "sprng"}, "Did you mean 'spring'"),
             ({"camera": "sid"}, "unknown camera of task 'ant': 'sid'.*Did you mean 'side'"),
             ({"look": "orginal"}, "unknown look: 'orginal'; allowed: default, dmc, original"),

@@ -34,6 +34,16 @@ def test_without_a_display_it_becomes_a_gif(tmp_path, monkeypatch, capsys):
     assert imageio.imread(tmp_path / "inverted_pendulum.gif", index=None).shape == (3, 40, 40, 3)
 
 
+@pytest.mark.usefixtures("_no_display")
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere there is always a display")
+def test_what_is_missing_is_told_before_anything_else(monkeypatch, capsys):
+    monkeypatch.setattr(play, "find_spec", lambda name: None)
+    assert main(["play", TASK, *SHORT]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "[human]" in line
+    assert "[video]" in line
+
+
 def test_a_window_until_it_is_closed(monkeypatch):
     import pygame
 

@@ -20,10 +20,11 @@ from tests.renderer.mujoco_rays import cast
 
 SIZE = 32
 NUM_POSES = 20
+RENDERERS = ("fused", pytest.param("pallas-interpret", marks=pytest.mark.slow))
 
 
-def compare(model: mujoco.MjModel, batch, shown: list[int]) -> None:
-    frames = jax.jit(jax.vmap(lambda scene: render(scene, SIZE, SIZE)))(batch)
+def compare(model: mujoco.MjModel, batch, shown: list[int], renderer: str) -> None:
+    frames = jax.jit(jax.vmap(lambda scene: render(scene, SIZE, SIZE, renderer)))(batch)
     same, depths, seen = [], [], 0
     for i in range(NUM_POSES):
         scene = jax.tree.map(lambda x, i=i: x[i], batch)
@@ -41,8 +42,9 @@ def compare(model: mujoco.MjModel, batch, shown: list[int]) -> None:
     assert seen >= 2 * NUM_POSES, "the poses show too little to compare"
 
 
+@pytest.mark.parametrize("renderer", RENDERERS)
 @pytest.mark.parametrize("task", BRAX_TASKS)
-def test_task_at_random_poses(task):
+def test_task_at_random_poses(task, renderer):
     _, params = pixelbrax_jax.make(task)
     name = {"halfcheetah": "half_cheetah"}.get(task, task)
     model = mjcf.load_mjmodel(epath.resource_path("brax") / f"envs/assets/{name}.xml")
@@ -58,12 +60,13 @@ def test_task_at_random_poses(task):
         xpos.append(data.xpos[1:].astype(np.float32))
         xquat.append(data.xquat[1:].astype(np.float32))
     dress = partial(place, params.geoms, params.rig, params.look)
-    compare(model, jax.jit(jax.vmap(dress))(np.stack(xpos), np.stack(xquat)), shown)
+    compare(model, jax.jit(jax.vmap(dress))(np.stack(xpos), np.stack(xquat)), shown, renderer)
 
 
-def test_every_primitive():
+@pytest.mark.parametrize("renderer", RENDERERS)
+def test_every_primitive(renderer):
     model = scenes.primitives()
     batch = jax.tree.map(
         lambda *leaves: jnp.stack(leaves), *[scenes.random_scene(s) for s in range(NUM_POSES)]
     )
-    compare(model, batch, list(range(model.ngeom)))
+    compare(model, batch, list(range(model.ngeom)), renderer)

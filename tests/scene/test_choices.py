@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pixelbrax_jax import make_look, named_rigs, rig
-from pixelbrax_jax.scene.cameras import make_rig
+from pixelbrax_jax import make_look, rig
+from pixelbrax_jax.scene.cameras import make_rig, rigs_of
 
 OWN = {
     "default": rig((0, -3, 1), (0, 0, 1), 45.0, link=2, track=(1.0, 1.0, 1.0)),
@@ -35,7 +35,7 @@ def test_dmcs_look_is_the_suites():
 
 
 def test_cameras_of_a_model_are_rigs_by_name():
-    rigs = named_rigs("a task", OWN)
+    rigs = rigs_of("a task", OWN)
     assert next(iter(rigs)) == "default"
     assert set(rigs) == {"default", "side", "front", "top", "back"}
     for name, own in OWN.items():
@@ -46,4 +46,4 @@ def test_cameras_of_a_model_are_rigs_by_name():
 
 
 def test_a_row_of_a_task_comes_before_a_fallback():
-    assert named_rigs("ant", OWN["back"])["default"] is named_rigs("ant")["default"]
+    assert rigs_of("ant", OWN["back"])["default"] is rigs_of("ant")["default"]

@@ -14,7 +14,7 @@ from pixelbrax_gym.bench.case import Case
 DUMP = "PIXELBRAX_PROGRAMS_DUMP"
 """Variable that names the folder for what XLA writes of a program, which is removed afterwards."""
 
-PROGRAMS = ("renderer", "step", "state step", "scan")
+PROGRAMS = ("renderer", "plain renderer", "step", "state step", "scan")
 """Programs that are compiled; `programs.py` makes them."""
 
 

@@ -21,6 +21,7 @@ from pixelbrax_gym.bench.ahead.kernels import kernels, longest_chain, loops
 from pixelbrax_gym.bench.ahead.programs import make_program
 from pixelbrax_gym.bench.ahead.registers import assemble
 from pixelbrax_gym.bench.ahead.targets import CARDS, LAUNCH_SECONDS, TPU_TOPOLOGY, Card
+from pixelbrax_jax.compilation import compiler_options
 
 _ASSEMBLED = 8
 """Files of kernels that are assembled, those of most code: they need the most registers."""
@@ -116,7 +117,8 @@ def _compile(topology: Any, platform: str, function: Any, arguments: Any) -> tup
 
     started = time.perf_counter()
     traced = jax.jit(ahead, in_shardings=where, out_shardings=where).trace(*arguments)
-    compiled = traced.lower(lowering_platforms=(platform,)).compile()
+    lowered = traced.lower(lowering_platforms=(platform,))
+    compiled = lowered.compile(compiler_options(platform="gpu" if platform == "cuda" else platform))
     return compiled, round(time.perf_counter() - started, 1)
 
 

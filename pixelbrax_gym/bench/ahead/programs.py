@@ -21,8 +21,9 @@ def make_program(
     """Make a program with the shapes of its arguments; nothing is computed.
 
     Args:
-        name: one of ``PROGRAMS``: frames of states; a step of a pixel environment; one without
-            pixels; a loop over ``SCAN_LENGTH`` steps with pixels.
+        name: one of ``PROGRAMS``: frames of states, drawn as the device has it and by the plain
+            ray-caster; a step of a pixel environment; one without pixels; a loop over
+            ``SCAN_LENGTH`` steps with pixels.
         task: the task.
         num_envs: environments.
         **options: further ones of ``pixelbrax_jax.make``.
@@ -35,6 +36,8 @@ def make_program(
     """
     check_choice("program", name, PROGRAMS)
     obs_mode = "state" if name == "state step" else "pixels"
+    if name == "plain renderer":
+        options = {"renderer": "fused", **options}
     # The batch as for any device: "auto" is for the one that JAX computes on.
     env, params = pb.make(task, obs_mode=obs_mode, physics_batching="vmap", **options)
     envs = pb.VectorPixelEnv(env, num_envs)
@@ -43,7 +46,7 @@ def make_program(
         lambda x: jax.ShapeDtypeStruct(jnp.shape(x), jnp.asarray(x).dtype), params
     )
     action = jax.ShapeDtypeStruct((num_envs, env.action_size), jnp.float32)
-    if name == "renderer":
+    if name.endswith("renderer"):
         return jax.vmap(env.draw, in_axes=(0, None)), (state.sim, params)
     if name != "scan":
         return envs.step, (state, action, params)

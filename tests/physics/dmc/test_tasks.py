@@ -57,11 +57,20 @@ def test_suites_are_listed_apart():
         ("hopper-hop", "dmc_hopper_hop"),
         ("Ball_In_Cup-Catch", "dmc_ball_in_cup_catch"),
         ("swimmer6", "dmc_swimmer_swimmer6"),
+        ("PixelBrax/DMC-CheetahRun-v0", "dmc_cheetah_run"),
     ],
 )
 def test_other_libraries_names_are_understood(given, meant):
     with pytest.raises(ValueError, match=rf"Did you mean '{meant}'\?$"):
         pb.make(given)
+
+
+def test_the_models_cameras_have_names():
+    assert list(pb.named_rigs("dmc_cheetah_run")) == ["default", "side", "front", "top", "back"]
+    with pytest.raises(
+        TypeError, match=r"got 0; names: pixelbrax_jax.named_rigs\('dmc_cheetah_run"
+    ):
+        pb.make("dmc_cheetah_run", camera=0)
 
 
 def test_without_dm_control_the_extra_is_named(monkeypatch):
