@@ -124,12 +124,13 @@ def forms_tables() -> dict[str, str]:
 def programs_tables() -> dict[str, str]:
     """Tables of programs that are compiled and not run, by name.
 
-    Of the GPUs the H100 alone, and no steps in a loop.
+    Of the GPUs the H100 alone, of many environments Ant alone, and no steps in a loop.
     """
     cards = [
         row
         for row in rows_of("programs", "gpu-program")
         if row["arguments"]["card"] == "H100" and row["arguments"]["program"] != "scan"
+        if row["arguments"]["num_envs"] == 1024 or row["arguments"]["task"] == "ant"
     ]
     cards.sort(key=_place)
     chips = sorted(rows_of("programs", "tpu-program"), key=_place)
