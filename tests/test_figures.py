@@ -167,8 +167,8 @@ def compiled(task: str, program: str, num_envs: int = 1024) -> dict[str, Any]:
     return find(rows, "compiling.gpu", **where)["values"]
 
 
-def traffic_of_frames() -> list[float]:
-    drawn = [compiled(task, "renderer") for task in TASKS]
+def traffic_of_frames(program: str = "renderer") -> list[float]:
+    drawn = [compiled(task, program) for task in TASKS]
     return [(row["read_bytes"] + row["written_bytes"]) / row["output_bytes"] for row in drawn]
 
 
@@ -249,7 +249,8 @@ STATEMENTS = {
     "docs/dmc.md": (),
     "docs/accelerators.md": (
         ("moves {} to {} times the bytes of the frames", span(traffic_of_frames())),
-        ("add {} or {} launches to a step", span(launches_of_pixels(), "{:.0f}")),
+        ("would move up to {} times as many bytes", [f"{max(traffic_of_frames('plain renderer')):.0f}"]),
+        ("to which pixels add {} or {} launches", span(launches_of_pixels(), "{:.0f}")),
         ("at least {} us a kernel", [f"{LAUNCH_SECONDS * 1e6:.1f}"]),
         ("moves {} MB for {} MB of frames", tpu_frames()),
     ),

@@ -72,8 +72,7 @@ def test_the_renderer_is_one_large_kernel(task):
 )
 def test_distractors_and_shadows_are_part_of_that_kernel(options):
     values = compiled("ant", "renderer", **options)
-    assert values["large_kernels"] <= 2
-    assert values["temporary_bytes"] <= 0.3 * values["output_bytes"]
+    assert values["large_kernels"] <= 2, "the other one gathers the video's pixels"
     assert not values["spilled"]
 
 
