@@ -43,7 +43,7 @@ def play(options: argparse.Namespace) -> int:
             raise ImportError(f"{lacking}; {fix}" if lacking else fix)
         if lacking:
             sys.stderr.write(f"pixelbrax play: {lacking}; writing {written} in its place\n")
-        sys.stderr.write("pixelbrax play: compiling, which takes a minute or two\n")
+        sys.stderr.write("pixelbrax play: compiling, which may take two minutes\n")
         shown = images(env, act, options.seed, options.size if options.observation else None)
         if written is None:
             _show(shown, env.metadata["render_fps"], f"PixelBrax {options.task}")

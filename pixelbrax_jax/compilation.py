@@ -18,8 +18,11 @@ _WIDTH = "xla_cpu_prefer_vector_width"
 _EMITTERS = "xla_cpu_use_fusion_emitters"
 _COMMANDS = "xla_gpu_enable_command_buffer"
 _CAPTURED = "FUSION,CUBLAS,CUBLASLT,CUDNN,CUSTOM_CALL,DYNAMIC_SLICE_FUSION,CONDITIONAL,WHILE"
-"""What a GPU may have in a CUDA graph: XLA's default and loops, without which a step is cut into
-parts that the host launches one after the other. XLA leaves out what a driver does not know."""
+"""What a GPU may have in a CUDA graph: the default of JAX 0.10.2 and loops, without which a step is
+cut into parts that the host launches one after the other. XLA leaves out what a driver lacks."""
+
+_PLATFORMS = {"cpu": "cpu", "gpu": "gpu", "cuda": "gpu", "rocm": "gpu", "tpu": "tpu"}
+"""JAX's names of platforms, and those of its default backends."""
 
 _MOST_CROSSINGS = 50
 """Geoms times rays of a pixel, one to the camera and one to each of the model's lamps, which XLA's
@@ -32,7 +35,8 @@ def compiler_options(env: Any = None, platform: str | None = None) -> dict[str, 
     On a CPU: XLA holds back where there is AVX-512 and computes with vectors of 256 bits; with 512
     the ray-caster is up to twice as fast. CPUs without such vectors are not affected. Some physics
     is faster with options of its own, and scenes of many geoms are drawn faster with XLA's older
-    emitters. On a GPU: loops may be part of a CUDA graph, so that the host launches a step at once.
+    emitters. On a GPU: loops of which all parts can be are captured in CUDA graphs, so that the
+    host launches a step of Brax's tasks at once.
     A TPU needs none. Whatever PixelBrax compiles by itself for the Gymnasium, TorchRL and
     Stable-Baselines3 environments and for its agents has these options.
     A program of your own gets them at its outermost ``jax.jit``, the only one that takes options:
@@ -45,14 +49,17 @@ def compiler_options(env: Any = None, platform: str | None = None) -> dict[str, 
     Args:
         env: a ``PixelEnv`` or ``VectorPixelEnv``; None for the options of the renderer alone,
             which are all that Brax's tasks have.
-        platform: ``cpu``, ``gpu`` or ``tpu``, which the program is compiled for; None for that of
-            the default device.
+        platform: ``cpu``, ``gpu`` (or ``cuda``, ``rocm``) or ``tpu``, which the program is compiled
+            for; None for that of the default device.
 
     Returns:
         The options. None of them if ``XLA_FLAGS`` name the width of vectors on a CPU
         (``xla_cpu_prefer_vector_width``; those of the physics are then yours to give too) or what
         is captured on a GPU (``xla_gpu_enable_command_buffer``). What the installed XLA does not
         know is left out.
+
+    Raises:
+        ValueError: there is no such platform.
     """
     return _options(_physics(env), platform)
 
@@ -89,9 +96,11 @@ def _physics(env: Any) -> Any:
 
 
 def _options(physics: Any, platform: str | None = None) -> dict[str, Any]:
-    if platform is not None:
-        check_choice("platform", platform, ("cpu", "gpu", "tpu"))
-    platform, flags = platform or jax.default_backend(), os.environ.get("XLA_FLAGS", "")
+    if platform is None:
+        platform = jax.default_backend()
+    else:
+        platform = _PLATFORMS[check_choice("platform", platform, _PLATFORMS)]
+    flags = os.environ.get("XLA_FLAGS", "")
     if platform == "gpu" and _COMMANDS not in flags:
         chosen: dict[str, Any] = {_COMMANDS: _CAPTURED}
     elif platform == "cpu" and _WIDTH not in flags:

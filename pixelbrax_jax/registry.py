@@ -86,6 +86,8 @@ def register(
         raise ValueError(f"task {name!r} is registered already; choose another name.")
     if not callable(make_physics):
         raise TypeError("make_physics must be a function that returns a Physics.")
+    if not isinstance(camera, CameraRig | Camera | None):
+        raise TypeError(f"camera must be a CameraRig, a Camera or None, got {camera!r}.")
     _OWN_TASKS[name] = _OwnTask(make_physics, None if camera is None else make_rig(name, camera))
 
 
@@ -139,7 +141,7 @@ def named_rigs(task: str) -> dict[str, CameraRig]:
     Returns:
         ``default``, ``side`` (seen along +y), ``front`` (along -x), ``top`` (from above, +y up in
         the image); ``original`` where the paper has the task; of the DM Control Suite the model's
-        own cameras that keep their orientation.
+        own cameras that keep their orientation, also in place of others of that name.
 
     Raises:
         ValueError: the task is unknown.

@@ -83,7 +83,12 @@ def test_on_a_gpu_loops_are_captured_unless_the_user_says_otherwise(monkeypatch)
 
     commands = "xla_gpu_enable_command_buffer"
     monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_prefer_vector_width=128")
-    assert "WHILE" in compiler_options(platform="gpu")[commands].split(",")
+    ours = compiler_options(platform="gpu")
+    assert "WHILE" in ours[commands].split(",")
+    assert compiler_options(platform="cuda") == ours
+    with monkeypatch.context() as patch:
+        patch.setattr("jax.default_backend", lambda: "gpu")
+        assert compiler_options() == ours
     monkeypatch.setenv("XLA_FLAGS", f"--{commands}=-WHILE")
     assert compiler_options(platform="gpu") == {}
     assert compiler_options(platform="tpu") == {}
@@ -92,8 +97,8 @@ def test_on_a_gpu_loops_are_captured_unless_the_user_says_otherwise(monkeypatch)
 def test_an_unknown_platform_is_named():
     from pixelbrax_jax.compilation import compiler_options
 
-    with pytest.raises(ValueError, match=r"platform.*'cuda'.*gpu"):
-        compiler_options(platform="cuda")
+    with pytest.raises(ValueError, match=r"unknown platform: 'cdua'; .* Did you mean 'cuda'"):
+        compiler_options(platform="cdua")
 
 
 EVERYTHING = """

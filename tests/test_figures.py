@@ -249,7 +249,10 @@ STATEMENTS = {
     "docs/dmc.md": (),
     "docs/accelerators.md": (
         ("moves {} to {} times the bytes of the frames", span(traffic_of_frames())),
-        ("would move up to {} times as many bytes", [f"{max(traffic_of_frames('plain renderer')):.0f}"]),
+        (
+            "would move up to {} times as many bytes",
+            [f"{max(traffic_of_frames('plain renderer')):.0f}"],
+        ),
         ("to which pixels add {} or {} launches", span(launches_of_pixels(), "{:.0f}")),
         ("at least {} us a kernel", [f"{LAUNCH_SECONDS * 1e6:.1f}"]),
         ("moves {} MB for {} MB of frames", tpu_frames()),

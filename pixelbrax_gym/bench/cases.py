@@ -129,11 +129,11 @@ COMPILED = {
     "gpu-program": Group(
         gpu_programs,
         compiled.gpu,
-        "Compiled, not run. A loop of unknown length counts as one turn, and makes the host wait "
-        "for the card. Parts for the host are launched one after the other, counted loops among "
-        "them; 1 is one CUDA graph. Bytes count what every kernel reads and writes once. The model "
-        "takes a kernel's bytes at the bandwidth of the card's data sheet, and 1.5 us at least: it "
-        "compares forms of a program, and is no measurement.",
+        "Compiled, not run. Parts for the host are launched one after the other, a loop outside a "
+        "graph among them as one; 1 is one CUDA graph. A loop of unknown length counts as one "
+        "turn; outside a graph the host waits for it. Bytes count what every kernel reads and "
+        "writes once. The model takes a kernel's bytes at the bandwidth of the card's data sheet, "
+        "and 1.5 us at least: it compares forms of a program, and is no measurement.",
         measured=False,
     ),
     "tpu-program": Group(

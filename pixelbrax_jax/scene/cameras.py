@@ -146,7 +146,7 @@ def make_rig(
     if not isinstance(camera, str):
         raise TypeError(
             "camera must be a name, a pixelbrax_jax.CameraRig or a pixelbrax_jax.Camera, "
-            f"got {camera!r}; names: pixelbrax_jax.named_rigs({task!r})."
+            f"got {camera!r}; names: {', '.join(sorted(rigs_of(task, fallback)))}."
         )
     rigs = rigs_of(task, fallback)
     return rigs[check_choice(f"camera of task {task!r}", camera, rigs)]

@@ -118,7 +118,7 @@ def _compile(topology: Any, platform: str, function: Any, arguments: Any) -> tup
     started = time.perf_counter()
     traced = jax.jit(ahead, in_shardings=where, out_shardings=where).trace(*arguments)
     lowered = traced.lower(lowering_platforms=(platform,))
-    compiled = lowered.compile(compiler_options(platform="gpu" if platform == "cuda" else platform))
+    compiled = lowered.compile(compiler_options(platform=platform))
     return compiled, round(time.perf_counter() - started, 1)
 
 
