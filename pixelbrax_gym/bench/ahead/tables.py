@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
+from itertools import compress
 
 from pixelbrax_gym.bench.case import Row
 from pixelbrax_gym.bench.tables import number, succeeded, table, title
 
 
-def gpu(rows: list[Row]) -> str:
-    """Programs for NVIDIA GPUs."""
+def gpu(rows: list[Row], left_out: Container[str] = ()) -> str:
+    """Programs for NVIDIA GPUs, without the columns that are left out."""
 
     def line(row: Row) -> Iterator[str]:
         values = row["values"]
@@ -40,7 +41,9 @@ def gpu(rows: list[Row]) -> str:
         "bytes spilled",
         "by a model, us",
     )
-    return table(heads, map(line, succeeded(rows)))
+    shown = [head not in left_out for head in heads]
+    lines = (compress(line(row), shown) for row in succeeded(rows))
+    return table(tuple(compress(heads, shown)), lines)
 
 
 def tpu(rows: list[Row]) -> str:
