@@ -74,27 +74,23 @@ def pair_of(run: dict) -> tuple[str, str]:
     return run["algorithm"], run["config"]["task"]
 
 
-def steps_per_second(run: dict) -> float:
-    """From the first line of a run's log to the last, evaluations included."""
-    steps, seconds = run["steps"], run["seconds"]
-    return (steps[-1] - steps[0]) / (seconds[-1] - seconds[0])
+def clocked(runs: dict[str, dict]) -> dict[str, dict]:
+    """The runs with the seconds that they take where nothing else computes; see `pace.py`.
 
-
-def undisturbed(runs: dict[str, dict]) -> dict[str, dict]:
-    """The runs with the seconds that they take at the speed of the fastest of their pair.
-
-    Runs are made in the background of other work, on several machines.
+    Those of which `pace.py` knows nothing keep their own.
     """
-    fastest: dict[tuple[str, str], dict] = {}
-    for run in sorted(runs.values(), key=steps_per_second):
-        fastest[pair_of(run)] = run
-    clocked = {}
+    presets = json.loads((FOLDER / "pace.json").read_text())["presets"]
+    found = dict(runs)
     for name, run in runs.items():
-        known = fastest[pair_of(run)]
-        compiling, rate = known["seconds_of_first_iteration"], steps_per_second(known)
-        seconds = [round(compiling + steps / rate, 1) for steps in run["steps"]]
-        clocked[name] = run | {"seconds": seconds}
-    return clocked
+        pace, config = presets.get("-".join(pair_of(run))), run["config"]
+        if pace is None:
+            continue
+        first = config["num_envs"] * config["num_steps"] * config["action_repeat"]
+        seconds = [
+            pace["first_iteration"] + (steps - first) * pace["step"] for steps in run["steps"]
+        ]
+        found[name] = run | {"seconds": [round(x, 1) for x in seconds]}
+    return found
 
 
 def return_at(run: dict, when: float, clock: str = "seconds", window: float = WINDOW) -> float:
@@ -284,9 +280,9 @@ def tables(runs: dict[str, list[dict]], untrained: dict[str, dict]) -> dict[str,
 
 
 def kept_runs() -> dict[str, dict]:
-    """All that is kept, by name, at the speed of undisturbed runs."""
+    """All that is kept, by name, with the seconds of undisturbed runs."""
     files = (FOLDER / "runs").glob("*.json")
-    return undisturbed({path.stem: json.loads(path.read_text()) for path in files})
+    return clocked({path.stem: json.loads(path.read_text()) for path in files})
 
 
 def main() -> None:
