@@ -9,8 +9,9 @@
 A run that was cut short, by Ctrl-C or by --minutes, goes on from its checkpoint at the next call.
 Of a finished one docs/results/runs/<name>.json is kept; `tests.benchmarks.results` draws all of
 them. Those in tasks of the DM Control Suite are kept in docs/dmc/runs, `tests.benchmarks.dmc_page`
-draws them. A run's minutes are those on its own clock: nothing else should compute meanwhile. The
-best policy of each of Brax's tasks goes into the package, for --pretrained.
+draws them, with the minutes on a run's own clock: nothing else should compute meanwhile. Those of
+Brax's tasks are computed, at the speed that `tests.benchmarks.pace` measures apart. The best policy
+of each of Brax's tasks goes into the package, for --pretrained.
 """
 
 from __future__ import annotations
