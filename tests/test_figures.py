@@ -261,7 +261,11 @@ STATEMENTS = {
         ("{} on HalfCheetah", [mean_end("ppo-halfcheetah")]),
         ("{} on Ant", [mean_end("ppo-ant")]),
         ("{} on Humanoid", [mean_end("ppo-humanoid")]),
-        ("encoder, {} on HalfCheetah in a run", [mean_end("ppo-halfcheetah-long")]),
+        (
+            "the length {} on Ant, {} on Humanoid, and",
+            [mean_end("ppo-ant-long"), mean_end("ppo-humanoid-long")],
+        ),
+        ("encoder, {} on HalfCheetah.", [mean_end("ppo-halfcheetah-long")]),
         ("more than no action does, {}", [without_action("ant")]),
         (
             "which sees the state, ends at {} after",
