@@ -18,7 +18,7 @@ from pixelbrax_gym.gymnasium.window import Window
 from pixelbrax_jax.extras import install_extra
 from pixelbrax_jax.policy import load_policy
 from pixelbrax_jax.validation import check_positive_int
-from pixelbrax_jax.video import write_frames
+from pixelbrax_jax.video import NO_IMAGEIO, write_frames
 
 ENV_OPTIONS = ("backend", "camera", "look", "shadows", "distractors", "clips", "split")
 """Options of an environment that the command takes; one that is not given stays as it is."""
@@ -39,8 +39,7 @@ def play(options: argparse.Namespace) -> int:
         lacking = "" if options.gif else _no_window()
         written = options.gif or (f"{options.task}.gif" if lacking else None)
         if written and find_spec("imageio") is None:
-            fix = f"a video needs imageio; try: {install_extra('video')}"
-            raise ImportError(f"{lacking}; {fix}" if lacking else fix)
+            raise ImportError(f"{lacking}; {NO_IMAGEIO}" if lacking else NO_IMAGEIO)
         if lacking:
             sys.stderr.write(f"pixelbrax play: {lacking}; writing {written} in its place\n")
         sys.stderr.write("pixelbrax play: compiling, which may take two minutes\n")

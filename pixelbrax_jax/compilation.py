@@ -36,10 +36,11 @@ def compiler_options(env: Any = None, platform: str | None = None) -> dict[str, 
     the ray-caster is up to twice as fast. CPUs without such vectors are not affected. Some physics
     is faster with options of its own, and scenes of many geoms are drawn faster with XLA's older
     emitters. On a GPU: loops of which all parts can be are captured in CUDA graphs, so that the
-    host launches a step of Brax's tasks at once.
-    A TPU needs none. Whatever PixelBrax compiles by itself for the Gymnasium, TorchRL and
-    Stable-Baselines3 environments and for its agents has these options.
-    A program of your own gets them at its outermost ``jax.jit``, the only one that takes options:
+    host launches a step of Brax's tasks at once. A TPU needs none.
+
+    Whatever PixelBrax compiles by itself for the Gymnasium, TorchRL and Stable-Baselines3
+    environments and for its agents has these options. A program of your own gets them at its
+    outermost ``jax.jit``, the only one that takes options:
 
         step = jax.jit(env.step, compiler_options=pixelbrax_jax.compiler_options(env))
 

@@ -78,7 +78,7 @@ def register(
 
     Raises:
         ValueError: the name is taken or empty.
-        TypeError: ``make_physics`` is not callable.
+        TypeError: ``make_physics`` is not callable, or ``camera`` is of another type.
     """
     if not isinstance(name, str) or not name:
         raise ValueError(f"a task needs a name, got {name!r}.")

@@ -12,6 +12,7 @@ import numpy as np
 from pixelbrax_jax.extras import install_extra
 
 SUFFIXES = (".gif", ".mp4")
+NO_IMAGEIO = f"a video needs imageio; try: {install_extra('video')}"
 
 
 def write_frames(path: str | Path, frames: Iterable[np.ndarray], fps: int) -> Path:
@@ -36,7 +37,7 @@ def write_frames(path: str | Path, frames: Iterable[np.ndarray], fps: int) -> Pa
     try:
         import imageio.v2 as imageio
     except ImportError as error:
-        raise ImportError(f"a video needs imageio; try: {install_extra('video')}") from error
+        raise ImportError(NO_IMAGEIO) from error
     path.parent.mkdir(parents=True, exist_ok=True)
     moving = {"duration": 1000.0 / fps, "loop": 0}
     options = moving if path.suffix == ".gif" else {"fps": fps, "macro_block_size": 1}

@@ -138,7 +138,6 @@ def record(folder: Path, arguments: list[str]) -> dict:
         "config": about["config"],
         "machine": describe_cpu(),
         "versions": {name: version(name) for name in packages},
-        "seconds_of_first_iteration": records[0]["seconds"],
         "steps": [r["steps"] for r in training],
         "seconds": [round(r["seconds"], 1) for r in training],
         "episodes": [int(r["episode/count"]) for r in training],

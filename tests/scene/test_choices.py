@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pixelbrax_jax import make_look, rig
+from pixelbrax_jax import list_envs, make_look, register, rig
 from pixelbrax_jax.scene.cameras import make_rig, rigs_of
 
 OWN = {
@@ -47,3 +47,9 @@ def test_cameras_of_a_model_are_rigs_by_name():
 
 def test_a_row_of_a_task_comes_before_a_fallback():
     assert rigs_of("ant", OWN["back"])["default"] is rigs_of("ant")["default"]
+
+
+def test_a_task_with_a_camera_of_another_kind_is_not_registered():
+    with pytest.raises(TypeError, match="camera must be a CameraRig, a Camera or None, got 'side'"):
+        register("a task", lambda: None, camera="side")
+    assert "a task" not in list_envs()
