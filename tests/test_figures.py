@@ -13,6 +13,7 @@ import pytest
 from pixelbrax_gym.bench.ahead.targets import LAUNCH_SECONDS
 from pixelbrax_gym.bench.cases import TASKS
 from pixelbrax_gym.bench.tables import find, number
+from pixelbrax_jax.policy import read_pretrained
 from tests.benchmarks import dmc_page, performance, results
 from tests.benchmarks.original import ORIGINAL
 from tests.benchmarks.pages import drawn, without_tables
@@ -204,6 +205,19 @@ def without_action(task: str) -> str:
     return f"{read('results/untrained.json')[task]['none']['return']:,.0f}"
 
 
+def by_brax_reward(task: str) -> float:
+    kept = read("results/by_brax_reward.json")[task]
+    assert kept["command"] == read_pretrained(task)["command"]
+    return kept["return"]
+
+
+def pretrained_length(task: str) -> float:
+    """Control steps of an episode of the pretrained policy."""
+    command = read_pretrained(task)["command"]
+    (run,) = (run for run in results.kept_runs().values() if run["command"] == command)
+    return run["evaluations"][-1]["clean/length"]
+
+
 STATEMENTS = {
     "README.md": (
         ("cheetah run make {} steps", [number(suite_speed("dmc_cheetah_run")[0])]),
@@ -258,11 +272,13 @@ STATEMENTS = {
         ("moves {} MB for {} MB of frames", tpu_frames()),
     ),
     "docs/results.md": (
-        ("{} on HalfCheetah", [mean_end("ppo-halfcheetah")]),
-        ("{} on Ant", [mean_end("ppo-ant")]),
-        ("{} on Humanoid", [mean_end("ppo-humanoid")]),
         (
-            "the length {} on Ant, {} on Humanoid, and",
+            "{} on HalfCheetah, {} on Ant and {} on Humanoid",
+            [mean_end(f"ppo-{task}") for task in ("halfcheetah", "ant", "humanoid")],
+        ),
+        ("{} by the paper's reward", [mean_end("ppo-walker2d")]),
+        (
+            "length it reaches {} on Ant, {} on Humanoid, and",
             [mean_end("ppo-ant-long"), mean_end("ppo-humanoid-long")],
         ),
         ("encoder, {} on HalfCheetah.", [mean_end("ppo-halfcheetah-long")]),
@@ -271,6 +287,8 @@ STATEMENTS = {
             "which sees the state, ends at {} after",
             [f"{read('results/from_state.json')['walker2d x 1']['return'][-1]:,.0f}"],
         ),
+        ("it runs, and earns {} by Brax's", [f"{by_brax_reward('walker2d'):,.0f}"]),
+        ("after {} of 1000 steps on average", [f"{pretrained_length('walker2d'):.0f}"]),
     ),
 }
 """Page -> what it says, and the figures in it."""
@@ -283,6 +301,7 @@ FROM_OTHERS = {
     "docs/accelerators.md": ("JAX 0.10.2",),
     "docs/results.md": (
         "which earns up to 1,000",
+        "standing earns 1,000",
         "took 0.5 from its pixels",
         "With 0.5 taken from the pixels",
         "0.6 MB each",

@@ -85,6 +85,10 @@ def experiments() -> dict[str, list[str]]:
             for name, options in DISTRACTORS.items():
                 for algorithm in ALGORITHMS:
                     add(algorithm, task, seed, *options, "--num-evals", "1", name=name)
+    for seed in range(2):
+        for algorithm in ALGORITHMS:
+            more = ("--reward-preset", "brax", "--num-evals", "3")
+            add(algorithm, "walker2d", seed, *more, name="brax")
     for algorithm in ALGORITHMS:
         add(algorithm, "inverted_pendulum", 0, "--num-evals", "3")
     for seed in range(3):
@@ -225,8 +229,10 @@ def main() -> int:
         kept = record(folder, arguments)
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(kept) + "\n")
-        if kept["config"]["task"] in TASKS and not kept["config"]["distractors"]:
-            offer(kept["config"]["task"], folder, kept)
+        task, reward = kept["config"]["task"], kept["config"]["reward_preset"]
+        by_preset = task in TASKS and reward == preset("ppo", "cpu", task).reward_preset
+        if by_preset and not kept["config"]["distractors"]:
+            offer(task, folder, kept)
     if failed:
         print(f"failed: {', '.join(failed)}", file=sys.stderr)
     return bool(failed)

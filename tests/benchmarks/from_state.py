@@ -1,7 +1,7 @@
 """What Brax's own PPO learns from the state in the environments of docs/results.md.
 
     python -m tests.benchmarks.from_state                     every task of the preset cpu
-    python -m tests.benchmarks.from_state --tasks humanoid
+    python -m tests.benchmarks.from_state --tasks walker2d --reward-preset brax
 
 It tells a hard task from an agent that does not see: same physics, rewards, action repeat,
 discount, environments, rollouts and number of steps, Brax's networks and Adam's usual step size.
@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from brax.training.agents.ppo import train as ppo
@@ -19,7 +20,8 @@ from brax.training.agents.ppo import train as ppo
 from pixelbrax_jax import BraxPixelEnv, make, wrap_fresh_episodes
 from pixelbrax_jax.agents.algorithms.presets import TASK_SETTINGS, preset
 from pixelbrax_jax.agents.core.config import TrainConfig
-from pixelbrax_jax.tasks import BRAX_TASKS
+from pixelbrax_jax.tasks import BRAX_TASKS, REWARD_PRESETS
+from tests.benchmarks.results import task_name
 
 OUTPUT = Path(__file__).parents[2] / "docs" / "results" / "from_state.json"
 
@@ -40,7 +42,8 @@ def keep(config: TrainConfig, times: int, evaluations: int) -> None:
         found["length"].append(float(metrics["eval/avg_episode_length"]) * config.action_repeat)
         print(config.task, found["steps"][-1], found["return"][-1], flush=True)
         known = json.loads(OUTPUT.read_text()) if OUTPUT.exists() else {}
-        OUTPUT.write_text(json.dumps(known | {f"{config.task} x {times}": found}) + "\n")
+        name = f"{task_name(asdict(config))} x {times}"
+        OUTPUT.write_text(json.dumps(known | {name: found}) + "\n")
 
     ppo.train(
         env,
@@ -71,9 +74,12 @@ def main() -> None:
     tasks = [task for task in TASK_SETTINGS["cpu"]["ppo"] if task in BRAX_TASKS]
     parser.add_argument("--tasks", nargs="+", choices=tasks, default=tasks)
     parser.add_argument("--times", type=int, default=1, help="the preset's number of steps")
+    parser.add_argument("--reward-preset", choices=REWARD_PRESETS, help="in place of the preset's")
     options = parser.parse_args()
     for task in options.tasks:
-        keep(preset("ppo", "cpu", task), options.times, 10)
+        config = preset("ppo", "cpu", task)
+        reward = options.reward_preset or config.reward_preset
+        keep(replace(config, reward_preset=reward), options.times, 10)
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -16,8 +17,10 @@ import numpy as np
 
 from pixelbrax_gym.bench.tables import table as markdown_table
 from pixelbrax_jax import VectorPixelEnv, make
-from pixelbrax_jax.agents.runner.evaluate import interquartile_mean
-from tests.benchmarks.experiments import REVISION
+from pixelbrax_jax.agents.runner.evaluate import Evaluator, interquartile_mean, make_split
+from pixelbrax_jax.agents.runner.trained import load_pretrained
+from pixelbrax_jax.policy import read_pretrained
+from tests.benchmarks.experiments import EPISODES, REVISION
 from tests.benchmarks.pages import redraw
 
 FOLDER = Path(__file__).parents[2] / "docs" / "results"
@@ -28,6 +31,12 @@ WINDOW = 60.0
 
 TASK_SETTINGS = ("task", "backend", "reward_preset", "action_repeat", "episode_length")
 """Settings that decide what a return means."""
+
+
+def task_name(settings: dict) -> str:
+    """A task as the page calls it: with its reward where that is not Brax's."""
+    reward = settings["reward_preset"]
+    return settings["task"] + ("" if reward == "brax" else f", reward `{reward}`")
 
 
 def untrained(settings: dict, episodes: int = 256) -> dict:
@@ -58,15 +67,32 @@ def untrained(settings: dict, episodes: int = 256) -> dict:
 
 
 def baselines(runs: dict[str, dict]) -> dict[str, dict]:
-    """What is earned without learning, by task; played where it is not known yet."""
+    """What is earned without learning, by `task_name`; played where it is not known yet."""
     path = FOLDER / "untrained.json"
     known = json.loads(path.read_text()) if path.exists() else {}
     for run in runs.values():
         settings = {name: run["config"][name] for name in TASK_SETTINGS}
-        if known.get(settings["task"], {}).get("settings") != settings:
-            known[settings["task"]] = untrained(settings)
+        name = task_name(settings)
+        if known.get(name, {}).get("settings") != settings:
+            known[name] = untrained(settings)
     path.write_text(json.dumps(known, indent=1) + "\n")
     return known
+
+
+def by_brax_reward(task: str) -> dict:
+    """What the pretrained policy of a task, trained by another reward, earns by Brax's."""
+    path = FOLDER / "by_brax_reward.json"
+    known = json.loads(path.read_text()) if path.exists() else {}
+    command = read_pretrained(task)["command"]
+    if known.get(task, {}).get("command") != command:
+        agent = load_pretrained(task)
+        config = replace(agent.algorithm.config, reward_preset="brax")
+        play = Evaluator(agent.algorithm, *make_split(config, "clean"), num_episodes=EPISODES)
+        result = play(agent.networks)
+        found = {"return": result.mean, "standard_error": result.standard_error}
+        known[task] = {"command": command, "episodes": EPISODES} | found
+        path.write_text(json.dumps(known, indent=1) + "\n")
+    return known[task]
 
 
 def pair_of(run: dict) -> tuple[str, str]:
@@ -171,8 +197,8 @@ def table(runs: dict[str, list[dict]], untrained: dict[str, dict]) -> str:
             blank = " | " * len(MINUTES)
             lines.append(f"| {task} | {text} | {blank} | {value:,.0f} ± {error:,.0f} | | |")
         for name, seeds in runs.items():
-            algorithm, of_task, *variant = name.split("-")
-            if of_task != task or variant not in ([], ["long"]):
+            config = seeds[0]["config"]
+            if task_name(config) != task or config["distractors"]:
                 continue
             times = " | ".join(middle([return_at(r, 60.0 * m) for r in seeds]) for m in MINUTES)
             ends = middle([final(run)["return"] for run in seeds])
@@ -181,7 +207,7 @@ def table(runs: dict[str, list[dict]], untrained: dict[str, dict]) -> str:
                 for name in ("random", "none")
             )
             minutes = np.median([run["seconds"][-1] for run in seeds]) / 60.0
-            agent = f"{algorithm.upper()}, {minutes:.0f} min"
+            agent = f"{seeds[0]['algorithm'].upper()}, {minutes:.0f} min"
             lines.append(
                 f"| {task} | {agent} | {seeds_of(seeds)} | {times} | {ends} | {random} | {none} |"
             )
@@ -195,15 +221,16 @@ def distracted_table(runs: dict[str, list[dict]]) -> str:
         "held out / training |",
         "|---|---|---|---|---|---|---|---|",
     ]
-    for name, seeds in sorted(runs.items(), key=lambda item: item[0].split("-")[1:]):
-        algorithm, task, *variant = name.split("-")
-        if variant in ([], ["long"]):
+    for _, seeds in sorted(runs.items(), key=lambda item: item[0].split("-")[1:]):
+        config = seeds[0]["config"]
+        if not config["distractors"]:
             continue
         splits = [[final(r, s)["return"] for r in seeds] for s in ("clean", "train", "test")]
         share = np.mean(splits[2]) / np.mean(splits[1])
         cells = " | ".join(middle(scores) for scores in splits)
-        who = f"`paper-{variant[0]}` | {algorithm.upper()} | {seeds_of(seeds)}"
-        lines.append(f"| {task} | {who} | {cells} | {share:.2f} |")
+        distractors = ", ".join(f"`{x}`" for x in config["distractors"])
+        who = f"{task_name(config)} | {distractors} | {seeds[0]['algorithm'].upper()}"
+        lines.append(f"| {who} | {seeds_of(seeds)} | {cells} | {share:.2f} |")
     return "\n".join(lines) + "\n" if len(lines) > 2 else "Not run yet.\n"
 
 
@@ -235,12 +262,13 @@ def plot(runs: dict[str, list[dict]], untrained: dict[str, dict], path: Path) ->
     import matplotlib.pyplot as plt
 
     shown = {name: seeds for name, seeds in runs.items() if name.count("-") == 1}
-    tasks = [task for task in untrained if any(name.endswith(task) for name in shown)]
+    tasks = list(dict.fromkeys(pair_of(seeds[0])[1] for seeds in shown.values()))
     figure, panels = plt.subplots(
         1, len(tasks), figsize=(4 * len(tasks), 3.4), layout="constrained", squeeze=False
     )
     colors = {"ppo": "C0", "ppg": "C1", "dcpg": "C2"}
     for task, axes in zip(tasks, panels[0], strict=True):
+        title = next(task_name(r[0]["config"]) for r in shown.values() if pair_of(r[0])[1] == task)
         for name in (f"{algorithm}-{task}" for algorithm in colors):
             if name not in shown:
                 continue
@@ -260,9 +288,9 @@ def plot(runs: dict[str, list[dict]], untrained: dict[str, dict], path: Path) ->
         for kind, style in (("random", ":"), ("none", "--")):
             label = {"random": "random policy", "none": "no action"}[kind]
             axes.axhline(
-                untrained[task][kind]["return"], color="gray", linestyle=style, label=label
+                untrained[title][kind]["return"], color="gray", linestyle=style, label=label
             )
-        axes.set(xlabel="million control steps", title=task)
+        axes.set(xlabel="million control steps", title=title)
         axes.grid(alpha=0.3)
     panels[0][0].set_ylabel("return of training episodes")
     for axes in panels[0]:
@@ -291,6 +319,7 @@ def main() -> None:
     if not runs:
         raise SystemExit("no run is kept yet: python -m tests.benchmarks.experiments makes them")
     without, grouped = baselines(runs), groups(runs)
+    by_brax_reward("walker2d")
     redraw(PAGE, tables(grouped, without))
     plot(grouped, without, FOLDER / "clean.png")
 
