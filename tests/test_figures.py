@@ -13,8 +13,8 @@ import pytest
 from pixelbrax_gym.bench.ahead.targets import LAUNCH_SECONDS
 from pixelbrax_gym.bench.cases import TASKS
 from pixelbrax_gym.bench.tables import find, number
-from pixelbrax_jax.policy import read_pretrained
 from tests.benchmarks import dmc_page, performance, results
+from tests.benchmarks.elsewhere import CASES, identity
 from tests.benchmarks.original import ORIGINAL
 from tests.benchmarks.pages import drawn, without_tables
 from tests.test_docs import without_code
@@ -205,17 +205,15 @@ def without_action(task: str) -> str:
     return f"{read('results/untrained.json')[task]['none']['return']:,.0f}"
 
 
-def by_brax_reward(task: str) -> float:
-    kept = read("results/by_brax_reward.json")[task]
-    assert kept["command"] == read_pretrained(task)["command"]
-    return kept["return"]
+def mean_length(name: str) -> str:
+    """Control steps of an episode of the mean action at the end."""
+    lengths = [results.final(run)["length"] for run in groups()[name]]
+    return f"{sum(lengths) / len(lengths):.0f}"
 
 
-def pretrained_length(task: str) -> float:
-    """Control steps of an episode of the pretrained policy."""
-    command = read_pretrained(task)["command"]
-    (run,) = (run for run in results.kept_runs().values() if run["command"] == command)
-    return run["evaluations"][-1]["clean/length"]
+def elsewhere(name: str) -> str:
+    """What a pretrained policy earns where it was not trained."""
+    return f"{read('results/elsewhere.json')[name]['return']:,.0f}"
 
 
 STATEMENTS = {
@@ -272,23 +270,23 @@ STATEMENTS = {
         ("moves {} MB for {} MB of frames", tpu_frames()),
     ),
     "docs/results.md": (
+        ("{} on HalfCheetah; {} on Ant", [mean_end(f"ppo-{t}") for t in ("halfcheetah", "ant")]),
         (
-            "{} on HalfCheetah, {} on Ant and {} on Humanoid",
-            [mean_end(f"ppo-{task}") for task in ("halfcheetah", "ant", "humanoid")],
+            "{} on Humanoid, which falls after {} of 1,000 steps",
+            [mean_end("ppo-humanoid"), mean_length("ppo-humanoid")],
         ),
-        ("{} by the paper's reward", [mean_end("ppo-walker2d")]),
+        ("{} on Walker2d by the paper's reward", [mean_end("ppo-walker2d")]),
+        ("walks, and falls after {}.", [mean_length("ppo-walker2d")]),
         (
-            "length it reaches {} on Ant, {} on Humanoid, and",
-            [mean_end("ppo-ant-long"), mean_end("ppo-humanoid-long")],
+            "times the length {} on Ant, {} on Humanoid, {} on HalfCheetah",
+            [mean_end(f"ppo-{task}-long") for task in ("ant", "humanoid", "halfcheetah")],
         ),
-        ("encoder, {} on HalfCheetah.", [mean_end("ppo-halfcheetah-long")]),
-        ("more than no action does, {}", [without_action("ant")]),
+        ("where standing still earns {}", [without_action("ant-brax")]),
         (
-            "which sees the state, ends at {} after",
-            [f"{read('results/from_state.json')['walker2d x 1']['return'][-1]:,.0f}"],
+            "earns {} under videos that it does not know, and {} under colors",
+            [elsewhere(f"halfcheetah under paper-{name}") for name in ("video", "color")],
         ),
-        ("it runs, and earns {} by Brax's", [f"{by_brax_reward('walker2d'):,.0f}"]),
-        ("after {} of 1000 steps on average", [f"{pretrained_length('walker2d'):.0f}"]),
+        ("earns {} by Brax's", [elsewhere("walker2d by Brax's reward")]),
     ),
 }
 """Page -> what it says, and the figures in it."""
@@ -301,10 +299,11 @@ FROM_OTHERS = {
     "docs/accelerators.md": ("JAX 0.10.2",),
     "docs/results.md": (
         "which earns up to 1,000",
-        "standing earns 1,000",
-        "took 0.5 from its pixels",
-        "With 0.5 taken from the pixels",
+        "where standing earns 1,000",
+        "of 1,000 steps these lasted",
+        "takes 0.5 from its pixels",
         "0.6 MB each",
+        "PixelBrax 0.1.0",
     ),
 }
 """Page -> what it says that is not of ours to measure."""
@@ -354,10 +353,15 @@ def test_tables_of_dm_control_are_those_of_the_results(name):
     assert drawn(dmc_page.PAGE, name) == dmc_page.page_tables()[name]
 
 
-@pytest.mark.parametrize("name", ["clean", "distracted", "centering"])
+@pytest.mark.parametrize("name", ["clean", "distracted", "pretrained", "centering"])
 def test_tables_of_results_are_those_of_the_runs(name):
-    tables = results.tables(groups(), read("results/untrained.json"))
-    assert drawn(results.PAGE, name) == tables[name]
+    assert drawn(results.PAGE, name) == results.tables(groups())[name]
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_what_a_policy_earns_elsewhere_is_of_the_policy_of_today(name):
+    task, *_ = CASES[name]
+    assert read("results/elsewhere.json")[name]["policy"] == identity(task)
 
 
 def test_a_figure_is_seen():

@@ -18,7 +18,13 @@ from pixelbrax_jax.agents.runner.train_command import parse
 from pixelbrax_jax.agents.runner.trained import load_config
 from pixelbrax_jax.cli import main
 from pixelbrax_jax.tasks import TASKS
-from tests.benchmarks.experiments import experiments, gpu_experiments
+from tests.benchmarks.experiments import (
+    config_of,
+    experiments,
+    gpu_experiments,
+    is_made,
+    kept_at,
+)
 
 TINY = (
     *("--task", "inverted_pendulum", "--height", "18", "--width", "18", "--frame-stack", "1"),
@@ -71,17 +77,20 @@ RUNS = experiments() | gpu_experiments()
 
 @pytest.mark.parametrize("name", RUNS)
 def test_the_runs_of_the_results_are_valid(name):
-    _, algorithm, *line = RUNS[name]
-    name_of_preset = "default"
-    if "--preset" in line:
-        _, name_of_preset, *line = line
-    config, _ = parse(algorithm, name_of_preset, line)
-    assert name.startswith(f"{algorithm}-{config.task}-")
+    config = config_of(RUNS[name])
+    assert name.startswith(f"{RUNS[name][1]}-{config.task}-")
     if name in gpu_experiments():
         assert config.total_steps >= 25_000_000
     # The largest buffer, that of PPG and DCPG, in bytes.
     frames = config.num_envs * (config.num_steps + 2) * config.height * config.width * 3
     assert frames * getattr(config, "num_policy_phases", 0) < 25e9
+
+
+def test_a_kept_run_of_other_settings_is_not_taken_for_made(tmp_path):
+    name, other = "ppo-walker2d-0", "ppo-walker2d-brax-0"
+    assert is_made(kept_at(name), RUNS[name])
+    assert not is_made(kept_at(other), RUNS[name])
+    assert not is_made(tmp_path / "none.json", RUNS[name])
 
 
 def test_errors_name_the_setting_and_the_cure(capsys):

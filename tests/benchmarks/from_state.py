@@ -21,7 +21,7 @@ from pixelbrax_jax import BraxPixelEnv, make, wrap_fresh_episodes
 from pixelbrax_jax.agents.algorithms.presets import TASK_SETTINGS, preset
 from pixelbrax_jax.agents.core.config import TrainConfig
 from pixelbrax_jax.tasks import BRAX_TASKS, REWARD_PRESETS
-from tests.benchmarks.results import task_name
+from tests.benchmarks.results import task_key
 
 OUTPUT = Path(__file__).parents[2] / "docs" / "results" / "from_state.json"
 
@@ -42,7 +42,7 @@ def keep(config: TrainConfig, times: int, evaluations: int) -> None:
         found["length"].append(float(metrics["eval/avg_episode_length"]) * config.action_repeat)
         print(config.task, found["steps"][-1], found["return"][-1], flush=True)
         known = json.loads(OUTPUT.read_text()) if OUTPUT.exists() else {}
-        name = f"{task_name(asdict(config))} x {times}"
+        name = f"{task_key(asdict(config))} x {times}"
         OUTPUT.write_text(json.dumps(known | {name: found}) + "\n")
 
     ppo.train(

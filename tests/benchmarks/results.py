@@ -9,18 +9,15 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import replace
 from pathlib import Path
 
-import jax
 import numpy as np
 
 from pixelbrax_gym.bench.tables import table as markdown_table
-from pixelbrax_jax import VectorPixelEnv, make
-from pixelbrax_jax.agents.runner.evaluate import Evaluator, interquartile_mean, make_split
-from pixelbrax_jax.agents.runner.trained import load_pretrained
+from pixelbrax_jax import list_pretrained
+from pixelbrax_jax.agents.runner.evaluate import interquartile_mean
 from pixelbrax_jax.policy import read_pretrained
-from tests.benchmarks.experiments import EPISODES, REVISION
+from tests.benchmarks.experiments import TASKS
 from tests.benchmarks.pages import redraw
 
 FOLDER = Path(__file__).parents[2] / "docs" / "results"
@@ -29,75 +26,18 @@ MINUTES = (1, 3, 5, 15)
 WINDOW = 60.0
 """Seconds whose training episodes make one point."""
 
-TASK_SETTINGS = ("task", "backend", "reward_preset", "action_repeat", "episode_length")
-"""Settings that decide what a return means."""
+OWNERS = {"brax": "Brax's", "paper": "the paper's"}
+"""Whose rewards a preset has."""
 
 
-def task_name(settings: dict) -> str:
-    """A task as the page calls it: with its reward where that is not Brax's."""
-    reward = settings["reward_preset"]
-    return settings["task"] + ("" if reward == "brax" else f", reward `{reward}`")
+def read(name: str) -> dict:
+    """A JSON file beside the runs."""
+    return json.loads((FOLDER / name).read_text("utf-8"))
 
 
-def untrained(settings: dict, episodes: int = 256) -> dict:
-    """Returns of whole episodes under uniform actions in [-1, 1], and under none (0)."""
-    env, params = make(obs_mode="state", **settings)
-    envs = VectorPixelEnv(env, episodes, "disabled")
-    steps = -(-settings["episode_length"] // env.action_repeat)
-
-    @jax.jit
-    def play(key, params, scale):
-        def step(state, key):
-            action = scale * jax.random.uniform(key, (episodes, env.action_size), minval=-1.0)
-            state, timestep = envs.step(state, action, params)
-            over = timestep.terminated | timestep.truncated
-            return state, (timestep.info["episode_return"], over)
-
-        first, rest = jax.random.split(key)
-        state, _ = envs.reset(first, params)
-        _, (returns, over) = jax.lax.scan(step, state, jax.random.split(rest, steps))
-        return returns[over.argmax(0), np.arange(episodes)]
-
-    result = {"settings": settings, "episodes": episodes}
-    for name, scale in (("random", 1.0), ("none", 0.0)):
-        returns = np.asarray(play(jax.random.key(0), params, scale))
-        error = float(returns.std(ddof=1) / np.sqrt(episodes))
-        result[name] = {"return": float(returns.mean()), "standard_error": error}
-    return result
-
-
-def baselines(runs: dict[str, dict]) -> dict[str, dict]:
-    """What is earned without learning, by `task_name`; played where it is not known yet."""
-    path = FOLDER / "untrained.json"
-    known = json.loads(path.read_text()) if path.exists() else {}
-    for run in runs.values():
-        settings = {name: run["config"][name] for name in TASK_SETTINGS}
-        name = task_name(settings)
-        if known.get(name, {}).get("settings") != settings:
-            known[name] = untrained(settings)
-    path.write_text(json.dumps(known, indent=1) + "\n")
-    return known
-
-
-def by_brax_reward(task: str) -> dict:
-    """What the pretrained policy of a task, trained by another reward, earns by Brax's."""
-    path = FOLDER / "by_brax_reward.json"
-    known = json.loads(path.read_text()) if path.exists() else {}
-    command = read_pretrained(task)["command"]
-    if known.get(task, {}).get("command") != command:
-        agent = load_pretrained(task)
-        config = replace(agent.algorithm.config, reward_preset="brax")
-        play = Evaluator(agent.algorithm, *make_split(config, "clean"), num_episodes=EPISODES)
-        result = play(agent.networks)
-        found = {"return": result.mean, "standard_error": result.standard_error}
-        known[task] = {"command": command, "episodes": EPISODES} | found
-        path.write_text(json.dumps(known, indent=1) + "\n")
-    return known[task]
-
-
-def pair_of(run: dict) -> tuple[str, str]:
-    """Algorithm and task."""
-    return run["algorithm"], run["config"]["task"]
+def task_key(config: dict) -> str:
+    """A task and its rewards, as files name them."""
+    return f"{config['task']}-{config['reward_preset']}"
 
 
 def clocked(runs: dict[str, dict]) -> dict[str, dict]:
@@ -105,10 +45,11 @@ def clocked(runs: dict[str, dict]) -> dict[str, dict]:
 
     Those of which `pace.py` knows nothing keep their own.
     """
-    presets = json.loads((FOLDER / "pace.json").read_text())["presets"]
+    presets = read("pace.json")["presets"]
     found = dict(runs)
     for name, run in runs.items():
-        pace, config = presets.get("-".join(pair_of(run))), run["config"]
+        config = run["config"]
+        pace = presets.get(f"{run['algorithm']}-{config['task']}")
         if pace is None:
             continue
         first = config["num_envs"] * config["num_steps"] * config["action_repeat"]
@@ -142,24 +83,28 @@ def return_at(run: dict, when: float, clock: str = "seconds", window: float = WI
 
 
 def groups(runs: dict[str, dict]) -> dict[str, list[dict]]:
-    """Runs that differ in their seeds alone, by their common name; the latest revision of each."""
+    """Runs that differ in their seeds alone, by their common name."""
     found: dict[str, list[dict]] = {}
     for name in sorted(runs):
         found.setdefault(re.sub(r"-\d+$", "", name), []).append(runs[name])
-    for name, seeds in found.items():
-        latest = max(run["revision"] for run in seeds)
-        found[name] = [run for run in seeds if run["revision"] == latest]
     return found
 
 
-def is_latest(runs: list[dict]) -> bool:
-    """Whether runs of one name are of what the presets train today."""
-    return runs[0]["revision"] == REVISION
+def by_task(runs: dict[str, list[dict]]) -> dict[str, dict[str, list[dict]]]:
+    """Groups without distractors by `task_key`; the presets' own rewards before others."""
+    clean = {name: seeds for name, seeds in runs.items() if not seeds[0]["config"]["distractors"]}
+    place = {task: number for number, task in enumerate(TASKS)}
+    found: dict[str, dict[str, list[dict]]] = {}
+    for name in sorted(clean, key=lambda name: (place.get(name.split("-")[1], 9), "brax" in name)):
+        found.setdefault(task_key(clean[name][0]["config"]), {})[name] = clean[name]
+    return found
 
 
-def seeds_of(runs: list[dict]) -> str:
-    """How many there are, with a star for those of an earlier revision."""
-    return f"{len(runs)}{'' if is_latest(runs) else '*'}"
+def title(key: str, keys: list[str]) -> str:
+    """A task as the page calls it: with its reward where another one is there, too."""
+    task, reward = key.rsplit("-", 1)
+    alone = sum(other.rsplit("-", 1)[0] == task for other in keys) == 1
+    return task if alone else f"{task}, {OWNERS[reward]} reward"
 
 
 def middle(scores: list[float]) -> str:
@@ -172,156 +117,165 @@ def middle(scores: list[float]) -> str:
 
 
 def final(run: dict, split: str = "clean") -> dict:
-    """Return and standard error of the last evaluation."""
+    """Return, standard error and length of an episode of the last evaluation."""
     last = run["evaluations"][-1]
-    return {name: last[f"{split}/{name}"] for name in ("return", "standard_error")}
+    return {name: last[f"{split}/{name}"] for name in ("return", "standard_error", "length")}
+
+
+def reached(seeds: list[dict]) -> str:
+    """The last evaluation: of one seed with its standard error."""
+    ends = [final(run) for run in seeds]
+    if len(ends) > 1:
+        return middle([end["return"] for end in ends])
+    return f"{ends[0]['return']:,.0f} ± {ends[0]['standard_error']:,.0f}"
 
 
 def distance(run: dict, other: dict) -> float:
     """Standard errors by which the last evaluation is above what is earned without learning."""
-    reached = final(run)
-    error = np.hypot(reached["standard_error"], other["standard_error"])
-    return (reached["return"] - other["return"]) / error
+    end = final(run)
+    error = np.hypot(end["standard_error"], other["standard_error"])
+    return (end["return"] - other["return"]) / error
 
 
-def table(runs: dict[str, list[dict]], untrained: dict[str, dict]) -> str:
-    """Return over time, clean, in Markdown."""
-    lines = [
-        "| task | agent | seeds | " + " | ".join(f"{m} min" for m in MINUTES) + " | mean action, "
-        "at the end | above random | above no action |",
-        "|" + "---|" * (6 + len(MINUTES)),
-    ]
-    for task, without in untrained.items():
-        for name, text in (("random", "random policy"), ("none", "no action")):
-            value, error = without[name]["return"], without[name]["standard_error"]
-            blank = " | " * len(MINUTES)
-            lines.append(f"| {task} | {text} | {blank} | {value:,.0f} ± {error:,.0f} | | |")
-        for name, seeds in runs.items():
-            config = seeds[0]["config"]
-            if task_name(config) != task or config["distractors"]:
-                continue
-            times = " | ".join(middle([return_at(r, 60.0 * m) for r in seeds]) for m in MINUTES)
-            ends = middle([final(run)["return"] for run in seeds])
-            random, none = (
-                f"{min(distance(run, without[name]) for run in seeds):.0f} s.e."
-                for name in ("random", "none")
-            )
+def clean_table(runs: dict[str, list[dict]]) -> str:
+    """Return over time, without distractors, in Markdown."""
+    heads = ["task", "agent", "seeds", "million steps", *(f"{m} min" for m in MINUTES)]
+    heads += ["mean action, at the end", "steps of an episode", "above random"]
+    lines, tasks, without = [], by_task(runs), read("untrained.json")
+    blank, from_state = [""] * len(MINUTES), read("from_state.json")
+    for key, of_task in tasks.items():
+        name = title(key, list(tasks))
+        for kind, text in (("random", "random policy"), ("none", "no action")):
+            value, error = without[key][kind]["return"], without[key][kind]["standard_error"]
+            lines.append([name, text, "", "", *blank, f"{value:,.0f} ± {error:,.0f}", "", ""])
+        if seen := from_state.get(f"{key} x 1"):
+            steps = f"{seen['steps'][-1] / 1e6:.1f}"
+            end = [f"{seen['return'][-1]:,.0f}", f"{seen['length'][-1]:.0f}", ""]
+            lines.append([name, "Brax's PPO, from the state", 1, steps, *blank, *end])
+        for seeds in of_task.values():
             minutes = np.median([run["seconds"][-1] for run in seeds]) / 60.0
-            agent = f"{seeds[0]['algorithm'].upper()}, {minutes:.0f} min"
             lines.append(
-                f"| {task} | {agent} | {seeds_of(seeds)} | {times} | {ends} | {random} | {none} |"
+                [
+                    name,
+                    f"{seeds[0]['algorithm'].upper()}, {minutes:.0f} min",
+                    len(seeds),
+                    f"{seeds[0]['config']['total_steps'] / 1e6:.1f}",
+                    *(middle([return_at(run, 60.0 * m) for run in seeds]) for m in MINUTES),
+                    reached(seeds),
+                    f"{np.mean([final(run)['length'] for run in seeds]):.0f}",
+                    f"{min(distance(run, without[key]['random']) for run in seeds):.0f} s.e.",
+                ]
             )
-    return "\n".join(lines) + "\n"
-
-
-def distracted_table(runs: dict[str, list[dict]]) -> str:
-    """Mean actions with distractors: clean, in training's clips and in held-out ones."""
-    lines = [
-        "| task | distractors | agent | seeds | clean | training | held out | "
-        "held out / training |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    for _, seeds in sorted(runs.items(), key=lambda item: item[0].split("-")[1:]):
-        config = seeds[0]["config"]
-        if not config["distractors"]:
-            continue
-        splits = [[final(r, s)["return"] for r in seeds] for s in ("clean", "train", "test")]
-        share = np.mean(splits[2]) / np.mean(splits[1])
-        cells = " | ".join(middle(scores) for scores in splits)
-        distractors = ", ".join(f"`{x}`" for x in config["distractors"])
-        who = f"{task_name(config)} | {distractors} | {seeds[0]['algorithm'].upper()}"
-        lines.append(f"| {who} | {seeds_of(seeds)} | {cells} | {share:.2f} |")
-    return "\n".join(lines) + "\n" if len(lines) > 2 else "Not run yet.\n"
-
-
-def centering_table() -> str:
-    """What short runs reach with pixels as they come and around zero."""
-    found = json.loads((FOLDER / "centering.json").read_text())["runs"]
-    lines = []
-    for plain, centered in zip(found[::2], found[1::2], strict=True):
-        ends = []
-        for run in (plain, centered):
-            late = np.array(run["steps"]) > 0.8 * run["total_steps"]
-            counts = np.array(run["episodes"])[late]
-            ends.append(f"{np.average(np.array(run['return'])[late], weights=counts):,.0f}")
-        video = ", `paper-video`" if run["options"] else ""
-        steps = f"{run['total_steps']:,}"
-        lines.append([f"{run['task']}{video}", run["algorithm"].upper(), steps, *ends])
-    heads = ("task", "agent", "steps", "pixels in [0, 1]", "pixels around 0")
     return markdown_table(heads, lines) + "\n"
 
 
-def plot(runs: dict[str, list[dict]], untrained: dict[str, dict], path: Path) -> None:
-    """Return over steps: a thin line for each seed, a thick one and a band for their middle.
+def distracted_table(runs: dict[str, list[dict]]) -> str:
+    """Mean actions of agents that were trained under distractors, in Markdown.
 
-    Minutes depend on the machine, and runs are from several.
+    Without clips training and test are the same.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    shown = {name: seeds for name, seeds in runs.items() if name.count("-") == 1}
-    tasks = list(dict.fromkeys(pair_of(seeds[0])[1] for seeds in shown.values()))
-    figure, panels = plt.subplots(
-        1, len(tasks), figsize=(4 * len(tasks), 3.4), layout="constrained", squeeze=False
-    )
-    colors = {"ppo": "C0", "ppg": "C1", "dcpg": "C2"}
-    for task, axes in zip(tasks, panels[0], strict=True):
-        title = next(task_name(r[0]["config"]) for r in shown.values() if pair_of(r[0])[1] == task)
-        for name in (f"{algorithm}-{task}" for algorithm in colors):
-            if name not in shown:
-                continue
-            color, seeds = colors[name.split("-")[0]], shown[name]
-            end = min(r["steps"][-1] for r in seeds)
-            grid, window = np.linspace(0.05 * end, end, 40), 0.1 * end
-            lines = np.array([[return_at(run, t, "steps", window) for t in grid] for run in seeds])
-            for line in lines:
-                axes.plot(grid / 1e6, line, color=color, alpha=0.3, linewidth=0.7)
-            label = name.split("-")[0].upper() + ("" if is_latest(seeds) else "*")
-            if len(seeds) > 1:
-                found = [interquartile_mean(column) for column in lines.T]
-                low, high = [f.low for f in found], [f.high for f in found]
-                axes.fill_between(grid / 1e6, low, high, color=color, alpha=0.2, linewidth=0)
-                lines = np.array([[f.value for f in found]])
-            axes.plot(grid / 1e6, lines[0], color=color, linewidth=1.8, label=label)
-        for kind, style in (("random", ":"), ("none", "--")):
-            label = {"random": "random policy", "none": "no action"}[kind]
-            axes.axhline(
-                untrained[title][kind]["return"], color="gray", linestyle=style, label=label
-            )
-        axes.set(xlabel="million control steps", title=title)
-        axes.grid(alpha=0.3)
-    panels[0][0].set_ylabel("return of training episodes")
-    for axes in panels[0]:
-        axes.legend(fontsize=7)
-    figure.savefig(path, dpi=130)
+    heads = ["task", "trained under", "agent", "seeds", "evaluated without", "under training's"]
+    heads += ["under held-out clips", "held out / training", "trained and evaluated without"]
+    lines = []
+    for name in sorted(runs, key=lambda name: name.split("-")[1:]):
+        seeds = runs[name]
+        algorithm, config = seeds[0]["algorithm"], seeds[0]["config"]
+        if not config["distractors"]:
+            continue
+        given = {run["config"]["seed"] for run in seeds}
+        plain = runs.get(f"{algorithm}-{config['task']}", [])
+        plain = [final(run)["return"] for run in plain if run["config"]["seed"] in given]
+        clean, train, test = (
+            [final(run, split)["return"] for run in seeds] for split in ("clean", "train", "test")
+        )
+        held_out = [middle(test), f"{np.mean(test) / np.mean(train):.2f}"]
+        lines.append(
+            [
+                config["task"],
+                ", ".join(f"`{distractor}`" for distractor in config["distractors"]),
+                algorithm.upper(),
+                len(seeds),
+                middle(clean),
+                middle(train),
+                *(held_out if config["clips"] else ["", ""]),
+                middle(plain),
+            ]
+        )
+    return markdown_table(heads, lines) + "\n"
 
 
-def tables(runs: dict[str, list[dict]], untrained: dict[str, dict]) -> dict[str, str]:
+def pretrained_table() -> str:
+    """The policies that come with the package, in Markdown."""
+    heads = ("task", "reward", "agent", "million steps", "return of 32 episodes", "PixelBrax")
+    lines = []
+    for name in sorted(list_pretrained(), key=TASKS.index):
+        about = read_pretrained(name)
+        lines.append(
+            [
+                f"`{name}`",
+                OWNERS[about["env_options"]["reward_preset"]],
+                about["algorithm"].upper(),
+                f"{about['steps'] / 1e6:.1f}",
+                f"{about['return']:,.0f} ± {about['standard_error']:,.0f}",
+                about["versions"]["pixelbrax"],
+            ]
+        )
+    return markdown_table(heads, lines) + "\n"
+
+
+def centering_table(runs: dict[str, list[dict]]) -> str:
+    """What whole runs reach with pixels as they come, and around zero, in Markdown."""
+    plain = groups({run["name"]: run for run in read("uncentered.json")["runs"]})
+    cells: dict[str, dict[str, str]] = {}
+    for name, seeds in plain.items():
+        algorithm, task = name.split("-", 1)
+        before = np.mean([run["clean/return"] for run in seeds])
+        after = np.mean([final(run)["return"] for run in runs[name]])
+        cells.setdefault(task, {})[algorithm.upper()] = f"{before:,.0f}, {after:,.0f}"
+    agents = ("PPO", "PPG", "DCPG")
+    lines = [
+        [task.replace("-brax", ", Brax's reward").replace("-video", ", `paper-video`")]
+        + [of_task[agent] for agent in agents]
+        for task, of_task in cells.items()
+    ]
+    return markdown_table(("task", *agents), lines) + "\n"
+
+
+def tables(runs: dict[str, list[dict]]) -> dict[str, str]:
     """All of the page's tables, by name."""
     return {
-        "clean": table(runs, untrained),
+        "clean": clean_table(runs),
         "distracted": distracted_table(runs),
-        "centering": centering_table(),
+        "pretrained": pretrained_table(),
+        "centering": centering_table(runs),
     }
 
 
 def kept_runs() -> dict[str, dict]:
-    """All that is kept, by name, with the seconds of undisturbed runs."""
-    files = (FOLDER / "runs").glob("*.json")
-    return clocked({path.stem: json.loads(path.read_text()) for path in files})
+    """All that is kept from CPUs, by name, with the seconds of undisturbed runs."""
+    files = (path for path in (FOLDER / "runs").glob("*.json") if "-gpu-" not in path.stem)
+    return clocked({path.stem: json.loads(path.read_text("utf-8")) for path in files})
 
 
 def main() -> None:
     """Draw everything."""
-    runs = kept_runs()
+    # Drawing and playing need more than tables do.
+    from tests.benchmarks.baselines import play_baselines
+    from tests.benchmarks.results_plot import draw
+
+    runs = groups(kept_runs())
     if not runs:
         raise SystemExit("no run is kept yet: python -m tests.benchmarks.experiments makes them")
-    without, grouped = baselines(runs), groups(runs)
-    by_brax_reward("walker2d")
-    redraw(PAGE, tables(grouped, without))
-    plot(grouped, without, FOLDER / "clean.png")
+    tasks = by_task(runs)
+    play_baselines({key: next(iter(g.values()))[0]["config"] for key, g in tasks.items()})
+    redraw(PAGE, tables(runs))
+    panels = {}
+    for key, of_task in tasks.items():
+        # Runs of the presets' own length and rewards, of the four tasks.
+        shown = [seeds for name, seeds in of_task.items() if name.count("-") == 1]
+        if shown and shown[0][0]["config"]["task"] in TASKS:
+            panels[title(key, list(tasks))] = (shown, read("untrained.json")[key])
+    draw(panels, FOLDER / "clean.png")
 
 
 if __name__ == "__main__":

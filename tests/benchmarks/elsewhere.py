@@ -1,0 +1,57 @@
+"""What pretrained policies earn where they were not trained, for docs/results.md.
+
+python -m tests.benchmarks.elsewhere        a minute
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+from pixelbrax_jax.agents.runner.evaluate import Evaluator, make_split
+from pixelbrax_jax.agents.runner.trained import load_pretrained
+from pixelbrax_jax.policy import read_pretrained
+from tests.benchmarks.experiments import EPISODES
+
+KEPT = Path(__file__).parents[2] / "docs" / "results" / "elsewhere.json"
+VIDEO = {"distractors": ("paper-video",), "clips": "procedural"}
+CASES = {
+    "walker2d by Brax's reward": ("walker2d", "clean", {"reward_preset": "brax"}),
+    "halfcheetah under paper-video": ("halfcheetah", "test", VIDEO),
+    "halfcheetah under paper-color": ("halfcheetah", "test", {"distractors": ("paper-color",)}),
+}
+"""Name -> policy, split and changed settings."""
+
+
+def identity(task: str) -> dict:
+    """What tells one pretrained policy of a task from another."""
+    about = read_pretrained(task)
+    return {name: about[name] for name in ("command", "return")}
+
+
+def play(task: str, split: str, changes: dict) -> dict:
+    """Play the episodes of an evaluation."""
+    agent = load_pretrained(task)
+    environment = make_split(replace(agent.algorithm.config, **changes), split)
+    result = Evaluator(agent.algorithm, *environment, num_episodes=EPISODES)(agent.networks)
+    return {
+        "policy": identity(task),
+        "episodes": EPISODES,
+        "return": result.mean,
+        "standard_error": result.standard_error,
+        "length": float(result.lengths.mean()),
+    }
+
+
+def main() -> None:
+    """Play where it is not known of the policy of today."""
+    known = json.loads(KEPT.read_text()) if KEPT.exists() else {}
+    for name, (task, split, changes) in CASES.items():
+        if known.get(name, {}).get("policy") != identity(task):
+            known[name] = play(task, split, changes)
+    KEPT.write_text(json.dumps(known, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
