@@ -300,7 +300,7 @@ FROM_OTHERS = {
     "docs/results.md": (
         "which earns up to 1,000",
         "where standing earns 1,000",
-        "of 1,000 steps these lasted",
+        "length is in steps, of 1,000",
         "takes 0.5 from its pixels",
         "0.6 MB each",
         "PixelBrax 0.1.0",
@@ -353,7 +353,7 @@ def test_tables_of_dm_control_are_those_of_the_results(name):
     assert drawn(dmc_page.PAGE, name) == dmc_page.page_tables()[name]
 
 
-@pytest.mark.parametrize("name", ["clean", "distracted", "pretrained", "centering"])
+@pytest.mark.parametrize("name", ["clean", "baselines", "distracted", "pretrained", "centering"])
 def test_tables_of_results_are_those_of_the_runs(name):
     assert drawn(results.PAGE, name) == results.tables(groups())[name]
 

@@ -26,9 +26,6 @@ MINUTES = (1, 3, 5, 15)
 WINDOW = 60.0
 """Seconds whose training episodes make one point."""
 
-OWNERS = {"brax": "Brax's", "paper": "the paper's"}
-"""Whose rewards a preset has."""
-
 
 def read(name: str) -> dict:
     """A JSON file beside the runs."""
@@ -101,19 +98,19 @@ def by_task(runs: dict[str, list[dict]]) -> dict[str, dict[str, list[dict]]]:
 
 
 def title(key: str, keys: list[str]) -> str:
-    """A task as the page calls it: with its reward where another one is there, too."""
+    """A task as the page calls it: with its reward preset where another one is there, too."""
     task, reward = key.rsplit("-", 1)
     alone = sum(other.rsplit("-", 1)[0] == task for other in keys) == 1
-    return task if alone else f"{task}, {OWNERS[reward]} reward"
+    return task if alone else f"{task} ({reward})"
 
 
 def middle(scores: list[float]) -> str:
-    """An interquartile mean with its interval; of one score that alone."""
+    """An interquartile mean with its interval, in one line; of one score that alone."""
     scores = [score for score in scores if np.isfinite(score)]
     if len(scores) < 2:
         return f"{scores[0]:,.0f}" if scores else ""
     found = interquartile_mean(np.array(scores))
-    return f"{found.value:,.0f} ({found.low:,.0f} to {found.high:,.0f})"
+    return f"{found.value:,.0f} ({found.low:,.0f} to {found.high:,.0f})".replace(" ", "\u00a0")
 
 
 def final(run: dict, split: str = "clean") -> dict:
@@ -127,7 +124,7 @@ def reached(seeds: list[dict]) -> str:
     ends = [final(run) for run in seeds]
     if len(ends) > 1:
         return middle([end["return"] for end in ends])
-    return f"{ends[0]['return']:,.0f} ± {ends[0]['standard_error']:,.0f}"
+    return f"{ends[0]['return']:,.0f}\u00a0±\u00a0{ends[0]['standard_error']:,.0f}"
 
 
 def distance(run: dict, other: dict) -> float:
@@ -139,33 +136,40 @@ def distance(run: dict, other: dict) -> float:
 
 def clean_table(runs: dict[str, list[dict]]) -> str:
     """Return over time, without distractors, in Markdown."""
-    heads = ["task", "agent", "seeds", "million steps", *(f"{m} min" for m in MINUTES)]
-    heads += ["mean action, at the end", "steps of an episode", "above random"]
+    heads = ["task", "agent", "seeds", "million steps", "minutes", *(f"{m} min" for m in MINUTES)]
+    heads += ["mean action", "length", "above random"]
     lines, tasks, without = [], by_task(runs), read("untrained.json")
-    blank, from_state = [""] * len(MINUTES), read("from_state.json")
     for key, of_task in tasks.items():
-        name = title(key, list(tasks))
-        for kind, text in (("random", "random policy"), ("none", "no action")):
-            value, error = without[key][kind]["return"], without[key][kind]["standard_error"]
-            lines.append([name, text, "", "", *blank, f"{value:,.0f} ± {error:,.0f}", "", ""])
-        if seen := from_state.get(f"{key} x 1"):
-            steps = f"{seen['steps'][-1] / 1e6:.1f}"
-            end = [f"{seen['return'][-1]:,.0f}", f"{seen['length'][-1]:.0f}", ""]
-            lines.append([name, "Brax's PPO, from the state", 1, steps, *blank, *end])
         for seeds in of_task.values():
             minutes = np.median([run["seconds"][-1] for run in seeds]) / 60.0
+            at_minutes = [np.mean([return_at(run, 60.0 * m) for run in seeds]) for m in MINUTES]
             lines.append(
                 [
-                    name,
-                    f"{seeds[0]['algorithm'].upper()}, {minutes:.0f} min",
+                    title(key, list(tasks)),
+                    seeds[0]["algorithm"].upper(),
                     len(seeds),
                     f"{seeds[0]['config']['total_steps'] / 1e6:.1f}",
-                    *(middle([return_at(run, 60.0 * m) for run in seeds]) for m in MINUTES),
+                    f"{minutes:.0f}",
+                    *("" if np.isnan(value) else f"{value:,.0f}" for value in at_minutes),
                     reached(seeds),
                     f"{np.mean([final(run)['length'] for run in seeds]):.0f}",
                     f"{min(distance(run, without[key]['random']) for run in seeds):.0f} s.e.",
                 ]
             )
+    return markdown_table(heads, lines) + "\n"
+
+
+def baselines_table(runs: dict[str, list[dict]]) -> str:
+    """What is earned without learning, and by another agent from the state, in Markdown."""
+    heads = ("task", "random policy", "no action", "Brax's PPO, from the state", "million steps")
+    lines, tasks = [], by_task(runs)
+    without, from_state = read("untrained.json"), read("from_state.json")
+    for key in tasks:
+        ends = [without[key][kind] for kind in ("random", "none")]
+        line = [f"{end['return']:,.0f} ± {end['standard_error']:,.0f}" for end in ends]
+        if seen := from_state.get(f"{key} x 1"):
+            line += [f"{seen['return'][-1]:,.0f}", f"{seen['steps'][-1] / 1e6:.1f}"]
+        lines.append([title(key, list(tasks)), *line, *[""] * (4 - len(line))])
     return markdown_table(heads, lines) + "\n"
 
 
@@ -206,14 +210,21 @@ def distracted_table(runs: dict[str, list[dict]]) -> str:
 
 def pretrained_table() -> str:
     """The policies that come with the package, in Markdown."""
-    heads = ("task", "reward", "agent", "million steps", "return of 32 episodes", "PixelBrax")
+    heads = (
+        "task",
+        "reward preset",
+        "agent",
+        "million steps",
+        "return of 32 episodes",
+        "PixelBrax",
+    )
     lines = []
     for name in sorted(list_pretrained(), key=TASKS.index):
         about = read_pretrained(name)
         lines.append(
             [
                 f"`{name}`",
-                OWNERS[about["env_options"]["reward_preset"]],
+                f"`{about['env_options']['reward_preset']}`",
                 about["algorithm"].upper(),
                 f"{about['steps'] / 1e6:.1f}",
                 f"{about['return']:,.0f} ± {about['standard_error']:,.0f}",
@@ -234,7 +245,7 @@ def centering_table(runs: dict[str, list[dict]]) -> str:
         cells.setdefault(task, {})[algorithm.upper()] = f"{before:,.0f}, {after:,.0f}"
     agents = ("PPO", "PPG", "DCPG")
     lines = [
-        [task.replace("-brax", ", Brax's reward").replace("-video", ", `paper-video`")]
+        [task.replace("-brax", " (brax)").replace("-video", ", `paper-video`")]
         + [of_task[agent] for agent in agents]
         for task, of_task in cells.items()
     ]
@@ -245,6 +256,7 @@ def tables(runs: dict[str, list[dict]]) -> dict[str, str]:
     """All of the page's tables, by name."""
     return {
         "clean": clean_table(runs),
+        "baselines": baselines_table(runs),
         "distracted": distracted_table(runs),
         "pretrained": pretrained_table(),
         "centering": centering_table(runs),
