@@ -137,7 +137,7 @@ def distance(run: dict, other: dict) -> float:
 def clean_table(runs: dict[str, list[dict]]) -> str:
     """Return over time, without distractors, in Markdown."""
     heads = ["task", "agent", "seeds", "million steps", "minutes", *(f"{m} min" for m in MINUTES)]
-    heads += ["mean action", "length", "above random"]
+    heads += ["mean action", "length", "s.e. above"]
     lines, tasks, without = [], by_task(runs), read("untrained.json")
     for key, of_task in tasks.items():
         for seeds in of_task.values():
@@ -153,7 +153,7 @@ def clean_table(runs: dict[str, list[dict]]) -> str:
                     *("" if np.isnan(value) else f"{value:,.0f}" for value in at_minutes),
                     reached(seeds),
                     f"{np.mean([final(run)['length'] for run in seeds]):.0f}",
-                    f"{min(distance(run, without[key]['random']) for run in seeds):.0f} s.e.",
+                    f"{min(distance(run, without[key]['random']) for run in seeds):.0f}",
                 ]
             )
     return markdown_table(heads, lines) + "\n"
