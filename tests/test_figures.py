@@ -6,6 +6,7 @@ import json
 import re
 from functools import cache
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import pytest
@@ -211,6 +212,11 @@ def mean_length(name: str) -> str:
     return f"{sum(lengths) / len(lengths):.0f}"
 
 
+def probed(run: str, inputs: str) -> str:
+    """How much of the state a linear map reads off, the median over its entries."""
+    return f"{median(read('results/probe.json')[run][inputs]):.2f}"
+
+
 def elsewhere(name: str) -> str:
     """What a pretrained policy earns where it was not trained."""
     return f"{read('results/elsewhere.json')[name]['return']:,.0f}"
@@ -278,7 +284,7 @@ STATEMENTS = {
         ("{} on Walker2d by the paper's reward", [mean_end("ppo-walker2d")]),
         ("walks, and falls after {}.", [mean_length("ppo-walker2d")]),
         (
-            "times the length {} on Ant, {} on Humanoid, {} on HalfCheetah",
+            "times the length {} on Ant, {} on Humanoid, and {} on HalfCheetah",
             [mean_end(f"ppo-{task}-long") for task in ("ant", "humanoid", "halfcheetah")],
         ),
         ("where standing still earns {}", [without_action("ant-brax")]),
@@ -287,6 +293,18 @@ STATEMENTS = {
             [elsewhere(f"halfcheetah under paper-{name}") for name in ("video", "color")],
         ),
         ("earns {} by Brax's", [elsewhere("walker2d by Brax's reward")]),
+        (
+            "PPO earns {} in as many",
+            [f"{read('results/from_state.json')['ant-brax x 1']['return'][-1]:,.0f}"],
+        ),
+        (
+            "median R² of {} over the state's entries, {} off the pixels",
+            [probed("ppo-ant-1", "features"), probed("ppo-ant-1", "pixels")],
+        ),
+        (
+            "Walker2d's features give {}, Humanoid's {}",
+            [probed(run, "features") for run in ("ppo-walker2d-0", "ppo-humanoid-1")],
+        ),
     ),
 }
 """Page -> what it says, and the figures in it."""
