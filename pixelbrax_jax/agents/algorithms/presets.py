@@ -115,7 +115,7 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
 }
 """Changes of the defaults, by name of the preset and of the algorithm."""
 
-_CPU_TASKS = {
+_CPU_TASKS: dict[str, dict[str, Any]] = {
     "halfcheetah": {"action_repeat": 2, "gamma": 0.97, "total_steps": 3_100_000},
     # By Brax's reward it stands, and hardly walks; see docs/results.md.
     "walker2d": {
