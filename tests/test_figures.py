@@ -278,11 +278,11 @@ STATEMENTS = {
     "docs/results.md": (
         ("{} on HalfCheetah; {} on Ant", [mean_end(f"ppo-{t}") for t in ("halfcheetah", "ant")]),
         (
-            "{} on Humanoid, which falls after {} of 1,000 steps",
+            "{} on Humanoid, whose episodes last {} of 1,000 steps",
             [mean_end("ppo-humanoid"), mean_length("ppo-humanoid")],
         ),
         ("{} on Walker2d by the paper's reward", [mean_end("ppo-walker2d")]),
-        ("walks, and falls after {}.", [mean_length("ppo-walker2d")]),
+        ("walks, for {} steps on average", [mean_length("ppo-walker2d")]),
         (
             "times the length {} on Ant, {} on Humanoid, and {} on HalfCheetah",
             [mean_end(f"ppo-{task}-long") for task in ("ant", "humanoid", "halfcheetah")],

@@ -92,7 +92,9 @@ def by_task(runs: dict[str, list[dict]]) -> dict[str, dict[str, list[dict]]]:
     clean = {name: seeds for name, seeds in runs.items() if not seeds[0]["config"]["distractors"]}
     place = {task: number for number, task in enumerate(TASKS)}
     found: dict[str, dict[str, list[dict]]] = {}
-    for name in sorted(clean, key=lambda name: (place.get(name.split("-")[1], 9), "brax" in name)):
+    for name in sorted(
+        clean, key=lambda name: (place.get(name.split("-")[1], len(TASKS)), "brax" in name)
+    ):
         found.setdefault(task_key(clean[name][0]["config"]), {})[name] = clean[name]
     return found
 
