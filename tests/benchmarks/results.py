@@ -182,7 +182,7 @@ def distracted_table(runs: dict[str, list[dict]]) -> str:
     """
     heads = ["task", "trained under", "agent", "seeds", "evaluated without", "under training's"]
     heads += ["under held-out clips", "held out / training", "trained and evaluated without"]
-    lines = []
+    lines, keys = [], list(by_task(runs))
     for name in sorted(runs, key=lambda name: name.split("-")[1:]):
         seeds = runs[name]
         algorithm, config = seeds[0]["algorithm"], seeds[0]["config"]
@@ -197,7 +197,7 @@ def distracted_table(runs: dict[str, list[dict]]) -> str:
         held_out = [middle(test), f"{np.mean(test) / np.mean(train):.2f}"]
         lines.append(
             [
-                config["task"],
+                title(task_key(config), keys),
                 ", ".join(f"`{distractor}`" for distractor in config["distractors"]),
                 algorithm.upper(),
                 len(seeds),
@@ -236,14 +236,14 @@ def pretrained_table() -> str:
     return markdown_table(heads, lines) + "\n"
 
 
-def centering_table(runs: dict[str, list[dict]]) -> str:
+def centering_table() -> str:
     """What whole runs reach with pixels as they come, and around zero, in Markdown."""
-    plain = groups({run["name"]: run for run in read("uncentered.json")["runs"]})
+    both = (run for run in read("centering.json")["runs"] if "centered" in run)
     cells: dict[str, dict[str, str]] = {}
-    for name, seeds in plain.items():
+    for name, seeds in groups({run["name"]: run for run in both}).items():
         algorithm, task = name.split("-", 1)
         before = np.mean([run["clean/return"] for run in seeds])
-        after = np.mean([final(run)["return"] for run in runs[name]])
+        after = np.mean([run["centered"]["clean/return"] for run in seeds])
         cells.setdefault(task, {})[algorithm.upper()] = f"{before:,.0f}, {after:,.0f}"
     agents = ("PPO", "PPG", "DCPG")
     lines = [
@@ -261,7 +261,7 @@ def tables(runs: dict[str, list[dict]]) -> dict[str, str]:
         "baselines": baselines_table(runs),
         "distracted": distracted_table(runs),
         "pretrained": pretrained_table(),
-        "centering": centering_table(runs),
+        "centering": centering_table(),
     }
 
 

@@ -124,7 +124,8 @@ _CPU_TASKS: dict[str, dict[str, Any]] = {
         "gamma": 0.99,
         "total_steps": 6_800_000,
     },
-    "ant": {"action_repeat": 2, "gamma": 0.97, "total_steps": 3_400_000},
+    # It falls less with less noise, and learns faster.
+    "ant": {"initial_std": 0.25, "action_repeat": 2, "gamma": 0.97, "total_steps": 3_400_000},
     "humanoid": {"action_repeat": 3, "gamma": 0.98, "total_steps": 3_500_000},
 }
 # Tasks of the DM Control Suite; tried with PPO alone.

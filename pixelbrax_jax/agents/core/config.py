@@ -31,7 +31,7 @@ class TrainConfig(EnvConfig):
     """Steps T of each environment in one rollout."""
 
     encoder: str = "impala"
-    """``impala``, ``nature``, ``drq`` or ``small``."""
+    """``impala``, ``nature``, ``drq``, ``small`` or ``patch``."""
     policy: str = "gaussian"
     """``gaussian``, ``tanh_gaussian`` or ``deacrep``."""
     initial_std: float = 1.0
