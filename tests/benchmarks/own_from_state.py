@@ -30,6 +30,7 @@ from pixelbrax_jax.agents.core.algorithm import train_function
 from pixelbrax_jax.agents.core.config import make_env
 from pixelbrax_jax.agents.core.distributions import Normal
 from pixelbrax_jax.agents.core.losses import Metrics
+from pixelbrax_jax.agents.core.networks import LOG_STD_RANGE
 from pixelbrax_jax.agents.core.optimizer import Networks
 from pixelbrax_jax.tasks import BRAX_TASKS
 from tests.benchmarks.results import task_key
@@ -52,12 +53,16 @@ class StateActor(nn.Module):
         mean = nn.Dense(self.action_size, kernel_init=init(0.01))(features)
         start = nn.initializers.constant(np.log(self.initial_std))
         log_std = self.param("log_std", start, (self.action_size,))
-        return Normal(mean, jnp.broadcast_to(jnp.exp(log_std), mean.shape), squash=False)
+        return Normal(
+            mean,
+            jnp.broadcast_to(jnp.exp(jnp.clip(log_std, *LOG_STD_RANGE)), mean.shape),
+            squash=False,
+        )
 
 
 @dataclass(frozen=True)
 class StateActorCritic(ActorCritic):
-    """Policy and value of the state."""
+    """Policy and value of the state; for training, whose `decide` asks for both."""
 
     @cached_property
     def _policy(self) -> StateActor:
@@ -114,7 +119,7 @@ def main() -> None:
     assert isinstance(given, PPOConfig)
     config = replace(
         given,
-        initial_std=options.initial_std or given.initial_std,
+        initial_std=given.initial_std if options.initial_std is None else options.initial_std,
         encoder="small",
         height=18,
         width=18,

@@ -90,7 +90,8 @@ def learned(
         params, opt_state = update(params, opt_state, pixels[chosen], targets[chosen])
     predict = jax.jit(model.apply)
     wrong = np.stack([predict(params, x[half:]) for x in pixels]) - targets[:, half:]
-    return 1.0 - (wrong**2).mean((0, 1)) / targets[:, half:].var((0, 1))
+    found = 1.0 - (wrong**2).mean((0, 1)) / targets[:, half:].var((0, 1))
+    return found.astype(np.float64)
 
 
 def probe(folder: Path, num_envs: int, num_steps: int, updates: int) -> dict:
@@ -114,6 +115,8 @@ def probe(folder: Path, num_envs: int, num_steps: int, updates: int) -> dict:
 
     features, pixels, state = (np.asarray(x) for x in play(jax.random.key(1), params))
     height, width, channels = pixels.shape[2:]
+    if height % 12 or width % 12:
+        raise SystemExit(f"frames must be multiples of 12, got {height} x {width}")
     # Means over squares, as the encoders' first layers of patches see them.
     squares = (num_steps, num_envs, 12, height // 12, 12, width // 12, channels)
     coarse = pixels.reshape(squares).mean((3, 5), dtype=np.float32)
