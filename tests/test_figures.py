@@ -311,7 +311,7 @@ STATEMENTS = {
     ),
     "docs/results.md": (
         (
-            "{} on HalfCheetah and {} on Humanoid, which falls after {} of 1,000 steps",
+            "{} on HalfCheetah (three seeds); {} on Humanoid, which falls after {} of 1,000 steps",
             [mean_end("ppo-halfcheetah"), mean_end("ppo-humanoid"), mean_length("ppo-humanoid")],
         ),
         (
