@@ -30,7 +30,7 @@ from pixelbrax_jax.agents.core.algorithm import train_function
 from pixelbrax_jax.agents.core.config import make_env
 from pixelbrax_jax.agents.core.distributions import Normal
 from pixelbrax_jax.agents.core.losses import Metrics
-from pixelbrax_jax.agents.core.networks import LOG_STD_RANGE
+from pixelbrax_jax.agents.core.networks import LOG_STD_RANGE, SMALLEST
 from pixelbrax_jax.agents.core.optimizer import Networks
 from pixelbrax_jax.tasks import BRAX_TASKS
 from tests.benchmarks.results import task_key
@@ -121,8 +121,8 @@ def main() -> None:
         given,
         initial_std=given.initial_std if options.initial_std is None else options.initial_std,
         encoder="small",
-        height=18,
-        width=18,
+        height=SMALLEST["small"],
+        width=SMALLEST["small"],
         layout="separate",
         state_critic=True,
     )

@@ -23,7 +23,7 @@ from flax import linen as nn
 
 from pixelbrax_jax import VectorPixelEnv
 from pixelbrax_jax.agents.core.config import make_env
-from pixelbrax_jax.agents.core.networks import ENCODERS
+from pixelbrax_jax.agents.core.networks import ENCODERS, scaled
 from pixelbrax_jax.agents.runner.trained import load_trained
 
 
@@ -56,7 +56,7 @@ class Regression(nn.Module):
     @nn.compact
     def __call__(self, pixels: jax.Array) -> jax.Array:
         """Map (B, H, W, C) uint8 to (B, S)."""
-        return nn.Dense(self.size)(ENCODERS[self.encoder]()(pixels.astype(jnp.float32) / 255.0))
+        return nn.Dense(self.size)(ENCODERS[self.encoder]()(scaled(pixels)))
 
 
 def learned(

@@ -177,7 +177,7 @@ class Actor(nn.Module):
             pixels: (B, H, W, C) uint8.
             detach_value: whether the value's gradient stops before the encoder.
         """
-        features = ENCODERS[self.encoder]()(_scaled(pixels))
+        features = ENCODERS[self.encoder]()(scaled(pixels))
         mean = _dense(self.action_size, 0.01, "mean")(features)
         if self.policy == "deacrep":
             mean = jnp.tanh(mean)
@@ -222,7 +222,7 @@ class Critic(nn.Module):
             features = jnp.tanh(nn.LayerNorm()(_dense(256)(state)))
             features = nn.relu(_dense(256)(features))
         else:
-            features = ENCODERS[self.encoder]()(_scaled(pixels))
+            features = ENCODERS[self.encoder]()(scaled(pixels))
         return _dense(1, 1.0, "value")(features)[..., 0]
 
 
@@ -238,7 +238,8 @@ class Dynamics(nn.Module):
         return _dense(1, 1.0)(x)[..., 0]
 
 
-def _scaled(pixels: jax.Array) -> jax.Array:
+def scaled(pixels: jax.Array) -> jax.Array:
+    """Return uint8 pixels as encoders take them: float32 in [0, 1]."""
     return pixels.astype(jnp.float32) / 255.0
 
 
