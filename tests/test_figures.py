@@ -201,6 +201,16 @@ def mean_end(name: str, digits: int = 2) -> str:
     return rounded(sum(ends(name)) / len(ends(name)), digits)
 
 
+def held_out_cost() -> str:
+    """What held-out clips take from the return under those of training, at most, in percent."""
+    parts = [
+        [sum(results.final(run, split)["return"] for run in seeds) for split in ("train", "test")]
+        for seeds in groups().values()
+        if seeds[0]["config"]["clips"]
+    ]
+    return f"{100 * max(1 - test / train for train, test in parts):.0f}"
+
+
 def without_action(task: str) -> str:
     return f"{read('results/untrained.json')[task]['none']['return']:,.0f}"
 
@@ -321,6 +331,7 @@ STATEMENTS = {
         ("walks, for {} steps on average", [mean_length("ppo-walker2d")]),
         ("took Humanoid to {}, and", [mean_end("ppo-humanoid-long", 3)]),
         ("no further ({}), one seed each", [mean_end("ppo-halfcheetah-long")]),
+        ("Held-out clips cost at most {} %.", [held_out_cost()]),
         (
             "earns {} under videos that it does not know, and {} under colors",
             [elsewhere(f"halfcheetah under paper-{name}") for name in ("video", "color")],
