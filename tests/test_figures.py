@@ -320,15 +320,19 @@ STATEMENTS = {
         ("moves {} MB for {} MB of frames", tpu_frames()),
     ),
     "docs/results.md": (
+        ("**HalfCheetah** {}.", [mean_end("ppo-halfcheetah")]),
         (
-            "{} on HalfCheetah (three seeds); {} on Humanoid, which falls after {} of 1,000 steps",
-            [mean_end("ppo-halfcheetah"), mean_end("ppo-humanoid"), mean_length("ppo-humanoid")],
+            "**Walker2d** {} by the paper's reward: it walks, for {} steps",
+            [mean_end("ppo-walker2d"), mean_length("ppo-walker2d")],
         ),
         (
-            "{} on Ant, where no action earns {}, and {} on Walker2d",
-            [mean_end("ppo-ant"), without_action("ant-brax"), mean_end("ppo-walker2d")],
+            "**Ant** {}, where no action earns {}.",
+            [mean_end("ppo-ant"), without_action("ant-brax")],
         ),
-        ("walks, for {} steps on average", [mean_length("ppo-walker2d")]),
+        (
+            "**Humanoid** {}: it falls after {} steps",
+            [mean_end("ppo-humanoid"), mean_length("ppo-humanoid")],
+        ),
         ("took Humanoid to {}, and", [mean_end("ppo-humanoid-long", 3)]),
         ("no further ({}), one seed each", [mean_end("ppo-halfcheetah-long")]),
         ("Held-out clips cost at most {} %.", [held_out_cost()]),
