@@ -175,6 +175,12 @@ def baselines_table(runs: dict[str, list[dict]]) -> str:
     return markdown_table(heads, lines) + "\n"
 
 
+def held_out_ratio(seeds: list[dict]) -> float:
+    """Mean return under held-out clips over that under the clips of training."""
+    test, train = ([final(run, split)["return"] for run in seeds] for split in ("test", "train"))
+    return float(np.mean(test) / np.mean(train))
+
+
 def distracted_table(runs: dict[str, list[dict]]) -> str:
     """Mean actions of agents that were trained under distractors, in Markdown.
 
@@ -194,7 +200,7 @@ def distracted_table(runs: dict[str, list[dict]]) -> str:
         clean, train, test = (
             [final(run, split)["return"] for run in seeds] for split in ("clean", "train", "test")
         )
-        held_out = [middle(test), f"{np.mean(test) / np.mean(train):.2f}"]
+        held_out = [middle(test), f"{held_out_ratio(seeds):.2f}"]
         lines.append(
             [
                 title(task_key(config), keys),
