@@ -82,7 +82,7 @@ def experiments() -> dict[str, list[str]]:
                 add(algorithm, task, seed, "--num-evals", "3")
     for task in TASKS:
         longer(task, 4, "long")
-    longer("halfcheetah", 16, "hour")
+    longer("halfcheetah", 8, "longest")
     for seed in range(2):
         for task in DISTRACTED:
             for name, options in DISTRACTORS.items():
