@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import jax
 import numpy as np
 
 from pixelbrax_jax import VectorPixelEnv, make
+from tests.benchmarks.results import FOLDER
 
-KEPT = Path(__file__).parents[2] / "docs" / "results" / "untrained.json"
+KEPT = FOLDER / "untrained.json"
 SETTINGS = ("task", "backend", "reward_preset", "action_repeat", "episode_length")
 """Settings that decide what a return means."""
 

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 from pixelbrax_jax.agents.runner.evaluate import Evaluator, make_split
 from pixelbrax_jax.agents.runner.trained import load_pretrained
 from pixelbrax_jax.policy import read_pretrained
 from tests.benchmarks.experiments import EPISODES
+from tests.benchmarks.results import FOLDER
 
-KEPT = Path(__file__).parents[2] / "docs" / "results" / "elsewhere.json"
+KEPT = FOLDER / "elsewhere.json"
 VIDEO = {"distractors": ("paper-video",), "clips": "procedural"}
 CASES = {
     "walker2d by Brax's reward": ("walker2d", "clean", {"reward_preset": "brax"}),

@@ -8,10 +8,9 @@
 
 A run that was cut short, by Ctrl-C or by --minutes, goes on from its checkpoint at the next call.
 Of a finished one docs/results/runs/<name>.json is kept; `tests.benchmarks.results` draws all of
-them. Those in tasks of the DM Control Suite are kept in docs/dmc/runs, `tests.benchmarks.dmc_page`
-draws them, with the minutes on a run's own clock: nothing else should compute meanwhile. Those of
-Brax's tasks are computed, at the speed that `tests.benchmarks.pace` measures apart. The best policy
-of each of Brax's tasks goes into the package, for --pretrained.
+them, with the minutes that follow from the speed which `tests.benchmarks.pace` measures apart.
+Those in tasks of the DM Control Suite are kept in docs/dmc/runs, and `tests.benchmarks.dmc_page`
+draws them. The best policy of each of Brax's tasks goes into the package, for --pretrained.
 """
 
 from __future__ import annotations
@@ -67,8 +66,7 @@ def experiments() -> dict[str, list[str]]:
 
     def add(algorithm: str, task: str, seed: int, *more: str, name: str = "") -> None:
         full = "-".join([algorithm, task, *([name] if name else []), str(seed)])
-        given = "ci" if task == "inverted_pendulum" else "cpu"
-        command = ["train", algorithm, "--preset", given, "--task", task, "--seed", str(seed)]
+        command = ["train", algorithm, "--preset", "cpu", "--task", task, "--seed", str(seed)]
         runs[full] = [*command, "--eval-episodes", str(EPISODES), *more]
 
     def longer(task: str, times: int, name: str) -> None:
@@ -92,8 +90,6 @@ def experiments() -> dict[str, list[str]]:
         for algorithm in ALGORITHMS:
             more = ("--reward-preset", "brax", "--num-evals", "3")
             add(algorithm, "walker2d", seed, *more, name="brax")
-    for algorithm in ALGORITHMS:
-        add(algorithm, "inverted_pendulum", 0, "--num-evals", "3")
     for seed in range(3):
         for task in TASK_SETTINGS["cpu"]["ppo"]:
             if task in DMC_TASKS:

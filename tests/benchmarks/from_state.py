@@ -1,6 +1,6 @@
 """What Brax's own PPO learns from the state in the environments of docs/results.md.
 
-    python -m tests.benchmarks.from_state                     every task of the preset cpu
+    python -m tests.benchmarks.from_state                     the four tasks
     python -m tests.benchmarks.from_state --tasks walker2d --reward-preset brax
 
 It tells a hard task from an agent that does not see: same physics, rewards, action repeat,
@@ -13,20 +13,20 @@ import argparse
 import json
 import time
 from dataclasses import asdict, replace
-from pathlib import Path
 
 from brax.training.agents.ppo import train as ppo
 
 from pixelbrax_jax import BraxPixelEnv, make, wrap_fresh_episodes
-from pixelbrax_jax.agents.algorithms.presets import TASK_SETTINGS, preset
+from pixelbrax_jax.agents.algorithms.presets import preset
 from pixelbrax_jax.agents.core.config import TrainConfig
-from pixelbrax_jax.tasks import BRAX_TASKS, REWARD_PRESETS
-from tests.benchmarks.results import task_key
+from pixelbrax_jax.tasks import REWARD_PRESETS
+from tests.benchmarks.experiments import TASKS
+from tests.benchmarks.results import FOLDER, task_key
 
-OUTPUT = Path(__file__).parents[2] / "docs" / "results" / "from_state.json"
+OUTPUT = FOLDER / "from_state.json"
 
 
-def keep(config: TrainConfig, times: int, evaluations: int) -> None:
+def keep(config: TrainConfig) -> None:
     """Train, and keep the curve: mean returns of 128 episodes with the mean action.
 
     What is known of it is written with every evaluation.
@@ -42,12 +42,11 @@ def keep(config: TrainConfig, times: int, evaluations: int) -> None:
         found["length"].append(float(metrics["eval/avg_episode_length"]) * config.action_repeat)
         print(config.task, found["steps"][-1], found["return"][-1], flush=True)
         known = json.loads(OUTPUT.read_text()) if OUTPUT.exists() else {}
-        name = f"{task_key(asdict(config))} x {times}"
-        OUTPUT.write_text(json.dumps(known | {name: found}) + "\n")
+        OUTPUT.write_text(json.dumps(known | {task_key(asdict(config)): found}) + "\n")
 
     ppo.train(
         env,
-        num_timesteps=times * config.total_steps // config.action_repeat,
+        num_timesteps=config.total_steps // config.action_repeat,
         episode_length=env.episode_length,
         wrap_env_fn=wrap_fresh_episodes,
         num_envs=config.num_envs,
@@ -60,7 +59,7 @@ def keep(config: TrainConfig, times: int, evaluations: int) -> None:
         discounting=config.gamma,
         gae_lambda=config.gae_lambda,
         normalize_observations=True,
-        num_evals=evaluations,
+        num_evals=10,
         deterministic_eval=True,
         progress_fn=progress,
     )
@@ -71,15 +70,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    tasks = [task for task in TASK_SETTINGS["cpu"]["ppo"] if task in BRAX_TASKS]
-    parser.add_argument("--tasks", nargs="+", choices=tasks, default=tasks)
-    parser.add_argument("--times", type=int, default=1, help="the preset's number of steps")
+    parser.add_argument("--tasks", nargs="+", choices=TASKS, default=TASKS)
     parser.add_argument("--reward-preset", choices=REWARD_PRESETS, help="in place of the preset's")
     options = parser.parse_args()
     for task in options.tasks:
         config = preset("ppo", "cpu", task)
         reward = options.reward_preset or config.reward_preset
-        keep(replace(config, reward_preset=reward), options.times, 10)
+        keep(replace(config, reward_preset=reward))
 
 
 if __name__ == "__main__":

@@ -15,7 +15,6 @@ import json
 import time
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +23,7 @@ from flax import linen as nn
 
 from pixelbrax_jax import VectorPixelEnv, compiler_options
 from pixelbrax_jax.agents.algorithms.ppo import PPO, PPOConfig
-from pixelbrax_jax.agents.algorithms.presets import TASK_SETTINGS, preset
+from pixelbrax_jax.agents.algorithms.presets import preset
 from pixelbrax_jax.agents.core.actor_critic import ActorCritic
 from pixelbrax_jax.agents.core.algorithm import train_function
 from pixelbrax_jax.agents.core.config import make_env
@@ -32,10 +31,10 @@ from pixelbrax_jax.agents.core.distributions import Normal
 from pixelbrax_jax.agents.core.losses import Metrics
 from pixelbrax_jax.agents.core.networks import LOG_STD_RANGE, SMALLEST
 from pixelbrax_jax.agents.core.optimizer import Networks
-from pixelbrax_jax.tasks import BRAX_TASKS
-from tests.benchmarks.results import task_key
+from tests.benchmarks.experiments import TASKS
+from tests.benchmarks.results import FOLDER, task_key
 
-OUTPUT = Path(__file__).parents[2] / "docs" / "results" / "own_from_state.json"
+OUTPUT = FOLDER / "own_from_state.json"
 
 
 class StateActor(nn.Module):
@@ -110,8 +109,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    tasks = [task for task in TASK_SETTINGS["cpu"]["ppo"] if task in BRAX_TASKS]
-    parser.add_argument("--task", choices=tasks, default="ant")
+    parser.add_argument("--task", choices=TASKS, default="ant")
     parser.add_argument("--initial-std", type=float, help="in place of the preset's")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()

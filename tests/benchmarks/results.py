@@ -15,7 +15,6 @@ import numpy as np
 
 from pixelbrax_gym.bench.tables import table as markdown_table
 from pixelbrax_jax import list_pretrained
-from pixelbrax_jax.agents.runner.evaluate import interquartile_mean
 from pixelbrax_jax.policy import read_pretrained
 from tests.benchmarks.experiments import TASKS
 from tests.benchmarks.pages import redraw
@@ -40,18 +39,17 @@ def task_key(config: dict) -> str:
 def clocked(runs: dict[str, dict]) -> dict[str, dict]:
     """The runs with the seconds that they take where nothing else computes; see `pace.py`.
 
-    Those of which `pace.py` knows nothing keep their own.
+    Those under distractors, which `pace.py` does not measure, keep their own.
     """
     presets = read("pace.json")["presets"]
     found = dict(runs)
     for name, run in runs.items():
-        config = run["config"]
-        pace = presets.get(f"{run['algorithm']}-{config['task']}")
-        if pace is None:
+        if run["config"]["distractors"]:
             continue
-        first = config["num_envs"] * config["num_steps"] * config["action_repeat"]
+        pace = presets[f"{run['algorithm']}-{run['config']['task']}"]
         seconds = [
-            pace["first_iteration"] + (steps - first) * pace["step"] for steps in run["steps"]
+            pace["first_seconds"] + (steps - pace["first_steps"]) * pace["step"]
+            for steps in run["steps"]
         ]
         found[name] = run | {"seconds": [round(x, 1) for x in seconds]}
     return found
@@ -60,8 +58,6 @@ def clocked(runs: dict[str, dict]) -> dict[str, dict]:
 def return_at(run: dict, when: float, clock: str = "seconds", window: float = WINDOW) -> float:
     """Mean return of the episodes that ended within a window before; NaN beyond the run.
 
-    A run that ended in the last tenth of that time counts with its end.
-
     Args:
         run: what is kept of it.
         when: on that clock.
@@ -69,9 +65,8 @@ def return_at(run: dict, when: float, clock: str = "seconds", window: float = WI
         window: on that clock.
     """
     times = np.array(run[clock])
-    if times[-1] < 0.9 * when:
+    if times[-1] < when:
         return float("nan")
-    when = min(when, times[-1])
     # All episodes may end in one iteration: the latest of them then.
     last = times[times <= when].max(initial=times[0])
     chosen = (times > min(when - window, last - 1e-3)) & (times <= max(when, last))
@@ -90,11 +85,8 @@ def groups(runs: dict[str, dict]) -> dict[str, list[dict]]:
 def by_task(runs: dict[str, list[dict]]) -> dict[str, dict[str, list[dict]]]:
     """Groups without distractors by `task_key`; the presets' own rewards before others."""
     clean = {name: seeds for name, seeds in runs.items() if not seeds[0]["config"]["distractors"]}
-    place = {task: number for number, task in enumerate(TASKS)}
     found: dict[str, dict[str, list[dict]]] = {}
-    for name in sorted(
-        clean, key=lambda name: (place.get(name.split("-")[1], len(TASKS)), "brax" in name)
-    ):
+    for name in sorted(clean, key=lambda name: (TASKS.index(name.split("-")[1]), "brax" in name)):
         found.setdefault(task_key(clean[name][0]["config"]), {})[name] = clean[name]
     return found
 
@@ -107,12 +99,11 @@ def title(key: str, keys: list[str]) -> str:
 
 
 def middle(scores: list[float]) -> str:
-    """An interquartile mean with its interval, in one line; of one score that alone."""
-    scores = [score for score in scores if np.isfinite(score)]
-    if len(scores) < 2:
-        return f"{scores[0]:,.0f}" if scores else ""
-    found = interquartile_mean(np.array(scores))
-    return f"{found.value:,.0f} ({found.low:,.0f} to {found.high:,.0f})".replace(" ", "\u00a0")
+    """A mean over seeds with the lowest and the highest, in one line; of one score that alone."""
+    mean = f"{np.mean(scores):,.0f}"
+    if len(scores) == 1:
+        return mean
+    return f"{mean} ({min(scores):,.0f} to {max(scores):,.0f})".replace(" ", "\u00a0")
 
 
 def final(run: dict, split: str = "clean") -> dict:
@@ -139,11 +130,11 @@ def distance(run: dict, other: dict) -> float:
 def clean_table(runs: dict[str, list[dict]]) -> str:
     """Return over time, without distractors, in Markdown."""
     heads = ["task", "agent", "seeds", "million steps", "minutes", *(f"{m} min" for m in MINUTES)]
-    heads += ["mean action", "length", "s.e. above"]
+    heads += ["mean action", "length", "s.e. above random"]
     lines, tasks, without = [], by_task(runs), read("untrained.json")
     for key, of_task in tasks.items():
         for seeds in of_task.values():
-            minutes = np.median([run["seconds"][-1] for run in seeds]) / 60.0
+            minutes = seeds[0]["seconds"][-1] / 60.0
             at_minutes = [np.mean([return_at(run, 60.0 * m) for run in seeds]) for m in MINUTES]
             lines.append(
                 [
@@ -169,7 +160,7 @@ def baselines_table(runs: dict[str, list[dict]]) -> str:
     for key in tasks:
         ends = [without[key][kind] for kind in ("random", "none")]
         line = [f"{end['return']:,.0f} ± {end['standard_error']:,.0f}" for end in ends]
-        if seen := from_state.get(f"{key} x 1"):
+        if seen := from_state.get(key):
             line += [f"{seen['return'][-1]:,.0f}", f"{seen['steps'][-1] / 1e6:.1f}"]
         lines.append([title(key, list(tasks)), *line, *[""] * (4 - len(line))])
     return markdown_table(heads, lines) + "\n"
@@ -210,7 +201,7 @@ def distracted_table(runs: dict[str, list[dict]]) -> str:
                 middle(clean),
                 middle(train),
                 *(held_out if config["clips"] else ["", ""]),
-                middle(plain),
+                middle(plain) if plain else "",
             ]
         )
     return markdown_table(heads, lines) + "\n"
@@ -242,15 +233,29 @@ def pretrained_table() -> str:
     return markdown_table(heads, lines) + "\n"
 
 
-def centering_table() -> str:
+def noisier() -> dict[str, float]:
+    """Returns of whole runs on Ant that began with a standard deviation of 0.5, by name."""
+    return {name: run["clean/return"] for name, run in read("search.json")["whole runs"].items()}
+
+
+def centering_table(runs: dict[str, list[dict]]) -> str:
     """What whole runs reach with pixels as they come, and around zero, in Markdown."""
-    both = (run for run in read("centering.json")["runs"] if "centered" in run)
+    centered = {
+        f"{name}-{run['config']['seed']}": final(run)["return"]
+        for name, seeds in runs.items()
+        for run in seeds
+    }
+    centered |= noisier()
+    both = {
+        run["name"]: {"before": run["clean/return"], "after": centered[run["name"]]}
+        for run in read("centering.json")["runs"]
+        if run["name"] in centered
+    }
     cells: dict[str, dict[str, str]] = {}
-    for name, seeds in groups({run["name"]: run for run in both}).items():
+    for name, pairs in groups(both).items():
         algorithm, task = name.split("-", 1)
-        before = np.mean([run["clean/return"] for run in seeds])
-        after = np.mean([run["centered"]["clean/return"] for run in seeds])
-        cells.setdefault(task, {})[algorithm.upper()] = f"{before:,.0f}, {after:,.0f}"
+        before, after = (np.mean([pair[when] for pair in pairs]) for when in ("before", "after"))
+        cells.setdefault(task, {})[algorithm.upper()] = f"{before:,.0f} → {after:,.0f}"
     agents = ("PPO", "PPG", "DCPG")
     lines = [
         [task.replace("-brax", " (brax)").replace("-video", ", `paper-video`")]
@@ -267,7 +272,7 @@ def tables(runs: dict[str, list[dict]]) -> dict[str, str]:
         "baselines": baselines_table(runs),
         "distracted": distracted_table(runs),
         "pretrained": pretrained_table(),
-        "centering": centering_table(),
+        "centering": centering_table(runs),
     }
 
 
@@ -291,9 +296,9 @@ def main() -> None:
     redraw(PAGE, tables(runs))
     panels = {}
     for key, of_task in tasks.items():
-        # Runs of the presets' own length and rewards, of the four tasks.
+        # Runs of the presets' own length and rewards.
         shown = [seeds for name, seeds in of_task.items() if name.count("-") == 1]
-        if shown and shown[0][0]["config"]["task"] in TASKS:
+        if shown:
             panels[title(key, list(tasks))] = (shown, read("untrained.json")[key])
     draw(panels, FOLDER / "clean.png")
 

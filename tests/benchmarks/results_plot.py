@@ -7,7 +7,6 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 
-from pixelbrax_jax.agents.runner.evaluate import interquartile_mean
 from tests.benchmarks.results import return_at
 
 matplotlib.use("Agg")
@@ -19,7 +18,7 @@ BASELINES = {"random": ("random policy", ":"), "none": ("no action", "--")}
 
 
 def draw(panels: dict[str, tuple[list[list[dict]], dict]], path: Path) -> None:
-    """Return over steps: a thin line for each seed, a thick one and a band for their middle.
+    """Return over steps: thin lines for seeds, a thick one for their mean, a band between them.
 
     Steps and not minutes, which depend on the machine.
 
@@ -52,8 +51,6 @@ def _curve(axes: plt.Axes, seeds: list[dict]) -> None:
     for line in lines:
         axes.plot(grid / 1e6, line, color=color, alpha=0.3, linewidth=0.7)
     if len(seeds) > 1:
-        found = [interquartile_mean(column) for column in lines.T]
-        low, high = [f.low for f in found], [f.high for f in found]
+        low, high = lines.min(0), lines.max(0)
         axes.fill_between(grid / 1e6, low, high, color=color, alpha=0.2, linewidth=0)
-        lines = np.array([[f.value for f in found]])
-    axes.plot(grid / 1e6, lines[0], color=color, linewidth=1.8, label=algorithm.upper())
+    axes.plot(grid / 1e6, lines.mean(0), color=color, linewidth=1.8, label=algorithm.upper())

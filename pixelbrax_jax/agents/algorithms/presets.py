@@ -145,7 +145,7 @@ _CPU_DMC_TASKS: dict[str, dict[str, Any]] = {
     },
 }
 _CPU_SHARES = {"ppo": 1.0, "ppg": 0.7, "dcpg": 0.6}
-"""Steps that an algorithm makes in the time in which PPO makes one."""
+"""An algorithm's number of steps over PPO's: an update of the others takes longer."""
 
 TASK_SETTINGS: dict[str, dict[str, dict[str, dict[str, Any]]]] = {
     "cpu": {
