@@ -69,9 +69,9 @@ def experiments() -> dict[str, list[str]]:
         command = ["train", algorithm, "--preset", "cpu", "--task", task, "--seed", str(seed)]
         runs[full] = [*command, "--eval-episodes", str(EPISODES), *more]
 
-    def longer(task: str, times: int, name: str) -> None:
+    def longer(task: str, times: int, *more: str, name: str) -> None:
         steps = times * preset("ppo", "cpu", task).total_steps
-        more = ("--total-steps", str(steps), "--num-evals", str(3 * times))
+        more = ("--total-steps", str(steps), "--num-evals", str(3 * times), *more)
         add("ppo", task, 0, *more, name=name)
 
     for seed in range(3):
@@ -79,8 +79,9 @@ def experiments() -> dict[str, list[str]]:
             for algorithm in ALGORITHMS:
                 add(algorithm, task, seed, "--num-evals", "3")
     for task in TASKS:
-        longer(task, 4, "long")
-    longer("halfcheetah", 8, "longest")
+        longer(task, 4, name="long")
+    for times, name in ((4, "long-slow"), (8, "longest-slow")):
+        longer("halfcheetah", times, "--learning-rate", "3e-4", name=name)
     for seed in range(2):
         for task in DISTRACTED:
             for name, options in DISTRACTORS.items():

@@ -15,6 +15,7 @@ import numpy as np
 
 from pixelbrax_gym.bench.tables import table as markdown_table
 from pixelbrax_jax import list_pretrained
+from pixelbrax_jax.agents.algorithms.presets import preset
 from pixelbrax_jax.policy import read_pretrained
 from tests.benchmarks.experiments import TASKS
 from tests.benchmarks.pages import redraw
@@ -127,6 +128,14 @@ def distance(run: dict, other: dict) -> float:
     return (end["return"] - other["return"]) / error
 
 
+def agent(run: dict) -> str:
+    """An algorithm as the page calls it: with its learning rate where that is not the preset's."""
+    name, config = run["algorithm"], run["config"]
+    rate = config["learning_rate"]
+    usual = preset(name, "cpu", config["task"]).learning_rate
+    return name.upper() + ("" if rate == usual else f", learning rate {rate:g}")
+
+
 def clean_table(runs: dict[str, list[dict]]) -> str:
     """Return over time, without distractors, in Markdown."""
     heads = ["task", "agent", "seeds", "million steps", "minutes", *(f"{m} min" for m in MINUTES)]
@@ -139,7 +148,7 @@ def clean_table(runs: dict[str, list[dict]]) -> str:
             lines.append(
                 [
                     title(key, list(tasks)),
-                    seeds[0]["algorithm"].upper(),
+                    agent(seeds[0]),
                     len(seeds),
                     f"{seeds[0]['config']['total_steps'] / 1e6:.1f}",
                     f"{minutes:.0f}",
