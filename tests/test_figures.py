@@ -294,6 +294,25 @@ def not_centered(name: str) -> str:
     return f"{run['clean/return']:,.0f}"
 
 
+def long_run(rate: str) -> dict[str, list[float]]:
+    """A long run of HalfCheetah, means over its twelfths."""
+    return read("results/step_size.json")["runs"][f"learning rate {rate}"]
+
+
+def fell() -> list[str]:
+    """Million steps, highest and last return, last standard deviation by the preset's rate."""
+    run = long_run("0.001")
+    millions, std = run["steps"][-1] / 1e6, run["policy/std_mean"][-1]
+    returns = (max(run["return"]), run["return"][-1])
+    return [f"{millions:.1f}", *(f"{value:,.0f}" for value in returns), f"{std:.2f}"]
+
+
+def large_updates() -> list[str]:
+    """KL divergence of an iteration's updates at the beginning and the end of that run."""
+    divergence = long_run("0.001")["policy/approx_kl"]
+    return [f"{value:.2f}" for value in (divergence[0], divergence[-1])]
+
+
 def balanced() -> str:
     """Mean return of the inverted pendulum's three examples, the same for all."""
     files = ("demo", "torchrl_ppo", "sb3_ppo")
@@ -374,7 +393,8 @@ STATEMENTS = {
             [mean_end("ppo-humanoid"), mean_length("ppo-humanoid")],
         ),
         ("took Humanoid to {}, and", [mean_end("ppo-humanoid-long", 3)]),
-        ("no further ({}), one seed each", [mean_end("ppo-halfcheetah-long")]),
+        ("no further ({}; with a", [mean_end("ppo-halfcheetah-long")]),
+        ("tried) {}), one seed each", [mean_end("ppo-halfcheetah-long-slow")]),
         ("on two CPU cores, {} seeds; mean return", [numbers_of_seeds()]),
         (
             "at least {} standard errors above the random policy, and at least {} above doing",
@@ -432,6 +452,15 @@ STATEMENTS = {
             [searched(task="humanoid", initial_std=0.5, sees=seen) for seen in ("pixels", "state")],
         ),
         ("four times the length ({}, before", [not_centered("ppo-walker2d-brax-long-0")]),
+        (
+            "With the preset's, {}, a run of eight times the length, stopped after {} million "
+            "steps, rose to {} in training episodes and fell to {}: its standard deviation shrank "
+            "to {}, for",
+            ["0.001", *fell()],
+        ),
+        ("went from {} to {}. With {} and", [*large_updates(), "0.0003"]),
+        ("it stays at {} or less", [f"{max(long_run('0.0003')['policy/approx_kl']):.2f}"]),
+        ("rise to the end, to {} in training", [f"{max(long_run('0.0003')['return']):,.0f}"]),
         (
             "long run ({}, with it {})",
             [not_centered("ppo-halfcheetah-long-0"), f"{ends('ppo-halfcheetah-long')[0]:,.0f}"],
