@@ -211,7 +211,7 @@ def error_of_ratio(run: dict) -> float:
     """Standard error of a run's return under held-out clips over that under those of training."""
     test, train = results.final(run, "test"), results.final(run, "train")
     relative = (end["standard_error"] / end["return"] for end in (test, train))
-    return test["return"] / train["return"] * math.hypot(*relative)
+    return results.held_out_ratio([run]) * math.hypot(*relative)
 
 
 def least_above(kind: str) -> str:
@@ -460,7 +460,7 @@ STATEMENTS = {
         ),
         ("went from {} to {}. With {} and", [*large_updates(), "0.0003"]),
         ("it stays at {} or less", [f"{max(long_run('0.0003')['policy/approx_kl']):.2f}"]),
-        ("rise to the end, to {} in training", [f"{max(long_run('0.0003')['return']):,.0f}"]),
+        ("rise to the end, to {} in training", [f"{long_run('0.0003')['return'][-1]:,.0f}"]),
         (
             "long run ({}, with it {})",
             [not_centered("ppo-halfcheetah-long-0"), f"{ends('ppo-halfcheetah-long')[0]:,.0f}"],

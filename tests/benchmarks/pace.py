@@ -19,9 +19,10 @@ from pixelbrax_gym.bench.machine import describe_cpu
 from pixelbrax_jax.agents.algorithms.presets import preset
 from pixelbrax_jax.agents.algorithms.registry import ALGORITHMS
 from pixelbrax_jax.agents.runner.metrics import read_metrics
-from tests.benchmarks.experiments import DOCS, TASKS
+from tests.benchmarks.experiments import TASKS
+from tests.benchmarks.results import FOLDER
 
-KEPT = DOCS / "results" / "pace.json"
+KEPT = FOLDER / "pace.json"
 ITERATIONS = 64
 ROUNDS = 2
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import re
-from pathlib import Path
 
 import numpy as np
 
@@ -17,10 +16,10 @@ from pixelbrax_gym.bench.tables import table as markdown_table
 from pixelbrax_jax import list_pretrained
 from pixelbrax_jax.agents.algorithms.presets import preset
 from pixelbrax_jax.policy import read_pretrained
-from tests.benchmarks.experiments import TASKS
+from tests.benchmarks.experiments import DOCS, TASKS
 from tests.benchmarks.pages import redraw
 
-FOLDER = Path(__file__).parents[2] / "docs" / "results"
+FOLDER = DOCS / "results"
 PAGE = FOLDER.with_suffix(".md")
 MINUTES = (1, 3, 5, 15)
 WINDOW = 60.0
