@@ -393,8 +393,8 @@ STATEMENTS = {
             [mean_end("ppo-humanoid"), mean_length("ppo-humanoid")],
         ),
         ("took Humanoid to {}, and", [mean_end("ppo-humanoid-long", 3)]),
-        ("no further ({}; with a", [mean_end("ppo-halfcheetah-long")]),
-        ("tried) {}), one seed each", [mean_end("ppo-halfcheetah-long-slow")]),
+        ("no further ({}); eight", [mean_end("ppo-halfcheetah-long")]),
+        ("took it to {}, one seed each", [mean_end("ppo-halfcheetah-longest-slow")]),
         ("on two CPU cores, {} seeds; mean return", [numbers_of_seeds()]),
         (
             "at least {} standard errors above the random policy, and at least {} above doing",
@@ -458,8 +458,8 @@ STATEMENTS = {
             "to {}, for",
             ["0.001", *fell()],
         ),
-        ("went from {} to {}. With {} and", [*large_updates(), "0.0003"]),
-        ("it stays at {} or less", [f"{max(long_run('0.0003')['policy/approx_kl']):.2f}"]),
+        ("went from {} to {}. With {} it", [*large_updates(), "0.0003"]),
+        ("stays at {} or less", [f"{max(long_run('0.0003')['policy/approx_kl']):.2f}"]),
         ("rise to the end, to {} in training", [f"{long_run('0.0003')['return'][-1]:,.0f}"]),
         (
             "long run ({}, with it {})",
