@@ -246,14 +246,9 @@ def noisier() -> dict[str, float]:
     return {name: run["clean/return"] for name, run in read("search.json")["whole runs"].items()}
 
 
-def centering_table(runs: dict[str, list[dict]]) -> str:
+def centering_table() -> str:
     """What whole runs reach with pixels as they come, and around zero, in Markdown."""
-    centered = {
-        f"{name}-{run['config']['seed']}": final(run)["return"]
-        for name, seeds in runs.items()
-        for run in seeds
-    }
-    centered |= noisier()
+    centered = {name: final(run)["return"] for name, run in kept_runs().items()} | noisier()
     both = {
         run["name"]: {"before": run["clean/return"], "after": centered[run["name"]]}
         for run in read("centering.json")["runs"]
@@ -280,7 +275,7 @@ def tables(runs: dict[str, list[dict]]) -> dict[str, str]:
         "baselines": baselines_table(runs),
         "distracted": distracted_table(runs),
         "pretrained": pretrained_table(),
-        "centering": centering_table(runs),
+        "centering": centering_table(),
     }
 
 
