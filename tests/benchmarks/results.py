@@ -209,7 +209,7 @@ def distracted_table(runs: dict[str, list[dict]]) -> str:
                 middle(clean),
                 middle(train),
                 *(held_out if config["clips"] else ["", ""]),
-                middle(plain) if plain else "",
+                f"{np.mean(plain):,.0f}" if plain else "",
             ]
         )
     return markdown_table(heads, lines) + "\n"
