@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import re
+from functools import cache
 
 import numpy as np
 
@@ -279,6 +280,7 @@ def tables(runs: dict[str, list[dict]]) -> dict[str, str]:
     }
 
 
+@cache
 def kept_runs() -> dict[str, dict]:
     """All that is kept from CPUs, by name, with the seconds of undisturbed runs."""
     files = (path for path in (FOLDER / "runs").glob("*.json") if "-gpu-" not in path.stem)
