@@ -10,23 +10,30 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pixelbrax_gym.packing import Packed, pack, unpack
 from pixelbrax_jax import PixelEnv, VectorPixelEnv, compilation
 from pixelbrax_jax.types import EnvParams, EnvState, Timestep
 
 Array = jax.Array | np.ndarray
-Stepped = tuple[EnvState, dict[str, Any]]
+Stepped = tuple[Packed, dict[str, Any]]
 
 
 def _env(programs: Programs) -> PixelEnv:
     return programs.vector.env
 
 
+# A `spare` is read by nothing; `keep_unused` lets it be written to all the same.
+_into_spare = compilation.jit(_env, static_argnums=0, donate_argnames="spare", keep_unused=True)
+
+
 @dataclass(frozen=True)
 class Programs:
     """The compiled programs of one set of options, which all environments with equal ones share.
 
-    States are donated: XLA overwrites them in place. Outputs are not, which is why they can be
-    given away.
+    States go in and come out packed, and stay as they are: an exception that arrives at any time
+    leaves the state before a step or the one after. Frames are written into ``spare``, the
+    memory of frames that nothing reads any more, or memory would be asked for in each step.
+    Outputs are never read again, which is why they can be given away.
 
     Attributes:
         vector: the environments.
@@ -39,45 +46,108 @@ class Programs:
     @compilation.jit(_env, static_argnums=0)
     def reset(self, seeds: Array, params: EnvParams) -> Stepped:
         """Reset all environments to episode 0 of their (N,) uint32 seeds."""
-        state, timestep = self.vector.reset(jax.vmap(jax.random.key)(seeds), params)
-        return state, self._outputs(timestep, jnp.ones(self.vector.num_envs, bool))
+        return self._stepped(*self.vector.reset(jax.vmap(jax.random.key)(seeds), params))
 
-    @compilation.jit(_env, static_argnums=0, donate_argnums=1)
+    @_into_spare
     def reset_where(
         self,
-        state: EnvState,
+        packed: Packed,
         mask: Array,
         reported: Array,
         params: EnvParams,
         seeds: Array | None,
+        spare: Array,
     ) -> Stepped:
         """Reset some environments; infos are about those that ``reported`` names, (N,) bool."""
+        del spare
         key = None if seeds is None else jax.vmap(jax.random.key)(seeds)
+        state = self._state(packed, params)
         state, timestep = self.vector.reset_where(state, mask, params, key)
-        return state, self._outputs(timestep, reported)
+        return self._stepped(state, timestep, reported)
 
-    @compilation.jit(_env, static_argnums=0, donate_argnums=1)
-    def step(self, state: EnvState, action: Array, params: EnvParams) -> Stepped:
+    @_into_spare
+    def step(self, packed: Packed, action: Array, params: EnvParams, spare: Array) -> Stepped:
         """Step all environments."""
-        return self._step(state, action, params)
+        del spare
+        return self._stepped(*self._step(self._state(packed, params), action, params))
 
-    @compilation.jit(_env, static_argnums=0, donate_argnums=1)
-    def step_where(self, state: EnvState, mask: Array, action: Array, params: EnvParams) -> Stepped:
+    @_into_spare
+    def step_where(
+        self, packed: Packed, mask: Array, action: Array, params: EnvParams, spare: Array
+    ) -> Stepped:
         """Step some environments; the others repeat their observation, with ``done`` False."""
-        stepped, outputs = self._step(state, action, params)
+        del spare
+        state = self._state(packed, params)
+        stepped, timestep = self._step(state, action, params)
+        state = self._where(mask, stepped, state)
+        packed, outputs = self._stepped(state, timestep.replace(obs=self.vector.obs(state)))
+        return packed, outputs | {"done": outputs["done"] & mask}
 
+    @compilation.jit(_env, static_argnums=0)
+    def state(self, packed: Packed, params: EnvParams) -> EnvState:
+        """Return the states, without the leading axis of a single environment."""
+        state = self._state(packed, params)
+        return jax.tree.map(lambda x: x[0], state) if self.single else state
+
+    @compilation.jit(_env, static_argnums=0)
+    def start(self, state: EnvState, params: EnvParams) -> Stepped:
+        """Go on from given states, which lack the leading axis of a single environment."""
+        if self.single:
+            state = jax.tree.map(lambda x: x[None], state)
+        return self._present(state, params)
+
+    @compilation.jit(_env, static_argnums=0)
+    def start_where(
+        self, packed: Packed, mask: Array, state: EnvState, params: EnvParams
+    ) -> Stepped:
+        """Go on from given states where (N,) ``mask``; the others stay as they are."""
+        return self._present(self._where(mask, state, self._state(packed, params)), params)
+
+    @compilation.jit(_env, static_argnums=(0, 3, 4))
+    def images(self, packed: Packed, params: EnvParams, height: int, width: int) -> jax.Array:
+        """Draw the states, (N, height, width, 3) uint8."""
+        env, state = self.vector.env, self._state(packed, params)
+        images: jax.Array = jax.vmap(lambda row: env.image(row, params, height, width))(state)
+        return images
+
+    def state_spec(self, params: EnvParams) -> EnvState:
+        """Return shapes and dtypes of what ``state`` returns and ``start`` takes."""
+        spec: EnvState = self._spec(params)
+        if not self.single:
+            return spec
+        return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), spec)
+
+    def _spec(self, params: EnvParams) -> Any:
+        seeds = jax.ShapeDtypeStruct((self.vector.num_envs,), np.uint32)
+        keys = jax.eval_shape(jax.vmap(jax.random.key), seeds)
+        return jax.eval_shape(self.vector.reset, keys, params)[0]
+
+    def _state(self, packed: Packed, params: EnvParams) -> EnvState:
+        return unpack(packed, self._spec(params))
+
+    def _present(self, state: EnvState, params: EnvParams) -> Stepped:
+        rewards = jnp.zeros(self.vector.num_envs)
+        return self._stepped(state, self.vector._timestep(state, rewards, params))
+
+    def _stepped(
+        self, state: EnvState, timestep: Timestep, present: Array | None = None
+    ) -> Stepped:
+        """Pack states, and return them and outputs; infos are about (N,) ``present``."""
+        # Without a barrier, what computes the parts is compiled into the loop that packs them.
+        state, timestep = jax.lax.optimization_barrier((state, timestep))
+        present = jnp.ones(self.vector.num_envs, bool) if present is None else present
+        return pack(state), self._outputs(timestep, present)
+
+    @staticmethod
+    def _where(mask: Array, state: EnvState, otherwise: EnvState) -> EnvState:
         def choose(new: jax.Array, old: jax.Array) -> jax.Array:
             return jnp.where(mask.reshape(mask.shape + (1,) * (new.ndim - 1)), new, old)
 
-        state = jax.tree.map(choose, stepped, state)
-        obs = self.vector.obs(state)
-        return state, outputs | {"obs": obs, "done": outputs["done"] & mask}
+        chosen: EnvState = jax.tree.map(choose, state, otherwise)
+        return chosen
 
-    def _step(self, state: EnvState, action: Array, params: EnvParams) -> Stepped:
-        if self.single:
-            action = action[None]
-        state, timestep = self.vector.step(state, action, params)
-        return state, self._outputs(timestep, jnp.ones(self.vector.num_envs, bool))
+    def _step(self, state: EnvState, action: Array, params: EnvParams) -> tuple[EnvState, Timestep]:
+        return self.vector.step(state, action[None] if self.single else action, params)
 
     def _outputs(self, timestep: Timestep, present: Array) -> dict[str, Any]:
         done = timestep.terminated | timestep.truncated
@@ -105,13 +175,3 @@ class Programs:
 def _with_masks(info: Mapping[str, Any], mask: Array) -> dict[str, Any]:
     """Add a mask ``_key`` for each ``key``, which says what environments it is about."""
     return {**info, **{f"_{name}": mask for name in info}}
-
-
-@compilation.jit(lambda env: env, static_argnums=(0, 3, 4))
-def draw_images(
-    env: PixelEnv, state: EnvState, params: EnvParams, height: int, width: int
-) -> jax.Array:
-    """Draw the states of N environments, (N, height, width, 3) uint8."""
-    draw = jax.vmap(lambda state: env.image(state, params, height, width))
-    images: jax.Array = draw(state)
-    return images

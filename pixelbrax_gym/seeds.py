@@ -79,3 +79,16 @@ def spread_seeds(seed: Any, num_envs: int) -> list[int]:
     """
     first = as_seed(seed)
     return [(first + i) % SEEDS for i in range(num_envs)]
+
+
+def check_unseeded(seed: Any) -> None:
+    """Reject a seed beside a state, which has its own random numbers.
+
+    Raises:
+        ValueError: there is one.
+    """
+    if seed is not None:
+        raise ValueError(
+            f"reset() takes a seed or options['state'], got both (seed={seed!r}): a state has the "
+            "random numbers of its own episodes; leave one out."
+        )

@@ -2,33 +2,56 @@
 
 from __future__ import annotations
 
-import copy
-from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from gymnasium import error
-from gymnasium.envs.registration import EnvSpec
 
+from pixelbrax_gym.given_state import check_state
 from pixelbrax_gym.interop.actions import as_actions, name_rows
-from pixelbrax_gym.interop.fork import check_not_forked, is_forked
-from pixelbrax_gym.programs import Programs, draw_images
+from pixelbrax_gym.interop.fork import check_not_forked
+from pixelbrax_gym.making import limited, make_env
+from pixelbrax_gym.packing import Packed
+from pixelbrax_gym.programs import Programs
 from pixelbrax_gym.seeds import SEEDS, seeds_of
-from pixelbrax_jax import EnvConfig, PixelEnv, VectorPixelEnv, make
+from pixelbrax_jax import VectorPixelEnv
 from pixelbrax_jax.config import env_config
 from pixelbrax_jax.memory import check_fits
-from pixelbrax_jax.types import EnvParams, EnvState
-from pixelbrax_jax.validation import check_positive_int
+from pixelbrax_jax.types import EnvState
 
-_made: deque[tuple[EnvConfig, PixelEnv, EnvParams]] = deque(maxlen=64)
-"""Options of the latest environments, so that forks of this process can name them."""
+Keep = Callable[[dict[str, Any]], Any]
+"""Makes of a call's outputs what an adapter keeps beside the state."""
+
+
+@dataclass(frozen=True)
+class _Held:
+    """What is kept between two calls, replaced as a whole or not at all.
+
+    Attributes:
+        packed: the states.
+        done: () or (N,) bool, whether episodes have ended.
+        spare: frames that nothing reads any more; None if there are none.
+        shared: whether somebody else may read ``packed``.
+        kept: what the adapter keeps.
+    """
+
+    packed: Packed
+    done: Any
+    spare: jax.Array | None = None
+    shared: bool = False
+    kept: Any = None
 
 
 class StatefulEnv:
     """``num_envs`` pixel environments and their present states.
+
+    An exception that arrives during a call, such as a ``KeyboardInterrupt``, leaves the states
+    before it or those after it. Copies and pickles go on as the original does; a copy shares its
+    compiled programs and its arrays, which nothing writes to.
 
     ``reset`` and ``step`` return *outputs*: a dict with ``obs``, ``reward``, ``terminated``,
     ``truncated``, ``done`` and ``info``, as ``Timestep`` has them, of JAX arrays that nothing
@@ -43,6 +66,7 @@ class StatefulEnv:
         num_envs: N.
         single: whether outputs lack the leading axis; N is then 1.
         episode_length: time limit in control steps.
+        is_limited: whether the caller has given it.
     """
 
     def __init__(
@@ -76,16 +100,16 @@ class StatefulEnv:
             RuntimeError: this process is a fork that cannot run JAX.
         """
         config = env_config(task, options, also_allowed)
+        self.is_limited = "episode_length" in options or max_episode_steps not in (None, -1)
         if max_episode_steps not in (None, -1):
-            config = _limited(config, max_episode_steps, "episode_length" in options)
-        self.env, self.params = _make(config)
+            config = limited(config, max_episode_steps, "episode_length" in options)
+        self.env, self.params = make_env(config)
         vector = VectorPixelEnv(self.env, num_envs, autoreset_mode)
         self.num_envs, self.single = vector.num_envs, single
         self.episode_length = config.episode_length
         self._programs = Programs(vector, single)
         self._must_reset = autoreset_mode == "disabled"
-        self._state: EnvState | None = None
-        self._done: jax.Array | None = None
+        self._held: _Held | None = None
         self._device: jax.Device | None = None
         self._closed = False
 
@@ -99,6 +123,7 @@ class StatefulEnv:
         seed: int | Sequence[int | None] | None,
         rng: np.random.Generator | None = None,
         mask: np.ndarray | None = None,
+        keep: Keep | None = None,
     ) -> dict[str, Any]:
         """Reset environments.
 
@@ -108,6 +133,7 @@ class StatefulEnv:
                 environment, or draws a seed if there was none yet.
             rng: where seeds are drawn from; by default from the operating system.
             mask: (N,) bool, which ones to reset; None means all.
+            keep: see ``step``.
 
         Returns:
             Outputs with reward 0; unmasked environments repeat their observation and flags.
@@ -122,41 +148,44 @@ class StatefulEnv:
         self._check_usable()
         seeds = seeds_of(seed, self.num_envs)
         where = np.ones(self.num_envs, bool) if mask is None else mask.copy()
-        if self._state is None:
+        if self._held is None:
             if not where.all():
                 raise error.ResetNeeded("the first reset must be of all environments.")
-            # Clips are there already, and once for all.
-            clips = self.params.clips
-            self.params = jax.device_put(self.params.replace(clips=None)).replace(clips=clips)
+            self._place_params()
             rng = np.random.default_rng() if rng is None else rng
             first = int(rng.integers(SEEDS - self.num_envs + 1))
             seeds = [first + i if s is None else s for i, s in enumerate(seeds)]
         given = np.array([s is not None for s in seeds]) & where
         numbers = np.array([s or 0 for s in seeds], np.uint32)
         if given.all():
-            self._state, outputs = self._programs.reset(numbers, self.params)
-        else:
-            assert self._state is not None
-            # One call unless some environments are seeded and others are not.
-            if (where & ~given).any() or not given.any():
-                self._state, outputs = self._programs.reset_where(
-                    self._state, where & ~given, where, self.params, None
-                )
-            if given.any():
-                self._state, outputs = self._programs.reset_where(
-                    self._state, given, where, self.params, numbers
-                )
-        self._done = outputs["done"]
-        self._device = next(iter(self._done.devices()))
+            packed, outputs = self._programs.reset(numbers, self.params)
+            self._hold(packed, outputs, keep)
+            return outputs
+        held = self._present
+        # One call unless some environments are seeded and others are not.
+        if (where & ~given).any() or not given.any():
+            packed, outputs = self._programs.reset_where(
+                held.packed, where & ~given, where, self.params, None, self._spare(held)
+            )
+            held = _Held(packed, outputs["done"])
+        if given.any():
+            packed, outputs = self._programs.reset_where(
+                held.packed, given, where, self.params, numbers, self._spare(held)
+            )
+        self._hold(packed, outputs, keep)
         return outputs
 
-    def step(self, action: Any, mask: np.ndarray | None = None) -> dict[str, Any]:
+    def step(
+        self, action: Any, mask: np.ndarray | None = None, keep: Keep | None = None
+    ) -> dict[str, Any]:
         """Step all environments, or some.
 
         Args:
             action: (N, A) or, of a single environment, (A,); see ``as_actions``.
             mask: (N,) bool, which ones to step; None means all. The others stay as they are.
                 Not for a single environment.
+            keep: makes of the outputs what ``kept`` returns until the next call; it and the
+                states are replaced at once.
 
         Returns:
             Outputs. Environments that were not stepped repeat their observation, with ``done``
@@ -175,13 +204,89 @@ class StatefulEnv:
             self._check_not_done()
         shape = (self.env.action_size,)
         action = as_actions(action, shape if self.single else (self.num_envs, *shape), self.device)
-        assert self._state is not None
+        held = self._present
         if mask is None:
-            self._state, outputs = self._programs.step(self._state, action, self.params)
+            packed, outputs = self._programs.step(
+                held.packed, action, self.params, self._spare(held)
+            )
         else:
-            self._state, outputs = self._programs.step_where(self._state, mask, action, self.params)
-        self._done = outputs["done"]
+            packed, outputs = self._programs.step_where(
+                held.packed, mask, action, self.params, self._spare(held)
+            )
+        self._hold(packed, outputs, keep)
         return outputs
+
+    @property
+    def kept(self) -> Any:
+        """What ``keep`` made of the last call's outputs; None if there was none."""
+        return None if self._held is None else self._held.kept
+
+    def keep(self, kept: Any) -> None:
+        """Replace ``kept``, and nothing else."""
+        self._held = replace(self._present, kept=kept)
+
+    def get_state(self) -> EnvState:
+        """Return the present states, with which ``set_state`` goes on to the bit.
+
+        Raises:
+            ResetNeeded: before the first reset.
+            ClosedEnvironmentError: after ``close``.
+            RuntimeError: this process is a fork that cannot run JAX.
+        """
+        self._check_ready("get_state")
+        self._held = replace(self._present, shared=True)
+        return self._programs.state(self._held.packed, self.params)
+
+    def set_state(self, state: Any, mask: np.ndarray | None = None) -> dict[str, Any]:
+        """Go on from given states.
+
+        Args:
+            state: what ``get_state`` returned here or of another environment of the same options,
+                or ``PixelEnv.reset`` and ``PixelEnv.step`` did; also of NumPy arrays.
+            mask: (N,) bool, which environments; None means all. Not for a single environment.
+
+        Returns:
+            Outputs as of ``reset``.
+
+        Raises:
+            TypeError: it is no ``EnvState``.
+            ValueError: it has other parts, shapes or types; the message names the first.
+            ResetNeeded: before the first reset some environments are left out.
+            ClosedEnvironmentError: after ``close``.
+            RuntimeError: this process is a fork that cannot run JAX.
+        """
+        self._check_usable()
+        check_state(state, self._programs.state_spec(self.params))
+        self._place_params()
+        if mask is None:
+            packed, outputs = self._programs.start(state, self.params)
+        elif self._held is None:
+            raise error.ResetNeeded("the first reset must be of all environments.")
+        else:
+            packed, outputs = self._programs.start_where(
+                self._held.packed, mask, state, self.params
+            )
+        self._hold(packed, outputs, None)
+        return outputs
+
+    def set_time_limit(self, control_steps: int) -> None:
+        """Set the time limit of all episodes, the present ones too.
+
+        Args:
+            control_steps: at least 1.
+        """
+        if control_steps == self.episode_length:
+            return
+        limit: Any = np.int32(control_steps)
+        if self._device is not None:
+            limit = jax.device_put(limit, self._device)
+        self.params = self.params.replace(episode_length=limit)
+        self.episode_length = control_steps
+
+    @property
+    def max_episode_steps(self) -> int:
+        """Time limit in calls of ``step``, of which the last may make fewer control steps."""
+        return -(-self.episode_length // self.env.action_repeat)
 
     def offset_time_limits(self, control_steps: np.ndarray) -> None:
         """Let the time limits of the present episodes come early.
@@ -194,10 +299,9 @@ class StatefulEnv:
             ClosedEnvironmentError: after ``close``.
             RuntimeError: this process is a fork that cannot run JAX.
         """
-        self._check_ready("offset_time_limits")
-        assert self._state is not None
-        offset = jnp.asarray(control_steps, jnp.int32)
-        self._state = self._state.replace(sim=self._state.sim.replace(time_limit_offset=offset))
+        state = self.get_state()
+        offset = np.asarray(control_steps, np.int32)
+        self.set_state(state.replace(sim=state.sim.replace(time_limit_offset=offset)))
 
     def render(self, height: int, width: int) -> jax.Array:
         """Draw the present states, at any size.
@@ -218,12 +322,11 @@ class StatefulEnv:
         self._check_ready("render")
         what = f"images of num_envs={self.num_envs}, height={height}, width={width}"
         check_fits(what, 3 * self.num_envs * height * width)
-        assert self._state is not None
-        return draw_images(self.env, self._state, self.params, height, width)
+        return self._programs.images(self._present.packed, self.params, height, width)
 
     def forget(self) -> None:
         """Let go of the states; a ``reset`` comes next."""
-        self._state = self._done = None
+        self._held = None
 
     def close(self) -> None:
         """Let go of the states; only another ``close`` may follow."""
@@ -237,18 +340,76 @@ class StatefulEnv:
             raise error.ResetNeeded("call reset() first.")
         return self._device
 
+    def __deepcopy__(self, memo: dict[int, Any]) -> StatefulEnv:
+        """Return an environment that goes on by itself, and shares what neither writes to."""
+        if self._held is not None:
+            self._held = replace(self._held, shared=True)
+        copied = memo[id(self)] = object.__new__(type(self))
+        copied.__dict__.update(self.__dict__)
+        return copied
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what is pickled: arrays in the host's memory, no device."""
+        held = self._held
+        if held is not None:
+            arrays = jax.tree.map(np.asarray, (held.packed, held.done, held.kept))
+            held = _Held(arrays[0], arrays[1], kept=arrays[2])
+        return self.__dict__ | {
+            "_held": held,
+            "_device": None,
+            "params": jax.tree.map(np.asarray, self.params),
+        }
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        held = self._held
+        if held is not None:
+            self._place_params()
+            arrays = jax.device_put((held.packed, held.done, held.kept))
+            self._held = _Held(arrays[0], arrays[1], kept=arrays[2])
+
     def _check_usable(self) -> None:
         check_not_forked()
         if self._closed:
             raise error.ClosedEnvironmentError("the environment is closed; make a new one.")
 
+    @property
+    def _present(self) -> _Held:
+        assert self._held is not None
+        return self._held
+
+    def _hold(self, packed: Packed, outputs: dict[str, Any], keep: Keep | None) -> None:
+        """Replace what is held by the states after a call."""
+        before = self._held
+        spare = None if before is None or before.shared else before.packed.frames
+        kept = None if keep is None else keep(outputs)
+        self._held = _Held(packed, outputs["done"], spare, kept=kept)
+
+    @staticmethod
+    def _spare(held: _Held) -> jax.Array:
+        """Return memory for the next frames."""
+        # It was handed to a call whose results an exception has kept from arriving.
+        if held.spare is None or held.spare.is_deleted():
+            return jnp.zeros(held.packed.frames.shape, jnp.uint8)
+        return held.spare
+
+    def _place_params(self) -> None:
+        """Put the parameters on the device, once."""
+        if self._device is not None:
+            return
+        # Clips are there already, and once for all.
+        clips = self.params.clips
+        params = jax.device_put(self.params.replace(clips=None)).replace(clips=clips)
+        self._device = next(iter(params.episode_length.devices()))
+        self.params = params
+
     def _check_ready(self, what: str) -> None:
         self._check_usable()
-        if self._state is None:
+        if self._held is None:
             raise error.ResetNeeded(f"call reset() before {what}().")
 
     def _check_not_done(self) -> None:
-        done = np.atleast_1d(np.asarray(self._done))
+        done = np.atleast_1d(np.asarray(self._present.done))
         if not done.any():
             return
         if self.single:
@@ -258,51 +419,3 @@ class StatefulEnv:
             'call reset(options={"reset_mask": mask}) with those entries True before the next '
             "step()."
         )
-
-
-def with_time_limit(spec: EnvSpec | None, stateful: StatefulEnv) -> EnvSpec | None:
-    """Return Gymnasium's description of an environment, with the time limit in it.
-
-    Args:
-        spec: what Gymnasium knows of the environment.
-        stateful: what was made.
-    """
-    if spec is None:
-        return None
-    spec, limit = copy.copy(spec), stateful.episode_length
-    # Calls of step(), of which the last one may make fewer control steps than the others.
-    spec.max_episode_steps = -(-limit // stateful.env.action_repeat)
-    spec.kwargs = {**spec.kwargs, "episode_length": limit}
-    spec.kwargs.pop("max_episode_steps", None)
-    return spec
-
-
-def _limited(config: EnvConfig, max_episode_steps: Any, is_limited: bool) -> EnvConfig:
-    """Return options whose time limit is no longer than so many calls of ``step``."""
-    limit = check_positive_int("max_episode_steps", max_episode_steps) * config.action_repeat
-    # Whichever is reached first, as with Gymnasium's own TimeLimit around an environment.
-    limit = min(limit, config.episode_length) if is_limited else limit
-    return env_config(config, {"episode_length": limit})
-
-
-def _make(config: EnvConfig) -> tuple[PixelEnv, EnvParams]:
-    if is_forked():
-        # What exists can be named in a fork without starting JAX. The worker then fails in
-        # reset(), where Gymnasium's AsyncVectorEnv passes errors on; from here it would only see
-        # a lost pipe.
-        for made, env, params in _made:
-            if _is_equal(made, config):
-                return env, params
-        check_not_forked()
-    env, params = make(config)
-    # Clips would be put on the device, which starts JAX.
-    if params.clips is None and not any(_is_equal(made, config) for made, _, _ in _made):
-        _made.append((config, env, params))
-    return env, params
-
-
-def _is_equal(one: EnvConfig, other: EnvConfig) -> bool:
-    try:
-        return one == other
-    except ValueError:  # Arrays of a camera or look, which have no truth value.
-        return False

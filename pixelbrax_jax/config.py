@@ -12,6 +12,7 @@ import jax
 from pixelbrax_jax.distractors.base import Distractor
 from pixelbrax_jax.distractors.clips import ClipBank
 from pixelbrax_jax.distractors.presets import as_tuple
+from pixelbrax_jax.plain import from_plain
 from pixelbrax_jax.renderer.base import check_renderer
 from pixelbrax_jax.scene.look import make_look
 from pixelbrax_jax.tasks import REWARD_PRESETS
@@ -48,7 +49,8 @@ class ProgramConfig:
     NVIDIA GPUs that ``auto`` takes there; ``pallas-interpret``, that kernel on any device, slowly;
     or ``reference``, the slow one that the others are tested against."""
     distractors: Distractors = ()
-    """What changes the image: a distractor, the name of a preset, or several of them."""
+    """What changes the image: a distractor, the name of a preset, or several of them; as
+    everywhere, a dictionary of ``plain.to_plain`` in place of an object."""
     physics_batching: str = "auto"
     """``auto``, the fastest for the device; or ``vmap``, also to compile for another device."""
 
@@ -62,7 +64,7 @@ class ProgramConfig:
         ):
             check_choice(name, self._static(name), allowed)
         check_renderer(self._static("renderer"))
-        self._store("distractors", as_tuple(self.distractors))
+        self._store("distractors", as_tuple(from_plain(self.distractors)))
 
     def _static(self, name: str) -> Any:
         """Return an option that decides which program is compiled.
@@ -129,6 +131,8 @@ class EnvConfig(ProgramConfig):
         self._store("episode_length", episode_length)
         if self.shadows is not None:
             self._store("shadows", check_bool("shadows", self.shadows))
+        self._store("camera", from_plain(self.camera))
+        self._store("look", from_plain(self.look))
         make_look(self.look)
         if self.clips is not None and not isinstance(self.clips, (str, PathLike, ClipBank)):
             raise TypeError(

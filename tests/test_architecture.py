@@ -42,7 +42,8 @@ ALLOWED: dict[str, set[str]] = {
     "pixelbrax_jax.deprecation": set(),
     "pixelbrax_jax.policy": {"pixelbrax_jax.extras", "pixelbrax_jax.validation"},
     **{f"pixelbrax_jax.{name}": _below() for name in LAYERS},
-    "pixelbrax_jax.config": _below("scene", "renderer", "distractors"),
+    "pixelbrax_jax.plain": _below("distractors"),
+    "pixelbrax_jax.config": _below("plain", "scene", "renderer", "distractors"),
     # How a CPU runs a batch: it knows nothing of PixelBrax, and only `envs` knows of it.
     "pixelbrax_jax._cpu": set(),
     "pixelbrax_jax.envs": _below("config", "_cpu", *LAYERS),
@@ -53,7 +54,7 @@ ALLOWED: dict[str, set[str]] = {
         "pixelbrax_jax",
         *_below("config", "envs", "policy", "registry", "distractors"),
     },
-    "pixelbrax_gym": {"pixelbrax_jax", *_below("config", "registry", "policy")},
+    "pixelbrax_gym": {"pixelbrax_jax", *_below("config", "plain", "registry", "policy")},
 }
 """Package -> the packages that it may import besides itself."""
 

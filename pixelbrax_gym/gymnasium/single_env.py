@@ -9,12 +9,14 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
 from pixelbrax_gym.gymnasium.spaces import action_space, observation_space
+from pixelbrax_gym.gymnasium.specs import complete_spec, time_limit_around
 from pixelbrax_gym.gymnasium.window import Window
 from pixelbrax_gym.interop.export import exporter, to_numpy
 from pixelbrax_gym.reset_options import check_reset_options
-from pixelbrax_gym.seeds import check_seed
-from pixelbrax_gym.stateful import StatefulEnv, with_time_limit
+from pixelbrax_gym.seeds import check_seed, check_unseeded
+from pixelbrax_gym.stateful import StatefulEnv
 from pixelbrax_jax.memory import check_fits
+from pixelbrax_jax.types import EnvState
 from pixelbrax_jax.validation import check_choice, check_positive_int
 
 RENDER_MODES = ("human", "rgb_array")
@@ -31,12 +33,11 @@ class PixelBraxEnv(gymnasium.Env):
     ``reset()`` without a seed goes on to the next episode, whose initial state depends on nothing
     but the seed and the number of the episode.
 
-    Time limits: the environment truncates after ``episode_length`` control steps, 1000 unless
-    told otherwise, hence after ``episode_length / action_repeat`` calls of ``step``.
-    ``max_episode_steps`` counts calls of ``step``, as everywhere in Gymnasium. Given to this
-    class it takes the place of the 1000 control steps; given to ``gymnasium.make`` it becomes
-    Gymnasium's own ``TimeLimit``. Whichever limit is reached first truncates. A longer episode
-    than 1000 control steps hence wants ``episode_length``.
+    Time limits: the environment truncates after ``episode_length`` control steps, hence after
+    ``episode_length / action_repeat`` calls of ``step``. ``max_episode_steps`` counts calls of
+    ``step``, as everywhere in Gymnasium, and so does a ``TimeLimit``, which ``gymnasium.make``
+    makes of it. Of those that are given, the limit that is reached first truncates; if none is, it
+    is 1000 control steps.
 
     Observations are never overwritten, and may be written to: nothing reads them again.
 
@@ -107,22 +108,55 @@ class PixelBraxEnv(gymnasium.Env):
         Args:
             seed: s resets to episode 0 of ``jax.random.key(s)``; None goes on to the next, or
                 draws a seed if there was none yet.
-            options: None or an empty dict; there are none.
+            options: ``{"state": state}`` goes on from a state of ``get_state``, and takes no
+                seed; there are no others.
 
         Returns:
             The observation and the info of ``step``.
 
         Raises:
-            TypeError: the seed is no integer, or ``options`` no dict.
-            ValueError: the seed is out of range, or there are options.
+            TypeError: the seed is no integer, ``options`` no dict, or the state no ``EnvState``.
+            ValueError: the seed is out of range, or given beside a state; the state is of another
+                environment; or there are other options.
             RuntimeError: this process is a fork that cannot run JAX.
         """
-        check_reset_options(options)
-        seed = None if seed is None else check_seed(seed)
-        super().reset(seed=seed)
-        outputs = self._stateful.reset(seed, self.np_random)
+        check_reset_options(options, ("state",))
+        self._take_time_limit()
+        if options:
+            check_unseeded(seed)
+            outputs = self._stateful.set_state(options["state"])
+        else:
+            seed = None if seed is None else check_seed(seed)
+            super().reset(seed=seed)
+            outputs = self._stateful.reset(seed, self.np_random)
         self._show()
         return self._export(outputs["obs"]), _plain(outputs["info"])
+
+    def get_state(self) -> EnvState:
+        """Return the present state.
+
+        Returns:
+            An ``EnvState`` of arrays that nothing writes to, with all that decides how the episode
+            and the later ones go on, but for a ``TimeLimit`` around the environment. It can be
+            pickled, and ``reset(options={"state": state})`` goes on from it to the bit.
+
+        Raises:
+            ResetNeeded: before the first reset, or after ``close``.
+        """
+        return self._stateful.get_state()
+
+    def set_state(self, state: EnvState) -> None:
+        """Go on from a given state, as ``reset(options={"state": state})`` does.
+
+        Args:
+            state: what ``get_state`` returned here or of another environment of the same options,
+                or ``PixelEnv.reset`` or ``step`` did.
+
+        Raises:
+            TypeError: it is no ``EnvState``.
+            ValueError: it is of another environment; the message names the first difference.
+        """
+        self._stateful.set_state(state)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Act for ``action_repeat`` control steps.
@@ -183,7 +217,13 @@ class PixelBraxEnv(gymnasium.Env):
 
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
-        self._spec = with_time_limit(spec, self._stateful)
+        self._spec = complete_spec(spec, self._stateful, self._stateful.is_limited)
+
+    def _take_time_limit(self) -> None:
+        """Let a ``TimeLimit`` around this environment have its way, unless a limit was given."""
+        calls = None if self._stateful.is_limited else time_limit_around(self)
+        if calls is not None and calls > self._stateful.max_episode_steps:
+            self._stateful.set_time_limit(calls * self._stateful.env.action_repeat)
 
     def _show(self) -> None:
         if self._window is not None:

@@ -14,12 +14,14 @@ from gymnasium.vector import AutoresetMode
 
 from pixelbrax_gym.gymnasium.single_env import check_render_size
 from pixelbrax_gym.gymnasium.spaces import action_space, observation_space
+from pixelbrax_gym.gymnasium.specs import complete_spec
 from pixelbrax_gym.interop.export import exporter, to_numpy
 from pixelbrax_gym.member import Member, call_members
-from pixelbrax_gym.reset_options import reset_mask
-from pixelbrax_gym.seeds import check_seed
-from pixelbrax_gym.stateful import StatefulEnv, with_time_limit
+from pixelbrax_gym.reset_options import check_reset_options, reset_mask
+from pixelbrax_gym.seeds import check_seed, check_unseeded
+from pixelbrax_gym.stateful import StatefulEnv
 from pixelbrax_jax import AUTORESET_MODES
+from pixelbrax_jax.types import EnvState
 from pixelbrax_jax.validation import check_choice
 
 _OWN_OPTIONS = (
@@ -159,24 +161,58 @@ class PixelBraxVectorEnv(gymnasium.vector.VectorEnv):
                 environment is reset to its episode 0; None goes on to its next episode,
                 or draws a seed if there was none yet.
             options: ``{"reset_mask": mask}`` with an (N,) bool array or tensor, at least one
-                True, resets only those and repeats the observations of the others. Never changed.
+                True, resets only those and repeats the observations of the others.
+                ``{"state": state}`` goes on from a state of ``get_state``, and takes no seed.
+                Both may be given. Never changed.
 
         Returns:
             Observations and infos.
 
         Raises:
-            TypeError: the mask is no array or tensor of bool, or a seed no integer.
-            ValueError: the mask has another shape or no True; a seed is out of range; or there
-                are other options.
+            TypeError: the mask is no array or tensor of bool, a seed no integer, or the state no
+                ``EnvState``.
+            ValueError: the mask has another shape or no True; a seed is out of range, or given
+                beside a state; the state is of other environments; or there are other options.
             ResetNeeded: the first reset has a mask that leaves environments out.
             ClosedEnvironmentError: after ``close``.
             RuntimeError: this process is a fork that cannot run JAX.
         """
+        check_reset_options(options, ("reset_mask", "state"))
         mask = reset_mask(options, self.num_envs)
+        if options and "state" in options:
+            check_unseeded(seed)
+            outputs = self._stateful.set_state(options["state"], mask)
+            return self._export(outputs["obs"]), self._infos(outputs)
         # One seed for all also seeds the generator that Gymnasium's wrappers draw from.
         super().reset(seed=None if seed is None or np.ndim(seed) else check_seed(seed))
         outputs = self._stateful.reset(seed, self.np_random, mask)
         return self._export(outputs["obs"]), self._infos(outputs)
+
+    def get_state(self) -> EnvState:
+        """Return the present states of all environments.
+
+        Returns:
+            An ``EnvState`` with a leading axis N, of arrays that nothing writes to. It can be
+            pickled, and ``reset(options={"state": state})`` goes on from it to the bit.
+
+        Raises:
+            ResetNeeded: before the first reset.
+            ClosedEnvironmentError: after ``close``.
+        """
+        return self._stateful.get_state()
+
+    def set_state(self, state: EnvState) -> None:
+        """Go on from given states, as ``reset(options={"state": state})`` does.
+
+        Args:
+            state: what ``get_state`` returned here or of other environments of the same options.
+
+        Raises:
+            TypeError: it is no ``EnvState``.
+            ValueError: it is of other environments; the message names the first difference.
+            ClosedEnvironmentError: after ``close``.
+        """
+        self._stateful.set_state(state)
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Step all environments.
@@ -268,7 +304,7 @@ class PixelBraxVectorEnv(gymnasium.vector.VectorEnv):
 
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
-        self._spec = with_time_limit(spec, self._stateful)
+        self._spec = complete_spec(spec, self._stateful, limited=True)
 
     def close_extras(self, **kwargs: Any) -> None:
         """Forget the states."""

@@ -34,6 +34,10 @@ class Window:
         self.closed = False
         """Whether the user has asked to close it."""
 
+    def __reduce__(self) -> Any:
+        """Return what is pickled or copied: a window that is not open yet."""
+        return Window, (self._title, self._fps)
+
     def show(self, image: np.ndarray) -> None:
         """Show an image.
 

@@ -25,6 +25,7 @@ from pixelbrax_gym.member import Member, call_members
 from pixelbrax_gym.reset_options import check_reset_options
 from pixelbrax_gym.seeds import SEEDS, spread_seeds
 from pixelbrax_gym.stateful import StatefulEnv
+from pixelbrax_jax import PixelEnv
 from pixelbrax_jax.validation import check_bool, check_choice
 
 _OWN_OPTIONS = (
@@ -36,6 +37,26 @@ _OWN_OPTIONS = (
     "stagger",
     "max_episode_steps",
 )
+
+
+def check_channels(env: PixelEnv, channels_first: bool) -> None:
+    """Reject images of which Stable-Baselines3 would read another axis as channels.
+
+    It takes the shortest axis for them, the first of several.
+
+    Raises:
+        ValueError: it would; the message names the options.
+    """
+    channels = 3 * env.frame_stack
+    shortest = min(env.height, env.width)
+    misread = shortest < channels if channels_first else env.height <= min(env.width, channels)
+    if env.obs_mode != "state" and misread:
+        raise ValueError(
+            f"height={env.height}, width={env.width} and frame_stack={env.frame_stack} make images "
+            f"with {channels} channels, and Stable-Baselines3 takes the shortest axis of an image "
+            f"for its channels: give more than {channels} pixels of height and width, or stack "
+            "fewer frames."
+        )
 
 
 class PixelBraxSB3VecEnv(VecEnv):
@@ -94,7 +115,9 @@ class PixelBraxSB3VecEnv(VecEnv):
 
         Raises:
             TypeError: an option is unknown; the message lists those there are.
-            ValueError: an option is out of range; the message lists what is allowed.
+            ValueError: an option is out of range; the message lists what is allowed. Or there are
+                at least as many channels as rows or columns, so that Stable-Baselines3 would read
+                these as channels.
             RuntimeError: this process is a fork that cannot run JAX.
         """
         if render_mode is not None:
@@ -113,6 +136,7 @@ class PixelBraxSB3VecEnv(VecEnv):
         self._render_size = check_render_size(render_height, render_width)
         space = observation_space(env.obs_spec)
         space = channels_first_space(space) if channels_first else space
+        check_channels(env, channels_first)
         spaces = (space, action_space(env.action_size))
         # Stable-Baselines3 asks them for their render mode while it makes the rest.
         self.render_mode = render_mode

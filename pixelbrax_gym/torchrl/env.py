@@ -105,9 +105,6 @@ class PixelBraxTorchRLEnv(EnvBase):
         # Of environments whose next reset shall be to episode 0 of a seed; else None.
         self._seeds: list[int | None] | None = None
         self._is_seeded = False
-        # First observations of the episodes that the last step began, and where it began any.
-        self._first_obs: Any = None
-        self._was_reset: Any = np.zeros(self._num_envs, bool)
 
         env, size = stateful.env, (self._num_envs, self.device)
         self.observation_spec = observation_spec(env.obs_spec, *size)
@@ -128,21 +125,32 @@ class PixelBraxTorchRLEnv(EnvBase):
         if not self._is_seeded:
             self._set_seed(None)
         seeds = None
+        first_obs, was_reset = self._begun
+        left = was_reset & ~mask
         # What was reset already is not reset twice, unless it shall have another seed.
-        to_reset = mask & ~np.asarray(self._was_reset)
+        to_reset = mask & ~was_reset
         if self._seeds is not None:
             seeds = [seed if here else None for seed, here in zip(self._seeds, mask, strict=True)]
             to_reset |= np.array([seed is not None for seed in seeds])
-        if to_reset.any() or self._first_obs is None:
-            outputs = self._stateful.reset(seeds, mask=to_reset)
-            self._first_obs = outputs["obs"]
-        self._was_reset = np.asarray(self._was_reset) & ~mask
-        if self._seeds is not None:
-            left = [None if here else seed for seed, here in zip(self._seeds, mask, strict=True)]
-            self._seeds = left if any(seed is not None for seed in left) else None
         # Handed out once, and so never shared by two who might write to it.
-        obs, self._first_obs = self._first_obs, None
-        return self._tensordict(self._observations(to_torch(obs)) | self._flags())
+        if to_reset.any() or first_obs is None:
+            outputs = self._stateful.reset(seeds, mask=to_reset, keep=lambda _: (None, left))
+            first_obs = outputs["obs"]
+        else:
+            self._stateful.keep((None, left))
+        if self._seeds is not None:
+            later = [None if here else seed for seed, here in zip(self._seeds, mask, strict=True)]
+            self._seeds = later if any(seed is not None for seed in later) else None
+        return self._tensordict(self._observations(to_torch(first_obs)) | self._flags())
+
+    @property
+    def _begun(self) -> tuple[Any, np.ndarray]:
+        """Of the last step: first observations of the episodes that it began; where it began any.
+
+        Kept with the state, so that an exception at any time leaves the two in step.
+        """
+        first_obs, where = self._stateful.kept or (None, np.zeros(self._num_envs, bool))
+        return first_obs, np.asarray(where)
 
     def _reset_proc_data(
         self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase
@@ -155,7 +163,7 @@ class PixelBraxTorchRLEnv(EnvBase):
         what the environment shows, also if the caller had changed them. A ``TransformedEnv``
         chooses, and copies, by itself.
         """
-        if tensordict is None or np.any(self._was_reset):
+        if tensordict is None or np.any(self._begun[1]):
             return super()._reset_proc_data(tensordict, tensordict_reset)
         names = list(self.observation_spec.keys())
         rest = super()._reset_proc_data(
@@ -173,7 +181,7 @@ class PixelBraxTorchRLEnv(EnvBase):
                 "step() needs an entry 'action' in its tensordict; a policy writes it, or "
                 "env.rand_action(tensordict)."
             )
-        began = np.asarray(self._was_reset)
+        began = self._begun[1]
         ended = began if mask is None else began & mask
         if ended.any():
             raise error.ResetNeeded(
@@ -181,13 +189,14 @@ class PixelBraxTorchRLEnv(EnvBase):
                 "their '_reset' True before the next step(). Should a transform step several "
                 "times in a row, use action_repeat instead."
             )
-        outputs = self._stateful.step(action.to(self._jax_device), mask)
+
+        def begun(outputs: dict[str, Any]) -> tuple[Any, Any]:
+            # Not `done` itself, which leaves and may be written to.
+            where = outputs["info"]["_final_obs"]
+            return outputs["obs"], where if mask is None else began | np.asarray(outputs["done"])
+
+        outputs = self._stateful.step(action.to(self._jax_device), mask, keep=begun)
         infos = outputs["info"]
-        self._first_obs = outputs["obs"]
-        # Not `done` itself, which leaves and may be written to.
-        self._was_reset = (
-            infos["_final_obs"] if mask is None else began | np.asarray(outputs["done"])
-        )
         names = ("reward", "done", "terminated", "truncated")
         exported = to_torch(
             {

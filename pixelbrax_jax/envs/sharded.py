@@ -25,8 +25,12 @@ def make_env_mesh(num_devices: int | None = None) -> Mesh:
     Args:
         num_devices: how many; None takes all, those of other processes too.
     """
-    num_devices = jax.device_count() if num_devices is None else num_devices
-    return jax.make_mesh((num_devices,), (AXIS,), axis_types=(AxisType.Auto,))
+    return _mesh(num_devices=jax.device_count() if num_devices is None else num_devices)
+
+
+def _mesh(devices: list[jax.Device] | None = None, *, num_devices: int = 0) -> Mesh:
+    shape = (len(devices) if devices else num_devices,)
+    return jax.make_mesh(shape, (AXIS,), axis_types=(AxisType.Auto,), devices=devices)
 
 
 @dataclass(frozen=True)
@@ -59,6 +63,23 @@ class ShardedVectorEnv:
             raise ValueError(f"num_envs={num_envs} must be a multiple of the {size} devices.")
         object.__setattr__(self, "num_envs", num_envs)
         _ = self._local  # It checks the other fields.
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what is pickled: of devices, which ones they are."""
+        ids = [device.id for device in self.mesh.devices.flat]
+        fields = ("env", "num_envs", "autoreset_mode")
+        return {name: getattr(self, name) for name in fields} | {"mesh": ids}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        devices = {device.id: device for device in jax.devices()}
+        missing = [i for i in state["mesh"] if i not in devices]
+        if missing:
+            raise ValueError(
+                f"environments spread over devices {state['mesh']} need devices {missing}, which "
+                f"this process has not; it has {sorted(devices)}."
+            )
+        mesh = _mesh([devices[i] for i in state["mesh"]])
+        self.__dict__.update(state | {"mesh": mesh})
 
     @partial(jax.jit, static_argnums=0)
     def reset(self, key: jax.Array, params: EnvParams) -> tuple[EnvState, Timestep]:

@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from pixelbrax_jax.physics.recipe import Recipe
 from pixelbrax_jax.spatial import quat_normalize
 from pixelbrax_jax.types import PhysicsState
 
@@ -35,6 +36,17 @@ class GuardedPhysics(abc.ABC):
     @abc.abstractmethod
     def _watched(self, state: PhysicsState) -> Any:
         """Return a tree of what must be finite besides observation and reward."""
+
+    def __reduce__(self) -> Any:
+        """Return what is pickled: of a task of the package, how it is made."""
+        identity = getattr(self, "_identity", None)
+        if isinstance(identity, Recipe):
+            return identity.make, identity.arguments
+        return super().__reduce_ex__(2)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> GuardedPhysics:
+        """Return the object itself, which nothing changes."""
+        return self
 
     # Traced once for equal objects, however many programs they are part of.
 

@@ -186,8 +186,13 @@ def test_sync_and_vector_doors_agree():
     np.testing.assert_array_equal(sync.reset(seed=5)[0], vector.reset(seed=5)[0])
     for action in np.linspace(-1, 1, 20, dtype=np.float32):
         batch = np.full((3, 1), action)
-        for left, right in zip(sync.step(batch)[:4], vector.step(batch)[:4], strict=True):
-            np.testing.assert_array_equal(left, right)
+        (obs, reward, *flags), (same_obs, same_reward, *same_flags) = (
+            env.step(batch)[:4] for env in (sync, vector)
+        )
+        # Two programs, of one environment and of three: they may round differently.
+        np.testing.assert_array_max_ulp(obs, same_obs, maxulp=1)
+        np.testing.assert_array_max_ulp(np.float32(reward), same_reward, maxulp=1)
+        np.testing.assert_array_equal(flags, same_flags)
 
 
 def test_spaces_cost_nothing_and_print_fast():

@@ -253,7 +253,7 @@ def test_episodes_that_begin_copy_no_pictures(make_torchrl):
     env = make_torchrl(obs_mode="both")
     td, seen = env.reset(), []
     step = env._stateful.step
-    env._stateful.step = lambda *args: seen.append(step(*args)) or seen[-1]
+    env._stateful.step = lambda *args, **options: seen.append(step(*args, **options)) or seen[-1]
     goes_right = torch.tensor([[0.0], [1.0], [0.0]])
     done = torch.zeros(3, 1, dtype=torch.bool)
     while not done.any():

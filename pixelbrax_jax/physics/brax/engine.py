@@ -6,6 +6,7 @@ import contextlib
 import copy
 from collections.abc import Callable, Collection, Hashable, Iterator, Mapping
 from typing import Any
+from uuid import uuid4
 
 import jax
 import jax.numpy as jnp
@@ -15,9 +16,11 @@ from flax import struct
 
 from pixelbrax_jax.physics.base import Kinematics, RewardFn
 from pixelbrax_jax.physics.brax.compatibility import accept_old_clip
+from pixelbrax_jax.physics.brax.pickling import with_modules, without_modules
 from pixelbrax_jax.physics.divergence import GuardedPhysics
 from pixelbrax_jax.physics.geometry import VISIBLE_GROUPS, read_geoms
 from pixelbrax_jax.physics.mujoco_compatibility import import_silenced, known_warnings_silenced
+from pixelbrax_jax.physics.recipe import Recipe
 from pixelbrax_jax.spatial import quat_normalize
 from pixelbrax_jax.tasks import Color
 from pixelbrax_jax.types import PhysicsState
@@ -86,7 +89,8 @@ class BraxPhysics(GuardedPhysics):
             reward: replaces the environment's reward; called with the state before the step,
                 the state after it and the action, returns a scalar.
             identity: objects of one identity are equal, and environments over them share compiled
-                programs; None makes the object equal to itself alone.
+                programs; None makes the object equal to itself and its pickles alone. A pickle
+                keeps nothing but it if it is a ``Recipe``.
 
         Raises:
             ValueError: if ``env`` is wrapped for training, has no MuJoCo model, does not
@@ -111,7 +115,15 @@ class BraxPhysics(GuardedPhysics):
         self._env = _replace_init(env, self._init)
         self._reward = reward
         self._control_range = _control_range(model) if unscale_actions else None
-        self._identity = object() if identity is None else identity
+        self._identity: Hashable = uuid4() if identity is None else identity
+        self._options = {
+            "colors": colors,
+            "drawn_radius": drawn_radius,
+            "geom_groups": geom_groups,
+            "unscale_actions": unscale_actions,
+            "reward": reward,
+            "identity": self._identity,
+        }
         self._check_shapes()
 
     def __eq__(self, other: object) -> bool:
@@ -119,6 +131,12 @@ class BraxPhysics(GuardedPhysics):
 
     def __hash__(self) -> int:
         return hash(self._identity)
+
+    def __reduce__(self) -> Any:
+        """Return what is pickled: how it is made, or of which environment."""
+        if isinstance(self._identity, Recipe):
+            return super().__reduce__()
+        return _restore, (type(self), without_modules(self._source), self._options)
 
     def _reset(self, key: jax.Array) -> PhysicsState:
         """See ``Physics.reset``. ``key`` may be typed, or uint32 as Brax's own are."""
@@ -265,6 +283,10 @@ class BraxPhysics(GuardedPhysics):
             raise ValueError(f"the reward must be a scalar, got shape {after.reward.shape}")
         if after.terminated.shape != ():
             raise ValueError(f"done must be a scalar, got shape {after.terminated.shape}")
+
+
+def _restore(cls: type[BraxPhysics], env: envs.Env, options: dict[str, Any]) -> BraxPhysics:
+    return cls(with_modules(env), **options)
 
 
 def kinematics(pipeline_state: Any) -> Kinematics:

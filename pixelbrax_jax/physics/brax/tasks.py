@@ -15,6 +15,7 @@ from pixelbrax_jax.physics.mujoco_compatibility import (
     load_onto_own_device,
     loading_silenced,
 )
+from pixelbrax_jax.physics.recipe import Recipe
 from pixelbrax_jax.tasks import BRAX_TASKS, REWARD_PRESETS
 from pixelbrax_jax.validation import check_choice
 
@@ -72,7 +73,7 @@ def _load(task: str, backend: str, reward_preset: str) -> BraxPhysics:
         drawn_radius=row.drawn_radius,
         unscale_actions=paper and row.paper_unscaled,
         reward=reward,
-        identity=("brax", task, backend, reward_preset),
+        identity=Recipe(_load, (task, backend, reward_preset)),
     )
 
 

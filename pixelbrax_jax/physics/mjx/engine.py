@@ -44,7 +44,7 @@ class MjxPhysics(GuardedPhysics):
             task: the task.
             model: the compiled model of its domain; changed as the task wants it.
             identity: objects of one identity are equal, and environments over them share compiled
-                programs.
+                programs. A pickle keeps nothing but it if it is a ``Recipe``.
 
         Raises:
             ValueError: the model has something visible that cannot be drawn.

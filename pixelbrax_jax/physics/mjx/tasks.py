@@ -8,6 +8,7 @@ from importlib import import_module
 from pixelbrax_jax.physics.mjx.engine import MjxPhysics
 from pixelbrax_jax.physics.mjx.models import load_model
 from pixelbrax_jax.physics.mjx.task import DmcTask
+from pixelbrax_jax.physics.recipe import Recipe
 from pixelbrax_jax.tasks import DMC_TASKS
 from pixelbrax_jax.validation import check_choice
 
@@ -65,4 +66,4 @@ def dmc_task(task: str) -> DmcTask:
 def _load(task: str) -> MjxPhysics:
     parts = dmc_task(task)
     model = load_model(parts.domain, **parts.options)
-    return MjxPhysics(parts, model, identity=("mjx", task))
+    return MjxPhysics(parts, model, identity=Recipe(_load, (task,)))

@@ -1,0 +1,97 @@
+"""Options as what JSON has: numbers, text, lists and dictionaries."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Mapping
+from importlib import import_module
+from typing import Any
+
+import jax
+import numpy as np
+
+from pixelbrax_jax.distractors.base import Distractor
+from pixelbrax_jax.distractors.camera import Camera as CameraDistractor
+from pixelbrax_jax.distractors.color import Color
+from pixelbrax_jax.distractors.video import Video
+from pixelbrax_jax.types import Camera, CameraRig, Lamp, Look
+from pixelbrax_jax.validation import check_choice, check_options
+
+TYPE = "type"
+"""The entry of a dictionary that names what it describes."""
+
+_TYPES: dict[str, type] = {cls.__name__: cls for cls in (Camera, CameraRig, Lamp, Look)} | {
+    cls.kind: cls for cls in (CameraDistractor, Color, Video)
+}
+_NAMES = {cls: name for name, cls in _TYPES.items()}
+
+
+def to_plain(value: Any) -> Any:
+    """Return an option's value as what JSON has.
+
+    A camera, look or distractor becomes a dictionary, which every option takes in its place: of
+    its fields, and its name under ``"type"``, of a class of your own ``"module:Class"``.
+
+    Args:
+        value: of an option of ``pixelbrax_jax.make`` or an environment of ``pixelbrax_gym``.
+
+    Raises:
+        ValueError: JSON has nothing for it, such as a bank of clips.
+    """
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    if isinstance(value, Mapping):
+        return {name: to_plain(part) for name, part in value.items()}
+    if isinstance(value, (tuple, list)):
+        return [to_plain(part) for part in value]
+    if isinstance(value, (jax.Array, np.ndarray, np.generic)):
+        return np.asarray(value).tolist()
+    cls = type(value)
+    if cls in _NAMES or (isinstance(value, Distractor) and dataclasses.is_dataclass(value)):
+        name = _NAMES.get(cls, f"{cls.__module__}:{cls.__qualname__}")
+        parts = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+        return {TYPE: name} | {name: to_plain(part) for name, part in parts.items()}
+    raise ValueError(f"JSON has nothing for a {cls.__name__}.")
+
+
+def from_plain(value: Any) -> Any:
+    """Return what a dictionary of ``to_plain`` describes, or those in a list; all else as it is.
+
+    Raises:
+        ValueError: the dictionary names no type, or one that there is not; the message lists them.
+        TypeError: there is no such field; the message lists them.
+    """
+    if isinstance(value, (tuple, list)):
+        return tuple(map(from_plain, value))
+    if not isinstance(value, Mapping):
+        return value
+    if TYPE not in value:
+        raise ValueError(
+            f"a dictionary as an option needs an entry {TYPE!r}, one of {', '.join(_TYPES)}; got "
+            f"{dict(value)!r}."
+        )
+    cls = _type_of(value[TYPE])
+    parts = {name: part for name, part in value.items() if name != TYPE}
+    fields = {field.name: field for field in dataclasses.fields(cls)}
+    check_options(parts, fields)
+    return cls(**{name: _field(part, fields[name]) for name, part in parts.items()})
+
+
+def _type_of(name: Any) -> Any:
+    if not isinstance(name, str) or ":" not in name:
+        return _TYPES[check_choice(f"entry {TYPE!r}", name, _TYPES)]
+    module, _, path = name.partition(":")
+    cls: Any = import_module(module)
+    for part in path.split("."):
+        cls = getattr(cls, part, None)
+    if not (isinstance(cls, type) and issubclass(cls, Distractor)):
+        raise ValueError(f"{TYPE}={name!r} is no distractor, which is all that a module may give.")
+    return cls
+
+
+def _field(value: Any, field: dataclasses.Field[Any]) -> Any:
+    is_array = "jax.Array" in str(field.type) and value is not None
+    return np.asarray(value, np.float32) if is_array else from_plain(value)

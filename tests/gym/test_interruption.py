@@ -1,0 +1,201 @@
+"""An exception that arrives at any time leaves the state before a step or the one after."""
+
+from __future__ import annotations
+
+import random
+import signal
+import sys
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+
+import pixelbrax_gym
+from tests.gym.conftest import ID, SIZE, TASK
+
+SIGNALS = 60
+"""Of each adapter."""
+OPTIONS = SIZE | {"episode_length": 7}
+PACKAGE = pixelbrax_gym.__path__[0]
+
+
+class InterruptedStepError(KeyboardInterrupt):
+    """Raised by the handler of a timer's signal."""
+
+
+def single():
+    env = gymnasium.make(ID, **OPTIONS)
+
+    def step():
+        if env.unwrapped._stateful._held.done:
+            env.reset()
+        else:
+            env.step(np.zeros(1, np.float32))
+
+    return env.unwrapped, lambda: env.reset(seed=0), step
+
+
+def vector(output):
+    def make():
+        env = gymnasium.make_vec(ID, num_envs=3, output=output, **OPTIONS)
+        return env, lambda: env.reset(seed=0), lambda: env.step(np.zeros((3, 1), np.float32))
+
+    return make
+
+
+def sb3():
+    env = pixelbrax_gym.PixelBraxSB3VecEnv(TASK, 3, **OPTIONS)
+
+    def reset():
+        env.seed(0)
+        env.reset()
+
+    return env, reset, lambda: env.step(np.zeros((3, 1), np.float32))
+
+
+def torchrl():
+    env = pixelbrax_gym.PixelBraxTorchRLEnv(TASK, 3, **OPTIONS)
+    zeros = torch.zeros(3, 1)
+    latest = [None]
+
+    def reset():
+        env.set_seed(0)
+        latest[0] = env.reset()
+
+    def step():
+        began = env._begun[1]
+        if began.any():
+            mask = torch.tensor(began)[:, None]
+            latest[0] = env.reset(latest[0].clone().set("_reset", mask))
+        else:
+            latest[0] = env.step(latest[0].clone().set("action", zeros))["next"]
+
+    return env, reset, step
+
+
+ADAPTERS = {
+    "single": single,
+    "numpy": vector("numpy"),
+    "torch": vector("torch"),
+    "sb3": sb3,
+    "torchrl": torchrl,
+}
+
+
+def held(env):
+    """The state that an adapter holds, and what it keeps beside it."""
+    now = env._stateful._held
+    begun = env._begun[1].tobytes() if hasattr(env, "_begun") else b""
+    arrays = (np.asarray(array).tobytes() for array in now.packed)
+    return b"".join(arrays) + np.asarray(now.done).tobytes() + begun
+
+
+@pytest.fixture
+def interrupt():
+    """Raise ``InterruptedStepError`` after so many seconds, by a real signal."""
+
+    def stop(number, frame):
+        raise InterruptedStepError
+
+    before = signal.signal(signal.SIGALRM, stop)
+    yield lambda seconds: signal.setitimer(signal.ITIMER_REAL, seconds)
+    signal.setitimer(signal.ITIMER_REAL, 0)
+    signal.signal(signal.SIGALRM, before)
+
+
+@pytest.mark.parametrize("name", ADAPTERS)
+def test_a_signal_leaves_the_state_before_or_after_a_step(name, interrupt):
+    env, reset, step = ADAPTERS[name]()
+    reset()
+    states = [held(env)]
+    # Later steps take the ways of the earlier ones, with everything compiled.
+    for _ in range(40):
+        step()
+        states.append(held(env))
+    places = {state: i for i, state in enumerate(states)}
+    assert len(places) == len(states)
+    delays = random.Random(0)
+    changed = 0
+    for _ in range(SIGNALS):
+        reset()
+        count = -1
+        interrupt(10 ** delays.uniform(-4.5, -2.5))
+        try:
+            for count in range(40):  # noqa: B007
+                step()
+            interrupt(0)
+        except InterruptedStepError:
+            pass
+        else:
+            continue
+        now = places[held(env)]
+        # `count` steps have returned, and perhaps one more, or the loop's own next was interrupted.
+        assert now in (max(count, 0), max(count, 0) + 1)
+        changed += now > 0
+        for _ in range(3):
+            step()
+        assert held(env) == states[now + 3] if now + 3 < len(states) else True
+    assert changed > SIGNALS // 4
+
+
+def raising_at(last):
+    """A trace function that raises at a line of the package, after so many others."""
+    seen = 0
+
+    def trace(frame, event, argument):
+        nonlocal seen
+        if not frame.f_code.co_filename.startswith(PACKAGE):
+            return None
+        if event == "line":
+            seen += 1
+            if seen > last:
+                raise InterruptedStepError
+        return trace
+
+    return trace
+
+
+@pytest.mark.parametrize("name", ADAPTERS)
+def test_an_exception_at_every_line_leaves_a_usable_environment(name):
+    """As a debugger raises one: from its trace function, at each line in turn."""
+    env, reset, step = ADAPTERS[name]()
+    reset()
+    step()
+    lines = 0
+    while True:
+        reset()
+        before = held(env)
+        try:
+            sys.settrace(raising_at(lines))
+            step()
+            break
+        except InterruptedStepError:
+            pass
+        finally:
+            sys.settrace(None)
+        interrupted = held(env)
+        if interrupted == before:
+            step()
+        after = held(env)
+        reset()
+        step()
+        assert held(env) == after
+        lines += 1
+    assert lines > 5
+
+
+def test_learning_goes_on_after_interruptions(interrupt):
+    stable_baselines3 = pytest.importorskip("stable_baselines3")
+    env = pixelbrax_gym.PixelBraxSB3VecEnv(TASK, 4, obs_mode="state", episode_length=7)
+    model = stable_baselines3.PPO("MlpPolicy", env, n_steps=8, batch_size=32, n_epochs=1, seed=0)
+    model.learn(64)
+    delays, interrupted = random.Random(0), 0
+    while interrupted < 10:
+        interrupt(delays.uniform(0.001, 0.05))
+        try:
+            model.learn(10_000)
+        except InterruptedStepError:
+            interrupted += 1
+    model.learn(64)
+    assert model.num_timesteps >= 64
