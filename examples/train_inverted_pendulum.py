@@ -17,7 +17,6 @@ import json
 import os
 import platform
 import time
-import warnings
 from dataclasses import asdict, dataclass, fields
 from importlib.metadata import version
 from pathlib import Path
@@ -27,7 +26,6 @@ from pathlib import Path
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import gymnasium
-import imageio.v2 as imageio
 import matplotlib
 import numpy as np
 import torch
@@ -35,6 +33,7 @@ from torch import nn
 from tqdm import tqdm
 
 import pixelbrax_gym  # noqa: F401  # registers PixelBrax/*
+from pixelbrax_jax.video import write_frames
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -297,10 +296,7 @@ def record(agent: Agent, config: Config, device: torch.device, path: Path) -> No
         frames.append(env.render())
         if terminated or truncated:
             obs, _ = env.reset()
-    with warnings.catch_warnings():
-        # FFmpeg is started as a process of its own at once, which is safe beside JAX's threads.
-        warnings.filterwarnings("ignore", r"os\.fork\(\) was called", RuntimeWarning)
-        imageio.mimwrite(path, frames, fps=env.metadata["render_fps"], codec="libx264")
+    write_frames(path, frames, env.metadata["render_fps"])
     env.close()
 
 

@@ -5,11 +5,13 @@ from __future__ import annotations
 import importlib.metadata
 import os
 import platform
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from pixelbrax_jax.cache import cache_folder
 from pixelbrax_jax.extras import install_extra
 
 _PACKAGES = ("pixelbrax", "jax", "jaxlib", "brax", "mujoco", "gymnasium", "numpy")
@@ -32,6 +34,51 @@ _FRACTION = "XLA_CLIENT_MEM_FRACTION"
 _OLD_FRACTION = "XLA_PYTHON_CLIENT_MEM_FRACTION"
 _ALLOCATOR = "XLA_PYTHON_CLIENT_ALLOCATOR"
 
+_XLA_FLAGS = "XLA_FLAGS"
+
+
+@dataclass(frozen=True)
+class _Variable:
+    """An environment variable that other tools leave behind.
+
+    Attributes:
+        package: which reads it.
+        code: fails where it does.
+        level: of the finding, as in ``Finding``.
+        text: what no longer works.
+    """
+
+    package: str
+    code: str
+    level: str
+    text: str
+
+
+_VARIABLES = {
+    _XLA_FLAGS: _Variable("jax", "import jax; jax.devices()", "problem", "JAX cannot start"),
+    "MUJOCO_GL": _Variable(
+        "mujoco",
+        "import mujoco.rendering.classic.gl_context",
+        "note",
+        "MuJoCo's own renderer cannot start; PixelBrax does not use it",
+    ),
+    "IMAGEIO_FFMPEG_EXE": _Variable(
+        "imageio-ffmpeg",
+        "from pixelbrax_jax.ffmpeg import check_ffmpeg; check_ffmpeg()",
+        "problem",
+        "videos can be neither read nor written",
+    ),
+    "SDL_VIDEODRIVER": _Variable(
+        "pygame", "import pygame; pygame.display.init()", "note", "no window can be opened"
+    ),
+    "MPLBACKEND": _Variable(
+        "matplotlib",
+        "import matplotlib.pyplot",
+        "note",
+        "matplotlib cannot be imported; PixelBrax's plots do not heed it",
+    ),
+}
+
 
 @dataclass(frozen=True)
 class Machine:
@@ -50,6 +97,9 @@ class Machine:
         renderer: what ``renderer="auto"`` stands for, and why; None where JAX has no device.
         gl_libraries: OpenGL libraries loaded into this process; None where that is unknown.
         environ: environment variables.
+        broken: environment variable -> what fails because of it, of those that often are left
+            behind by other tools.
+        cache: why nothing can be kept in the cache; empty where it can.
     """
 
     versions: dict[str, str | None]
@@ -63,6 +113,8 @@ class Machine:
     renderer: tuple[str, str] | None
     gl_libraries: tuple[str, ...] | None
     environ: dict[str, str]
+    broken: dict[str, str]
+    cache: str
 
 
 @dataclass(frozen=True)
@@ -84,7 +136,10 @@ def inspect() -> Machine:
     """Look at this machine. Starts JAX; takes a second or two."""
     versions = {name: _version(name) for name in (*_PACKAGES, *_OPTIONAL)}
     device = jax_platform = jax_error = renderer = None
+    broken = _broken_variables()
     try:
+        if _XLA_FLAGS in broken:  # XLA would end this process
+            raise RuntimeError(broken[_XLA_FLAGS])
         import jax
 
         import pixelbrax_jax
@@ -114,6 +169,8 @@ def inspect() -> Machine:
         renderer=renderer,
         gl_libraries=_gl_libraries(),
         environ=dict(os.environ),
+        broken=broken,
+        cache=_why_no_cache(),
     )
 
 
@@ -133,6 +190,8 @@ def diagnose(machine: Machine) -> list[Finding]:
         *_about_sharing(machine),
         *_about_memory(machine),
         *_about_gl(machine),
+        *_about_variables(machine),
+        *_about_cache(machine),
     ]
 
 
@@ -161,10 +220,14 @@ def _about_packages(machine: Machine) -> Iterator[Finding]:
 
 
 def _about_devices(machine: Machine) -> Iterator[Finding]:
+    if _XLA_FLAGS in machine.broken:  # told of with the other variables
+        return
     if machine.jax_error is not None:
+        platforms = machine.environ.get("JAX_PLATFORMS")
         yield Finding(
             "problem",
-            f"JAX finds no device to compute on: {machine.jax_error}",
+            f"JAX finds no device to compute on: {machine.jax_error}"
+            + (f" (JAX_PLATFORMS={platforms})" if platforms else ""),
             "unset JAX_PLATFORMS, or install the jax release that goes with your driver: "
             + _JAX_ON_CUDA,
         )
@@ -271,6 +334,49 @@ def _about_gl(machine: Machine) -> Iterator[Finding]:
         yield Finding("note", f"images need no OpenGL, though something else has loaded {names}")
     else:
         yield Finding("ok", "images need no OpenGL and no display, and none is loaded")
+
+
+def _about_variables(machine: Machine) -> Iterator[Finding]:
+    for name, why in machine.broken.items():
+        variable = _VARIABLES[name]
+        yield Finding(
+            variable.level,
+            f"with {name}={machine.environ.get(name, '')}, {variable.text}: {why}",
+            f"unset {name}, or mend it",
+        )
+
+
+def _about_cache(machine: Machine) -> Iterator[Finding]:
+    if machine.cache:
+        yield Finding(
+            "note",
+            f"clips are read anew each time, as they cannot be cached: {machine.cache}",
+            "export PIXELBRAX_CACHE=<a folder that can be written>",
+        )
+
+
+def _broken_variables() -> dict[str, str]:
+    """Try each variable that is set in a process of its own, which some of them end."""
+    broken = {}
+    for name, variable in _VARIABLES.items():
+        if not os.environ.get(name) or _version(variable.package) is None:
+            continue
+        command = [sys.executable, "-c", variable.code]
+        result = subprocess.run(command, capture_output=True, text=True, check=False)
+        if result.returncode:
+            lines = [line for line in result.stderr.splitlines() if line.strip()]
+            broken[name] = lines[-1][:200] if lines else f"exit status {result.returncode}"
+    return broken
+
+
+def _why_no_cache() -> str:
+    try:
+        folder = cache_folder().absolute()
+        while not folder.exists():
+            folder = folder.parent
+    except OSError as error:
+        return str(error)
+    return "" if os.access(folder, os.W_OK) else f"{folder} cannot be written"
 
 
 def _version(package: str) -> str | None:

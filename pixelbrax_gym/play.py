@@ -18,7 +18,7 @@ from pixelbrax_gym.gymnasium.window import Window
 from pixelbrax_jax.extras import install_extra
 from pixelbrax_jax.policy import load_policy
 from pixelbrax_jax.validation import check_positive_int
-from pixelbrax_jax.video import NO_IMAGEIO, write_frames
+from pixelbrax_jax.video import NO_WRITER, write_frames
 
 ENV_OPTIONS = ("backend", "camera", "look", "shadows", "distractors", "clips", "split")
 """Options of an environment that the command takes; one that is not given stays as it is."""
@@ -38,8 +38,8 @@ def play(options: argparse.Namespace) -> int:
         env, act = _make(options)
         lacking = "" if options.gif else _no_window()
         written = options.gif or (f"{options.task}.gif" if lacking else None)
-        if written and find_spec("imageio") is None:
-            raise ImportError(f"{lacking}; {NO_IMAGEIO}" if lacking else NO_IMAGEIO)
+        if written and None in map(find_spec, ("imageio_ffmpeg", "PIL")):
+            raise ImportError(f"{lacking}; {NO_WRITER}" if lacking else NO_WRITER)
         if lacking:
             sys.stderr.write(f"pixelbrax play: {lacking}; writing {written} in its place\n")
         sys.stderr.write("pixelbrax play: compiling, which may take two minutes\n")

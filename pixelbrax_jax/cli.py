@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import signal
 import sys
+import warnings
 from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
@@ -123,17 +124,25 @@ def _add_clips(commands: Any) -> None:
 
 def _clips(options: argparse.Namespace) -> int:
     from pixelbrax_jax.distractors.clips import load_clips
-    from pixelbrax_jax.distractors.contact_sheet import contact_sheet
+    from pixelbrax_jax.distractors.contact_sheet import check_image, contact_sheet
+
+    def tell(message: Warning | str, *_: Any, **__: Any) -> None:
+        sys.stderr.write(f"pixelbrax clips: {message}\n")
 
     try:
-        bank = load_clips(
-            options.source,
-            options.split,
-            height=options.size,
-            width=options.size,
-            num_clips=options.num_clips,
-            cache_dir=options.cache_dir,
-        )
+        if options.sheet:
+            check_image(options.sheet)
+        with warnings.catch_warnings():
+            warnings.simplefilter("always", UserWarning)
+            warnings.showwarning = tell
+            bank = load_clips(
+                options.source,
+                options.split,
+                height=options.size,
+                width=options.size,
+                num_clips=options.num_clips,
+                cache_dir=options.cache_dir,
+            )
         if options.sheet:
             contact_sheet(bank).save(options.sheet)
     except (OSError, ValueError, MemoryError, ImportError) as error:

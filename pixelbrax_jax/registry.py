@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -18,6 +19,7 @@ from pixelbrax_jax.distractors.clips import ClipBank, load_clips, warn_procedura
 from pixelbrax_jax.distractors.presets import resolve
 from pixelbrax_jax.distractors.video import Video
 from pixelbrax_jax.envs.pixel_env import PixelEnv
+from pixelbrax_jax.extras import install_extra
 from pixelbrax_jax.physics import make_physics
 from pixelbrax_jax.physics.base import Physics
 from pixelbrax_jax.scene.cameras import make_rig, rig_around, rigs_of, seen_from
@@ -111,8 +113,10 @@ def make(task: str | EnvConfig, **options: Any) -> tuple[PixelEnv, EnvParams]:
             message has the line that installs it.
         FileNotFoundError: clips are missing.
         MemoryError: the clips would take too much memory.
+        RuntimeError: JAX has no device to compute on.
     """
     config = env_config(task, options)
+    _check_device()
     physics = _physics(config)
     program = {name: getattr(config, name) for name in PROGRAM_OPTIONS}
     program["distractors"] = resolve(config.distractors, config.task)
@@ -130,6 +134,24 @@ def make(task: str | EnvConfig, **options: Any) -> tuple[PixelEnv, EnvParams]:
         clips=_clips(config, env),
         episode_length=np.int32(config.episode_length),
     )
+
+
+def _check_device() -> None:
+    """Start JAX, whose own error may be without a word.
+
+    Raises:
+        RuntimeError: it finds no device; the message names what was asked for, and has the fix.
+    """
+    try:
+        jax.devices()
+    except (RuntimeError, AssertionError) as error:
+        asked = os.environ.get("JAX_PLATFORMS")
+        raise RuntimeError(
+            "JAX finds no device to compute on"
+            + (f" with JAX_PLATFORMS={asked}; unset it" if asked else "; run pixelbrax doctor")
+            + f", or {install_extra('cuda12', 'cuda13')}"
+            + (f" ({error})." if str(error) else ".")
+        ) from error
 
 
 def named_rigs(task: str) -> dict[str, CameraRig]:

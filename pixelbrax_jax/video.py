@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import warnings
+import contextlib
+import math
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -10,13 +11,17 @@ from typing import Any
 import numpy as np
 
 from pixelbrax_jax.extras import install_extra
+from pixelbrax_jax.ffmpeg import Decoder, Encoder
 
 SUFFIXES = (".gif", ".mp4")
-NO_IMAGEIO = f"a video needs imageio; try: {install_extra('video')}"
+NO_WRITER = f"a video needs imageio-ffmpeg and Pillow; try: {install_extra('video')}"
 
 
-def write_frames(path: str | Path, frames: Iterable[np.ndarray], fps: int) -> Path:
+def write_frames(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> Path:
     """Write frames as they come; what came before an error or Ctrl-C is kept.
+
+    An MP4 has even sides: the last row or column of an odd one is repeated. What was written is
+    read back and compared with what was given.
 
     Args:
         path: of the file, ``.mp4``, or ``.gif``, which repeats for ever; folders are made.
@@ -27,24 +32,104 @@ def write_frames(path: str | Path, frames: Iterable[np.ndarray], fps: int) -> Pa
         The path.
 
     Raises:
-        ValueError: the suffix is another.
-        ImportError: imageio is not installed, with the fix.
-        OSError: the file cannot be written.
+        ValueError: the suffix is another, ``fps`` is not positive, there are no frames, or one is
+            of another shape or dtype.
+        ImportError: imageio-ffmpeg or Pillow is not installed, with the fix.
+        OSError: the file cannot be written, or is not what was given; with the reason.
     """
     path = Path(path)
-    if path.suffix not in SUFFIXES:
+    if path.suffix.lower() not in SUFFIXES:
         raise ValueError(f"a video must be one of {', '.join(SUFFIXES)}, got {str(path)!r}.")
+    if not 0 < fps < math.inf:
+        raise ValueError(f"fps must be a positive number, got {fps!r}.")
+    gif = path.suffix.lower() == ".gif"
     try:
-        import imageio.v2 as imageio
+        writer = _Gif(path, fps) if gif else Encoder(path, fps)
     except ImportError as error:
-        raise ImportError(NO_IMAGEIO) from error
+        raise ImportError(NO_WRITER) from error
     path.parent.mkdir(parents=True, exist_ok=True)
-    moving = {"duration": 1000.0 / fps, "loop": 0}
-    options = moving if path.suffix == ".gif" else {"fps": fps, "macro_block_size": 1}
-    writer: Any = imageio.get_writer(path, **options)
-    with writer, warnings.catch_warnings():
-        # Python warns of a fork beside JAX's threads; the child becomes ffmpeg at once.
-        warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)
-        for frame in frames:
-            writer.append_data(frame)
+    path.open("ab").close()  # whether it can be written, before anything is drawn
+    count, shape = 0, None
+    try:
+        with contextlib.closing(writer):
+            for frame in frames:
+                shape = _check_frame(frame, shape)
+                writer.append(frame)
+                count += 1
+    finally:
+        if path.exists() and path.stat().st_size == 0:
+            path.unlink()
+    if shape is None:
+        raise ValueError(f"{path} was not written: there are no frames.")
+    (_check_gif if gif else _check_mp4)(path, count, shape, fps)
     return path
+
+
+class _Gif:
+    """Collects frames, as ``Encoder`` writes them, into an animated image."""
+
+    def __init__(self, path: Path, fps: float) -> None:
+        from PIL import Image
+
+        self._from_array, self._path, self._milliseconds = Image.fromarray, path, 1000.0 / fps
+        self._images: list[Any] = []
+        self._times: list[float] = []
+
+    def append(self, frame: np.ndarray) -> None:
+        image = self._from_array(frame)
+        # Older releases of Pillow lose the time of equal images.
+        if self._images and image == self._images[-1]:
+            self._times[-1] += self._milliseconds
+        else:
+            self._images.append(image)
+            self._times.append(self._milliseconds)
+
+    def close(self) -> None:
+        if not self._images:
+            return
+        first, *others = self._images
+        times = self._times if others else self._times[0]
+        moving = {"save_all": True, "duration": times, "loop": 0}
+        try:
+            first.save(self._path, format="GIF", append_images=others, **moving)
+        except OSError as error:
+            self._path.unlink(missing_ok=True)
+            raise OSError(f"{self._path} was not written: {error}.") from error
+
+
+def _check_frame(frame: np.ndarray, first: tuple[int, int, int] | None) -> tuple[int, int, int]:
+    shape, dtype = np.shape(frame), getattr(frame, "dtype", None)
+    if len(shape) != 3 or shape[2] != 3 or 0 in shape or dtype != np.uint8:
+        raise ValueError(f"a frame must be (H, W, 3) uint8, got {shape} {dtype}.")
+    if first is not None and shape != first:
+        raise ValueError(f"all frames must be of one size, got {shape} after {first}.")
+    return shape
+
+
+def _check_mp4(path: Path, count: int, shape: tuple[int, int, int], fps: float) -> None:
+    del fps
+    expected = (shape[0] + shape[0] % 2, shape[1] + shape[1] % 2, 3)
+    decoder = Decoder(path)
+    found = [frame.shape for frame in decoder]
+    if found != [expected] * count:
+        raise OSError(
+            f"{path} is not what was written: {count} frames of {expected}, and {len(found)} of "
+            f"{found[0] if found else 'no size'} come back"
+            + (f" ({decoder.complaint})." if decoder.complaint else ".")
+        )
+
+
+def _check_gif(path: Path, count: int, shape: tuple[int, int, int], fps: float) -> None:
+    from PIL import Image, ImageSequence
+
+    shown = 1000.0 * count / fps
+    with Image.open(path) as image:
+        size = (image.height, image.width, 3)
+        # Equal frames that follow one another are one, which is shown for longer.
+        times = [frame.info.get("duration", 0) for frame in ImageSequence.Iterator(image)]
+    # A GIF counts in hundredths of a second.
+    if size != shape or abs(sum(times) - shown) > 10 * count:
+        raise OSError(
+            f"{path} is not what was written: {shown:.0f} ms of {shape}, and {sum(times)} ms of "
+            f"{size} come back."
+        )

@@ -25,6 +25,8 @@ FOUNDATIONS = {
     "memory",
     "tasks",
     "video",
+    "ffmpeg",
+    "cache",
 }
 LAYERS = {"physics", "scene", "renderer", "distractors"}
 """They never import each other; `envs` joins them."""
@@ -38,7 +40,7 @@ ALLOWED: dict[str, set[str]] = {
     **{f"pixelbrax_jax.{name}": set() for name in FOUNDATIONS},
     "pixelbrax_jax.spatial": {"pixelbrax_jax.types"},
     "pixelbrax_jax.compilation": {"pixelbrax_jax.validation"},
-    "pixelbrax_jax.video": {"pixelbrax_jax.extras"},
+    "pixelbrax_jax.video": {"pixelbrax_jax.extras", "pixelbrax_jax.ffmpeg"},
     "pixelbrax_jax.deprecation": set(),
     "pixelbrax_jax.policy": {"pixelbrax_jax.extras", "pixelbrax_jax.validation"},
     **{f"pixelbrax_jax.{name}": _below() for name in LAYERS},

@@ -31,6 +31,21 @@ def test_vectors_are_wide_unless_the_user_says_otherwise(monkeypatch, flags, wid
     assert done.stdout.split() == [width, "128.0"]
 
 
+def test_a_platform_that_is_not_there_is_named(monkeypatch):
+    monkeypatch.setenv("JAX_PLATFORMS", "cuda")
+    code = (
+        "import jax, pixelbrax_jax\ntry: jax.devices()\nexcept Exception: pixelbrax_jax.make('ant')"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    if done.returncode == 0:
+        pytest.skip("there is a GPU")
+    last = done.stderr.splitlines()[-1]
+    assert last.startswith(
+        "RuntimeError: JAX finds no device to compute on with JAX_PLATFORMS=cuda"
+    )
+    assert "unset it" in last
+
+
 DMC = """
 import pixelbrax_jax as pb
 from pixelbrax_jax.compilation import _is_known

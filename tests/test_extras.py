@@ -13,7 +13,7 @@ import pytest
 from pixelbrax_gym import doctor
 from pixelbrax_gym.gymnasium import window
 from pixelbrax_jax import cli, load_clips
-from pixelbrax_jax.distractors import clips
+from pixelbrax_jax.distractors import media
 from pixelbrax_jax.extras import install_extra
 from pixelbrax_jax.video import write_frames
 
@@ -58,13 +58,13 @@ def test_a_framework_that_is_missing(monkeypatch, absent, adapter, extra):
 
 
 def test_a_reader_that_is_missing(monkeypatch, tmp_path):
-    monkeypatch.setitem(sys.modules, "PIL", None)
-    with pytest.raises(ImportError, match=r"images needs Pillow; try: .*\[clips\]"):
-        clips.pillow()
-    monkeypatch.setitem(sys.modules, "imageio", None)
-    monkeypatch.setitem(sys.modules, "imageio.v3", None)
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "PIL", None)
+        with pytest.raises(ImportError, match=r"images needs Pillow; try: .*\[clips\]"):
+            media.pillow()
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     (tmp_path / "video.mp4").write_bytes(b"")
-    with pytest.raises(ImportError, match=r"videos needs imageio; try: .*\[clips\]"):
+    with pytest.raises(ImportError, match=r"videos needs imageio-ffmpeg; try: .*\[clips\]"):
         load_clips(tmp_path, "all", cache_dir=tmp_path, progress=False)
 
 
@@ -75,9 +75,10 @@ def test_a_window_without_pygame(monkeypatch):
 
 
 def test_a_video_needs_an_extra(monkeypatch, tmp_path):
-    monkeypatch.setitem(sys.modules, "imageio.v2", None)
-    with pytest.raises(ImportError, match=r"needs imageio; try: .*\[video\]"):
-        write_frames(tmp_path / "a.gif", [], 20)
+    for absent, name in (("PIL", "a.gif"), ("imageio_ffmpeg", "a.mp4")):
+        monkeypatch.setitem(sys.modules, absent, None)
+        with pytest.raises(ImportError, match=r"needs imageio-ffmpeg and Pillow; try: .*\[video\]"):
+            write_frames(tmp_path / name, [], 20)
 
 
 @pytest.mark.parametrize("command", ["record", "evaluate_command"])

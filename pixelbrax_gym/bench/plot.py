@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from pixelbrax_gym.bench.case import Row
@@ -32,6 +33,8 @@ def plot(rows: list[Row], path: Path) -> bool:
     tasks = {r["arguments"]["task"]: None for r in chosen if r["group"] == "environments"}
     if not tasks:
         return False
+    # What other tools leave there keeps matplotlib from being imported.
+    os.environ["MPLBACKEND"] = "Agg"
     import matplotlib
 
     matplotlib.use("Agg")

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import numpy as np
 
 from pixelbrax_jax.extras import install_extra
+
+_DRIVER = "SDL_VIDEODRIVER"
 
 
 class Window:
@@ -43,12 +46,22 @@ class Window:
 
         Args:
             image: (H, W, 3) uint8.
+
+        Raises:
+            OSError: no window can be opened; with the reason and the fix.
         """
         pygame = self._pygame
         if self._screen is None:
-            pygame.display.init()
-            pygame.display.set_caption(self._title)
-            self._screen = pygame.display.set_mode((image.shape[1], image.shape[0]))
+            try:
+                pygame.display.init()
+                pygame.display.set_caption(self._title)
+                self._screen = pygame.display.set_mode((image.shape[1], image.shape[0]))
+            except pygame.error as error:
+                raise OSError(
+                    f"no window can be opened ({error}); mend or unset "
+                    f"{_DRIVER if _DRIVER in os.environ else 'DISPLAY'}, or draw into a "
+                    "file: pixelbrax play --gif FILE, or render_mode='rgb_array'."
+                ) from error
             self._clock = pygame.time.Clock()
         # pygame counts columns first.
         pygame.surfarray.blit_array(self._screen, image.swapaxes(0, 1))

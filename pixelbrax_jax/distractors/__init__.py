@@ -3,6 +3,7 @@
 from pixelbrax_jax.distractors.base import Distractor as Distractor
 from pixelbrax_jax.distractors.camera import Camera as Camera
 from pixelbrax_jax.distractors.clips import ClipBank as ClipBank
+from pixelbrax_jax.distractors.clips import OnlySplitWarning as OnlySplitWarning
 from pixelbrax_jax.distractors.clips import ProceduralClipsWarning as ProceduralClipsWarning
 from pixelbrax_jax.distractors.clips import load_clips as load_clips
 from pixelbrax_jax.distractors.color import Color as Color

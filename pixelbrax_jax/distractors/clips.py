@@ -11,32 +11,39 @@ import tempfile
 import warnings
 import zipfile
 from collections.abc import Iterable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
+from pixelbrax_jax.cache import cache_folder, in_home
 from pixelbrax_jax.distractors import folders, procedural
-from pixelbrax_jax.extras import install_extra
+from pixelbrax_jax.distractors.media import AGAIN, read_clip
 from pixelbrax_jax.types import Clips
 from pixelbrax_jax.validation import check_choice, check_positive_int
 
 MAX_BYTES = 2 * 1024**3
 """Device memory that a bank may take by default."""
 
-_CACHE_VERSION = 1
+_CACHE_VERSION = 2
 """Raised when the same files would give other pixels."""
 
 _NOT_THE_USER = {"pixelbrax_jax", "pixelbrax_gym", "gymnasium", "stable_baselines3", "torchrl"}
 """Packages between a user's line and ``load_clips``."""
 
 
+_Decoded = tuple[np.ndarray, np.ndarray, list[str]]
+"""Frames, and of each clip its length and what its file lacks."""
+
+
 class ProceduralClipsWarning(UserWarning):
     """Procedural clips are in use, not DAVIS."""
+
+
+class OnlySplitWarning(UserWarning):
+    """A folder has one split, and it is taken for the training's."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +121,9 @@ def load_clips(
     """Return a bank of clips.
 
     Images are cut to the middle of the wanted proportions and scaled with an antialiasing
-    filter. What was read once is cached on disk, under a name made from all that decides it.
+    filter; ``media.read_clip`` says how their pixels become colors. What was read once is cached
+    on disk, under a name made from all that decides it. A warning names each file that has fewer
+    frames than it declares.
 
     Args:
         source: a folder: DAVIS-2017, or videos, or folders of images; see
@@ -122,7 +131,9 @@ def load_clips(
             are not results with DAVIS.
         split: of a DAVIS folder ``"train"``, ``"test"``, ``"paper-train"``, ``"paper-test"``; of
             procedural clips ``"train"``, ``"test"`` (other clips of the same families) and
-            ``"ood"`` (other families); of another folder its subfolders, or ``"all"``.
+            ``"ood"`` (other families); of another folder its subfolders, or ``"all"``. Where a
+            folder has one split, ``"train"`` takes it, with an ``OnlySplitWarning``; a test on the
+            same clips must be asked for by their split's own name.
         height: pixels.
         width: pixels.
         num_clips: how many of the split, the first ones; None means all.
@@ -138,7 +149,7 @@ def load_clips(
         FileNotFoundError: something is missing; the message names it and what was expected.
         ValueError: an unknown split, a file that cannot be read, or a clip without frames.
         MemoryError: the bank would be too large; the message says how to make it smaller.
-        ImportError: Pillow or imageio is missing, with the fix.
+        ImportError: Pillow or imageio-ffmpeg is missing, with the fix.
     """
     height, width = check_positive_int("height", height), check_positive_int("width", width)
     if num_clips is not None:
@@ -148,15 +159,29 @@ def load_clips(
         names = procedural.names(split)[:num_clips]
         _check_size(len(names) * procedural.FRAMES, height, width, max_bytes)
         return _procedural(tuple(names), split, height, width)
-    folder = Path(source).expanduser()
-    sources = folders.find(folder, split)[:num_clips]
+    folder = in_home(Path(source)).absolute()
+    sources, present = folders.find(folder, split)
+    if present != split:
+        warnings.warn(
+            f"split={split!r} is split {present!r} of {folder}, the only one that it has; there is "
+            f"none to test on. Say split={present!r} if that is what you want, or put the clips "
+            "into subfolders train and test.",
+            OnlySplitWarning,
+            stacklevel=_stacklevel_of_the_user(),
+        )
+    sources = sources[:num_clips]
     images = sum(len(s.files) for s in sources if not s.is_video)
     _check_size(images, height, width, max_bytes)
-    home = _cache_home(cache_dir) / f"{_digest(sources, height, width)}.npz"
-    frames, length = _read_cache(home) or _decode(sources, height, width, max_bytes, progress)
+    cached = Path("clips", f"{_digest(sources, height, width)}.npz")
+    frames, length, lacks = _read_cache(cache_dir, cached) or _decode(
+        sources, height, width, max_bytes, progress
+    )
     _check_size(len(frames), height, width, max_bytes)
-    _write_cache(home, frames, length)
-    return ClipBank(frames, length, tuple(s.name for s in sources), str(folder), split)
+    _write_cache(cache_dir, cached, frames, length, lacks)
+    for clip, lack in zip(sources, lacks, strict=True):
+        if lack:
+            warnings.warn(f"{clip.files[0]} {lack}; {AGAIN}.", stacklevel=_stacklevel_of_the_user())
+    return ClipBank(frames, length, tuple(s.name for s in sources), str(folder), present)
 
 
 @lru_cache(maxsize=8)
@@ -203,17 +228,21 @@ def _check_size(frames: int, height: int, width: int, max_bytes: int) -> None:
 
 def _decode(
     sources: list[folders.Source], height: int, width: int, max_bytes: int, progress: bool
-) -> tuple[np.ndarray, np.ndarray]:
+) -> _Decoded:
     clips: list[np.ndarray] = []
+    lacks: list[str] = []
     total = 0
+
+    def check_count(count: int) -> None:
+        _check_size(total + count, height, width, max_bytes)
+
     for source in _with_progress(sources, progress):
-        frames = _frames(source, height, width, max_bytes)
-        if not frames:
-            raise ValueError(f"{source.files[0]} has no frames; remove it.")
+        frames, lack = read_clip(source, height, width, check_count)
         clips.append(np.stack(frames))
+        lacks.append(lack)
         total += len(frames)
         _check_size(total, height, width, max_bytes)
-    return np.concatenate(clips), np.array([len(clip) for clip in clips], np.int32)
+    return np.concatenate(clips), np.array([len(clip) for clip in clips], np.int32), lacks
 
 
 def _with_progress(sources: list[folders.Source], progress: bool) -> Iterable[folders.Source]:
@@ -224,71 +253,6 @@ def _with_progress(sources: list[folders.Source], progress: bool) -> Iterable[fo
     except ImportError:
         return sources
     return tqdm(sources, desc="reading clips", unit="clip", leave=False)
-
-
-def _frames(source: folders.Source, height: int, width: int, max_bytes: int) -> list[np.ndarray]:
-    """Return the clip's frames at the wanted size."""
-    if source.is_video:
-        return _video_frames(source.files[0], height, width, max_bytes)
-    with ThreadPoolExecutor() as pool:  # Pillow decodes and scales without Python's lock
-        return list(pool.map(lambda file: _picture(file, height, width), source.files))
-
-
-def _picture(file: Path, height: int, width: int) -> np.ndarray:
-    try:
-        with pillow().open(file) as image:
-            return _fit(image.convert("RGB"), height, width)
-    except OSError as error:
-        raise ValueError(
-            f"{file} cannot be read as an image ({error}); unpack it again."
-        ) from error
-
-
-def _video_frames(file: Path, height: int, width: int, max_bytes: int) -> list[np.ndarray]:
-    try:
-        import imageio.v3 as imageio
-    except ImportError as error:
-        raise ImportError(f"reading videos needs imageio; try: {install_extra('clips')}") from error
-    image_module = pillow()
-    with warnings.catch_warnings():
-        # FFmpeg is started as a process of its own at once, which is safe beside JAX's threads.
-        warnings.filterwarnings("ignore", r"os\.fork\(\) was called", RuntimeWarning)
-        frames: list[np.ndarray] = []
-        try:
-            for frame in imageio.imiter(file):
-                image = image_module.fromarray(np.asarray(frame)).convert("RGB")
-                frames.append(_fit(image, height, width))
-                _check_size(len(frames), height, width, max_bytes)
-            return frames
-        except (OSError, RuntimeError, StopIteration) as error:
-            raise ValueError(f"{file} cannot be read as a video ({error}).") from error
-
-
-def _fit(image: Any, height: int, width: int) -> np.ndarray:
-    """Return the middle of an image at the wanted proportions, scaled; (height, width, 3) uint8."""
-    scale = min(image.width / width, image.height / height)
-    across, down = round(scale * width), round(scale * height)
-    left, top = (image.width - across) // 2, (image.height - down) // 2
-    middle = image.crop((left, top, left + across, top + down))
-    return np.asarray(middle.resize((width, height), pillow().Resampling.LANCZOS), np.uint8)
-
-
-def pillow() -> Any:
-    """Return Pillow's module of images.
-
-    Raises:
-        ImportError: it is missing, with the fix.
-    """
-    try:
-        from PIL import Image
-    except ImportError as error:
-        raise ImportError(f"reading images needs Pillow; try: {install_extra('clips')}") from error
-    return Image
-
-
-def _cache_home(given: str | Path | None) -> Path:
-    home = given or os.environ.get("PIXELBRAX_CACHE") or Path.home() / ".cache" / "pixelbrax"
-    return Path(home).expanduser() / "clips"
 
 
 def _digest(sources: list[folders.Source], height: int, width: int) -> str:
@@ -303,12 +267,13 @@ def _digest(sources: list[folders.Source], height: int, width: int) -> str:
     return digest.hexdigest()[:32]
 
 
-def _read_cache(file: Path) -> tuple[np.ndarray, np.ndarray] | None:
-    if not file.is_file():
-        return None
+def _read_cache(cache_dir: str | Path | None, name: Path) -> _Decoded | None:
     try:
+        file = cache_folder(cache_dir) / name
+        if not file.is_file():
+            return None
         with file.open("rb") as opened, np.load(opened) as cached:
-            return cached["frames"], cached["length"]
+            return cached["frames"], cached["length"], cached["lacks"].tolist()
     except (EOFError, ValueError, KeyError, zipfile.BadZipFile):
         with contextlib.suppress(OSError):
             file.unlink(missing_ok=True)  # damaged: it is made again
@@ -317,16 +282,23 @@ def _read_cache(file: Path) -> tuple[np.ndarray, np.ndarray] | None:
         return None
 
 
-def _write_cache(file: Path, frames: np.ndarray, length: np.ndarray) -> None:
+def _write_cache(
+    cache_dir: str | Path | None,
+    name: Path,
+    frames: np.ndarray,
+    length: np.ndarray,
+    lacks: list[str],
+) -> None:
     """Write beside and then rename: a half-written cache never has the name that is read."""
-    if file.is_file():
-        return
     half: Path | None = None
     try:
+        file = cache_folder(cache_dir) / name
+        if file.is_file():
+            return
         file.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile(dir=file.parent, suffix=".tmp", delete=False) as opened:
             half = Path(opened.name)
-            np.savez(opened, frames=frames, length=length)
+            np.savez(opened, frames=frames, length=length, lacks=np.array(lacks, str))
         half.chmod(0o644)  # others may share the cache
         half.replace(file)
     except OSError as error:
@@ -334,6 +306,7 @@ def _write_cache(file: Path, frames: np.ndarray, length: np.ndarray) -> None:
             with contextlib.suppress(OSError):
                 half.unlink(missing_ok=True)
         warnings.warn(
-            f"clips could not be cached in {file.parent} ({error}).",
+            f"clips could not be cached ({error}); name a folder in the environment variable "
+            "PIXELBRAX_CACHE, or they are read anew each time.",
             stacklevel=_stacklevel_of_the_user(),
         )

@@ -2,16 +2,33 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pixelbrax_jax.distractors.clips import ClipBank, pillow
+from pixelbrax_jax.distractors.clips import ClipBank
+from pixelbrax_jax.distractors.media import pillow
 
 _COLUMNS = 6
 """Frames shown of each clip, evenly spaced."""
 
 _GAP = 2
+
+
+def check_image(path: str) -> None:
+    """Check, before anything is read, that an image can be saved under a name.
+
+    Raises:
+        ValueError: its suffix is that of no image; the message lists some that are.
+        FileNotFoundError: there is no such folder.
+        ImportError: Pillow is missing, with the fix.
+    """
+    suffix, folder = Path(path).suffix.lower(), Path(path).absolute().parent
+    if suffix not in pillow().registered_extensions():
+        raise ValueError(f"a contact sheet is an image, as .png, .jpg or .webp, got {path!r}.")
+    if not folder.is_dir():
+        raise FileNotFoundError(f"there is no folder {folder} for the contact sheet.")
 
 
 def contact_sheet(bank: ClipBank) -> Any:

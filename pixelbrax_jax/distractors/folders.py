@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -9,10 +10,16 @@ from pathlib import Path
 
 from pixelbrax_jax.validation import check_choice, suggest
 
-IMAGES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".webp"})
+IMAGES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff"})
 VIDEOS = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".gif"})
 
 _RESOLUTION = "480p"
+
+ALL = "all"
+"""The split of a folder without subfolders."""
+
+_FOR_TESTS = frozenset({"test", "val", "valid", "validation", "eval", "evaluation", "ood"})
+"""Splits that nobody trains on unasked."""
 
 # The split of the original PixelBrax, arXiv 2502.00021. It mixes DAVIS's own two.
 _PAPER = {
@@ -53,47 +60,70 @@ class Source:
         return self.files[0].suffix.lower() in VIDEOS
 
 
-def find(folder: Path, split: str) -> list[Source]:
+def find(folder: Path, split: str) -> tuple[list[Source], str]:
     """Return the clips of a split.
 
     A folder in DAVIS's layout has the splits ``"train"``, ``"test"`` (DAVIS's validation set),
     ``"paper-train"`` and ``"paper-test"``. Any other folder holds video files, or folders of
     images, in subfolders named like the splits; without subfolders all are in split ``"all"``.
+    Where there is one split, and its name is not that of a test, ``"train"`` stands for it too.
 
     Args:
-        folder: where to look; its subfolder ``DAVIS`` counts as well.
+        folder: where to look; the folder ``DAVIS``, the one above it, and its ``JPEGImages`` and
+            ``JPEGImages/480p`` have the same clips.
         split: of which clips.
 
     Returns:
-        The clips, in the order of the split file, else by name.
+        The clips, in the order of the split file, else by name; and the split that they are,
+        which is not ``split`` where ``"train"`` stands for it.
 
     Raises:
         FileNotFoundError: the folder, a split file or a listed clip is missing; the message
             names it and the layout that was expected.
         ValueError: there is no such split, or it has no clips.
     """
+    if folder.is_file():
+        raise FileNotFoundError(
+            f"clips must be a folder, and {folder} is a file; give the folder that it is in."
+        )
     if not folder.is_dir():
         raise FileNotFoundError(
             f"there is no folder of clips at {folder}. {_DAVIS_LAYOUT}. Or give a folder with "
             "video files or folders of images; or clips='procedural', which needs no files."
-            + suggest(folder, ["procedural"])
+            + suggest(folder.name, ["procedural"])
         )
+    images = _davis_images(folder)
+    if images is None:
+        return _plain(folder, split)
+    return _davis(images, split), split
+
+
+def _davis_images(folder: Path) -> Path | None:
+    """Return the folder of DAVIS's clips, of whichever of its folders was given; else None."""
     for root in (folder, folder / "DAVIS"):
         if (root / "JPEGImages").is_dir():
-            return _davis(root, split)
-    return _plain(folder, split)
+            return root / "JPEGImages" / _RESOLUTION
+    # Other benchmarks ask for the folder of the images; any part of the path may be a link.
+    for part in (Path(os.path.abspath(folder)), folder.resolve()):  # noqa: PTH100  # keeps links
+        for images in (part, part / _RESOLUTION):
+            if images.parent.name == "JPEGImages" and _lists(images).is_dir() and images.is_dir():
+                return images
+    return None
 
 
-def _davis(root: Path, split: str) -> list[Source]:
-    check_choice(f"split of {root}", split, DAVIS_SPLITS)
-    images = root / "JPEGImages" / _RESOLUTION
+def _lists(images: Path) -> Path:
+    return images.parents[1] / "ImageSets" / "2017"
+
+
+def _davis(images: Path, split: str) -> list[Source]:
+    check_choice(f"split of {images.parents[1]}", split, DAVIS_SPLITS)
     if not images.is_dir():
         raise FileNotFoundError(f"{images} is missing. {_DAVIS_LAYOUT}.")
     if split in _PAPER:
         listed: Iterable[str] = _PAPER[split]
         where = f"split {split!r}"
     else:
-        file = root / "ImageSets" / "2017" / ("train.txt" if split == "train" else "val.txt")
+        file = _lists(images) / ("train.txt" if split == "train" else "val.txt")
         if not file.is_file():
             raise FileNotFoundError(f"the split file {file} is missing. {_DAVIS_LAYOUT}.")
         listed = file.read_text("utf-8").split()
@@ -111,33 +141,47 @@ def _davis(root: Path, split: str) -> list[Source]:
     return sources
 
 
-def _plain(folder: Path, split: str) -> list[Source]:
+def _plain(folder: Path, split: str) -> tuple[list[Source], str]:
     # A folder of images is a clip; one that holds clips is a split; others do not matter.
-    parts = [p.name for p in _entries(folder) if p.is_dir() and _holds_clips(p)]
-    if parts and _holds_clips(folder):
+    parts = [p.name for p in _entries(folder) if p.is_dir() and _clips(p)]
+    clips = _clips(folder)
+    if parts and clips:
         raise ValueError(
             f"{folder} has clips beside the folders {', '.join(parts)} that hold clips too; move "
             "them into a folder of their own."
         )
-    check_choice(f"split of {folder}", split, parts or ["all"])
-    home = folder / split if parts else folder
-    sources = []
-    for entry in _entries(home):
-        if entry.is_dir() and _pictures(entry):
-            sources.append(_sequence(entry))
-        elif entry.suffix.lower() in VIDEOS:
-            sources.append(Source(entry.stem, (entry,)))
-    if not sources:
+    if not parts and not clips:
         kinds = ", ".join(sorted(VIDEOS))
-        raise ValueError(f"{home} has neither videos ({kinds}) nor folders of images.")
-    return sources
+        own = "; it has images itself, so give the folder above it" if _pictures(folder) else ""
+        raise ValueError(f"{folder} has neither videos ({kinds}) nor folders of images{own}.")
+    present = _present(folder, split, parts or [ALL])
+    return [_source(p) for p in (_clips(folder / present) if parts else clips)], present
 
 
-def _holds_clips(folder: Path) -> bool:
-    return any(
-        _pictures(entry) if entry.is_dir() else entry.suffix.lower() in VIDEOS
+def _present(folder: Path, split: str, splits: list[str]) -> str:
+    """Return the split that is meant."""
+    if split not in splits and len(splits) == 1:
+        (only,) = splits
+        if split == "train" and only.lower() not in _FOR_TESTS:
+            return only
+        raise ValueError(
+            f"{folder} has no split {split!r}, only {only!r}; for more than one, put the clips "
+            "into subfolders named like the splits, as train and test."
+        )
+    return check_choice(f"split of {folder}", split, splits)
+
+
+def _clips(folder: Path) -> list[Path]:
+    """Return what is a clip in a folder: videos, and folders of images."""
+    return [
+        entry
         for entry in _entries(folder)
-    )
+        if (_pictures(entry) if entry.is_dir() else entry.suffix.lower() in VIDEOS)
+    ]
+
+
+def _source(clip: Path) -> Source:
+    return _sequence(clip) if clip.is_dir() else Source(clip.stem, (clip,))
 
 
 def _sequence(folder: Path) -> Source:
@@ -149,7 +193,7 @@ def _sequence(folder: Path) -> Source:
 
 
 def _pictures(folder: Path) -> list[Path]:
-    return [p for p in _entries(folder) if p.suffix.lower() in IMAGES]
+    return [p for p in _entries(folder) if p.suffix.lower() in IMAGES and not p.is_dir()]
 
 
 def _entries(folder: Path) -> list[Path]:

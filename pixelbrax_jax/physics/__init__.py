@@ -5,8 +5,11 @@ from __future__ import annotations
 from importlib import import_module
 
 from pixelbrax_jax.physics.base import Physics
+from pixelbrax_jax.physics.opengl import import_mujoco
 from pixelbrax_jax.tasks import TASKS
 from pixelbrax_jax.validation import check_choice
+
+import_mujoco()  # before any module below does
 
 
 def make_physics(task: str, *, backend: str | None = None, reward_preset: str = "brax") -> Physics:

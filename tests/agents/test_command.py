@@ -194,16 +194,17 @@ def test_a_run_is_evaluated_and_recorded(tmp_path, capsys):
     assert main(["evaluate", folder, "--split", "test"]) == 1
     assert "there is only 'clean'" in capsys.readouterr().err
     video = str(tmp_path / "video.mp4")
-    line = ["record", folder, "--output", video, "--grid", "2", "--size", "32", "--num-frames", "3"]
+    line = ["record", folder, "--output", video, "--grid", "3", "--size", "15", "--num-frames", "3"]
     assert main(line) == 0
     frames = imageio.imread(video)
-    assert frames.shape == (3, 64, 64, 3)
+    assert frames.shape == (3, 46, 46, 3), "an odd side is padded"
     assert frames[0].std() > 5, "something is seen"
     for wrong, told in (
         ("--best --steps 16", "give best or steps, not both; got steps=16"),
         ("--run 1", "run must be from 0 to 0, got 1"),
         ("--split tset", "Did you mean 'test'?"),
         ("--steps 3", "there are those of 16 steps"),
+        ("--output a.avi", "one of .gif, .mp4, got 'a.avi'"),
     ):
         assert main(["record", folder, *wrong.split()]) == 1
         assert told in capsys.readouterr().err

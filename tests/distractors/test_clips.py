@@ -75,6 +75,83 @@ def test_the_folder_above_will_do(davis):
     assert load_clips(davis.parent, "test", height=8, width=8).names == ("blackswan",)
 
 
+@pytest.mark.parametrize("given", ["JPEGImages/480p", "JPEGImages", "JPEGImages/480p/../480p"])
+@pytest.mark.parametrize("split", ["train", "test"])
+def test_the_folder_of_the_images_stands_for_the_whole(davis, given, split):
+    whole, part = (
+        load_clips(folder, split, height=8, width=8) for folder in (davis, davis / given)
+    )
+    assert part.names == whole.names
+    assert part.digest == whole.digest
+
+
+@pytest.mark.parametrize("linked", ["elsewhere", "inside"])
+def test_links_to_the_folder_of_the_images(davis, tmp_path, linked):
+    images = davis / "JPEGImages" / "480p"
+    if linked == "elsewhere":
+        link = tmp_path / "clips"
+        link.symlink_to(images)
+    else:
+        link = images
+        images.rename(tmp_path / "other disk")
+        link.symlink_to(tmp_path / "other disk")
+    assert load_clips(link, "test", height=8, width=8).names == tuple(VAL)
+
+
+def test_images_without_their_lists_are_one_split(davis, tmp_path):
+    images = shutil.copytree(davis / "JPEGImages" / "480p", tmp_path / "JPEGImages" / "480p")
+    with pytest.warns(distractors.OnlySplitWarning, match="'train' is split 'all' of .*480p"):
+        bank = load_clips(images, height=8, width=8)
+    assert bank.names == tuple(sorted(LENGTHS | VAL))
+    with pytest.raises(ValueError, match=r"no split 'test', only 'all'; .*train and test"):
+        load_clips(images, "test")
+
+
+def a_clip(folder):
+    """A folder with one image."""
+    folder.mkdir(parents=True)
+    Image.new("RGB", (8, 8), "red").save(folder / "0.png")
+
+
+@pytest.mark.parametrize(
+    ("folders", "only"), [(("one", "two"), "all"), (("mine/one", "mine/two"), "mine")]
+)
+def test_the_only_split_is_taken_for_training(tmp_path, folders, only):
+    for folder in folders:
+        a_clip(tmp_path / "clips" / folder)
+    with pytest.warns(distractors.OnlySplitWarning, match=f"the only one.*split={only!r}") as told:
+        bank = load_clips(tmp_path / "clips", height=4, width=4)
+    assert len(told) == 1
+    assert told[0].filename == __file__
+    assert (bank.names, bank.split) == (("one", "two"), only)
+    assert load_clips(tmp_path / "clips", only, height=4, width=4).digest == bank.digest
+    for other in ("test", "val", "paper-train"):
+        with pytest.raises(ValueError, match=f"no split {other!r}, only {only!r}"):
+            load_clips(tmp_path / "clips", other)
+
+
+@pytest.mark.parametrize("only", ["test", "Val", "ood"])
+def test_nobody_trains_on_clips_for_tests(tmp_path, only):
+    a_clip(tmp_path / "clips" / only / "one")
+    with pytest.raises(ValueError, match=f"no split 'train', only {only!r}"):
+        load_clips(tmp_path / "clips")
+
+
+def test_one_of_several_splits_must_be_chosen(tmp_path):
+    for name in ("day", "night"):
+        a_clip(tmp_path / "clips" / name / "one")
+    with pytest.raises(ValueError, match=r"unknown split of .*'train'; allowed: day, night"):
+        load_clips(tmp_path / "clips")
+
+
+def test_a_file_or_a_single_clip_in_place_of_a_folder(tmp_path):
+    a_clip(tmp_path / "clips" / "one")
+    with pytest.raises(ValueError, match="it has images itself, so give the folder above it"):
+        load_clips(tmp_path / "clips" / "one")
+    with pytest.raises(FileNotFoundError, match=r"0\.png is a file; give the folder"):
+        load_clips(tmp_path / "clips" / "one" / "0.png")
+
+
 def test_splits_share_no_clip(davis):
     train = load_clips(davis, "train", height=8, width=8)
     test = load_clips(davis, "test", height=8, width=8)
@@ -346,6 +423,12 @@ def test_command(davis, tmp_path, capsys):
         assert image.width > 16 * 4
     assert cli.main(["clips", str(tmp_path / "nowhere")]) == 1
     assert "no folder of clips" in capsys.readouterr().err
+    assert cli.main(["clips", str(davis), "--sheet", str(tmp_path / "sheet.pgn")]) == 1
+    assert "a contact sheet is an image" in capsys.readouterr().err
+    folder = str(davis / "JPEGImages" / "480p" / "bear" / "..")
+    shutil.rmtree(davis / "ImageSets")
+    assert cli.main(["clips", folder, "--size", "8"]) == 0
+    assert "pixelbrax clips: split='train' is split 'all' of" in capsys.readouterr().err
     nowhere = str(tmp_path / "nowhere" / "sheet.png")
     assert cli.main(["clips", str(davis), "--size", "8", "--sheet", nowhere]) == 1
     assert "nowhere" in capsys.readouterr().err

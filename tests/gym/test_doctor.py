@@ -24,6 +24,8 @@ HEALTHY = doctor.Machine(
     renderer=("pallas", "by one kernel, on NVIDIA H100"),
     gl_libraries=(),
     environ={"XLA_CLIENT_MEM_FRACTION": "0.4"},
+    broken={},
+    cache="",
 )
 
 
@@ -96,6 +98,30 @@ def test_a_healthy_machine():
         ),
         ({"gl_libraries": ("libGL.so.1",)}, "note", "loaded libGL.so.1", ""),
         (
+            {
+                "jax_error": "AssertionError: ",
+                "environ": HEALTHY.environ | {"JAX_PLATFORMS": "cuda"},
+                "to_torch": None,
+                "to_jax": None,
+            },
+            "problem",
+            "no device to compute on: AssertionError:  (JAX_PLATFORMS=cuda)",
+            "unset JAX_PLATFORMS",
+        ),
+        (
+            {"jax_error": "RuntimeError: flag", "broken": {"XLA_FLAGS": "Unknown flag"}},
+            "problem",
+            "JAX cannot start: Unknown flag",
+            "unset XLA_FLAGS",
+        ),
+        (
+            {"broken": {"MUJOCO_GL": "no glGetError"}},
+            "note",
+            "MuJoCo's own renderer cannot start; PixelBrax does not use it: no glGetError",
+            "unset MUJOCO_GL",
+        ),
+        ({"cache": "/home cannot be written"}, "note", "read anew each time", "PIXELBRAX_CACHE"),
+        (
             {"versions": HEALTHY.versions | {"torchrl": None}},
             "note",
             "torchrl is not installed",
@@ -146,6 +172,33 @@ def test_this_machine():
     assert machine.versions["jax"] == version("jax")
     assert machine.to_torch is True
     assert machine.to_jax is True
+
+
+def test_variables_that_other_tools_leave(monkeypatch):
+    values = {
+        "XLA_FLAGS": ("--xla_nonsense=1", "Unknown flag in XLA_FLAGS: --xla_nonsense=1"),
+        "MUJOCO_GL": ("garbage", "invalid value for environment variable MUJOCO_GL: garbage"),
+        "IMAGEIO_FFMPEG_EXE": ("/nowhere/ffmpeg", "'/nowhere/ffmpeg', which is no program"),
+        "SDL_VIDEODRIVER": ("garbage", "garbage not available"),
+        "MPLBACKEND": ("garbage", "'garbage' is not a valid value"),
+    }
+    assert set(values) == set(doctor._VARIABLES)
+    for name, (value, _) in values.items():
+        monkeypatch.setenv(name, value)
+    broken = doctor._broken_variables()
+    for name, (_, why) in values.items():
+        assert why in broken[name]
+        monkeypatch.delenv(name)
+    assert doctor._broken_variables() == {}
+
+
+def test_a_cache_that_cannot_be_written(monkeypatch, tmp_path):
+    monkeypatch.setenv("PIXELBRAX_CACHE", str(tmp_path / "made" / "later"))
+    assert doctor._why_no_cache() == ""
+    monkeypatch.delenv("PIXELBRAX_CACHE")
+    monkeypatch.delenv("HOME", raising=False)
+    monkeypatch.setattr("pwd.getpwuid", lambda uid: {}[uid])
+    assert "no home folder" in doctor._why_no_cache()
 
 
 @pytest.mark.parametrize(("broken", "status"), [(False, 0), (True, 1)])

@@ -62,6 +62,15 @@ def test_a_window_until_it_is_closed(monkeypatch):
     assert pygame.display.get_surface() is None
 
 
+def test_a_window_that_cannot_be_opened(monkeypatch, capsys):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "garbage")
+    assert main(["play", TASK, "--size", "40"]) == 1
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if "window" in line]
+    assert "garbage not available" in line
+    assert "unset SDL_VIDEODRIVER" in line
+    assert "--gif FILE" in line
+
+
 def test_a_file_shows_what_the_environment_draws(tmp_path):
     path = tmp_path / "a.gif"
     line = ["--policy", "zero", "--look", "original", "--camera", "original", "--gif", str(path)]

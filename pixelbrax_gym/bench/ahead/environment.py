@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from importlib.metadata import version
 from pathlib import Path
 
+from pixelbrax_gym.bench.case import AbsentError
 from pixelbrax_gym.bench.packages import install_packages
+from pixelbrax_jax.cache import cache_folder
 
 
 def packages(platform: str) -> tuple[str, ...]:
@@ -23,8 +24,15 @@ def packages(platform: str) -> tuple[str, ...]:
 
 
 def folder(platform: str) -> Path:
-    """Return the folder that they are in once they are installed, in the cache of PixelBrax."""
-    home = Path(os.environ.get("PIXELBRAX_CACHE") or Path.home() / ".cache" / "pixelbrax")
+    """Return the folder that they are in once they are installed, in the cache of PixelBrax.
+
+    Raises:
+        AbsentError: no cache is named, and the user has no home folder.
+    """
+    try:
+        home = cache_folder()
+    except FileNotFoundError as error:
+        raise AbsentError(f"{error}; name a cache in PIXELBRAX_CACHE") from error
     python = f"py{sys.version_info[0]}{sys.version_info[1]}"
     return home / "compilers" / f"{platform}-jax{version('jax')}-{python}"
 

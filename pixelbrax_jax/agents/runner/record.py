@@ -74,7 +74,7 @@ def write_video(
 
     Raises:
         ValueError: an option is out of range.
-        ImportError: imageio is not installed, with the fix.
+        ImportError: imageio-ffmpeg or Pillow is not installed, with the fix.
     """
     check_positive_int("grid", grid)
     check_positive_int("size", size)

@@ -1,0 +1,38 @@
+"""The folder in which PixelBrax keeps what it need not make twice."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+
+def cache_folder(given: str | Path | None = None) -> Path:
+    """Return the folder, which need not exist.
+
+    Args:
+        given: by the caller; None means ``$PIXELBRAX_CACHE``, else ``~/.cache/pixelbrax``.
+
+    Raises:
+        FileNotFoundError: the user has no home folder, and it would be in it.
+    """
+    named = given or os.environ.get("PIXELBRAX_CACHE")
+    if named:
+        return in_home(Path(named))
+    try:
+        return Path.home() / ".cache" / "pixelbrax"
+    except RuntimeError as error:  # as of a container's user that has no entry anywhere
+        raise FileNotFoundError("the user has no home folder") from error
+
+
+def in_home(path: Path) -> Path:
+    """Return a path with the home folder in place of ``~``.
+
+    Raises:
+        FileNotFoundError: there is no such home folder; with the fix.
+    """
+    try:
+        return path.expanduser()
+    except RuntimeError as error:
+        raise FileNotFoundError(
+            f"{path} is in a home folder that is unknown; set HOME, or give the whole path."
+        ) from error

@@ -1,0 +1,233 @@
+"""FFmpeg as a process: frames into a file, frames out of a file, and its complaints in a line."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import shutil
+import signal
+import subprocess
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+_VARIABLE = "IMAGEIO_FFMPEG_EXE"
+
+
+def find_ffmpeg() -> str:
+    """Return the path of FFmpeg's program.
+
+    Raises:
+        ImportError: imageio-ffmpeg, which brings it, is not installed.
+        OSError: there is none for this machine, or ``IMAGEIO_FFMPEG_EXE`` names none; with the
+            fix.
+    """
+    import imageio_ffmpeg
+
+    try:
+        program: str = imageio_ffmpeg.get_ffmpeg_exe()
+    except RuntimeError as error:
+        raise FileNotFoundError(
+            f"there is no FFmpeg for this machine; install it, or name it in {_VARIABLE}."
+        ) from error
+    if shutil.which(program) is None:
+        raise FileNotFoundError(
+            f"the environment variable {_VARIABLE} is {program!r}, which is no program; unset it "
+            "to use the FFmpeg that imageio-ffmpeg brings."
+        )
+    return program
+
+
+def check_ffmpeg() -> None:
+    """Check that FFmpeg is found and starts.
+
+    Raises:
+        ImportError: imageio-ffmpeg, which brings it, is not installed.
+        OSError: it does not; with the reason.
+    """
+    command = [find_ffmpeg(), "-version"]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    if result.returncode:
+        raise OSError(f"{command[0]} does not start: {reason(result.stderr) or result.returncode}.")
+
+
+class Encoder:
+    """Writes frames into an MP4 that every player plays: H.264, 4:2:0, as they come."""
+
+    def __init__(self, path: Path, fps: float) -> None:
+        """Start nothing yet.
+
+        Args:
+            path: of the file.
+            fps: frames per second.
+
+        Raises:
+            ImportError: imageio-ffmpeg is not installed.
+            OSError: there is no FFmpeg; the message has the fix.
+        """
+        self._program, self._path, self._fps = find_ffmpeg(), path, fps
+        self._process: subprocess.Popen[bytes] | None = None
+        self._log: IO[bytes] | None = None
+
+    def append(self, frame: np.ndarray) -> None:
+        """Write a frame.
+
+        4:2:0 has one color for two by two pixels, so an odd side is repeated once at its end.
+
+        Args:
+            frame: (H, W, 3) uint8, of the size of the first one.
+
+        Raises:
+            OSError: FFmpeg could not write it; with its reason.
+        """
+        odd = [(0, side % 2) for side in frame.shape[:2]]
+        frame = np.ascontiguousarray(np.pad(frame, (*odd, (0, 0)), mode="edge"))
+        if self._process is None:
+            self._start(*frame.shape[:2])
+        assert self._process is not None
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write(frame.data)
+        except OSError as error:
+            self.close()  # it says why
+            raise OSError(f"{self._path} was not written: {error}.") from error
+
+    def _start(self, height: int, width: int) -> None:
+        taken = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"]
+        given = ["-f", "mp4", "-pix_fmt", "yuv420p", str(self._path.absolute())]
+        # A file, as a pipe that nobody reads would stop FFmpeg once it is full.
+        self._log = tempfile.TemporaryFile()  # noqa: SIM115
+        self._process = _start(
+            [self._program, "-y", "-v", "error", *taken, "-r", str(self._fps), "-i", "-", *given],
+            stdin=subprocess.PIPE,
+            stderr=self._log,
+        )
+
+    def close(self) -> None:
+        """End the file, with the frames that were written.
+
+        Raises:
+            OSError: FFmpeg could not write it; with its reason.
+        """
+        process, log = self._process, self._log
+        if process is None or log is None:
+            return
+        self._process = self._log = None
+        assert process.stdin is not None
+        with log:
+            with contextlib.suppress(OSError):
+                process.stdin.close()
+            status = process.wait()
+            if status:
+                log.seek(0)
+                why = reason(_text(log)) or f"FFmpeg's exit status is {status}"
+                if status < 0:
+                    why = f"FFmpeg was ended by {signal.Signals(-status).name}"
+                self._path.unlink(missing_ok=True)  # a part of a file that no player plays
+                raise OSError(f"{self._path} was not written: {why}.")
+
+
+class Decoder:
+    """Reads the frames of a file's video, turned as a player turns them, at a constant rate.
+
+    Attributes:
+        declared: after all frames, about how many of them the file says that it has; None where
+            it does not say.
+        of_file: whether that goes by the length of the whole file, whose sound may be longer than
+            its video.
+        complaint: what FFmpeg found wrong, in one line; empty if nothing.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Start nothing yet.
+
+        Raises:
+            ImportError: imageio-ffmpeg is not installed.
+            OSError: there is no FFmpeg; the message has the fix.
+        """
+        self._program, self._path = find_ffmpeg(), path
+        self.declared: int | None = None
+        self.of_file = False
+        self.complaint = ""
+
+    def __iter__(self) -> Iterator[np.ndarray]:
+        """Yield (H, W, 3) uint8 frames."""
+        # A PPM says its own size, which a video may change on its way.
+        images = ["-f", "image2pipe", "-c:v", "ppm", "-pix_fmt", "rgb24", "-"]
+        # An absolute path: a colon in a name would make it the name of a protocol.
+        file = ["-nostdin", "-nostats", "-loglevel", "level+info", "-i", str(self._path.absolute())]
+        with tempfile.TemporaryFile() as log:
+            process = _start([self._program, *file, *images], stdout=subprocess.PIPE, stderr=log)
+            assert process.stdout is not None
+            try:
+                with process.stdout as pipe:
+                    while (image := _read_ppm(pipe)) is not None:
+                        yield image
+                    process.wait()
+            finally:
+                process.kill()  # of whoever stops early
+                process.wait()
+            log.seek(0)
+            self._interpret(_text(log))
+
+    def _interpret(self, log: str) -> None:
+        source = log.partition("Output #0")[0]
+        self.complaint = reason(log) if "[error]" in log or "[fatal]" in log else ""
+        if "Stream #0:" in source and "Video: " not in source:
+            self.complaint = "there is only sound in it"
+        duration = re.search(r"Duration: (\d+):(\d+):([\d.]+)", source)
+        rate = re.search(r"Video: .* ([\d.]+) fps", source)
+        count = _frames_of_avi(self._path)
+        alone = source.count("Stream #0:") <= 1
+        if duration and rate and (alone or not count):
+            hours, minutes, seconds = map(float, duration.groups())
+            length = 3600 * hours + 60 * minutes + seconds
+            count, self.of_file = max(count, round(length * float(rate[1]))), not alone
+        self.declared = count or None
+
+
+def reason(log: str) -> str:
+    """Return what FFmpeg says first of what is wrong, without its marks; empty if it says nothing.
+
+    Args:
+        log: all that it wrote, at whatever level.
+    """
+    lines = [line for line in log.splitlines() if line.strip()]
+    wrong = [line for line in lines if "[error]" in line or "[fatal]" in line] or lines
+    # "[mov,mp4 @ 0x55] [error] moov atom not found"
+    said = [re.sub(r"^(\[[^]]*\]\s*)+", "", line).strip().rstrip(".") for line in wrong]
+    return said[0] if said else ""
+
+
+def _start(command: list[str], **pipes: Any) -> subprocess.Popen[bytes]:
+    # In a group of its own, so that Ctrl-C in a terminal does not end it before its file is whole.
+    return subprocess.Popen(command, process_group=0 if os.name == "posix" else None, **pipes)
+
+
+def _read_ppm(pipe: IO[bytes]) -> np.ndarray | None:
+    """Return the next image of a pipe; None at its end."""
+    if pipe.readline() != b"P6\n":
+        return None
+    width, height = map(int, pipe.readline().split())
+    pipe.readline()  # 255
+    pixels = pipe.read(width * height * 3)
+    if len(pixels) < width * height * 3:
+        return None
+    return np.frombuffer(pixels, np.uint8).reshape(height, width, 3)
+
+
+def _frames_of_avi(path: Path) -> int:
+    """Return the number in an AVI's main header, else 0; FFmpeg tells what the size allows."""
+    with path.open("rb") as file:
+        head = file.read(52)
+    if head[:4] != b"RIFF" or head[24:28] != b"avih":
+        return 0
+    return int.from_bytes(head[48:52], "little")
+
+
+def _text(log: IO[bytes]) -> str:
+    return log.read().decode("utf-8", "replace")
