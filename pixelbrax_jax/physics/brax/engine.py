@@ -17,10 +17,12 @@ from pixelbrax_jax.physics.base import Kinematics, RewardFn
 from pixelbrax_jax.physics.brax.compatibility import accept_old_clip
 from pixelbrax_jax.physics.divergence import GuardedPhysics
 from pixelbrax_jax.physics.geometry import VISIBLE_GROUPS, read_geoms
+from pixelbrax_jax.physics.model_scene import COM_LINK, tracked_body, with_sites
 from pixelbrax_jax.physics.mujoco_compatibility import import_silenced, known_warnings_silenced
-from pixelbrax_jax.spatial import quat_normalize
+from pixelbrax_jax.physics.viewpoints import followed_body, read_rigs, unfit_cameras
+from pixelbrax_jax.spatial import quat_normalize, rotate
 from pixelbrax_jax.tasks import Color
-from pixelbrax_jax.types import PhysicsState
+from pixelbrax_jax.types import CameraRig, PhysicsState
 
 with import_silenced():
     from brax import envs, fluid
@@ -61,6 +63,10 @@ class BraxPhysics(GuardedPhysics):
 
     On the ``"mjx"`` backend link poses are one physics step older than joint positions after a
     ``step`` (never after a ``reset``), because MuJoCo computes them before it integrates.
+
+    Beyond the interface it has ``followed_link``; and ``rigs`` and ``unfit_cameras``, of the model's
+    own cameras. If one of these follows a center of mass, there is a link ``camera/com`` after those
+    of the bodies.
     """
 
     def __init__(
@@ -70,6 +76,7 @@ class BraxPhysics(GuardedPhysics):
         colors: Mapping[str, Color] | None = None,
         drawn_radius: Mapping[str, float] | None = None,
         geom_groups: Collection[int] = VISIBLE_GROUPS,
+        sites_and_cameras: bool = True,
         unscale_actions: bool = False,
         reward: RewardFn | None = None,
         identity: Hashable | None = None,
@@ -80,7 +87,8 @@ class BraxPhysics(GuardedPhysics):
             env: a bare environment, such as ``brax.envs.get_environment("ant")``.
             colors: replacements for colors by geom name, see ``read_geoms``.
             drawn_radius: metres by name of a sphere to draw larger, see ``read_geoms``.
-            geom_groups: MuJoCo's geom groups that are visible.
+            geom_groups: MuJoCo's groups of geoms and sites that are visible.
+            sites_and_cameras: whether the model's sites are drawn and its cameras are viewpoints.
             unscale_actions: for environments that map actions from [-1, 1] to the control
                 range: undo that map, so that costs and actuators see the action as given.
             reward: replaces the environment's reward; called with the state before the step,
@@ -106,6 +114,14 @@ class BraxPhysics(GuardedPhysics):
         self.link_names = tuple(
             model.body(i).name or f"link/{i - 1}" for i in range(1, model.nbody)
         )
+        self.followed_link = 0
+        self.rigs: dict[str, CameraRig] = {}
+        self.unfit_cameras: dict[str, str] = {}
+        self._com_masses: np.ndarray | None = None
+        if sites_and_cameras:
+            self.geoms = with_sites(model, self.geoms, geom_groups)
+            self.followed_link = max(followed_body(model) - 1, 0)
+            self._read_cameras(model)
         self._model = model
         self._source = env
         self._env = _replace_init(env, self._init)
@@ -119,6 +135,13 @@ class BraxPhysics(GuardedPhysics):
 
     def __hash__(self) -> int:
         return hash(self._identity)
+
+    def _read_cameras(self, model: mujoco.MjModel) -> None:
+        com_link = len(self.link_names)
+        self.rigs, self.unfit_cameras = read_rigs(model, com_link), unfit_cameras(model)
+        if any(rig.link == com_link for rig in self.rigs.values()):
+            self.link_names += (COM_LINK,)
+            self._com_masses = _masses_below(model, tracked_body(model))
 
     def _reset(self, key: jax.Array) -> PhysicsState:
         """See ``Physics.reset``. ``key`` may be typed, or uint32 as Brax's own are."""
@@ -210,16 +233,24 @@ class BraxPhysics(GuardedPhysics):
         # Brax writes Python numbers into some fields. Fixed dtypes keep a jitted step from
         # being traced again for its own output.
         carry = jax.tree.map(_as_dtype, carry, self._dtypes)
-        seen = kinematics(brax_state.pipeline_state)
+        xpos, xquat = self._links(kinematics(brax_state.pipeline_state))
         return PhysicsState(
             engine=carry,
-            xpos=seen.xpos,
-            xquat=seen.xquat,
+            xpos=xpos,
+            xquat=xquat,
             obs=jnp.asarray(brax_state.obs, jnp.float32),
             reward=reward,
             terminated=terminated,
             non_finite=jnp.zeros((), bool),
         )
+
+    def _links(self, seen: Kinematics) -> tuple[jax.Array, jax.Array]:
+        if self._com_masses is None:
+            return seen.xpos, seen.xquat
+        centers = seen.xpos + rotate(seen.xquat, jnp.asarray(self._model.body_ipos[1:]))
+        com = self._com_masses @ centers
+        upright = jnp.array([[1.0, 0.0, 0.0, 0.0]])
+        return jnp.concatenate([seen.xpos, com[None]]), jnp.concatenate([seen.xquat, upright])
 
     def _init(self, q: jax.Array, qd: jax.Array, *args: Any, **kwargs: Any) -> Any:
         """Call the environment's ``pipeline_init`` at a proper rotation."""
@@ -248,11 +279,9 @@ class BraxPhysics(GuardedPhysics):
                 "the environment must observe one flat array, got "
                 f"{jax.tree.map(lambda leaf: leaf.shape, first.obs)}"
             )
-        links = first.pipeline_state.x.pos.shape[0]
-        if links != len(self.link_names):
-            raise ValueError(
-                f"the environment's state has {links} links, its model {len(self.link_names)}"
-            )
+        links, bodies = first.pipeline_state.x.pos.shape[0], self._model.nbody - 1
+        if links != bodies:
+            raise ValueError(f"the environment's state has {links} links, its model {bodies}")
         self.state_size = int(first.obs.shape[0])
         self._obs_dtype = first.obs.dtype
         self._dtypes = jax.tree.map(lambda leaf: leaf.dtype, _carry(first))
@@ -325,6 +354,16 @@ def _carry(brax_state: envs.State) -> BraxCarry:
     return BraxCarry(
         pipeline=brax_state.pipeline_state, metrics=brax_state.metrics, info=brax_state.info
     )
+
+
+def _masses_below(model: mujoco.MjModel, root: int) -> np.ndarray:
+    """Return (bodies - 1,) float32, each body's fraction of the mass of ``root``'s subtree."""
+    below = np.zeros(model.nbody, bool)
+    below[root] = True
+    for body in range(1, model.nbody):
+        below[body] |= below[model.body_parentid[body]]
+    masses = np.where(below, model.body_mass, 0.0)[1:]
+    return (masses / masses.sum()).astype(np.float32)
 
 
 def _control_range(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:

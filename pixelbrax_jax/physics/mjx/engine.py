@@ -15,6 +15,7 @@ from pixelbrax_jax.physics.mjx.dynamics import Dynamics, MjxState
 from pixelbrax_jax.physics.mjx.snapshot import Snapshot
 from pixelbrax_jax.physics.mjx.task import DmcTask
 from pixelbrax_jax.physics.model_scene import COM_LINK, TARGET_LINK, read_scene, tracked_body
+from pixelbrax_jax.physics.viewpoints import unfit_cameras
 from pixelbrax_jax.types import PhysicsState
 
 # XLA's library for sums and products on a CPU, YNNPACK, takes longer for the small ones of these
@@ -54,6 +55,7 @@ class MjxPhysics(GuardedPhysics):
         scene = read_scene(model, task.camera, movable=task.movable)
         self.geoms, self.look = scene.geoms, scene.look
         self.rigs = scene.rigs | {"default": scene.rig}
+        self.unfit_cameras = unfit_cameras(model)
         bodies = [model.body(i).name or f"link/{i - 1}" for i in range(1, model.nbody)]
         self.link_names = (*bodies, *scene.links)
         self.dynamics = Dynamics(
