@@ -19,6 +19,7 @@ from pixelbrax_jax.physics.divergence import GuardedPhysics
 from pixelbrax_jax.physics.geometry import VISIBLE_GROUPS, read_geoms
 from pixelbrax_jax.physics.model_scene import COM_LINK, tracked_body, with_sites
 from pixelbrax_jax.physics.mujoco_compatibility import import_silenced, known_warnings_silenced
+from pixelbrax_jax.physics.poses import check_pose, with_unit_rotations
 from pixelbrax_jax.physics.viewpoints import followed_body, read_rigs, unfit_cameras
 from pixelbrax_jax.spatial import quat_normalize, rotate
 from pixelbrax_jax.tasks import Color
@@ -64,9 +65,9 @@ class BraxPhysics(GuardedPhysics):
     On the ``"mjx"`` backend link poses are one physics step older than joint positions after a
     ``step`` (never after a ``reset``), because MuJoCo computes them before it integrates.
 
-    Beyond the interface it has ``followed_link``; and ``rigs`` and ``unfit_cameras``, of the model's
-    own cameras. If one of these follows a center of mass, there is a link ``camera/com`` after those
-    of the bodies.
+    Beyond the interface it has ``followed_link``; and ``rigs`` and ``unfit_cameras``, of the
+    model's own cameras. If one of these follows a center of mass, there is a link ``camera/com``
+    after those of the bodies.
     """
 
     def __init__(
@@ -168,13 +169,7 @@ class BraxPhysics(GuardedPhysics):
         Raises:
             ValueError: for a wrong shape.
         """
-        q = jnp.asarray(q, jnp.float32)
-        qd = jnp.zeros(self._model.nv) if qd is None else jnp.asarray(qd, jnp.float32)
-        if q.shape != (self._model.nq,) or qd.shape != (self._model.nv,):
-            raise ValueError(
-                f"q and qd must have shapes ({self._model.nq},) and ({self._model.nv},), "
-                f"got {q.shape} and {qd.shape}"
-            )
+        q, qd = check_pose(self._model, q, qd)
 
         def init(_q: jax.Array, _qd: jax.Array, *args: Any, **kwargs: Any) -> Any:
             return self._init(q, qd, *args, **kwargs)
@@ -254,14 +249,7 @@ class BraxPhysics(GuardedPhysics):
 
     def _init(self, q: jax.Array, qd: jax.Array, *args: Any, **kwargs: Any) -> Any:
         """Call the environment's ``pipeline_init`` at a proper rotation."""
-        for kind, address in zip(self._model.jnt_type, self._model.jnt_qposadr, strict=True):
-            if kind == mujoco.mjtJoint.mjJNT_FREE:
-                rotation = slice(address + 3, address + 7)
-            elif kind == mujoco.mjtJoint.mjJNT_BALL:
-                rotation = slice(address, address + 4)
-            else:
-                continue
-            q = q.at[rotation].set(quat_normalize(q[rotation]))
+        q = with_unit_rotations(self._model, q)
         return self._source.unwrapped.pipeline_init(q, qd, *args, **kwargs)
 
     def _unscale(self, action: jax.Array) -> jax.Array:

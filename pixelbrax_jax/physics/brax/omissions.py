@@ -1,8 +1,8 @@
 """What Brax's backends leave out of a MuJoCo model, by name.
 
 They read some attributes of a model and ignore the others without a word. What is listed here
-decides how ``mujoco.mj_step`` moves a model, and not how they do. Not listed is what hardly matters,
-which docs/howto/own-task.md names, and what ``mujoco.mjx.put_model`` refuses itself.
+decides how ``mujoco.mj_step`` moves a model, and not how they do. Not listed is what hardly
+matters, which docs/howto/own-task.md names, and what ``mujoco.mjx.put_model`` refuses itself.
 """
 
 from __future__ import annotations
