@@ -26,6 +26,10 @@ from pixelbrax_jax.validation import check_choice
 
 _NO_REFSAFE = int(mujoco.mjtDisableBit.mjDSBL_REFSAFE)
 
+# Brax's approximate inverse of the mass matrix makes damping explicit, which diverges where it is
+# strong; and with fewer searches for a step size, forces on light links diverge.
+_EXACT_SOLUTIONS = {"matrix_inv_iterations": 0, "solver_maxls": 40}
+
 
 def never(after: Kinematics) -> jax.Array:
     """Return False: the task has no end of its own."""
@@ -214,6 +218,8 @@ def _check_model(model: mujoco.MjModel, backend: str) -> None:
 
 def _load(model: mujoco.MjModel, backend: str) -> mjcf.System:
     """Return the model as Brax knows it, changed so that Brax's backends move it as MuJoCo does."""
+    # MuJoCo XLA refuses models with this flag, though energies are only reported.
+    model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_ENERGY)
     if backend != "mjx":
         # A limit with a margin is one without that comes earlier, and Brax reads no margins.
         model.jnt_range += np.outer(model.jnt_margin, [1, -1])
@@ -231,10 +237,10 @@ def _load(model: mujoco.MjModel, backend: str) -> mjcf.System:
         raise ValueError(
             f"MuJoCo XLA, which loads models for all backends, cannot simulate this one: {error}"
         ) from error
-    numerics = [model.numeric(i).name for i in range(model.nnumeric)]
-    if backend == "generalized" and "matrix_inv_iterations" not in numerics:
-        # Brax's approximate inverse needs explicit damping, which diverges where it is strong.
-        system = system.replace(matrix_inv_iterations=0)
+    if backend == "generalized":
+        numerics = {model.numeric(i).name for i in range(model.nnumeric)}
+        chosen = {k: v for k, v in _EXACT_SOLUTIONS.items() if k not in numerics}
+        system = system.replace(**chosen)
     return system
 
 

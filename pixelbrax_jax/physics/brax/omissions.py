@@ -221,18 +221,19 @@ def _in_maximal(model: mujoco.MjModel) -> Iterator[str]:
 def _joints(model: mujoco.MjModel, of_dofs: np.ndarray) -> np.ndarray:
     """Return (joints,) bool, where any of a joint's dofs has a number other than 0."""
     chosen = np.zeros(model.njnt, bool)
-    flat = of_dofs.reshape(model.nv, -1)
-    chosen[model.dof_jntid[(flat != 0).any(axis=1)]] = True
+    chosen[model.dof_jntid[_any_by_row(of_dofs)]] = True
     return chosen
 
 
 def _of(model: mujoco.MjModel, feature: str, kind: str, where: Any) -> Iterator[str]:
     """Yield the feature with the names of those elements whose entries are not all 0."""
-    where = np.asarray(where)
-    flat = where.reshape(len(where), -1) if len(where) else np.zeros((0, 1))
-    rows = np.flatnonzero((flat != 0).any(axis=1))
+    rows = np.flatnonzero(_any_by_row(np.asarray(where)))
     if len(rows):
         yield f"{feature} ({kind} {_some([_name(model, kind, int(i)) for i in rows])})"
+
+
+def _any_by_row(values: np.ndarray) -> np.ndarray:
+    return (values != 0).any(axis=tuple(range(1, values.ndim)))
 
 
 def _flags(model: mujoco.MjModel, *names: str) -> Iterator[str]:
