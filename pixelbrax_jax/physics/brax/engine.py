@@ -242,9 +242,10 @@ class BraxPhysics(GuardedPhysics):
     def _links(self, seen: Kinematics) -> tuple[jax.Array, jax.Array]:
         if self._com_masses is None:
             return seen.xpos, seen.xquat
-        centers = seen.xpos + rotate(seen.xquat, jnp.asarray(self._model.body_ipos[1:]))
+        offsets = jnp.asarray(self._model.body_ipos[1:], jnp.float32)
+        centers = seen.xpos + rotate(seen.xquat, offsets)
         com = self._com_masses @ centers
-        upright = jnp.array([[1.0, 0.0, 0.0, 0.0]])
+        upright = jnp.array([[1.0, 0.0, 0.0, 0.0]], jnp.float32)
         return jnp.concatenate([seen.xpos, com[None]]), jnp.concatenate([seen.xquat, upright])
 
     def _init(self, q: jax.Array, qd: jax.Array, *args: Any, **kwargs: Any) -> Any:
