@@ -42,7 +42,8 @@ class _OwnTask:
 
     @cached_property
     def default_rig(self) -> CameraRig:
-        return self.camera or _corner_rig(self.physics)
+        own = getattr(self.physics, "rigs", {})
+        return self.camera or own.get("default") or _corner_rig(self.physics)
 
 
 _OWN_TASKS: dict[str, _OwnTask] = {}
@@ -76,7 +77,8 @@ def register(
         make_physics: builds the physics, e.g. ``lambda: BraxPhysics(MyEnv())`` or
             ``lambda: mjcf_physics("arm.xml", reward=my_reward)``. Called once, by the first
             ``make``.
-        camera: default viewpoint; None looks from a corner at everything but the ground.
+        camera: default viewpoint; None is the model's camera ``default``, or without it a look from
+            a corner at everything but the ground, following the first body of what actuators move.
 
     Raises:
         ValueError: the name is taken or empty.
@@ -121,7 +123,7 @@ def make(task: str | EnvConfig, **options: Any) -> tuple[PixelEnv, EnvParams]:
     program = {name: getattr(config, name) for name in PROGRAM_OPTIONS}
     program["distractors"] = resolve(config.distractors, config.task)
     env = PixelEnv(physics, **program)
-    rig = make_rig(config.task, config.camera, _own_rigs(config.task, physics))
+    rig = _rig(config, physics)
     if not rig.link < len(physics.link_names):
         raise ValueError(
             f"the camera follows link {rig.link}, but task {config.task!r} has only "
@@ -162,8 +164,9 @@ def named_rigs(task: str) -> dict[str, CameraRig]:
 
     Returns:
         ``default``, ``side`` (seen along +y), ``front`` (along -x), ``top`` (from above, +y up in
-        the image); ``original`` where the paper has the task; of the DM Control Suite the model's
-        own cameras that keep their orientation, also in place of others of that name.
+        the image); ``original`` where the paper has the task; of the DM Control Suite and of tasks
+        of your own the model's cameras that keep their orientation, also in place of others of
+        that name.
 
     Raises:
         ValueError: the task is unknown.
@@ -211,11 +214,24 @@ def _meant(task: object) -> str | None:
     return found[0] if len(found) == 1 else None
 
 
-def _own_rigs(task: str, physics: Physics) -> CameraRig | Mapping[str, CameraRig] | None:
+def _own_rigs(task: str, physics: Physics) -> Mapping[str, CameraRig]:
     """Return the viewpoints of a task that its row has not."""
-    if task in _OWN_TASKS:
-        return _OWN_TASKS[task].default_rig
-    return getattr(physics, "rigs", None)
+    rigs: Mapping[str, CameraRig] = getattr(physics, "rigs", {})
+    return {**rigs, "default": _OWN_TASKS[task].default_rig} if task in _OWN_TASKS else rigs
+
+
+def _rig(config: EnvConfig, physics: Physics) -> CameraRig:
+    rigs = _own_rigs(config.task, physics)
+    unfit: Mapping[str, str] = getattr(physics, "unfit_cameras", {})
+    if isinstance(config.camera, str) and config.camera in set(unfit) - set(
+        rigs_of(config.task, rigs)
+    ):
+        raise ValueError(
+            f"camera {config.camera!r} of task {config.task!r} cannot be a viewpoint: "
+            f"{unfit[config.camera]}, and a viewpoint is a perspective that keeps its direction. "
+            f"Allowed: {', '.join(sorted(rigs_of(config.task, rigs)))}, a CameraRig or a Camera."
+        )
+    return make_rig(config.task, config.camera, rigs)
 
 
 def _look(config: EnvConfig, physics: Physics) -> Look:
@@ -274,7 +290,10 @@ def _corner_rig(physics: Physics) -> CameraRig:
         for g, link in enumerate(geoms.link)
         if geoms.kind[g] != GeomKind.PLANE
     ]
-    track_first = rig_around(np.stack([np.asarray(p) for p in points] + list(xpos[:1])))
+    link = int(getattr(physics, "followed_link", 0))
+    around = rig_around(
+        np.stack([np.asarray(p) for p in points] + list(xpos[link : link + 1])), link
+    )
     # `rig_around` wants the target relative to the link it follows.
-    shift = np.array([xpos[0, 0], xpos[0, 1], 0.0], np.float32)
-    return track_first.replace(eye=track_first.eye - shift, target=track_first.target - shift)
+    shift = np.array([xpos[link, 0], xpos[link, 1], 0.0], np.float32)
+    return around.replace(eye=around.eye - shift, target=around.target - shift)

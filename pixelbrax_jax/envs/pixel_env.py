@@ -175,10 +175,38 @@ class PixelEnv(ProgramConfig):
         """
         return self._reset(state.key, state.sim.episode + 1, params)
 
-    def _reset(
-        self, key: jax.Array, episode: jax.Array, params: EnvParams
+    @partial(jax.jit, static_argnums=0)
+    def from_qpos(
+        self, qpos: jax.Array, qvel: jax.Array | None, key: jax.Array, params: EnvParams
     ) -> tuple[EnvState, Timestep]:
-        sim = self.reset_sim(key, episode, params)
+        """Start as ``reset(key, params)`` does, but in a chosen pose.
+
+        Args:
+            qpos: (Q,) float, joint positions in MuJoCo's order: metres, radians, quaternions.
+            qvel: (V,) float, joint velocities, per second; None for rest.
+            key: a typed PRNG key; decides targets and distractors.
+            params: what may be randomised.
+
+        Returns:
+            The state and the first timestep, with reward 0 and not terminated, even if the task
+            would end in this pose; the next step says so.
+
+        Raises:
+            ValueError: ``qpos`` or ``qvel`` has another shape.
+            TypeError: ``key`` is not a single typed key, or the physics has no ``from_qpos``.
+        """
+        check_key(key)
+        if not hasattr(self.physics, "from_qpos"):
+            raise TypeError(
+                f"{type(self.physics).__name__} cannot start in a chosen pose: give it a function "
+                "from_qpos(q, qd, *, key) that returns the first state of an episode."
+            )
+        return self._reset(key, jnp.uint32(0), params, (qpos, qvel))
+
+    def _reset(
+        self, key: jax.Array, episode: jax.Array, params: EnvParams, pose: Any = None
+    ) -> tuple[EnvState, Timestep]:
+        sim = self.reset_sim(key, episode, params, pose)
         frames = self.push_frame(self.blank_frames(), sim, params, jnp.bool_(True))
         state = EnvState(sim=sim, frames=frames, key=key)
         return state, self.timestep(state, jnp.float32(0.0), params)
@@ -237,11 +265,19 @@ class PixelEnv(ProgramConfig):
 
     # The pieces of a step, which `VectorPixelEnv` puts together in another order.
 
-    def reset_sim(self, key: jax.Array, episode: jax.Array, params: EnvParams) -> SimState:
-        """Return the first state of an episode."""
+    def reset_sim(
+        self, key: jax.Array, episode: jax.Array, params: EnvParams, pose: Any = None
+    ) -> SimState:
+        """Return the first state of an episode, in joint positions and velocities if given."""
         episode_key = jax.random.fold_in(key, episode)
+        physics_key = jax.random.fold_in(episode_key, _RESET_STREAM)
+        physics: Any = self.physics
+        if pose is None:
+            first = physics.reset(physics_key)
+        else:
+            first = physics.from_qpos(*pose, key=physics_key)
         return SimState(
-            physics=self.physics.reset(jax.random.fold_in(episode_key, _RESET_STREAM)),
+            physics=first,
             episode=episode,
             step_count=jnp.int32(0),
             time_limit_offset=jnp.int32(0),

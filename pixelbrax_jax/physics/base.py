@@ -31,6 +31,9 @@ class Kinematics(struct.PyTreeNode):
 RewardFn = Callable[[Kinematics, Kinematics, jax.Array], jax.Array]
 """A reward of the states before and after a step and the (A,) action; returns a scalar."""
 
+ResetFn = Callable[[jax.Array], tuple[jax.Array, jax.Array]]
+"""Of a PRNG key; returns joint positions (Q,) and velocities (V,), as in ``Kinematics``."""
+
 
 @runtime_checkable
 class Physics(Protocol):
@@ -43,7 +46,10 @@ class Physics(Protocol):
     equal only to what computes the same.
 
     An engine may have more attributes: ``rigs``, cameras by name, of which ``default`` is the
-    task's own; ``look``, the lights, sky and ground of its model; ``batch_last``, False where a
+    task's own if it is there; ``unfit_cameras``, by name why other cameras of the model cannot be
+    rigs; ``followed_link``, the link that a camera follows if nothing else is said, 0 by default;
+    ``look``, the lights, sky and ground of its model; ``from_qpos``, a function of joint positions,
+    velocities and a key that returns the first state of an episode; ``batch_last``, False where a
     CPU computes a batch faster with the environments as first axis; and ``compiler_options``, which
     XLA needs on a CPU to make its programs fast.
 

@@ -74,7 +74,7 @@ def read_scene(
     """
     _check_movable(model, movable)
     links = [COM_LINK] if tracked_body(model) >= 0 else []
-    geoms = _with_strings(model, _with_sites(model, _with_planes(model)))
+    geoms = _with_strings(model, with_sites(model, _with_planes(model)))
     target = model.nbody - 1 + len(links)
     moved = [g for g, name in enumerate(geoms.name) if name.removeprefix("site/") in movable]
     anchor = np.zeros(3)
@@ -141,11 +141,20 @@ def _with_planes(model: mujoco.MjModel) -> Geoms:
     )
 
 
-def _with_sites(model: mujoco.MjModel, geoms: Geoms) -> Geoms:
+def with_sites(
+    model: mujoco.MjModel, geoms: Geoms, groups: Collection[int] = VISIBLE_GROUPS
+) -> Geoms:
+    """Return the geoms with the sites that MuJoCo's viewer would show, as ``site/<name>``.
+
+    Args:
+        model: the compiled model.
+        geoms: its geoms.
+        groups: MuJoCo's groups of sites that are visible.
+    """
     rows = []
     for i in range(model.nsite):
         rgba = resolve_rgba(model, model.site_rgba[i], model.site_matid[i])
-        if model.site_group[i] not in VISIBLE_GROUPS or not rgba[3] > 0:
+        if model.site_group[i] not in groups or not rgba[3] > 0:
             continue
         kind = GeomKind(int(model.site_type[i]))
         size = np.array(model.site_size[i], np.float32)
@@ -275,7 +284,7 @@ def _append(geoms: Geoms, rows: list[_Row]) -> Geoms:
         pos=stack(geoms.pos, "pos"),
         quat=stack(geoms.quat, "quat"),
         rgb=jnp.asarray(np.stack(rgb)),
-        material_name=tuple(names),
-        bounded=geoms.bounded + none,
-        patterned=geoms.patterned + none,
+        material_name=tuple(names) if geoms.material_name else (),
+        bounded=geoms.bounded + none if geoms.bounded else (),
+        patterned=geoms.patterned + none if geoms.patterned else (),
     )

@@ -12,6 +12,7 @@ from pixelbrax_jax.types import CameraRig
 _TRACK = int(mujoco.mjtCamLight.mjCAMLIGHT_TRACK)
 _TRACKCOM = int(mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM)
 _FIXED = int(mujoco.mjtCamLight.mjCAMLIGHT_FIXED)
+_PERSPECTIVE = int(mujoco.mjtProjection.mjPROJ_PERSPECTIVE)
 
 
 def tracked_body(model: mujoco.MjModel) -> int:
@@ -37,11 +38,27 @@ def follows_tracked(model: mujoco.MjModel, body: int) -> bool:
     return bool(np.isclose(mass[body], mass[tracked_body(model)], rtol=1e-6))
 
 
+def followed_body(model: mujoco.MjModel) -> int:
+    """Return the body that a view follows if nothing else is said.
+
+    Returns:
+        The first body that moves of the first kinematic tree on which an actuator acts, so that a
+        goal or an obstacle is not followed; without such a tree the first body that moves; 0 if
+        none does.
+    """
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    driven = {int(model.dof_treeid[dof]) for dof in data.moment_colind[: data.moment_rownnz.sum()]}
+    moving = [body for body in range(1, model.nbody) if model.body_treeid[body] >= 0]
+    robot = [body for body in moving if model.body_treeid[body] in driven]
+    return (robot or moving or [0])[0]
+
+
 def read_rigs(model: mujoco.MjModel, com_link: int) -> dict[str, CameraRig]:
     """Return rigs of a model's cameras that keep their orientation.
 
-    Cameras at rest and those of MuJoCo's modes track and trackcom are; cameras that turn with a
-    body or towards one are left out. A rig's target is on the camera's axis as deep as what it
+    Cameras at rest and those of MuJoCo's modes track and trackcom are; those of
+    ``unfit_cameras`` are left out. A rig's target is on the camera's axis as deep as what it
     shows, the tracked point or the model's center of mass, so that a camera distractor turns about
     that.
 
@@ -55,22 +72,49 @@ def read_rigs(model: mujoco.MjModel, com_link: int) -> dict[str, CameraRig]:
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     rigs = {}
+    unfit = unfit_cameras(model)
     for camera in range(model.ncam):
+        name = _name(model, camera)
+        if name in unfit:
+            continue
         mode, body = int(model.cam_mode[camera]), int(model.cam_bodyid[camera])
         if mode == _TRACK and body:
             link, subject = body - 1, np.zeros(3)
             eye, axes = model.cam_pos0[camera], model.cam_mat0[camera]
-        elif mode == _TRACKCOM and follows_tracked(model, body):
+        elif mode == _TRACKCOM:
             link, subject = com_link, np.zeros(3)
             eye, axes = model.cam_poscom0[camera], model.cam_mat0[camera]
-        elif mode in (_FIXED, _TRACK) and model.body_weldid[body] == 0:
+        else:
             link, subject = -1, data.subtree_com[0]
             eye, axes = data.cam_xpos[camera], data.cam_xmat[camera]
-        else:
-            continue
-        name = model.camera(camera).name or f"camera/{camera}"
         rigs[name] = _rig(link, eye, axes.reshape(3, 3), subject, float(model.cam_fovy[camera]))
     return rigs
+
+
+def unfit_cameras(model: mujoco.MjModel) -> dict[str, str]:
+    """Return why cameras cannot be rigs, by their names, for those that cannot."""
+    reasons = {}
+    for camera in range(model.ncam):
+        mode, body = int(model.cam_mode[camera]), int(model.cam_bodyid[camera])
+        reason = ""
+        if model.cam_projection[camera] != _PERSPECTIVE:
+            reason = "it has no perspective"
+        elif model.cam_sensorsize[camera].any() and model.cam_intrinsic[camera, 2:].any():
+            reason = "its principal point is not the middle of its image"
+        elif mode == _FIXED and model.body_weldid[body] != 0:
+            reason = f"it turns with body {model.body(body).name or body!r}"
+        elif mode == _TRACKCOM and not follows_tracked(model, body):
+            reason = "it follows another center of mass than the first such camera does"
+        elif mode not in (_FIXED, _TRACK, _TRACKCOM):
+            target = int(model.cam_targetbodyid[camera])
+            reason = f"it turns towards body {model.body(target).name or target!r}"
+        if reason:
+            reasons[_name(model, camera)] = reason
+    return reasons
+
+
+def _name(model: mujoco.MjModel, camera: int) -> str:
+    return model.camera(camera).name or f"camera/{camera}"
 
 
 def _rig(

@@ -158,7 +158,9 @@ def test_start_and_every_feature_of_mjx(compiled):
     assert not after.non_finite
     assert after.obs[4] > 1
     with pytest.raises(
-        ValueError, match="'spring' backend does not simulate equality constraints or tendons"
+        ValueError,
+        match=r"'spring' backend does not simulate equality constraints \(equality 'equality/0'\); "
+        r"tendons \(tendon 'pull'\); ball joints \(joint 'ball'\); .* use backend='mjx'",
     ):
         mjcf_physics(xml, reward=lambda *_: jnp.zeros(()), backend="spring")
 
@@ -211,6 +213,12 @@ def test_mesh():
         ({"reset_noise": -1.0}, "reset_noise must be finite and not negative"),
         ({"reset_noise": float("nan")}, "reset_noise must be finite and not negative"),
         ({"backend": "mjs"}, "unknown backend: 'mjs'; .* Did you mean 'mjx'"),
+        ({"reset": lambda key: jnp.zeros(4)}, r"reset must return .* \(2,\) and velocities \(2,\)"),
+        ({"reset": lambda key: (jnp.zeros(2), jnp.zeros(3))}, r"got \(\(2,\), \(3,\)\)"),
+        (
+            {"reset": lambda key: (jnp.zeros(2), jnp.zeros(2)), "reset_noise": 0.1},
+            "reset samples the whole initial state: leave reset_noise and init_q out",
+        ),
         ({"colors": {"pol": (1, 0, 0)}}, "unknown geom: 'pol'; .* Did you mean 'pole'"),
         ({"geom_groups": (5,)}, "no geom is visible"),
     ],
@@ -224,8 +232,21 @@ def test_bad_arguments(change, message):
 def test_models_beyond_brax_engines(backend):
     """What an engine cannot simulate is said when it is chosen, not when it runs."""
     xml = CART.replace('timestep="0.01"', 'timestep="0.01" integrator="RK4"')
-    with pytest.raises(ValueError, match=f"'{backend}' backend cannot simulate this model: Only"):
+    with pytest.raises(
+        ValueError, match=f"'{backend}' backend does not simulate .*option integrator='rk4'"
+    ):
         build(xml, backend=backend)
+
+
+@pytest.mark.parametrize("backend", ["generalized", "mjx"])
+def test_models_beyond_mujoco_xla(backend):
+    option = CART.replace('timestep="0.01"', 'timestep="0.01" solver="PGS"')
+    with pytest.raises(ValueError, match=r"MuJoCo XLA, which loads .* cannot simulate .*SOL_PGS"):
+        build(option, backend=backend)
+
+
+def test_energy_is_only_reported():
+    build(CART.replace('"0.01"/>', '"0.01"><flag energy="enable"/></option>'))
 
 
 def test_view_is_public():

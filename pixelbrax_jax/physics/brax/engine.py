@@ -19,11 +19,14 @@ from pixelbrax_jax.physics.brax.compatibility import accept_old_clip
 from pixelbrax_jax.physics.brax.pickling import with_modules, without_modules
 from pixelbrax_jax.physics.divergence import GuardedPhysics
 from pixelbrax_jax.physics.geometry import VISIBLE_GROUPS, read_geoms
+from pixelbrax_jax.physics.model_scene import COM_LINK, tracked_body, with_sites
 from pixelbrax_jax.physics.mujoco_compatibility import import_silenced, known_warnings_silenced
+from pixelbrax_jax.physics.poses import check_pose, with_unit_rotations
 from pixelbrax_jax.physics.recipe import Recipe
-from pixelbrax_jax.spatial import quat_normalize
+from pixelbrax_jax.physics.viewpoints import followed_body, read_rigs, unfit_cameras
+from pixelbrax_jax.spatial import quat_normalize, rotate
 from pixelbrax_jax.tasks import Color
-from pixelbrax_jax.types import PhysicsState
+from pixelbrax_jax.types import CameraRig, PhysicsState
 
 with import_silenced():
     from brax import envs, fluid
@@ -64,6 +67,10 @@ class BraxPhysics(GuardedPhysics):
 
     On the ``"mjx"`` backend link poses are one physics step older than joint positions after a
     ``step`` (never after a ``reset``), because MuJoCo computes them before it integrates.
+
+    Beyond the interface it has ``followed_link``; and ``rigs`` and ``unfit_cameras``, of the
+    model's own cameras. If one of these follows a center of mass, there is a link ``camera/com``
+    after those of the bodies.
     """
 
     def __init__(
@@ -73,6 +80,7 @@ class BraxPhysics(GuardedPhysics):
         colors: Mapping[str, Color] | None = None,
         drawn_radius: Mapping[str, float] | None = None,
         geom_groups: Collection[int] = VISIBLE_GROUPS,
+        sites_and_cameras: bool = True,
         unscale_actions: bool = False,
         reward: RewardFn | None = None,
         identity: Hashable | None = None,
@@ -83,7 +91,8 @@ class BraxPhysics(GuardedPhysics):
             env: a bare environment, such as ``brax.envs.get_environment("ant")``.
             colors: replacements for colors by geom name, see ``read_geoms``.
             drawn_radius: metres by name of a sphere to draw larger, see ``read_geoms``.
-            geom_groups: MuJoCo's geom groups that are visible.
+            geom_groups: MuJoCo's groups of geoms and sites that are visible.
+            sites_and_cameras: whether the model's sites are drawn and its cameras are viewpoints.
             unscale_actions: for environments that map actions from [-1, 1] to the control
                 range: undo that map, so that costs and actuators see the action as given.
             reward: replaces the environment's reward; called with the state before the step,
@@ -110,6 +119,14 @@ class BraxPhysics(GuardedPhysics):
         self.link_names = tuple(
             model.body(i).name or f"link/{i - 1}" for i in range(1, model.nbody)
         )
+        self.followed_link = 0
+        self.rigs: dict[str, CameraRig] = {}
+        self.unfit_cameras: dict[str, str] = {}
+        self._com_masses: np.ndarray | None = None
+        if sites_and_cameras:
+            self.geoms = with_sites(model, self.geoms, geom_groups)
+            self.followed_link = max(followed_body(model) - 1, 0)
+            self._read_cameras(model)
         self._model = model
         self._source = env
         self._env = _replace_init(env, self._init)
@@ -120,6 +137,7 @@ class BraxPhysics(GuardedPhysics):
             "colors": colors,
             "drawn_radius": drawn_radius,
             "geom_groups": geom_groups,
+            "sites_and_cameras": sites_and_cameras,
             "unscale_actions": unscale_actions,
             "reward": reward,
             "identity": self._identity,
@@ -137,6 +155,13 @@ class BraxPhysics(GuardedPhysics):
         if isinstance(self._identity, Recipe):
             return super().__reduce__()
         return _restore, (type(self), without_modules(self._source), self._options)
+
+    def _read_cameras(self, model: mujoco.MjModel) -> None:
+        com_link = len(self.link_names)
+        self.rigs, self.unfit_cameras = read_rigs(model, com_link), unfit_cameras(model)
+        if any(rig.link == com_link for rig in self.rigs.values()):
+            self.link_names += (COM_LINK,)
+            self._com_masses = _masses_below(model, tracked_body(model))
 
     def _reset(self, key: jax.Array) -> PhysicsState:
         """See ``Physics.reset``. ``key`` may be typed, or uint32 as Brax's own are."""
@@ -163,13 +188,7 @@ class BraxPhysics(GuardedPhysics):
         Raises:
             ValueError: for a wrong shape.
         """
-        q = jnp.asarray(q, jnp.float32)
-        qd = jnp.zeros(self._model.nv) if qd is None else jnp.asarray(qd, jnp.float32)
-        if q.shape != (self._model.nq,) or qd.shape != (self._model.nv,):
-            raise ValueError(
-                f"q and qd must have shapes ({self._model.nq},) and ({self._model.nv},), "
-                f"got {q.shape} and {qd.shape}"
-            )
+        q, qd = check_pose(self._model, q, qd)
 
         def init(_q: jax.Array, _qd: jax.Array, *args: Any, **kwargs: Any) -> Any:
             return self._init(q, qd, *args, **kwargs)
@@ -228,27 +247,29 @@ class BraxPhysics(GuardedPhysics):
         # Brax writes Python numbers into some fields. Fixed dtypes keep a jitted step from
         # being traced again for its own output.
         carry = jax.tree.map(_as_dtype, carry, self._dtypes)
-        seen = kinematics(brax_state.pipeline_state)
+        xpos, xquat = self._links(kinematics(brax_state.pipeline_state))
         return PhysicsState(
             engine=carry,
-            xpos=seen.xpos,
-            xquat=seen.xquat,
+            xpos=xpos,
+            xquat=xquat,
             obs=jnp.asarray(brax_state.obs, jnp.float32),
             reward=reward,
             terminated=terminated,
             non_finite=jnp.zeros((), bool),
         )
 
+    def _links(self, seen: Kinematics) -> tuple[jax.Array, jax.Array]:
+        if self._com_masses is None:
+            return seen.xpos, seen.xquat
+        offsets = jnp.asarray(self._model.body_ipos[1:], jnp.float32)
+        centers = seen.xpos + rotate(seen.xquat, offsets)
+        com = self._com_masses @ centers
+        upright = jnp.array([[1.0, 0.0, 0.0, 0.0]], jnp.float32)
+        return jnp.concatenate([seen.xpos, com[None]]), jnp.concatenate([seen.xquat, upright])
+
     def _init(self, q: jax.Array, qd: jax.Array, *args: Any, **kwargs: Any) -> Any:
         """Call the environment's ``pipeline_init`` at a proper rotation."""
-        for kind, address in zip(self._model.jnt_type, self._model.jnt_qposadr, strict=True):
-            if kind == mujoco.mjtJoint.mjJNT_FREE:
-                rotation = slice(address + 3, address + 7)
-            elif kind == mujoco.mjtJoint.mjJNT_BALL:
-                rotation = slice(address, address + 4)
-            else:
-                continue
-            q = q.at[rotation].set(quat_normalize(q[rotation]))
+        q = with_unit_rotations(self._model, q)
         return self._source.unwrapped.pipeline_init(q, qd, *args, **kwargs)
 
     def _unscale(self, action: jax.Array) -> jax.Array:
@@ -266,11 +287,9 @@ class BraxPhysics(GuardedPhysics):
                 "the environment must observe one flat array, got "
                 f"{jax.tree.map(lambda leaf: leaf.shape, first.obs)}"
             )
-        links = first.pipeline_state.x.pos.shape[0]
-        if links != len(self.link_names):
-            raise ValueError(
-                f"the environment's state has {links} links, its model {len(self.link_names)}"
-            )
+        links, bodies = first.pipeline_state.x.pos.shape[0], self._model.nbody - 1
+        if links != bodies:
+            raise ValueError(f"the environment's state has {links} links, its model {bodies}")
         self.state_size = int(first.obs.shape[0])
         self._obs_dtype = first.obs.dtype
         self._dtypes = jax.tree.map(lambda leaf: leaf.dtype, _carry(first))
@@ -347,6 +366,16 @@ def _carry(brax_state: envs.State) -> BraxCarry:
     return BraxCarry(
         pipeline=brax_state.pipeline_state, metrics=brax_state.metrics, info=brax_state.info
     )
+
+
+def _masses_below(model: mujoco.MjModel, root: int) -> np.ndarray:
+    """Return (bodies - 1,) float32, each body's fraction of the mass of ``root``'s subtree."""
+    below = np.zeros(model.nbody, bool)
+    below[root] = True
+    for body in range(1, model.nbody):
+        below[body] |= below[model.body_parentid[body]]
+    masses = np.where(below, model.body_mass, 0.0)[1:]
+    return (masses / masses.sum()).astype(np.float32)
 
 
 def _control_range(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:

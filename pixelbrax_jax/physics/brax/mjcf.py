@@ -12,8 +12,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from pixelbrax_jax.physics.base import Kinematics, RewardFn
+from pixelbrax_jax.physics.base import Kinematics, ResetFn, RewardFn
 from pixelbrax_jax.physics.brax.engine import BraxPhysics, kinematics
+from pixelbrax_jax.physics.brax.omissions import check_simulated
 from pixelbrax_jax.physics.geometry import VISIBLE_GROUPS, read_geoms
 from pixelbrax_jax.physics.mujoco_compatibility import import_silenced, loading_silenced
 from pixelbrax_jax.tasks import BRAX_BACKENDS, Color
@@ -22,6 +23,12 @@ with import_silenced():
     from brax import envs
     from brax.io import mjcf
 from pixelbrax_jax.validation import check_choice
+
+_NO_REFSAFE = int(mujoco.mjtDisableBit.mjDSBL_REFSAFE)
+
+# Brax's approximate inverse of the mass matrix makes damping explicit, which diverges where it is
+# strong; and with fewer searches for a step size, forces on light links diverge.
+_EXACT_SOLUTIONS = {"matrix_inv_iterations": 0, "solver_maxls": 40}
 
 
 def never(after: Kinematics) -> jax.Array:
@@ -48,6 +55,7 @@ class MjcfTask:
             ``init_q`` and 0, uniformly (metres, radians, per second).
         n_frames: physics steps per control step.
         init_q: (Q,) joint positions to start from; None for the model's own.
+        reset: samples joint positions and velocities, in place of ``reset_noise`` and ``init_q``.
     """
 
     reward: RewardFn
@@ -56,14 +64,14 @@ class MjcfTask:
     reset_noise: float = 0.01
     n_frames: int = 5
     init_q: np.ndarray | None = None
+    reset: ResetFn | None = None
 
 
 class MjcfEnv(envs.PipelineEnv):
     """A Brax environment for any model, with the formulas of an ``MjcfTask``."""
 
     def __init__(self, model: mujoco.MjModel, task: MjcfTask, backend: str):
-        with loading_silenced():
-            system = mjcf.load_model(model)
+        system = _load(model, backend)
         super().__init__(system, backend=backend, n_frames=task.n_frames)
         self._task = task
         self._model = model
@@ -78,15 +86,21 @@ class MjcfEnv(envs.PipelineEnv):
         return int(self._model.nu)
 
     def reset(self, rng: jax.Array) -> envs.State:
-        """Sample uniform noise around the initial pose."""
+        """Sample joint positions and velocities, by the task's own function if it has one."""
+        if self._task.reset is None:
+            q, qd = self._around_initial_pose(rng)
+        else:
+            q, qd = (jnp.asarray(part, jnp.float32) for part in self._task.reset(rng))
+        pipeline = self.pipeline_init(q, qd)
+        zero = jnp.zeros(())
+        return envs.State(pipeline, self._task.observation(kinematics(pipeline)), zero, zero)
+
+    def _around_initial_pose(self, rng: jax.Array) -> tuple[jax.Array, jax.Array]:
         q_key, qd_key = jax.random.split(rng)
         noise = self._task.reset_noise
         q = self.sys.init_q if self._task.init_q is None else jnp.asarray(self._task.init_q)
         q = q + jax.random.uniform(q_key, q.shape, minval=-noise, maxval=noise)
-        qd = jax.random.uniform(qd_key, (self._model.nv,), minval=-noise, maxval=noise)
-        pipeline = self.pipeline_init(q, qd)
-        zero = jnp.zeros(())
-        return envs.State(pipeline, self._task.observation(kinematics(pipeline)), zero, zero)
+        return q, jax.random.uniform(qd_key, (self._model.nv,), minval=-noise, maxval=noise)
 
     def step(self, state: envs.State, action: jax.Array) -> envs.State:
         """Advance by one control step, with the task's formulas."""
@@ -107,9 +121,10 @@ def mjcf_physics(
     reward: RewardFn,
     terminated: Callable[[Kinematics], jax.Array] = never,
     observation: Callable[[Kinematics], jax.Array] = joint_state,
-    reset_noise: float = 0.01,
+    reset_noise: float | None = None,
     n_frames: int = 5,
     init_q: np.ndarray | None = None,
+    reset: ResetFn | None = None,
     backend: str = "mjx",
     colors: Mapping[str, Color] | None = None,
     geom_groups: Collection[int] = VISIBLE_GROUPS,
@@ -118,20 +133,25 @@ def mjcf_physics(
 
     An action in [-1, 1] is mapped linearly to an actuator's control range, or passed as it is
     if the actuator has none. Bodies without joints are fused with their parents, because links
-    are what moves. The model starts at ``qpos0``, or at its custom numeric ``init_qpos``.
+    are what moves. The model starts at ``qpos0``, or at its custom numeric ``init_qpos``. Sites are
+    drawn as geoms are, named ``site/<name>``. Cameras of the model are viewpoints by their names,
+    see ``named_rigs``.
 
     Args:
         source: a file, or the XML itself.
         reward: see ``MjcfTask``.
         terminated: see ``MjcfTask``.
         observation: see ``MjcfTask``.
-        reset_noise: see ``MjcfTask``.
+        reset_noise: see ``MjcfTask``; 0.01 by default.
         n_frames: see ``MjcfTask``; the control step lasts this many of the model's time steps.
         init_q: see ``MjcfTask``.
+        reset: samples the joint positions and velocities that an episode starts from, of a PRNG
+            key; a goal for each episode is a body with joints that no actuator moves. In place of
+            ``init_q`` and ``reset_noise``.
         backend: ``"mjx"`` simulates most of MuJoCo; the others are Brax's own backends for
             trees of hinges, slides and free joints.
         colors: replacements for the model's colors by geom name, red, green, blue in [0, 1].
-        geom_groups: MuJoCo's geom groups that are visible.
+        geom_groups: MuJoCo's groups of geoms and sites that are visible.
 
     Returns:
         The physics, to be used as any other.
@@ -139,9 +159,16 @@ def mjcf_physics(
     Raises:
         FileNotFoundError: if there is no such file.
         ValueError: if the model cannot be compiled, simulated or drawn, has no joint or no
-            actuator, or a function returns the wrong shape or dtype.
+            actuator, has what the backend would leave out, ``reset`` is given with ``init_q`` or
+            ``reset_noise``, or a function returns the wrong shape or dtype.
     """
     check_choice("backend", backend, BRAX_BACKENDS)
+    if reset is not None and (reset_noise is not None or init_q is not None):
+        raise ValueError(
+            "reset samples the whole initial state: leave reset_noise and init_q out, and add the "
+            "noise in reset."
+        )
+    reset_noise = 0.01 if reset_noise is None else reset_noise
     if not math.isfinite(reset_noise) or reset_noise < 0:
         raise ValueError(f"reset_noise must be finite and not negative, got {reset_noise}")
     if n_frames < 1 or n_frames != int(n_frames):
@@ -154,7 +181,9 @@ def mjcf_physics(
         init_q = np.asarray(init_q, np.float32)
         if init_q.shape != (model.nq,):
             raise ValueError(f"init_q must have shape ({model.nq},), got {init_q.shape}")
-    task = MjcfTask(reward, terminated, observation, float(reset_noise), int(n_frames), init_q)
+    task = MjcfTask(
+        reward, terminated, observation, float(reset_noise), int(n_frames), init_q, reset
+    )
     _check_functions(task, model)
     return BraxPhysics(MjcfEnv(model, task, backend), colors=colors, geom_groups=geom_groups)
 
@@ -184,22 +213,35 @@ def _check_model(model: mujoco.MjModel, backend: str) -> None:
         raise ValueError("the model has no joint, so nothing can move")
     if model.nu == 0:
         raise ValueError("the model has no actuator, so an agent could not act on it")
-    if backend == "mjx":
-        return
-    # Brax's other backends would leave these out silently.
-    left_out = [
-        what
-        for what, count in (
-            ("equality constraints", model.neq),
-            ("tendons", model.ntendon),
-            ("bodies without a joint", int((model.body_jntnum[1:] == 0).sum())),
-        )
-        if count
-    ]
-    if left_out:
+    check_simulated(model, backend)
+
+
+def _load(model: mujoco.MjModel, backend: str) -> mjcf.System:
+    """Return the model as Brax knows it, changed so that Brax's backends move it as MuJoCo does."""
+    # MuJoCo XLA refuses models with this flag, though energies are only reported.
+    model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_ENERGY)
+    if backend != "mjx":
+        # A limit with a margin is one without that comes earlier, and Brax reads no margins.
+        model.jnt_range += np.outer(model.jnt_margin, [1, -1])
+        model.jnt_margin[:] = 0
+    if backend == "generalized" and not model.opt.disableflags & _NO_REFSAFE:
+        for solref in (model.jnt_solref, model.geom_solref, model.pair_solref):
+            constant = solref[:, 0]
+            constant[:] = np.where(
+                constant > 0, np.maximum(constant, 2 * model.opt.timestep), constant
+            )
+    try:
+        with loading_silenced():
+            system = mjcf.load_model(model)
+    except NotImplementedError as error:
         raise ValueError(
-            f"the {backend!r} backend does not simulate {' or '.join(left_out)}; use backend='mjx'"
-        )
+            f"MuJoCo XLA, which loads models for all backends, cannot simulate this one: {error}"
+        ) from error
+    if backend == "generalized":
+        numerics = {model.numeric(i).name for i in range(model.nnumeric)}
+        chosen = {k: v for k, v in _EXACT_SOLUTIONS.items() if k not in numerics}
+        system = system.replace(**chosen)
+    return system
 
 
 def _check_functions(task: MjcfTask, model: mujoco.MjModel) -> None:
@@ -216,6 +258,17 @@ def _check_functions(task: MjcfTask, model: mujoco.MjModel) -> None:
     _check_result("reward", "a scalar number", jax.eval_shape(task.reward, shapes, shapes, action))
     _check_result("terminated", "a scalar bool", jax.eval_shape(task.terminated, shapes))
     _check_result("observation", "a flat float array", jax.eval_shape(task.observation, shapes))
+    if task.reset is not None:
+        start = jax.eval_shape(task.reset, jax.random.key(0))
+        expected = [(model.nq,), (model.nv,)]
+        if not isinstance(start, tuple | list) or [getattr(x, "shape", None) for x in start] != (
+            expected
+        ):
+            got = jax.tree.map(lambda leaf: leaf.shape, start)
+            raise ValueError(
+                f"reset must return joint positions ({model.nq},) and velocities ({model.nv},), "
+                f"got {got}"
+            )
 
 
 def _check_result(name: str, expected: str, result: object) -> None:

@@ -71,6 +71,8 @@ def _load(task: str, backend: str, reward_preset: str) -> BraxPhysics:
         load_brax_env(task, backend, **(row.paper_options if paper else {})),
         colors=row.colors,
         drawn_radius=row.drawn_radius,
+        # These tasks' pictures and viewpoints are those of the original.
+        sites_and_cameras=False,
         unscale_actions=paper and row.paper_unscaled,
         reward=reward,
         identity=Recipe(_load, (task, backend, reward_preset)),

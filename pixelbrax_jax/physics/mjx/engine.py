@@ -13,8 +13,10 @@ import numpy as np
 from pixelbrax_jax.physics.divergence import GuardedPhysics
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics, MjxState
 from pixelbrax_jax.physics.mjx.snapshot import Snapshot
-from pixelbrax_jax.physics.mjx.task import DmcTask
+from pixelbrax_jax.physics.mjx.task import DmcTask, Start
 from pixelbrax_jax.physics.model_scene import COM_LINK, TARGET_LINK, read_scene, tracked_body
+from pixelbrax_jax.physics.poses import check_pose, with_unit_rotations
+from pixelbrax_jax.physics.viewpoints import unfit_cameras
 from pixelbrax_jax.types import PhysicsState
 
 # XLA's library for sums and products on a CPU, YNNPACK, takes longer for the small ones of these
@@ -54,6 +56,7 @@ class MjxPhysics(GuardedPhysics):
         scene = read_scene(model, task.camera, movable=task.movable)
         self.geoms, self.look = scene.geoms, scene.look
         self.rigs = scene.rigs | {"default": scene.rig}
+        self.unfit_cameras = unfit_cameras(model)
         bodies = [model.body(i).name or f"link/{i - 1}" for i in range(1, model.nbody)]
         self.link_names = (*bodies, *scene.links)
         self.dynamics = Dynamics(
@@ -130,7 +133,30 @@ class MjxPhysics(GuardedPhysics):
         Returns:
             The state, and readings of all sensors as ``observe`` takes them.
         """
-        start = self._task.start(self.dynamics, key)
+        return self._settle(self._task.start(self.dynamics, key))
+
+    def from_qpos(
+        self, q: jax.Array, qd: jax.Array | None = None, *, key: jax.Array | None = None
+    ) -> PhysicsState:
+        """Return the first state of an episode, in a chosen pose.
+
+        Args:
+            q: (Q,) float32, joint positions in MuJoCo's order; quaternions of any length.
+            qd: (V,) float32, joint velocities, 0 if not given.
+            key: decides the episode's target, where the task has one that is no joint.
+
+        Returns:
+            A state that ``step`` accepts.
+
+        Raises:
+            ValueError: for a wrong shape.
+        """
+        q, qd = check_pose(self._model, q, qd)
+        start = self._task.start(self.dynamics, jax.random.key(0) if key is None else key)
+        start = start.replace(qpos=with_unit_rotations(self._model, q), qvel=qd)
+        return self._guard_first(self.observe(*self._settle(start)))
+
+    def _settle(self, start: Start) -> tuple[MjxState, jax.Array]:
         state = self.dynamics.state(start.qpos, start.qvel, start.target)
         sensors = jnp.zeros(self._model.nsensordata)
         if self._task.starts_with_forces:

@@ -1,0 +1,41 @@
+"""Poses of a MuJoCo model, as joint positions and velocities."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import mujoco
+
+from pixelbrax_jax.spatial import quat_normalize
+
+
+def check_pose(
+    model: mujoco.MjModel, q: jax.Array, qd: jax.Array | None
+) -> tuple[jax.Array, jax.Array]:
+    """Return joint positions (Q,) and velocities (V,) in float32; the latter 0 if not given.
+
+    Raises:
+        ValueError: for a wrong shape.
+    """
+    q = jnp.asarray(q, jnp.float32)
+    qd = jnp.zeros(model.nv) if qd is None else qd
+    qd = jnp.asarray(qd, jnp.float32)
+    if q.shape != (model.nq,) or qd.shape != (model.nv,):
+        raise ValueError(
+            f"q and qd must have shapes ({model.nq},) and ({model.nv},), got {q.shape} and "
+            f"{qd.shape}"
+        )
+    return q, qd
+
+
+def with_unit_rotations(model: mujoco.MjModel, q: jax.Array) -> jax.Array:
+    """Return joint positions (Q,) with the quaternions of free and ball joints normalized."""
+    for kind, address in zip(model.jnt_type, model.jnt_qposadr, strict=True):
+        if kind == mujoco.mjtJoint.mjJNT_FREE:
+            rotation = slice(address + 3, address + 7)
+        elif kind == mujoco.mjtJoint.mjJNT_BALL:
+            rotation = slice(address, address + 4)
+        else:
+            continue
+        q = q.at[rotation].set(quat_normalize(q[rotation]))
+    return q
