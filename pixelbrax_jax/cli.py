@@ -8,6 +8,7 @@ import sys
 from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 from pixelbrax_jax.extras import install_extra
@@ -46,6 +47,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     _add_record(commands)
     commands.add_parser("bench", help="measure this machine: bench --help", add_help=False)
     arguments = sys.argv[1:] if arguments is None else list(arguments)
+    # For tasks of the user's, as `python -m` has it; last, so that no file here hides a library.
+    if not {"", (here := str(Path.cwd()))}.intersection(sys.path):
+        sys.path.append(here)
     if arguments[:1] == ["train"]:
         return _train(arguments[1:])
     if arguments[:1] == ["bench"]:
@@ -73,7 +77,10 @@ def _add_play(commands: Any) -> None:
         description="Plays a task in a window, or, with --gif or where there is no display, into "
         "an animated image.",
     )
-    command.add_argument("task", help="as ant; 'pixelbrax tasks' lists them")
+    command.add_argument(
+        "task",
+        help="as ant; 'pixelbrax tasks' lists them; or MODULE:NAME, which imports the module first",
+    )
     command.add_argument(
         "--policy",
         choices=("random", "zero", "pretrained"),
@@ -176,6 +183,11 @@ def _add_trained(command: argparse.ArgumentParser) -> None:
         help="in its place a policy that comes with the package, as halfcheetah",
     )
     command.add_argument("--steps", type=int, help="of which checkpoint (default: the latest)")
+    command.add_argument(
+        "--clips",
+        metavar="FOLDER",
+        help="of the clips, where it is not that of the training; train wants the same clips in it",
+    )
     command.add_argument("--best", action="store_true", help="take the best checkpoint")
     command.add_argument(
         "--run",
@@ -199,7 +211,8 @@ def _add_evaluate(commands: Any) -> None:
         "--split",
         nargs="+",
         choices=("clean", "train", "test"),
-        help="default: clean, and with distractors train and test too",
+        help="default: clean, with distractors train too, and test where there are clips that "
+        "training never shows",
     )
     command.set_defaults(run=_evaluate)
 

@@ -148,7 +148,7 @@ def load_clips(
         names = procedural.names(split)[:num_clips]
         _check_size(len(names) * procedural.FRAMES, height, width, max_bytes)
         return _procedural(tuple(names), split, height, width)
-    folder = Path(source).expanduser()
+    folder = Path(source).expanduser().absolute()
     sources = folders.find(folder, split)[:num_clips]
     images = sum(len(s.files) for s in sources if not s.is_video)
     _check_size(images, height, width, max_bytes)

@@ -203,7 +203,7 @@ def test_the_best_outlives_a_resumed_run(tmp_path):
 
 def test_only_evaluations_score_where_there_are_any(tmp_path, monkeypatch):
     splits = {"clean": (PixelEnv(Ball(), **OPTIONS), PARAMS)}
-    monkeypatch.setattr(train, "make_splits", lambda config: splits)
+    monkeypatch.setattr(train, "make_splits", lambda *_: splits)
     each = options(tmp_path, num_evals=2, eval_episodes=1, checkpoint_every=PER_ITERATION)
     run(ppg(4), PARAMS, replace(each, keep_checkpoints=9))
     scores = [read_about(tmp_path / "checkpoints", PER_ITERATION * i)["score"] for i in range(1, 5)]
