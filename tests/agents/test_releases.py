@@ -106,3 +106,24 @@ def test_a_run_of_another_kind_is_refused(folder):
     change(folder, format=5)
     with pytest.raises(CheckpointError, match="has format 5, this version reads 4"):
         restore(folder, ppo())
+
+
+def test_of_clips_the_content_decides_and_without_digests_the_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+    def other(there, here, digests_there=None, digests_here=None):
+        about = {"config": {"clips": there}, "clips": digests_there}
+        return settings.differences(about, {"config": {"clips": here}, "clips": digests_here})
+
+    assert other("a", "b", ["1", "2"], ["1", "2"]) == []
+    assert other("a", "a", ["1", "2"], ["2", "1"]) == [
+        f"clips: those of '{tmp_path}/a' there, others in '{tmp_path}/a' here"
+    ]
+    assert other("a", str(tmp_path / "a"), None, ["1"]) == []
+    assert other("a", "b", None, ["1"])[0].endswith(
+        f"'{tmp_path}/b' here (it has no digest of its clips: the folder decides)"
+    )
+    assert other(None, "procedural") == []
+    assert other("procedural", "a", None, ["1"]) == [
+        f"clips: 'procedural' there, '{tmp_path}/a' here"
+    ]

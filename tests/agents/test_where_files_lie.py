@@ -112,18 +112,30 @@ def test_a_run_goes_on_wherever_its_clips_lie(home, monkeypatch, capsys):
     told = capsys.readouterr()
     found = rows(told.out)
     assert found.keys() == {"clean", "train"}
-    assert found["train"]["clips"] == "../node/staged"
+    assert found["train"]["clips"] == f"{home}/elsewhere/../node/staged"
     assert "clips" not in found["clean"]
     assert (found["train"]["steps"], found["train"]["seed"]) == (16, 0)
     assert "no split 'test': of the 2 clips of split 'all'" in told.err
     assert main([*of_run, "--clips", "../others", "--split", "test"]) == 0
-    assert rows(capsys.readouterr().out)["test"]["clips"] == "../others"
+    assert rows(capsys.readouterr().out)["test"]["clips"] == f"{home}/elsewhere/../others"
     assert main([*of_run, "--clips", "../others", "--split", "train"]) == 1
     assert "are not those of the training" in capsys.readouterr().err
+    # A run of a release that stored no digests.
+    path = home / "run" / "checkpoints" / "16" / "about" / "metadata"
+    about = json.loads(path.read_text())
+    path.write_text(json.dumps({n: v for n, v in about.items() if n != "clips"}))
+    assert main([*of_run, "--clips", "../others", "--split", "train"]) == 1
+    assert "are not those of the training" in capsys.readouterr().err
+    (home / "node" / "staged").rename(home / "node" / "gone")
+    assert main([*of_run, "--clips", "../others", "--split", "train"]) == 0
+    told = capsys.readouterr()
+    assert "has no digest of its clips; those of ../others are taken for them" in told.err
+    assert rows(told.out)["train"]["clips"] == f"{home}/elsewhere/../others"
+    path.write_text(json.dumps(about))
     video = ["--num-frames", "2", "--grid", "1", "--size", "18", "--output", "a.gif"]
     assert main(["record", str(home / "run"), "--clips", "../others", *video]) == 1
     assert "are not those of the training" in capsys.readouterr().err
-    assert main(["record", str(home / "run"), "--clips", "../node/staged", *video]) == 0
+    assert main(["record", str(home / "run"), "--clips", "../node/gone", *video]) == 0
     assert (home / "elsewhere" / "a.gif").stat().st_size > 0
 
 

@@ -8,6 +8,7 @@ import sys
 
 from pixelbrax_jax.agents.runner.checkpoint import CheckpointError
 from pixelbrax_jax.agents.runner.evaluate import Evaluator, NoSplitError, make_split, splits_of
+from pixelbrax_jax.agents.runner.settings import place_of
 from pixelbrax_jax.agents.runner.trained import load_chosen, with_clips
 from pixelbrax_jax.validation import check_positive_int
 
@@ -22,6 +23,11 @@ def evaluate(options: argparse.Namespace) -> int:
         check_positive_int("episodes", options.episodes)
         agent = load_chosen(options)
         config, shown = with_clips(agent, options.clips)
+        if options.clips and not shown:
+            sys.stderr.write(
+                "pixelbrax evaluate: the run has no digest of its clips; those of "
+                f"{options.clips} are taken for them\n"
+            )
         for name in options.split or splits_of(config):
             try:
                 env, params = make_split(config, name, shown)
@@ -41,7 +47,7 @@ def evaluate(options: argparse.Namespace) -> int:
                 "length": float(result.lengths.mean()),
             }
             if params.clips is not None:
-                line["clips"] = config.clips or "procedural"
+                line["clips"] = place_of(str(config.clips or "procedural"))
             if options.episodes > 1:
                 line["standard_error"] = result.standard_error
             sys.stdout.write(json.dumps(line) + "\n")

@@ -35,7 +35,7 @@ _FREE = ("total_steps", "memory_budget_gb")
 def settings_of(algorithm: Algorithm, options: RunConfig) -> dict[str, Any]:
     """Return what decides the result of a run, as JSON has it; a folder of clips from the root."""
     settings = describe(algorithm.config) | {name: getattr(options, name) for name in OF_RUNS}
-    return settings | {"clips": _place(settings["clips"])}
+    return settings | {"clips": place_of(settings["clips"])}
 
 
 def former_settings(kind: type[TrainConfig]) -> dict[str, Any]:
@@ -95,12 +95,14 @@ def differences(about: Mapping[str, Any], own: Mapping[str, Any]) -> list[str]:
         for name in sorted((old.keys() | new.keys()) - free - {"clips"})
         if name not in new or old.get(name) != new[name]
     ]
-    there, here = (_place(settings.get("clips")) or "procedural" for settings in (old, new))
+    there, here = (place_of(settings.get("clips")) or "procedural" for settings in (old, new))
     if about.get("clips") and own.get("clips"):
         if about["clips"] != own["clips"]:
             found.append(f"clips: those of {there!r} there, others in {here!r} here")
     elif there != here:
-        found.append(f"clips: {there!r} there, {here!r} here")
+        named = there == "procedural" or about.get("clips")
+        why = "" if named else " (it has no digest of its clips: the folder decides)"
+        found.append(f"clips: {there!r} there, {here!r} here{why}")
     return found
 
 
@@ -133,7 +135,7 @@ def _digest(frames: np.ndarray) -> str:
     return digest.hexdigest()[:32]
 
 
-def _place(clips: str | None) -> str | None:
+def place_of(clips: str | None) -> str | None:
     """Return where clips are, whatever the current folder will be."""
     if clips is None or clips == "procedural":
         return clips

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -159,7 +160,7 @@ def with_clips(agent: Trained, clips: str | None) -> tuple[TrainConfig, tuple[st
 
     Returns:
         The settings, and digests of the clips that training played, for ``make_split``. They are
-        None where nobody knows better than the folder's name.
+        None where none are stored and the clips are no longer where they were.
 
     Raises:
         ValueError: clips are given, but no distractor of the run plays any.
@@ -172,8 +173,9 @@ def with_clips(agent: Trained, clips: str | None) -> tuple[TrainConfig, tuple[st
             f"--clips {clips} is given, but no distractor of the run plays clips; it had "
             f"{', '.join(map(str, as_tuple(config.distractors))) or 'none'}."
         )
-    if shown is None and config.clips in (None, "procedural"):
-        shown = tuple(clip_digests(make_env(config)[1].clips))
+    if shown is None:
+        with suppress(FileNotFoundError):
+            shown = tuple(clip_digests(make_env(config)[1].clips))
     return replace(config, clips=clips), shown
 
 
