@@ -6,6 +6,7 @@ import argparse
 import signal
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
@@ -47,15 +48,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     _add_record(commands)
     commands.add_parser("bench", help="measure this machine: bench --help", add_help=False)
     arguments = sys.argv[1:] if arguments is None else list(arguments)
-    # For tasks of the user's, as `python -m` has it; last, so that no file here hides a library.
-    if not {"", (here := str(Path.cwd()))}.intersection(sys.path):
-        sys.path.append(here)
+    _find_modules_here()
     if arguments[:1] == ["train"]:
         return _train(arguments[1:])
     if arguments[:1] == ["bench"]:
         return _bench(arguments[1:])
     options = parser.parse_args(arguments)
     return int(options.run(options))
+
+
+def _find_modules_here() -> None:
+    """Let modules with tasks of the user's be found in the current folder, as `python -m` does.
+
+    It comes last, so that no file in it hides a library.
+    """
+    with suppress(OSError):  # the folder is deleted
+        if not {"", (here := str(Path.cwd()))}.intersection(sys.path):
+            sys.path.append(here)
 
 
 def _tasks(options: argparse.Namespace) -> int:
