@@ -37,7 +37,9 @@ def play(options: argparse.Namespace) -> int:
         check_positive_int("num_frames", options.num_frames)
         env, act = _make(options)
         lacking = "" if options.gif else _no_window()
-        written = options.gif or (f"{options.task}.gif" if lacking else None)
+        # Of a task module:name, not all systems have files so called.
+        name = options.task.rpartition(":")[2]
+        written = options.gif or (f"{name}.gif" if lacking else None)
         if written and None in map(find_spec, ("imageio_ffmpeg", "PIL")):
             raise ImportError(f"{lacking}; {NO_WRITER}" if lacking else NO_WRITER)
         if lacking:

@@ -7,8 +7,10 @@ import signal
 import sys
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 from pixelbrax_jax.extras import install_extra
@@ -47,12 +49,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     _add_record(commands)
     commands.add_parser("bench", help="measure this machine: bench --help", add_help=False)
     arguments = sys.argv[1:] if arguments is None else list(arguments)
+    _find_modules_here()
     if arguments[:1] == ["train"]:
         return _train(arguments[1:])
     if arguments[:1] == ["bench"]:
         return _bench(arguments[1:])
     options = parser.parse_args(arguments)
     return int(options.run(options))
+
+
+def _find_modules_here() -> None:
+    """Let modules with tasks of the user's be found in the current folder, as `python -m` does.
+
+    It comes last, so that no file in it hides a library.
+    """
+    with suppress(OSError):  # the folder is deleted
+        if not {"", (here := str(Path.cwd()))}.intersection(sys.path):
+            sys.path.append(here)
 
 
 def _tasks(options: argparse.Namespace) -> int:
@@ -74,7 +87,10 @@ def _add_play(commands: Any) -> None:
         description="Plays a task in a window, or, with --gif or where there is no display, into "
         "an animated image.",
     )
-    command.add_argument("task", help="as ant; 'pixelbrax tasks' lists them")
+    command.add_argument(
+        "task",
+        help="as ant; 'pixelbrax tasks' lists them; or MODULE:NAME, which imports the module first",
+    )
     command.add_argument(
         "--policy",
         choices=("random", "zero", "pretrained"),
@@ -185,6 +201,11 @@ def _add_trained(command: argparse.ArgumentParser) -> None:
         help="in its place a policy that comes with the package, as halfcheetah",
     )
     command.add_argument("--steps", type=int, help="of which checkpoint (default: the latest)")
+    command.add_argument(
+        "--clips",
+        metavar="FOLDER",
+        help="of the clips, where it is not that of the training; train wants the same clips in it",
+    )
     command.add_argument("--best", action="store_true", help="take the best checkpoint")
     command.add_argument(
         "--run",
@@ -208,7 +229,8 @@ def _add_evaluate(commands: Any) -> None:
         "--split",
         nargs="+",
         choices=("clean", "train", "test"),
-        help="default: clean, and with distractors train and test too",
+        help="default: clean, with distractors train too, and test where there are clips that "
+        "training never shows",
     )
     command.set_defaults(run=_evaluate)
 

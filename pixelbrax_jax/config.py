@@ -100,7 +100,8 @@ class EnvConfig(ProgramConfig):
     """
 
     task: str = "ant"
-    """Task, one of ``pixelbrax_jax.list_envs()``."""
+    """Task, one of ``pixelbrax_jax.list_envs()``; or ``module:name``, which imports the module that
+    registers it."""
     backend: str | None = None
     """Physics backend: ``spring``, ``positional``, ``generalized`` or ``mjx``; None means the
     task's own, which is all that tasks of the DM Control Suite have."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import importlib
 import inspect
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 from weakref import WeakValueDictionary
 
@@ -26,7 +28,7 @@ from pixelbrax_jax.scene.cameras import make_rig, rig_around, rigs_of, seen_from
 from pixelbrax_jax.scene.look import make_look
 from pixelbrax_jax.tasks import DMC_TASKS, SUITES, TASKS
 from pixelbrax_jax.types import Camera, CameraRig, Clips, EnvParams, GeomKind, Look
-from pixelbrax_jax.validation import check_choice
+from pixelbrax_jax.validation import check_choice, suggest
 
 
 @dataclass
@@ -102,7 +104,8 @@ def make(task: str | EnvConfig, **options: Any) -> tuple[PixelEnv, EnvParams]:
     in nothing but camera, look, time limit or clips are equal too: these are parameters.
 
     Args:
-        task: one of ``list_envs()``; or an ``EnvConfig``, of which ``options`` are changed.
+        task: one of ``list_envs()``; or ``"module:name"``, a task that importing the module
+            registers; or an ``EnvConfig``, of which ``options`` are changed.
         **options: the fields of ``EnvConfig``, which says what they are.
 
     Returns:
@@ -112,12 +115,12 @@ def make(task: str | EnvConfig, **options: Any) -> tuple[PixelEnv, EnvParams]:
         ValueError: a name is unknown or a number out of range; the message lists what is allowed.
         TypeError: there is no such option; the message lists them and names the nearest one.
         ImportError: the task is of the DM Control Suite, and dm_control is not installed; the
-            message has the line that installs it.
+            message has the line that installs it. Or the module of a task cannot be imported.
         FileNotFoundError: clips are missing.
         MemoryError: the clips would take too much memory.
         RuntimeError: JAX has no device to compute on.
     """
-    config = env_config(task, options)
+    config = _registered(env_config(task, options))
     _check_device()
     physics = _physics(config)
     program = {name: getattr(config, name) for name in PROGRAM_OPTIONS}
@@ -160,7 +163,7 @@ def named_rigs(task: str) -> dict[str, CameraRig]:
     """Return the viewpoints of a task by name, which ``camera=`` takes.
 
     Args:
-        task: one of ``list_envs()``.
+        task: as ``make`` takes it.
 
     Returns:
         ``default``, ``side`` (seen along +y), ``front`` (along -x), ``top`` (from above, +y up in
@@ -172,7 +175,8 @@ def named_rigs(task: str) -> dict[str, CameraRig]:
         ValueError: the task is unknown.
         ImportError: as in ``make``.
     """
-    return rigs_of(task, _own_rigs(task, _physics(env_config(task, {}))))
+    config = _registered(env_config(task, {}))
+    return rigs_of(config.task, _own_rigs(config.task, _physics(config)))
 
 
 _parameters = [
@@ -190,6 +194,44 @@ _parameters = [
 make.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
     sorted(_parameters, key=lambda parameter: parameter.kind)
 )
+
+
+def _registered(config: EnvConfig) -> EnvConfig:
+    """Return the options with the bare name of the task, the module of which is imported.
+
+    Raises:
+        ValueError: the module's name is none, or it registers no task of that name.
+        ImportError: the module cannot be imported.
+    """
+    task = config.task
+    if not isinstance(task, str) or ":" not in task or task in list_envs():
+        return config
+    module, _, name = task.partition(":")
+    if not all(part.isidentifier() for part in module.split(".")):
+        raise ValueError(
+            f"task {task!r} must be NAME or MODULE:NAME, with the module as 'import' has it, such "
+            "as my_tasks:my_swing for a file my_tasks.py."
+        )
+    try:
+        found = importlib.import_module(module)
+    except ImportError as error:
+        if not f"{module}.".startswith(f"{error.name}."):
+            raise ImportError(
+                f"module {module!r} of task {task!r} cannot be imported: {error}"
+            ) from error
+        here = sorted(path.stem for path in Path.cwd().glob("*.py"))
+        raise ModuleNotFoundError(
+            f"there is no module {error.name!r}, which task {task!r} names: its folder must be the "
+            f"current one, {Path.cwd()}, or in PYTHONPATH.{suggest(module, here)}",
+            name=error.name,
+        ) from error
+    if name not in _OWN_TASKS:
+        own = ", ".join(sorted(_OWN_TASKS)) or "none"
+        raise ValueError(
+            f"module {module!r} ({getattr(found, '__file__', None)}) registers no task {name!r}; "
+            f"registered are: {own}.{suggest(name, _OWN_TASKS)}"
+        )
+    return replace(config, task=name)
 
 
 def _physics(config: EnvConfig) -> Physics:

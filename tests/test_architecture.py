@@ -23,6 +23,7 @@ FOUNDATIONS = {
     "extras",
     "compilation",
     "memory",
+    "stop_signals",
     "tasks",
     "video",
     "ffmpeg",

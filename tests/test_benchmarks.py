@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 import time
@@ -137,6 +138,24 @@ def test_a_run_that_is_stopped_goes_on_where_it_was(workers, tmp_path, monkeypat
     assert run.main(command) == 0
     assert len(asked) == len(list(GROUPS["renderer"].cases()))
     assert len({arguments for _, arguments, _ in asked}) == len(asked)
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP", "SIGUSR1", "SIGXCPU"])
+def test_a_scheduler_s_signal_loses_nothing(workers, tmp_path, monkeypatch, capsys, name):
+    asked, _ = workers
+    measure, number = runner.measure, getattr(signal, name)
+    before = signal.getsignal(number)
+
+    def told_to_stop_at_the_third(case, timeout):
+        if len(asked) == 2:
+            os.kill(os.getpid(), number)
+        return measure(case, timeout)
+
+    monkeypatch.setattr(runner, "measure", told_to_stop_at_the_third)
+    assert run.main(["--only", "renderer", "--output-dir", str(tmp_path)]) == 128 + number
+    assert f"stopped by {name}; the same command goes on from here" in capsys.readouterr().err
+    assert outcomes(tmp_path) == ["ok", "ok"]
+    assert signal.getsignal(number) is before
 
 
 def test_another_machine_s_figures_are_not_taken_for_this_one_s(workers, tmp_path, monkeypatch):

@@ -11,7 +11,7 @@ from subprocess import SubprocessError
 
 from pixelbrax_gym.bench.case import Case, Group
 from pixelbrax_gym.bench.cases import COMPILED, FULL, QUICK, TASKS
-from pixelbrax_gym.bench.runner import measure_all
+from pixelbrax_gym.bench.runner import StoppedError, measure_all
 from pixelbrax_jax.extras import install_extra
 
 
@@ -99,6 +99,9 @@ def run(
     except KeyboardInterrupt:
         sys.stderr.write(f"\n{program}: stopped; the same command goes on from here\n")
         return 130
+    except StoppedError as stopped:
+        sys.stderr.write(f"\n{program}: {stopped}; the same command goes on from here\n")
+        return 128 + stopped.signal
     except (OSError, ValueError, RuntimeError, MemoryError, SubprocessError) as error:
         sys.stderr.write(f"{program}: {error}\n")
         return 1

@@ -17,6 +17,7 @@ from pixelbrax_gym.bench import report, tables
 from pixelbrax_gym.bench.case import ABSENT, AbsentError, Case, Group
 from pixelbrax_gym.bench.machine import file_stem
 from pixelbrax_gym.bench.results import Results
+from pixelbrax_jax.stop_signals import signal_name, stop_signals
 
 OUT_OF_MEMORY = (
     "resource_exhausted",
@@ -30,6 +31,18 @@ OUT_OF_MEMORY = (
 
 class KilledError(RuntimeError):
     """The system killed a process, most likely for its memory."""
+
+
+class StoppedError(BaseException):
+    """A signal other than SIGINT asks for an end, which no handler of errors may hold up.
+
+    Attributes:
+        signal: its number.
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__(f"stopped by {signal_name(number)}")
+        self.signal = number
 
 
 def measure_all(
@@ -54,9 +67,16 @@ def measure_all(
     Returns:
         The JSON file, and whether a case failed for another reason than memory or something
         absent.
+
+    Raises:
+        StoppedError: by a signal.
     """
     # A process must not outlive this one and disturb the next one's measurements.
-    before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    before = {
+        number: signal.signal(number, _stopped)
+        for number in stop_signals()
+        if number != signal.SIGINT
+    }
     describe = Case("machine", "machine.describe")
     machine = process(describe.command(), {}, 300.0)["values"]
     file = output_dir / f"{file_stem(machine)}.json"
@@ -75,7 +95,8 @@ def measure_all(
     finally:
         if file.exists():
             report.write(file, groups)
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
     return file, failed
 
 
@@ -154,6 +175,11 @@ def _stop(child: subprocess.Popen[str]) -> None:
         return
     with suppress(ProcessLookupError):
         os.killpg(child.pid, signal.SIGKILL)
+
+
+def _stopped(number: int, frame: Any) -> None:
+    del frame
+    raise StoppedError(number)
 
 
 def _name(case: Case) -> str:

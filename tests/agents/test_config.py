@@ -13,7 +13,6 @@ from pixelbrax_jax.agents.algorithms.ppg import PPGConfig
 from pixelbrax_jax.agents.algorithms.ppo import PPO, PPOConfig
 from pixelbrax_jax.agents.algorithms.registry import ALGORITHMS, make_train
 from pixelbrax_jax.agents.core.config import TrainConfig, describe, make_env
-from pixelbrax_jax.agents.runner import evaluate
 from pixelbrax_jax.agents.runner.train import RunConfig
 from pixelbrax_jax.envs.vector import VectorPixelEnv
 from tests.agents.small import SMALL, ball_envs
@@ -251,23 +250,6 @@ def test_environments_come_with_their_parameters():
 def test_options_of_a_run_out_of_range_are_told(settings, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         RunConfig(**settings)
-
-
-@pytest.mark.parametrize(("split", "held_out"), [("train", "test"), ("paper-train", "paper-test")])
-def test_a_run_is_evaluated_on_its_own_split_and_on_the_held_out_one(split, held_out, monkeypatch):
-    config = PPOConfig(
-        task="inverted_pendulum", distractors="video", clips="procedural", split=split
-    )
-    asked = {}
-    monkeypatch.setattr(evaluate, "make_env", lambda config, **changes: asked.update(changes))
-    splits = {}
-    for name in evaluate.SPLITS:
-        asked.clear()
-        evaluate.make_split(config, name)
-        splits[name] = asked.get("split", config.split)
-        assert (asked.get("distractors", config.distractors) == ()) == (name == "clean")
-    # What shows no clips accepts no other split than the default.
-    assert splits == {"clean": "train", "train": split, "test": held_out}
 
 
 def test_environments_that_cannot_be_hashed_are_refused():

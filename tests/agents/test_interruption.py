@@ -172,6 +172,20 @@ def test_a_scheduler_sends_several_signals(whole, tmp_path):
 
 
 @slow
+@pytest.mark.parametrize("name", ["SIGUSR1", "SIGUSR2", "SIGXCPU"])
+def test_the_warning_of_a_scheduler(whole, tmp_path, name):
+    number = getattr(signal, name)
+    process = start(tmp_path, stderr=subprocess.PIPE)
+    until(lambda: under_way(tmp_path))
+    process.send_signal(number)
+    told = process.communicate(timeout=60)[1]
+    assert process.returncode == 128 + number
+    assert f"{name}: stopping within two iterations" in told
+    assert f"stopped by {name} after" in told
+    assert_goes_on(tmp_path, whole)
+
+
+@slow
 def test_ctrl_c_before_the_first_iteration(tmp_path):
     told = ""
     with start(tmp_path, stderr=subprocess.PIPE) as process:

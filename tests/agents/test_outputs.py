@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import resource
 import signal
 import struct
@@ -273,6 +274,40 @@ def test_only_a_second_ctrl_c_stops_at_once(monkeypatch):
             signal.raise_signal(signal.SIGINT)
             now[0] += 0.1
     assert signal.getsignal(signal.SIGINT) is before
+
+
+NUMBERS = [
+    getattr(signal, name)
+    for name in ("SIGTERM", "SIGHUP", "SIGUSR1", "SIGUSR2", "SIGXCPU")
+    if hasattr(signal, name)
+]
+
+
+@pytest.mark.parametrize("number", NUMBERS)
+def test_what_schedulers_send_is_a_request_to_stop(number):
+    lines, before = [], signal.getsignal(number)
+    with interruption.stop_requests(lines.append) as request:
+        os.kill(os.getpid(), number)
+        assert request.signal == number
+    assert lines[0].startswith(f"{number.name}: stopping within two iterations, with a checkpoint")
+    assert signal.getsignal(number) is before
+
+
+@pytest.mark.parametrize("number", NUMBERS[1:])
+def test_signals_that_the_program_uses_stay_its_own(number):
+    """Launchers requeue a job on them, and ``nohup`` ignores one."""
+    got = []
+    before = signal.signal(number, lambda number, _: got.append(number))
+    try:
+        with interruption.stop_requests(got.append) as request:
+            os.kill(os.getpid(), number)
+            assert (request.signal, got) == (0, [number])
+        signal.signal(number, signal.SIG_IGN)
+        with interruption.stop_requests(got.append) as request:
+            os.kill(os.getpid(), number)
+            assert (request.signal, got) == (0, [number])
+    finally:
+        signal.signal(number, before)
 
 
 def test_messages_go_to_who_can_read_them():

@@ -203,7 +203,7 @@ def test_the_best_outlives_a_resumed_run(tmp_path):
 
 def test_only_evaluations_score_where_there_are_any(tmp_path, monkeypatch):
     splits = {"clean": (PixelEnv(Ball(), **OPTIONS), PARAMS)}
-    monkeypatch.setattr(train, "make_splits", lambda config: splits)
+    monkeypatch.setattr(train, "make_splits", lambda *_: splits)
     each = options(tmp_path, num_evals=2, eval_episodes=1, checkpoint_every=PER_ITERATION)
     run(ppg(4), PARAMS, replace(each, keep_checkpoints=9))
     scores = [read_about(tmp_path / "checkpoints", PER_ITERATION * i)["score"] for i in range(1, 5)]
@@ -238,7 +238,8 @@ def test_losses_that_are_not_finite_stop_the_run(tmp_path):
     assert max(names) == 4 * PER_ITERATION
 
 
-def test_ctrl_c_writes_a_checkpoint_and_the_run_goes_on(whole, tmp_path):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGUSR1])
+def test_a_signal_writes_a_checkpoint_and_the_run_goes_on(whole, tmp_path, number):
     outcome, _ = whole
     algorithm = ppg(8)
     seen = []
@@ -249,12 +250,14 @@ def test_ctrl_c_writes_a_checkpoint_and_the_run_goes_on(whole, tmp_path):
         return state, metrics
 
     def interrupt():
-        signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
+        signal.pthread_kill(threading.main_thread().ident, number)
 
     lines = []
     begun = options(tmp_path, resume="latest")
     stopped = run(with_iterate(algorithm, iterate), PARAMS, begun, report=lines.append)
     assert stopped.interrupted
+    assert stopped.signal == number
+    assert any(f"stopped by {number.name} after" in line for line in lines)
     assert any("a new run begins" in line for line in lines)
     assert any("stopping within two iterations" in line for line in lines)
     assert int(stopped.state.iteration) < 8

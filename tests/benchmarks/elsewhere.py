@@ -19,7 +19,7 @@ VIDEO = {"distractors": ("paper-video",), "clips": "procedural"}
 CASES = {
     "walker2d by Brax's reward": ("walker2d", "clean", {"reward_preset": "brax"}),
     "halfcheetah under paper-video": ("halfcheetah", "test", VIDEO),
-    "halfcheetah under paper-color": ("halfcheetah", "test", {"distractors": ("paper-color",)}),
+    "halfcheetah under paper-color": ("halfcheetah", "train", {"distractors": ("paper-color",)}),
 }
 """Name -> policy, split and changed settings."""
 

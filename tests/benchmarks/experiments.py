@@ -36,6 +36,7 @@ from pixelbrax_jax.agents.runner.checkpoint import read_about
 from pixelbrax_jax.agents.runner.metrics import read_metrics
 from pixelbrax_jax.agents.runner.train_command import parse
 from pixelbrax_jax.agents.runner.trained import load_config
+from pixelbrax_jax.stop_signals import stop_signals
 from pixelbrax_jax.tasks import DMC_TASKS
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -186,7 +187,7 @@ def run(arguments: list[str], folder: Path, until: float) -> int:
     command += ["--resume", "latest", "--output-dir", str(folder)]
     with subprocess.Popen(["nice", "-n", "19", *command], start_new_session=True) as process:
         stop = lambda *_: process.terminate()  # noqa: E731
-        previous = {s: signal.signal(s, stop) for s in (signal.SIGINT, signal.SIGTERM)}
+        previous = {number: signal.signal(number, stop) for number in stop_signals()}
         try:
             # None would be no limit, and infinity is an error.
             return process.wait(min(1e6, max(0.0, until - time.monotonic())))

@@ -6,8 +6,7 @@ import contextlib
 import json
 import logging
 import shutil
-from collections.abc import Iterator
-from importlib import metadata
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -16,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
+from pixelbrax_jax.agents.runner.settings import differences, unknown_settings, versions
 from pixelbrax_jax.agents.runner.sharding import any_process
 
 FORMAT = 4
@@ -24,14 +24,8 @@ FORMAT = 4
 _NETWORKS_ALONE = (2, 3)
 """Former formats whose networks can be read: their runs can be evaluated, and not gone on with."""
 
-_FREE = ("total_steps", "memory_budget_gb")
-"""Settings that a run may go on with although they differ."""
-
 _ROOM = 1.2
 """Free bytes on the disk that are asked for, in sizes of a checkpoint."""
-
-_PACKAGES = ("pixelbrax", "jax", "jaxlib", "brax", "mujoco", "flax", "optax")
-"""Packages whose versions a run's last bits depend on."""
 
 Tree = TypeVar("Tree")
 
@@ -55,7 +49,14 @@ class Checkpoints:
     """
 
     def __init__(
-        self, folder: str | Path, settings: dict[str, Any], algorithm: str, *, keep: int = 3
+        self,
+        folder: str | Path,
+        settings: dict[str, Any],
+        algorithm: str,
+        *,
+        keep: int = 3,
+        former: Mapping[str, Any] | None = None,
+        clips: Sequence[str] | None = None,
     ) -> None:
         """Open the folder, which is made if need be.
 
@@ -64,6 +65,9 @@ class Checkpoints:
             settings: by name, stored with every checkpoint.
             algorithm: name of the algorithm, stored likewise.
             keep: how many of the latest are kept, besides the best one.
+            former: by name, what a stored run had that lacks a setting.
+            clips: digests of the clips that are played, which decide in place of their folder
+                whether they are the same; None of clips that their name tells.
 
         Raises:
             CheckpointError: the folder cannot be written to.
@@ -73,9 +77,10 @@ class Checkpoints:
             "format": FORMAT,
             "algorithm": algorithm,
             "config": settings,
-            "versions": _versions(),
+            "clips": None if clips is None else list(clips),
+            "versions": versions(),
         }
-        self._free = tuple(n for n in _FREE if n != "total_steps" or not settings.get("anneal"))
+        self._former = dict(former or {})
         check_writable(self.folder)
         policy = ocp.checkpoint_managers
         best = policy.BestN(
@@ -187,6 +192,7 @@ class Checkpoints:
         steps = self._which(steps)
         self._check(steps)
         wanted = _plain(template)
+        self._check_arrays(steps, wanted)
         targets = {
             name: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=_sharding(leaf))
             for name, leaf in wanted.items()
@@ -244,19 +250,31 @@ class Checkpoints:
                 f"{self.folder} is a run of {about['algorithm']}, not of "
                 f"{self._about['algorithm']}; give another --output-dir."
             )
-        old, new = about["config"], self._about["config"]
-        other = [
-            f"{name}: {old.get(name)!r} there, {new.get(name)!r} here"
-            for name in sorted(old.keys() | new.keys())
-            if old.get(name) != new.get(name) and name not in self._free
-        ]
-        if other:
-            why = ""
+        about = about | {"config": self._former | about["config"]}
+        if other := differences(about, self._about):
+            old, new = about["config"], self._about["config"]
+            why = unknown_settings(about, new)
             if old.get("total_steps") != new.get("total_steps") and new.get("anneal"):
-                why = "A step size that falls over all of total_steps leaves them fixed. "
+                why += "A step size that falls over all of total_steps leaves them fixed. "
             raise CheckpointError(
                 f"the checkpoint in {self.folder} has other settings: {'; '.join(other)}. "
                 f"{why}Use the same ones, or another --output-dir."
+            )
+
+    def _check_arrays(self, steps: int, wanted: dict[str, Any]) -> None:
+        stored = _shapes(self.folder / str(steps) / "state")
+        shapes = {name: tuple(leaf.shape) for name, leaf in wanted.items()}
+        other = [
+            f"{name}: {stored.get(name, 'none')} there, {shapes.get(name, 'none')} here"
+            for name in sorted(stored.keys() | shapes.keys())
+            if stored.get(name) != shapes.get(name)
+        ]
+        if other:
+            more = f" and {len(other) - 3} more" if len(other) > 3 else ""
+            others = "; ".join(self.other_versions(steps)) or "of the same versions"
+            raise CheckpointError(
+                f"the checkpoint in {self.folder} has other arrays: {'; '.join(other[:3])}{more} "
+                f"({others}). Go on with what wrote it, or train anew in another --output-dir."
             )
 
 
@@ -322,11 +340,10 @@ def read_networks(folder: str | Path, template: Tree, steps: int | None = None) 
     path = Path(folder).absolute() / str(about["steps"]) / "state"
     wanted = _plain({"networks": template})
     reader = ocp.Checkpointer(ocp.PyTreeCheckpointHandler())
-    with _without_warnings():
-        stored = reader.metadata(path).item_metadata.tree
+    stored = _shapes(path)
     for name, leaf in wanted.items():
-        if name not in stored or tuple(stored[name].shape) != leaf.shape:
-            found = tuple(stored[name].shape) if name in stored else "missing"
+        if stored.get(name) != leaf.shape:
+            found = stored.get(name, "missing")
             raise CheckpointError(f"{path.parent}: {name} is {found}, not {leaf.shape}.")
     as_numpy = {name: ocp.RestoreArgs(restore_type=np.ndarray) for name in wanted}
     with _without_warnings():
@@ -335,6 +352,14 @@ def read_networks(folder: str | Path, template: Tree, steps: int | None = None) 
         )
     leaves = {name: jnp.asarray(restored[name]) for name in wanted}
     return _typed({"networks": template}, leaves)["networks"]
+
+
+def _shapes(path: Path) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of stored arrays, by their place."""
+    reader = ocp.Checkpointer(ocp.PyTreeCheckpointHandler())
+    with _without_warnings():
+        stored = reader.metadata(path).item_metadata.tree
+    return {name: tuple(leaf.shape) for name, leaf in stored.items()}
 
 
 def check_writable(folder: Path) -> None:
@@ -407,16 +432,6 @@ def _without_warnings() -> Iterator[None]:
         yield
     finally:
         logger.setLevel(level)
-
-
-def _versions() -> dict[str, str]:
-    """Return versions of packages, and number and kind of devices."""
-    kind = jax.devices()[0].device_kind
-    found = {"devices": f"{jax.device_count()} x {kind}"}
-    for name in _PACKAGES:
-        with contextlib.suppress(metadata.PackageNotFoundError):
-            found[name] = metadata.version(name)
-    return found
 
 
 def _sharding(leaf: Any) -> Any:

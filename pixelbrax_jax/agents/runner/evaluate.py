@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any, Protocol
 
 import jax
@@ -12,13 +14,22 @@ import numpy as np
 
 from pixelbrax_jax.agents.core.config import TrainConfig, make_env
 from pixelbrax_jax.agents.core.optimizer import Networks
+from pixelbrax_jax.agents.runner.settings import clip_digests, shared_clips
+from pixelbrax_jax.cache import in_home
 from pixelbrax_jax.compilation import jit
+from pixelbrax_jax.distractors import folders, procedural
+from pixelbrax_jax.distractors.presets import resolve
+from pixelbrax_jax.distractors.video import Video
 from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.types import EnvParams, EnvState
 from pixelbrax_jax.validation import check_choice
 
 SPLITS = ("clean", "train", "test")
+
+HELD_OUT = {"train": "test", "paper-train": "paper-test"}
+"""Split of the clips that training plays -> the one kept for tests. Of another split the test
+plays the same one, of another folder."""
 
 WITHOUT_DISTRACTORS: dict[str, Any] = {"distractors": (), "clips": None, "split": "train"}
 """Options of an environment that shows none, whatever its other options are."""
@@ -60,40 +71,126 @@ class Result:
         return float(self.returns.std(ddof=1) / np.sqrt(len(self.returns)))
 
 
-def make_splits(config: TrainConfig) -> dict[str, tuple[PixelEnv, EnvParams]]:
+class NoSplitError(ValueError):
+    """A split is not there, or would not be what its name says."""
+
+
+def _silent(line: str) -> None:
+    del line
+
+
+def make_splits(
+    config: TrainConfig,
+    shown: Sequence[str] | None = None,
+    report: Callable[[str], None] = _silent,
+) -> dict[str, tuple[PixelEnv, EnvParams]]:
     """Return environments to evaluate in, by name of the split.
 
-    ``clean`` has no distractors, ``train`` those of the training, and ``test`` the same with
-    clips that training never shows: of the split ``test`` or, if ``train`` is within the name of
-    the training's, that with ``test`` in its place. Without distractors there is only ``clean``.
+    ``clean`` has no distractors, ``train`` those of the training, and ``test`` the same with clips
+    that training never shows: those of the split ``test``, or ``paper-test`` where training plays
+    ``paper-train``. A split that there is not is left out. Without distractors there is only
+    ``clean``, and without a video no ``test``.
+
+    Args:
+        config: of the training.
+        shown: digests of the clips that training plays, as of ``clip_digests``; None takes those
+            that ``config`` names.
+        report: gets a line about a split that is left out.
     """
-    return {name: make_split(config, name) for name in splits_of(config)}
+    made = {}
+    for name in splits_of(config):
+        try:
+            made[name] = make_split(config, name, shown)
+        except NoSplitError as error:
+            report(f"no split {name!r}: {error}")
+    return made
 
 
 def splits_of(config: TrainConfig) -> tuple[str, ...]:
-    """Return names of the splits that there are."""
-    return SPLITS if config.distractors else SPLITS[:1]
+    """Return names of the splits that there may be."""
+    if not config.distractors:
+        return SPLITS[:1]
+    plays = any(isinstance(link, Video) for link in resolve(config.distractors, config.task))
+    return SPLITS if plays else SPLITS[:2]
 
 
-def make_split(config: TrainConfig, name: str) -> tuple[PixelEnv, EnvParams]:
+def make_split(
+    config: TrainConfig, name: str, shown: Sequence[str] | None = None
+) -> tuple[PixelEnv, EnvParams]:
     """Return one of the environments of `make_splits`.
 
+    Args:
+        config: of the training, or with other clips.
+        name: of the split.
+        shown: digests of the clips that training plays; None takes those that ``config`` names.
+
     Raises:
+        NoSplitError: ``train`` would not show the clips of the training, or ``test`` would show
+            some of them, or there are no clips for it.
         ValueError: there is no such split.
+        FileNotFoundError: the folder of the clips is missing.
     """
     check_choice("split", name, SPLITS)
-    if name not in splits_of(config):
-        raise ValueError(
-            f"split {name!r} is for distractors, and the run had none; there is only 'clean'."
+    names = splits_of(config)
+    if name not in names:
+        lacks = (
+            "clips, and the run played" if config.distractors else "distractors, and the run had"
         )
-    changes = {
-        "clean": WITHOUT_DISTRACTORS,
-        # That of the training, whatever it is called.
-        "train": {},
-        "test": {"split": config.split.replace("train", "test")},
-    }[name]
-    # What training sees of the state, evaluation need not.
-    return make_env(config, obs_mode="pixels", **changes)
+        raise ValueError(
+            f"split {name!r} is for {lacks} none; there is only {' and '.join(map(repr, names))}."
+        )
+    if name == "clean":
+        return _make(config, **WITHOUT_DISTRACTORS)
+    if name == "train":
+        env, params = _make(config)
+        if shown and clip_digests(params.clips) != list(shown):
+            raise NoSplitError(
+                f"the clips of split {config.split!r} of {_source(config)} are not those of the "
+                "training."
+            )
+        return env, params
+    split = HELD_OUT.get(config.split, config.split)
+    _check_there(config, split)
+    shown = shown or clip_digests(_make(config)[1].clips)
+    env, params = _make(config, split=split)
+    played = clip_digests(params.clips)
+    if shared := shared_clips(played, shown):
+        raise NoSplitError(
+            f"of the {len(played)} clips of split {split!r} of {_source(config)}, training plays "
+            f"{shared}; --clips takes others."
+        )
+    return env, params
+
+
+def _make(config: TrainConfig, **changes: Any) -> tuple[PixelEnv, EnvParams]:
+    try:
+        # What training sees of the state, evaluation need not.
+        return make_env(config, obs_mode="pixels", **changes)
+    except FileNotFoundError as error:
+        if _source(config) == "procedural":
+            raise
+        raise FileNotFoundError(
+            f"{error} If the clips of the run are elsewhere, name their folder with --clips."
+        ) from error
+
+
+def _check_there(config: TrainConfig, split: str) -> None:
+    """Reject a split that the clips have not.
+
+    Raises:
+        NoSplitError: saying which there are.
+    """
+    try:
+        if _source(config) == "procedural":
+            check_choice("split of procedural clips", split, procedural.SPLITS)
+        else:
+            folders.find(in_home(Path(_source(config))), split)
+    except (ValueError, FileNotFoundError) as error:
+        raise NoSplitError(str(error)) from error
+
+
+def _source(config: TrainConfig) -> str:
+    return str(config.clips or "procedural")
 
 
 class Evaluator:

@@ -1,4 +1,4 @@
-"""Requests to stop: Ctrl-C, a scheduler's SIGTERM, the SIGHUP of a closed terminal."""
+"""Requests to stop: Ctrl-C, the signals of schedulers, the SIGHUP of a closed terminal."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
+
+from pixelbrax_jax.stop_signals import signal_name, stop_signals
 
 _APART = 1.0
 """Seconds between two SIGINTs that a person means; a wrapper may pass one key press on twice."""
@@ -46,8 +48,8 @@ class StopRequest:
         # The terminal may be gone, and another line may be half written.
         with suppress(Exception):
             self._report(
-                "stopping within two iterations, with a checkpoint; a second Ctrl-C stops at once, "
-                "without one"
+                f"{signal_name(number)}: stopping within two iterations, with a checkpoint; a "
+                "second Ctrl-C stops at once, without one"
             )
 
 
@@ -55,19 +57,15 @@ class StopRequest:
 def stop_requests(report: Callable[[str], None]) -> Iterator[StopRequest]:
     """Handle the signals that ask a process to stop, until the end of the block.
 
-    Outside the main thread, where Python allows no handlers, the request stays empty. SIGHUP stays
-    ignored where it was, as ``nohup`` has it.
+    Outside the main thread, where Python allows no handlers, the request stays empty. Which signals
+    there are, ``stop_signals`` says.
 
     Args:
         report: gets a line when the first signal comes; it may raise.
     """
     request = StopRequest(report)
-    numbers = [signal.SIGINT, signal.SIGTERM]
-    hangup = getattr(signal, "SIGHUP", None)  # Windows has none.
-    if hangup is not None and signal.getsignal(hangup) != signal.SIG_IGN:
-        numbers.append(hangup)
     before = {}
-    for number in numbers:
+    for number in stop_signals():
         with suppress(ValueError):
             before[number] = signal.signal(number, request.ask)
     try:

@@ -14,7 +14,7 @@ import numpy as np
 
 from pixelbrax_jax.agents.runner.checkpoint import CheckpointError
 from pixelbrax_jax.agents.runner.evaluate import SPLITS, make_split
-from pixelbrax_jax.agents.runner.trained import Trained, load_chosen
+from pixelbrax_jax.agents.runner.trained import Trained, load_chosen, with_clips
 from pixelbrax_jax.compilation import compiler_options
 from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.validation import check_choice, check_positive_int
@@ -36,6 +36,7 @@ def record(options: argparse.Namespace) -> int:
             agent,
             options.output or Path(options.folder or "") / "videos" / f"{name}.mp4",
             split=split,
+            clips=options.clips,
             grid=options.grid,
             size=options.size,
             num_frames=options.num_frames,
@@ -53,6 +54,7 @@ def write_video(
     path: str | Path,
     *,
     split: str = "clean",
+    clips: str | None = None,
     grid: int = 3,
     size: int = 168,
     num_frames: int = 300,
@@ -64,6 +66,7 @@ def write_video(
         agent: who plays, with mean actions.
         path: of the video; its suffix decides the format.
         split: ``"clean"``, ``"train"`` or ``"test"``.
+        clips: folder of the clips, in place of that of the training.
         grid: episodes a side.
         size: pixels of one episode, square.
         num_frames: at most.
@@ -81,7 +84,8 @@ def write_video(
     check_positive_int("num_frames", num_frames)
     check_choice("split", split, SPLITS)
     algorithm, networks = agent.algorithm, agent.networks
-    env, params = make_split(algorithm.config, split)
+    config, shown = with_clips(agent, clips)
+    env, params = make_split(config, split, shown)
     envs = VectorPixelEnv(env, grid * grid)
 
     @partial(jax.jit, compiler_options=compiler_options(env))

@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from pixelbrax_jax.agents.core.algorithm import Algorithm
-from pixelbrax_jax.agents.core.config import describe
 from pixelbrax_jax.agents.core.train_state import TrainState
 from pixelbrax_jax.agents.runner import programs
 from pixelbrax_jax.agents.runner.checkpoint import CheckpointError, Checkpoints
@@ -28,6 +27,12 @@ from pixelbrax_jax.agents.runner.run_config import RunConfig
 from pixelbrax_jax.agents.runner.saving import Saver
 from pixelbrax_jax.agents.runner.schedule import Schedule
 from pixelbrax_jax.agents.runner.seeds import Runs
+from pixelbrax_jax.agents.runner.settings import (
+    clip_digests,
+    former_settings,
+    settings_of,
+    stored_clips,
+)
 from pixelbrax_jax.agents.runner.sharding import (
     any_process,
     highest,
@@ -36,6 +41,7 @@ from pixelbrax_jax.agents.runner.sharding import (
     state_shardings,
 )
 from pixelbrax_jax.envs.pixel_env import PixelEnv
+from pixelbrax_jax.stop_signals import signal_name
 from pixelbrax_jax.types import EnvParams
 
 __all__ = ["Outcome", "RunConfig", "TrainingDivergedError", "run"]
@@ -83,8 +89,9 @@ def run(
 ) -> Outcome:
     """Train to the end, or until it is interrupted.
 
-    Ctrl-C, SIGTERM, or SIGHUP, lets the iteration finish, and one that waits behind it, writes a
-    checkpoint and returns. What reports, draws or logs may fail without an effect on the training.
+    Ctrl-C, or a signal of ``stop_signals``, lets the iteration finish, and one that waits behind
+    it, writes a checkpoint and returns. What reports, draws or logs may fail without an effect on
+    the training.
 
     Args:
         algorithm: with its settings.
@@ -116,7 +123,7 @@ def _run(
     stop: StopRequest,
 ) -> Outcome:
     runs, mesh = Runs(algorithm, options.seeds), mesh_of(algorithm)
-    seed = jnp.uint32(options.seed)
+    seed, clips = jnp.uint32(options.seed), env_params.clips
     if mesh is not None:
         env_params = replicate(mesh, env_params)
     template = jax.eval_shape(runs.init, seed, env_params)
@@ -129,9 +136,11 @@ def _run(
     check_memory(algorithm, template, report)
     checkpoints = Checkpoints(
         Path(options.output_dir) / "checkpoints",
-        _settings(algorithm, options),
+        settings_of(algorithm, options),
         algorithm.name,
         keep=options.keep_checkpoints,
+        former=former_settings(type(algorithm.config)),
+        clips=stored_clips(algorithm.config, clips),
     )
     try:
         if _goes_on(checkpoints, options, report):
@@ -142,7 +151,7 @@ def _run(
         else:
             state = programs.init(runs, seed, env_params)
         if options.num_evals and splits is None:
-            splits = make_splits(algorithm.config)
+            splits = make_splits(algorithm.config, clip_digests(clips), report)
         return _Run(runs, env_params, options, checkpoints, report, splits or {}, stop).train(state)
     finally:
         checkpoints.close()
@@ -247,7 +256,8 @@ class _Run:
             try:
                 writer = MetricsWriter(
                     self._folder,
-                    {"algorithm": self._algorithm.name} | _settings(self._algorithm, self._options),
+                    {"algorithm": self._algorithm.name}
+                    | settings_of(self._algorithm, self._options),
                     first_step=steps,
                     wandb_project=self._options.wandb_project,
                     report=self._report,
@@ -274,7 +284,7 @@ class _Run:
             return state, steps, 0
         if stopped_by := highest(self._stop.signal)[0]:
             left = f"go on from {steps} steps with --resume latest" if steps else "nothing is lost"
-            self._report(f"stopped before the first iteration; {left}")
+            self._report(f"stopped by {signal_name(stopped_by)} before the first iteration; {left}")
             return state, steps, stopped_by
         self._report("compiling")
         saver = Saver(
@@ -305,7 +315,10 @@ class _Run:
                         last = number == total or bool(stopped_by)
                         saver.save(state, steps, self._score(steps), last=last)
                     case "report_stop":
-                        self._report(f"stopped after {steps} steps; go on with --resume latest")
+                        self._report(
+                            f"stopped by {signal_name(stopped_by)} after {steps} steps; go on with "
+                            "--resume latest"
+                        )
             if "save" not in jobs:
                 saver.look_after()
             if jobs:
@@ -422,11 +435,6 @@ class _Run:
         if self._options.num_evals:
             return self._results["clean"].mean if self._evaluated_steps == steps else None
         return self._record.get("episode/return")
-
-
-def _settings(algorithm: Algorithm, options: RunConfig) -> dict[str, Any]:
-    """Return what decides the result of a run."""
-    return describe(algorithm.config) | {"seed": options.seed, "seeds": options.seeds}
 
 
 def _steps(algorithm: Algorithm, state: TrainState) -> int:

@@ -38,7 +38,7 @@ def train(arguments: list[str]) -> int:
     Returns:
         The exit status: 0 when all is well, 1 for an error, which stderr names, and for a run
         that was stopped 128 plus the signal's number, as shells have it: 130 for Ctrl-C, 143 for
-        SIGTERM, 129 for SIGHUP.
+        SIGTERM, 138 for SIGUSR1 on most systems.
     """
     try:
         return _train(arguments)

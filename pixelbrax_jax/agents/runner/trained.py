@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +20,15 @@ from pixelbrax_jax.agents.runner.checkpoint import (
     read_about,
     read_networks,
 )
-from pixelbrax_jax.agents.runner.evaluate import WITHOUT_DISTRACTORS, Player
+from pixelbrax_jax.agents.runner.evaluate import WITHOUT_DISTRACTORS, Player, splits_of
 from pixelbrax_jax.agents.runner.seeds import Runs
+from pixelbrax_jax.agents.runner.settings import (
+    OF_RUNS,
+    clip_digests,
+    former_settings,
+    unknown_settings,
+)
+from pixelbrax_jax.distractors.presets import as_tuple
 from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.policy import Policy, load_policy, read_pretrained
 
@@ -51,11 +60,16 @@ class Trained:
         algorithm: with the run's settings; its ``act`` plays.
         networks: for ``act``, for an ``Evaluator`` and for ``save_policy``.
         steps: control steps of the checkpoint.
+        seed: of the run.
+        clips: digests of the clips that it was trained on, for ``make_split``; None where they are
+            not stored, and the settings' own are taken.
     """
 
     algorithm: Player
     networks: Networks
     steps: int
+    seed: int = 0
+    clips: tuple[str, ...] | None = None
 
 
 def load_pretrained(name: str) -> Trained:
@@ -69,7 +83,7 @@ def load_pretrained(name: str) -> Trained:
     """
     about = read_pretrained(name)
     player = Pretrained(load_config(about), load_policy(name))
-    return Trained(player, {"actor": {}}, about["steps"])
+    return Trained(player, {"actor": {}}, about["steps"], about["config"].get("seed", 0))
 
 
 def load_chosen(options: argparse.Namespace) -> Trained:
@@ -127,14 +141,49 @@ def load_trained(
     runs = Runs(algorithm, num_seeds)
     template = jax.eval_shape(runs.init, 0, params).networks
     networks = runs.split(read_networks(checkpoints, template, about["steps"]))[run]
-    return Trained(algorithm, networks, about["steps"])
+    clips = about.get("clips")
+    return Trained(
+        algorithm,
+        networks,
+        about["steps"],
+        about["config"].get("seed", 0) + run,
+        None if clips is None else tuple(clips),
+    )
 
 
-def load_config(about: dict[str, Any]) -> TrainConfig:
+def with_clips(agent: Trained, clips: str | None) -> tuple[TrainConfig, tuple[str, ...] | None]:
+    """Return the settings of an agent with clips of another folder, and those of its training.
+
+    Args:
+        agent: who plays.
+        clips: a folder or ``"procedural"``; None keeps those of the training.
+
+    Returns:
+        The settings, and digests of the clips that training played, for ``make_split``. They are
+        None where none are stored and the clips are no longer where they were.
+
+    Raises:
+        ValueError: clips are given, but no distractor of the run plays any.
+    """
+    config, shown = agent.algorithm.config, agent.clips
+    if clips is None:
+        return config, shown
+    if "test" not in splits_of(config):
+        raise ValueError(
+            f"--clips {clips} is given, but no distractor of the run plays clips; it had "
+            f"{', '.join(map(str, as_tuple(config.distractors))) or 'none'}."
+        )
+    if shown is None:
+        with suppress(FileNotFoundError):
+            shown = tuple(clip_digests(make_env(config)[1].clips))
+    return replace(config, clips=clips), shown
+
+
+def load_config(about: Mapping[str, Any]) -> TrainConfig:
     """Return the settings that are stored with a checkpoint.
 
     Raises:
-        CheckpointError: it is of an algorithm that is not known here.
+        CheckpointError: it is of an algorithm that is not known here, or has such settings.
     """
     if about["algorithm"] not in ALGORITHMS:
         raise CheckpointError(
@@ -143,10 +192,12 @@ def load_config(about: dict[str, Any]) -> TrainConfig:
             "pixelbrax_jax.agents.runner.checkpoint.read_networks."
         )
     kind = ALGORITHMS[about["algorithm"]].config_class
-    names = {field.name for field in fields(kind)}
+    former = former_settings(kind)
+    if unknown := unknown_settings(about, former):
+        raise CheckpointError(unknown.strip())
     values: dict[str, Any] = {
         name: tuple(value) if isinstance(value, list) else value
-        for name, value in about["config"].items()
-        if name in names
+        for name, value in (former | about["config"]).items()
+        if name not in OF_RUNS
     }
-    return replace(kind(), **values)
+    return kind(**values)
