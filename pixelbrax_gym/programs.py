@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import jax
@@ -26,7 +26,6 @@ def _env(programs: Programs) -> PixelEnv:
 _into_spare = compilation.jit(_env, static_argnums=0, donate_argnames="spare", keep_unused=True)
 
 
-@dataclass(frozen=True)
 class Programs:
     """The compiled programs of one set of options, which all environments with equal ones share.
 
@@ -35,13 +34,21 @@ class Programs:
     memory of frames that nothing reads any more, or memory would be asked for in each step.
     Outputs are never read again, which is why they can be given away.
 
+    Objects are made by ``programs_of`` and equal to themselves alone. JAX compares them in every
+    call, and an exception out of a comparison in Python would arrive as one of JAX's own.
+
     Attributes:
         vector: the environments.
         single: whether actions and outputs lack the leading axis; there is one environment then.
     """
 
-    vector: VectorPixelEnv
-    single: bool
+    def __init__(self, vector: VectorPixelEnv, single: bool) -> None:
+        """Compile nothing yet."""
+        self.vector, self.single = vector, single
+
+    def __reduce__(self) -> Any:
+        """Return what is pickled or copied: the options."""
+        return programs_of, (self.vector, self.single)
 
     @compilation.jit(_env, static_argnums=0)
     def reset(self, seeds: Array, params: EnvParams) -> Stepped:
@@ -170,6 +177,12 @@ class Programs:
             ended["final_info"] = _with_masks(ended["final_info"], done)
             info |= _with_masks(ended, done)
         return outputs | {"info": info}
+
+
+@cache
+def programs_of(vector: VectorPixelEnv, single: bool) -> Programs:
+    """Return the programs of environments, the same object for equal ones."""
+    return Programs(vector, single)
 
 
 def _with_masks(info: Mapping[str, Any], mask: Array) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from pixelbrax_gym.interop.actions import as_actions, name_rows
 from pixelbrax_gym.interop.fork import check_not_forked
 from pixelbrax_gym.making import limited, make_env
 from pixelbrax_gym.packing import Packed
-from pixelbrax_gym.programs import Programs
+from pixelbrax_gym.programs import programs_of
 from pixelbrax_gym.seeds import SEEDS, seeds_of
 from pixelbrax_jax import VectorPixelEnv
 from pixelbrax_jax.config import env_config
@@ -107,7 +107,7 @@ class StatefulEnv:
         vector = VectorPixelEnv(self.env, num_envs, autoreset_mode)
         self.num_envs, self.single = vector.num_envs, single
         self.episode_length = config.episode_length
-        self._programs = Programs(vector, single)
+        self._programs = programs_of(vector, single)
         self._must_reset = autoreset_mode == "disabled"
         self._held: _Held | None = None
         self._device: jax.Device | None = None
