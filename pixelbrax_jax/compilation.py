@@ -9,6 +9,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import jax
 
+from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.validation import check_choice
 
 _P = ParamSpec("_P")
@@ -79,9 +80,11 @@ def jit(
     """
 
     def decorate(function: Callable[_P, _T]) -> Callable[_P, _T]:
+        traced = under_default_flags(function)
+
         @cache
         def program(physics: Any) -> Any:
-            return jax.jit(function, compiler_options=_options(physics), **options)
+            return jax.jit(traced, compiler_options=_options(physics), **options)
 
         @wraps(function)
         def call(*args: _P.args, **kwargs: _P.kwargs) -> _T:

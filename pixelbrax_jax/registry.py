@@ -18,6 +18,7 @@ from pixelbrax_jax.distractors.clips import ClipBank, load_clips, warn_procedura
 from pixelbrax_jax.distractors.presets import resolve
 from pixelbrax_jax.distractors.video import Video
 from pixelbrax_jax.envs.pixel_env import PixelEnv
+from pixelbrax_jax.flags import default_flags
 from pixelbrax_jax.physics import make_physics
 from pixelbrax_jax.physics.base import Physics
 from pixelbrax_jax.scene.cameras import make_rig, rig_around, rigs_of, seen_from
@@ -91,6 +92,7 @@ def register(
     _OWN_TASKS[name] = _OwnTask(make_physics, None if camera is None else make_rig(name, camera))
 
 
+@default_flags()
 def make(task: str | EnvConfig, **options: Any) -> tuple[PixelEnv, EnvParams]:
     """Make a pixel environment and its parameters.
 

@@ -12,6 +12,7 @@ from jax.sharding import AxisType, Mesh, PartitionSpec
 
 from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.envs.vector import VectorPixelEnv
+from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.types import EnvParams, EnvState, Timestep
 from pixelbrax_jax.validation import check_positive_int
 
@@ -61,6 +62,7 @@ class ShardedVectorEnv:
         _ = self._local  # It checks the other fields.
 
     @partial(jax.jit, static_argnums=0)
+    @under_default_flags
     def reset(self, key: jax.Array, params: EnvParams) -> tuple[EnvState, Timestep]:
         """As ``VectorPixelEnv.reset``, of one key."""
         keys = self._local.env_keys(key, self.num_envs)
@@ -68,6 +70,7 @@ class ShardedVectorEnv:
         return result
 
     @partial(jax.jit, static_argnums=0)
+    @under_default_flags
     def step(
         self, state: EnvState, action: jax.Array, params: EnvParams
     ) -> tuple[EnvState, Timestep]:

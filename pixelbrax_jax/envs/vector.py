@@ -14,6 +14,7 @@ from pixelbrax_jax._cpu.chunks import step_rows
 from pixelbrax_jax.envs import observe
 from pixelbrax_jax.envs.autoreset import AUTORESET_MODES, replace_rows, reset_rows
 from pixelbrax_jax.envs.pixel_env import PixelEnv, check_key
+from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.types import EnvParams, EnvState, SimState, Timestep
 from pixelbrax_jax.validation import check_choice, check_positive_int
 
@@ -62,6 +63,7 @@ class VectorPixelEnv:
         self.env.check_memory(self.num_envs)
 
     @partial(jax.jit, static_argnums=0)
+    @under_default_flags
     def reset(self, key: jax.Array, params: EnvParams) -> tuple[EnvState, Timestep]:
         """Reset all environments to episode 0.
 
@@ -86,6 +88,7 @@ class VectorPixelEnv:
         return state, self._timestep(state, jnp.zeros(self.num_envs), params)
 
     @partial(jax.jit, static_argnums=0)
+    @under_default_flags
     def reset_where(
         self,
         state: EnvState,
@@ -124,6 +127,7 @@ class VectorPixelEnv:
         return state, self._timestep(state, jnp.zeros(self.num_envs), params)
 
     @partial(jax.jit, static_argnums=0)
+    @under_default_flags
     def step(
         self, state: EnvState, action: jax.Array, params: EnvParams
     ) -> tuple[EnvState, Timestep]:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from importlib import import_module
 
+from pixelbrax_jax.flags import default_flags
 from pixelbrax_jax.physics.base import Physics
 from pixelbrax_jax.tasks import TASKS
 from pixelbrax_jax.validation import check_choice
 
 
+@default_flags()
 def make_physics(task: str, *, backend: str | None = None, reward_preset: str = "brax") -> Physics:
     """Make the physics of a built-in task, by the engine of its row.
 

@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 from flax import struct
 
+from pixelbrax_jax.flags import default_flags
 from pixelbrax_jax.physics.base import Kinematics, RewardFn
 from pixelbrax_jax.physics.brax.compatibility import accept_old_clip
 from pixelbrax_jax.physics.divergence import GuardedPhysics
@@ -63,6 +64,7 @@ class BraxPhysics(GuardedPhysics):
     ``step`` (never after a ``reset``), because MuJoCo computes them before it integrates.
     """
 
+    @default_flags()
     def __init__(
         self,
         env: envs.Env,
