@@ -6,10 +6,14 @@ FLAGS is JSON, names of ``jax.config`` and values. A part is ``env:TASK`` (with 
 comma, if any), ``gymnasium``, ``sb3``, ``torchrl`` or an algorithm. Digests are printed as JSON.
 """
 
+import contextlib
 import hashlib
 import json
 import sys
+import tempfile
+import traceback
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -107,10 +111,32 @@ def play_torchrl() -> dict[str, Any]:
 
 
 def train(name: str) -> dict[str, Any]:
-    raise NotImplementedError
+    """``pixelbrax train``, and the policy that it leaves."""
+    from pixelbrax_jax.cli import main as pixelbrax
+    from pixelbrax_jax.policy import load_policy
+
+    with tempfile.TemporaryDirectory() as folder:
+        options = {
+            **{"task": TASK, "height": 18, "width": 18, "frame-stack": 1, "encoder": "small"},
+            **{"num-envs": 2, "num-steps": 4, "num-minibatches": 2, "total-steps": 16},
+            **{"num-evals": 1, "eval-episodes": 2, "episode-length": 6, "output-dir": folder},
+            **({"num-policy-phases": 2, "aux-minibatches": 2} if name != "ppo" else {}),
+        }
+        words = [word for pair in options.items() for word in (f"--{pair[0]}", str(pair[1]))]
+        with contextlib.redirect_stdout(sys.stderr):
+            status = pixelbrax(["train", name, *words, "--no-progress"])
+        assert status == 0, f"exit status {status}"
+        lines = (Path(folder) / "metrics.jsonl").read_text("utf-8").splitlines()
+        measured = [json.loads(line) for line in lines]
+        for record in measured:
+            record.pop("seconds", None), record.pop("speed/steps_per_second", None)
+        pixels = jax.device_put(np.full((2, 18, 18, 3), 100, np.uint8))
+        action = load_policy(Path(folder) / "policy.jax")(pixels)
+    return {"metrics": measured, "policy": action}
 
 
-PLAYS = {"gymnasium": play_gymnasium, "sb3": play_sb3, "torchrl": play_torchrl}
+PLAYS = {"env": play_env, "train": train}
+PLAYS |= {"gymnasium": play_gymnasium, "sb3": play_sb3, "torchrl": play_torchrl}
 
 
 def main(flags: str, *parts: str) -> None:
@@ -118,9 +144,13 @@ def main(flags: str, *parts: str) -> None:
         jax.config.update(name, value)
     found = {}
     for part in parts:
-        kind, _, name = part.partition(":")
-        results = play_env(name) if kind == "env" else PLAYS[kind]()
-        found |= {f"{part} {name}": digest(result) for name, result in results.items()}
+        kind, *name = part.split(":")
+        try:
+            results = PLAYS[kind](*name)
+            found |= {f"{part} {name}": digest(result) for name, result in results.items()}
+        except Exception as error:
+            traceback.print_exc()
+            found[part] = f"{type(error).__name__}: {error}"
     print(json.dumps(found))
 
 

@@ -21,6 +21,7 @@ from pixelbrax_jax.agents.runner.checkpoint import (
 from pixelbrax_jax.agents.runner.evaluate import WITHOUT_DISTRACTORS, Player
 from pixelbrax_jax.agents.runner.seeds import Runs
 from pixelbrax_jax.envs.vector import VectorPixelEnv
+from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.policy import Policy, load_policy, read_pretrained
 
 
@@ -31,6 +32,7 @@ class Pretrained:
     config: TrainConfig
     policy: Policy
 
+    @under_default_flags
     def act(self, networks: Networks, pixels: jax.Array, key: jax.Array | None = None) -> jax.Array:
         """Return mean actions, (N, A), of (N, H, W, 3 K) pixels.
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from pixelbrax_jax.flags import default_flags
 from pixelbrax_jax.physics.base import Kinematics, RewardFn
 from pixelbrax_jax.physics.brax.engine import BraxPhysics, kinematics
 from pixelbrax_jax.physics.geometry import VISIBLE_GROUPS, read_geoms
@@ -101,6 +102,7 @@ class MjcfEnv(envs.PipelineEnv):
         )
 
 
+@default_flags()
 def mjcf_physics(
     source: str | Path,
     *,
