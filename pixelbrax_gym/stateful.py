@@ -8,12 +8,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from gymnasium import error
 from gymnasium.envs.registration import EnvSpec
 
 from pixelbrax_gym.interop.actions import as_actions, name_rows
+from pixelbrax_gym.interop.export import read_under_guard
 from pixelbrax_gym.interop.fork import check_not_forked, is_forked
 from pixelbrax_gym.programs import Programs, draw_images
 from pixelbrax_gym.seeds import SEEDS, seeds_of
@@ -148,6 +148,7 @@ class StatefulEnv:
                 )
         self._done = outputs["done"]
         self._device = next(iter(self._done.devices()))
+        read_under_guard(outputs)
         return outputs
 
     def step(self, action: Any, mask: np.ndarray | None = None) -> dict[str, Any]:
@@ -181,6 +182,7 @@ class StatefulEnv:
         else:
             self._state, outputs = self._programs.step_where(self._state, mask, action, self.params)
         self._done = outputs["done"]
+        read_under_guard(outputs)
         return outputs
 
     def offset_time_limits(self, control_steps: np.ndarray) -> None:
@@ -196,7 +198,7 @@ class StatefulEnv:
         """
         self._check_ready("offset_time_limits")
         assert self._state is not None
-        offset = jnp.asarray(control_steps, jnp.int32)
+        offset = jax.device_put(np.asarray(control_steps, np.int32))
         self._state = self._state.replace(sim=self._state.sim.replace(time_limit_offset=offset))
 
     def render(self, height: int, width: int) -> jax.Array:

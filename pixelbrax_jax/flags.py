@@ -23,6 +23,8 @@ _FLAGS = (
     partial(jax.numpy_rank_promotion, "allow"),
     partial(jax.default_prng_impl, PRNG),
     partial(jax.threefry_partitionable, True),
+    partial(jax.debug_infs, False),
+    partial(jax.transfer_guard, "allow"),
 )
 """Those that change what a program computes, or which programs JAX accepts, at JAX's defaults."""
 

@@ -125,13 +125,15 @@ def make(task: str | EnvConfig, **options: Any) -> tuple[PixelEnv, EnvParams]:
             f"the camera follows link {rig.link}, but task {config.task!r} has only "
             f"{len(physics.link_names)} links: {', '.join(physics.link_names)}."
         )
-    return env, EnvParams(
+    params = EnvParams(
         geoms=seen_from(physics.geoms, rig),
         rig=rig,
         look=_look(config, physics),
         clips=_clips(config, env),
         episode_length=np.int32(config.episode_length),
     )
+    # Here, so that no program has to: JAX may be told to refuse that (`jax.transfer_guard`).
+    return env, jax.device_put(params)
 
 
 def named_rigs(task: str) -> dict[str, CameraRig]:

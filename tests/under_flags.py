@@ -44,7 +44,7 @@ def play_env(name: str) -> dict[str, Any]:
     task, *distractors = name.split(",")
     env, params = pb.make(task, **SIZE, distractors=tuple(distractors))
     params = jax.device_put(params)
-    key = jax.random.key(jax.device_put(np.uint32(0)))
+    key = jax.jit(jax.random.key)(jax.device_put(np.uint32(0)))
     actions = np.linspace(-0.5, 0.5, NUM_STEPS * 2 * env.action_size)
     # As a user has them: 64 bits under jax_enable_x64.
     actions = jax.device_put(actions.reshape(NUM_STEPS, 2, -1))

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from pixelbrax_jax.agents.core.algorithm import Algorithm
@@ -116,7 +115,7 @@ def _run(
     stop: StopRequest,
 ) -> Outcome:
     runs, mesh = Runs(algorithm, options.seeds), mesh_of(algorithm)
-    seed = jnp.uint32(options.seed)
+    seed = jax.device_put(np.uint32(options.seed))
     if mesh is not None:
         env_params = replicate(mesh, env_params)
     template = jax.eval_shape(runs.init, seed, env_params)
