@@ -58,15 +58,16 @@ def under_default_flags(function: Callable[_P, _T]) -> Callable[_P, _T]:
     @wraps(function)
     def call(*args: _P.args, **kwargs: _P.kwargs) -> _T:
         with default_flags():
-            args, kwargs = jax.tree.map(_as_by_default, (args, kwargs))
+            args, kwargs = jax.tree.map(as_by_default, (args, kwargs))
             return function(*args, **kwargs)
 
     return call
 
 
-def _as_by_default(leaf: Any) -> Any:
+def as_by_default(leaf: Any) -> Any:
+    """Return an array of 32 bits, or keys of threefry; anything else as it is."""
     dtype = getattr(leaf, "dtype", None)
-    if dtype is None or not hasattr(leaf, "astype"):
+    if dtype is None or dtype == jax.dtypes.float0 or not hasattr(leaf, "astype"):
         return leaf
     if jnp.issubdtype(dtype, jax.dtypes.prng_key):
         if jax.random.key_impl(leaf) == PRNG:

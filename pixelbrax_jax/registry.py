@@ -136,6 +136,7 @@ def make(task: str | EnvConfig, **options: Any) -> tuple[PixelEnv, EnvParams]:
     return env, jax.device_put(params)
 
 
+@default_flags()
 def named_rigs(task: str) -> dict[str, CameraRig]:
     """Return the viewpoints of a task by name, which ``camera=`` takes.
 

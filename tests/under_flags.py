@@ -47,9 +47,10 @@ def play_env(name: str) -> dict[str, Any]:
     key = jax.jit(jax.random.key)(jax.device_put(np.uint32(0)))
     actions = np.linspace(-0.5, 0.5, NUM_STEPS * 2 * env.action_size)
     # As a user has them: 64 bits under jax_enable_x64.
-    actions = jax.device_put(actions.reshape(NUM_STEPS, 2, -1))
+    actions = actions.reshape(NUM_STEPS, 2, -1)
+    action, actions = jax.device_put((actions[0, 0], actions))
     state, first = env.reset(key, params)
-    state, second = env.step(state, actions[0, 0], params)
+    state, second = env.step(state, action, params)
     frame = env.render(state, params)
     found = {
         "single": outputs(first) + outputs(second),
