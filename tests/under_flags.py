@@ -1,9 +1,10 @@
-"""What environments, adapters and agents give under flags of JAX, as digests of their arrays.
+"""What environments, adapters and agents give under flags of JAX, as digests.
 
 python -m tests.under_flags FLAGS PART [PART ...]
 
-FLAGS is JSON, names of ``jax.config`` and values. A part is ``env:TASK`` (with distractors after a
-comma, if any), ``gymnasium``, ``sb3``, ``torchrl`` or an algorithm. Digests are printed as JSON.
+FLAGS is JSON, names of ``jax.config`` and values. A part is ``env:TASK[,DISTRACTOR...]``;
+``program:TASK[,DISTRACTOR...][/RENDERER]``, compiled by nobody; ``gymnasium``, ``sb3``,
+``torchrl``; or ``train:ALGORITHM``. Digests, or the errors instead, are printed as JSON.
 """
 
 import contextlib
@@ -22,6 +23,7 @@ import numpy as np
 SIZE = {"height": 16, "width": 16}
 TASK = "inverted_pendulum"
 NUM_STEPS = 3
+KEY = jax.eval_shape(lambda: jax.random.key(0, impl="threefry2x32"))
 
 
 def digest(tree: Any) -> str:
@@ -70,6 +72,29 @@ def play_env(name: str) -> dict[str, Any]:
     return found
 
 
+def lower_env(name: str) -> dict[str, Any]:
+    """The programs of two environments as they are lowered.
+
+    JAX gives counters of loops 64 bits if it may; they are no part of what is compared.
+    """
+    import pixelbrax_jax as pb
+
+    name, _, renderer = name.partition("/")
+    task, *distractors = name.split(",")
+    options = SIZE | {"distractors": tuple(distractors), "renderer": renderer or "auto"}
+    if any("video" in link or "dcs" in link for link in distractors):
+        options["clips"] = "procedural"
+    env, params = pb.make(task, **options)
+    envs = pb.VectorPixelEnv(env, 2)
+    state, _ = jax.eval_shape(envs.reset, KEY, params)
+    action = jax.ShapeDtypeStruct((2, env.action_size), np.float32)
+    lowered = {
+        "reset": type(envs).reset.lower(envs, KEY, params),
+        "step": type(envs).step.lower(envs, state, action, params),
+    }
+    return {name: one.as_text().replace("i64", "i32") for name, one in lowered.items()}
+
+
 def play_gymnasium() -> dict[str, Any]:
     import gymnasium
 
@@ -93,14 +118,14 @@ def play_sb3() -> dict[str, Any]:
     envs = PixelBraxSB3VecEnv(TASK, num_envs=2, **SIZE)
     envs.seed(0)
     found = {"reset": envs.reset()}
-    obs, reward, done, infos = envs.step(np.full((2, 1), 0.5, np.float32))
-    return found | {"step": (obs, reward, done), "infos": infos[0]["episode_return"] if "episode_return" in infos[0] else 0}
+    obs, reward, done, _ = envs.step(np.full((2, 1), 0.5, np.float32))
+    return found | {"step": (obs, reward, done)}
 
 
 def play_torchrl() -> dict[str, Any]:
-    from pixelbrax_gym.torchrl.env import PixelBraxTorchRLEnv
-
     import torch
+
+    from pixelbrax_gym.torchrl.env import PixelBraxTorchRLEnv
 
     env = PixelBraxTorchRLEnv(TASK, num_envs=2, **SIZE)
     env.set_seed(0)
@@ -129,15 +154,23 @@ def train(name: str) -> dict[str, Any]:
         assert status == 0, f"exit status {status}"
         lines = (Path(folder) / "metrics.jsonl").read_text("utf-8").splitlines()
         measured = [json.loads(line) for line in lines]
+        # What a clock says.
         for record in measured:
-            record.pop("seconds", None), record.pop("speed/steps_per_second", None)
+            for name in ("seconds", "speed/steps_per_second"):
+                record.pop(name, None)
         pixels = jax.device_put(np.full((2, 18, 18, 3), 100, np.uint8))
         action = load_policy(Path(folder) / "policy.jax")(pixels)
     return {"metrics": measured, "policy": action}
 
 
-PLAYS = {"env": play_env, "train": train}
+PLAYS = {"env": play_env, "program": lower_env, "train": train}
 PLAYS |= {"gymnasium": play_gymnasium, "sb3": play_sb3, "torchrl": play_torchrl}
+
+
+def play(part: str) -> dict[str, str]:
+    """Digests of a part."""
+    kind, *name = part.split(":")
+    return {f"{part} {name}": digest(result) for name, result in PLAYS[kind](*name).items()}
 
 
 def main(flags: str, *parts: str) -> None:
@@ -145,14 +178,12 @@ def main(flags: str, *parts: str) -> None:
         jax.config.update(name, value)
     found = {}
     for part in parts:
-        kind, *name = part.split(":")
         try:
-            results = PLAYS[kind](*name)
-            found |= {f"{part} {name}": digest(result) for name, result in results.items()}
+            found |= play(part)
         except Exception as error:
             traceback.print_exc()
             found[part] = f"{type(error).__name__}: {error}"
-    print(json.dumps(found))
+    sys.stdout.write(json.dumps(found) + "\n")
 
 
 if __name__ == "__main__":
