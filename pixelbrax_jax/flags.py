@@ -23,6 +23,7 @@ _FLAGS = (
     partial(jax.numpy_rank_promotion, "allow"),
     partial(jax.default_prng_impl, PRNG),
     partial(jax.threefry_partitionable, True),
+    partial(jax.check_tracer_leaks, False),
     partial(jax.debug_infs, False),
     partial(jax.transfer_guard, "allow"),
 )
