@@ -10,7 +10,7 @@ from typing import Any, ParamSpec, TypeVar
 import jax
 import numpy as np
 
-from pixelbrax_jax.flags import under_default_flags
+from pixelbrax_jax.flags import is_guarded, under_default_flags
 from pixelbrax_jax.validation import check_choice
 
 _P = ParamSpec("_P")
@@ -89,7 +89,7 @@ def jit(
 
         @wraps(function)
         def call(*args: _P.args, **kwargs: _P.kwargs) -> _T:
-            if jax.config.jax_transfer_guard_host_to_device is not None:
+            if is_guarded("host_to_device"):
                 args, kwargs = jax.tree.map(_put, (args, kwargs))
             return program(_physics(env_of(args[0])))(*args, **kwargs)
 

@@ -65,6 +65,11 @@ def under_default_flags(function: Callable[_P, _T]) -> Callable[_P, _T]:
     return call
 
 
+def is_guarded(direction: str) -> bool:
+    """Return whether ``jax.transfer_guard`` watches ``host_to_device`` or ``device_to_host``."""
+    return getattr(jax.config, f"jax_transfer_guard_{direction}", None) is not None
+
+
 def as_by_default(leaf: Any) -> Any:
     """Return an array of 32 bits, or keys of threefry; anything else as it is."""
     dtype = getattr(leaf, "dtype", None)

@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from pixelbrax_jax.flags import is_guarded
 from pixelbrax_jax.validation import check_choice
 
 OUTPUTS = ("jax", "numpy", "torch")
@@ -58,7 +59,7 @@ def read_under_guard(outputs: dict[str, Any]) -> None:
     Args:
         outputs: of a ``StatefulEnv``.
     """
-    if jax.config.jax_transfer_guard_device_to_host is not None:
+    if is_guarded("device_to_host"):
         jax.device_get({name: x for name, x in outputs.items() if name != "obs"})
 
 

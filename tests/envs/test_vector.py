@@ -205,8 +205,11 @@ def test_a_step_that_ends_no_episode_computes_no_first_state():
     env, params = pb.make("inverted_pendulum", obs_mode="state")
     venv = VectorPixelEnv(env, 2)
     state, _ = jax.eval_shape(venv.reset, jax.random.key(0), params)
-    arguments = (state, state.done, state.sim.episode, params)
-    program = jax.jit(venv._reset_rows).lower(*arguments).compile().as_text()
+
+    def reset_rows(state, params):
+        return venv._reset_rows(state, state.done, state.sim.episode, venv._rows(params))
+
+    program = jax.jit(reset_rows).lower(state, params).compile().as_text()
     # XLA may take out of a loop what its turns have in common, such as physics at the first pose;
     # then every step pays for it.
     every_step = program[program.index("ENTRY") :]
