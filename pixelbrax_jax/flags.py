@@ -9,6 +9,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
@@ -27,7 +28,20 @@ _FLAGS = (
     partial(jax.debug_infs, False),
     partial(jax.transfer_guard, "allow"),
 )
-"""Those that change what a program computes, or which programs JAX accepts, at JAX's defaults."""
+"""Those that change what a program computes, or which programs JAX accepts, at JAX's defaults. The
+last three check what is within: jaxopt, which Brax steps with, leaks tracers, limits of joints are
+infinite, and models are made of Python's numbers. What a compiled program takes and returns is
+checked as a process has set it."""
+
+_SHORT = {
+    np.dtype(long): np.dtype(short)
+    for long, short in (
+        ("float64", "float32"),
+        ("int64", "int32"),
+        ("uint64", "uint32"),
+        ("complex128", "complex64"),
+    )
+}
 
 
 @contextmanager
@@ -35,9 +49,8 @@ def default_flags() -> Iterator[None]:
     """Trace what is within as JAX does by default.
 
     Brax, MuJoCo XLA, flax and optax are written for JAX's defaults, and so is this package: with
-    ``jax_enable_x64`` or strict promotion some of their programs are others, or none. What a flag
-    checks in values (NaNs, infinities, transfers, leaks, keys used twice) is checked as it is set,
-    and so is how precisely an accelerator multiplies matrices.
+    ``jax_enable_x64`` or strict promotion some of their programs are others, or none. How precisely
+    an accelerator multiplies matrices stays as it is set.
     """
     with ExitStack() as flags:
         for flag in _FLAGS:
@@ -73,12 +86,11 @@ def is_guarded(direction: str) -> bool:
 def as_by_default(leaf: Any) -> Any:
     """Return an array of 32 bits, or keys of threefry; anything else as it is."""
     dtype = getattr(leaf, "dtype", None)
-    if dtype is None or dtype == jax.dtypes.float0 or not hasattr(leaf, "astype"):
+    if dtype is None:
         return leaf
     if jnp.issubdtype(dtype, jax.dtypes.prng_key):
         if jax.random.key_impl(leaf) == PRNG:
             return leaf
         # The others of JAX keep a threefry key twice.
         return jax.random.wrap_key_data(jax.random.key_data(leaf)[..., :2], impl=PRNG)
-    short = jax.dtypes.canonicalize_dtype(dtype)
-    return leaf if short == dtype else leaf.astype(short)
+    return leaf.astype(_SHORT[dtype]) if dtype in _SHORT else leaf
