@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from itertools import islice
 from typing import Any
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 
 from pixelbrax_gym.gymnasium.single_env import PixelBraxEnv
@@ -101,7 +101,7 @@ def _make(options: argparse.Namespace) -> tuple[PixelBraxEnv, Act]:
         **given,
     )
     if policy is not None:
-        return env, lambda obs: np.asarray(policy(jnp.asarray(obs)[None]))[0]
+        return env, lambda obs: jax.device_get(policy(jax.device_put(np.asarray(obs)[None])))[0]
     if options.policy == "zero":
         return env, lambda _: np.zeros(env.action_space.shape or (), np.float32)
     env.action_space.seed(options.seed)

@@ -134,7 +134,8 @@ class Programs:
 
     def _present(self, state: EnvState, params: EnvParams) -> Stepped:
         rewards = jnp.zeros(self.vector.num_envs)
-        return self._stepped(state, self.vector._timestep(state, rewards, params))
+        see = jax.vmap(self.vector.env.timestep, in_axes=(0, 0, None))
+        return self._stepped(state, see(state, rewards, params))
 
     def _stepped(
         self, state: EnvState, timestep: Timestep, present: Array | None = None

@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from gymnasium import error
 
 from pixelbrax_gym.given_state import check_state
 from pixelbrax_gym.interop.actions import as_actions, name_rows
+from pixelbrax_gym.interop.export import read_under_guard
 from pixelbrax_gym.interop.fork import check_not_forked
 from pixelbrax_gym.making import limited, make_env
 from pixelbrax_gym.packing import Packed
@@ -382,6 +382,7 @@ class StatefulEnv:
         """Replace what is held by the states after a call."""
         before = self._held
         spare = None if before is None or before.shared else before.packed.frames
+        read_under_guard(outputs)
         kept = None if keep is None else keep(outputs)
         self._held = _Held(packed, outputs["done"], spare, kept=kept)
 
@@ -390,7 +391,7 @@ class StatefulEnv:
         """Return memory for the next frames."""
         # It was handed to a call whose results an exception has kept from arriving.
         if held.spare is None or held.spare.is_deleted():
-            return jnp.zeros(held.packed.frames.shape, jnp.uint8)
+            return jax.device_put(np.zeros(held.packed.frames.shape, np.uint8))
         return held.spare
 
     def _place_params(self) -> None:

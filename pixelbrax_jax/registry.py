@@ -22,6 +22,7 @@ from pixelbrax_jax.distractors.presets import resolve
 from pixelbrax_jax.distractors.video import Video
 from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.extras import install_extra
+from pixelbrax_jax.flags import default_flags
 from pixelbrax_jax.physics import make_physics
 from pixelbrax_jax.physics.base import Physics
 from pixelbrax_jax.scene.cameras import make_rig, rig_around, rigs_of, seen_from
@@ -97,6 +98,7 @@ def register(
     _OWN_TASKS[name] = _OwnTask(make_physics, None if camera is None else make_rig(name, camera))
 
 
+@default_flags()
 def make(task: str | EnvConfig, **options: Any) -> tuple[PixelEnv, EnvParams]:
     """Make a pixel environment and its parameters.
 
@@ -132,13 +134,15 @@ def make(task: str | EnvConfig, **options: Any) -> tuple[PixelEnv, EnvParams]:
             f"the camera follows link {rig.link}, but task {config.task!r} has only "
             f"{len(physics.link_names)} links: {', '.join(physics.link_names)}."
         )
-    return env, EnvParams(
+    params = EnvParams(
         geoms=seen_from(physics.geoms, rig),
         rig=rig,
         look=_look(config, physics),
         clips=_clips(config, env),
         episode_length=np.int32(config.episode_length),
     )
+    # Here, so that no program has to: JAX may be told to refuse that (`jax.transfer_guard`).
+    return env, jax.device_put(params)
 
 
 def _check_device() -> None:
@@ -159,6 +163,7 @@ def _check_device() -> None:
         ) from error
 
 
+@default_flags()
 def named_rigs(task: str) -> dict[str, CameraRig]:
     """Return the viewpoints of a task by name, which ``camera=`` takes.
 

@@ -20,6 +20,10 @@ import jax
 import numpy as np
 from flax import struct
 
+FAR = float(np.finfo(np.float32).max)
+"""Metres, the depth where nothing is hit: the largest float32. Not infinity, which
+``jax_debug_infs`` takes for a mistake."""
+
 
 class GeomKind(IntEnum):
     """Shapes the renderer draws, numbered as MuJoCo's ``mjtGeom``."""
@@ -250,7 +254,7 @@ class Frame(struct.PyTreeNode):
     Attributes:
         r, g, b: (H, W) float32 in [0, 1].
         depth: (H, W) float32, metres along the camera's viewing axis (not along the ray),
-            ``inf`` where nothing is hit.
+            ``FAR`` where nothing is hit.
         seg: (H, W) int32, index of the geom seen, -1 for the sky.
         ground: (H, W) bool, a plane that is ground is seen; cheaper to ask than ``seg``.
     """

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from pixelbrax_jax.extras import install_extra
@@ -106,5 +105,5 @@ def default_torch_device() -> torch.device:
         ValueError: torch has none, e.g. of a TPU.
     """
     # A small array has it, whatever the device was chosen by.
-    (device,) = jnp.zeros(()).devices()
+    (device,) = jax.device_put(np.float32(0)).devices()
     return torch_device(device)

@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from pixelbrax_jax.flags import is_guarded
 from pixelbrax_jax.validation import check_choice
 
 OUTPUTS = ("jax", "numpy", "torch")
@@ -50,6 +51,18 @@ def to_numpy(tree: Any) -> Any:
     return jax.tree.map(_writable, tree)
 
 
+def read_under_guard(outputs: dict[str, Any]) -> None:
+    """Read all but observations explicitly where ``jax.transfer_guard`` watches what is read.
+
+    JAX keeps what it has read, so that ``float(x)`` and ``np.asarray(x)`` transfer nothing then.
+
+    Args:
+        outputs: of a ``StatefulEnv``.
+    """
+    if is_guarded("device_to_host"):
+        jax.device_get({name: x for name, x in outputs.items() if name != "obs"})
+
+
 class _Memory:
     """The memory of a read-only array, offered to NumPy as one that may be written to."""
 
@@ -65,7 +78,7 @@ class _Memory:
 def _writable(array: jax.Array) -> np.ndarray:
     (device,) = array.devices()
     if device.platform != "cpu" or not array.size:
-        return np.array(array)
+        return np.array(jax.device_get(array))
     # The interface has no name for types such as bfloat16.
     return np.asarray(_Memory(np.asarray(array))).view(array.dtype)
 

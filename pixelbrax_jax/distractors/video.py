@@ -11,7 +11,7 @@ import numpy as np
 from flax import struct
 
 from pixelbrax_jax.distractors.base import Distractor
-from pixelbrax_jax.types import Clips, EnvParams, Frame
+from pixelbrax_jax.types import FAR, Clips, EnvParams, Frame
 from pixelbrax_jax.validation import check_choice, check_fraction, check_positive_int
 
 MODES = ("overlay", "background")
@@ -146,7 +146,7 @@ class Video(Distractor):
         assert backdrop is not None
         kept: float | jax.Array = 1.0 - self.fraction
         if self.mode == "background":
-            kept = jnp.where(jnp.isinf(frame.depth), kept, 1.0)
+            kept = jnp.where(frame.depth == FAR, kept, 1.0)
             if self.ground_alpha != 1.0:
                 kept = jnp.where(frame.ground, self.ground_alpha, kept)
         # Where all is kept, the video's fraction is an exact zero and the pixel stays to the bit.

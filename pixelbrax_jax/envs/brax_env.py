@@ -67,7 +67,7 @@ class BraxPixelEnv(Env):
             raise TypeError(f"env must be a PixelEnv, got {type(env).__name__}.")
         _patch_trainers()
         self.env = env
-        self.sys = params.replace(episode_length=np.int32(_NO_LIMIT))
+        self.sys = params.replace(episode_length=jax.device_put(np.int32(_NO_LIMIT)))
         self.episode_length = -(-int(params.episode_length) // env.action_repeat)
 
     def reset(self, rng: jax.Array) -> State:

@@ -15,6 +15,7 @@ from pixelbrax_jax.distractors.base import Chain
 from pixelbrax_jax.distractors.presets import as_tuple
 from pixelbrax_jax.envs import observe
 from pixelbrax_jax.envs.fusion_barrier import fusion_barrier
+from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.memory import check_fits
 from pixelbrax_jax.physics.base import Physics
 from pixelbrax_jax.renderer import kernel
@@ -111,6 +112,7 @@ class PixelEnv(ProgramConfig):
         check_fits(what, num_bytes)
 
     @partial(jax.jit, static_argnums=0)
+    @under_default_flags
     def reset(self, key: jax.Array, params: EnvParams) -> tuple[EnvState, Timestep]:
         """Reset to episode 0 of the environment that ``key`` stands for.
 
@@ -128,6 +130,7 @@ class PixelEnv(ProgramConfig):
         return self._reset(key, jnp.uint32(0), params)
 
     @partial(jax.jit, static_argnums=0)
+    @under_default_flags
     def step(
         self, state: EnvState, action: jax.Array, params: EnvParams
     ) -> tuple[EnvState, Timestep]:
@@ -163,6 +166,7 @@ class PixelEnv(ProgramConfig):
         return state, self.timestep(state, reward, params)
 
     @partial(jax.jit, static_argnums=0)
+    @under_default_flags
     def next_episode(self, state: EnvState, params: EnvParams) -> tuple[EnvState, Timestep]:
         """Reset to the environment's next episode.
 
@@ -212,6 +216,7 @@ class PixelEnv(ProgramConfig):
         return state, self.timestep(state, jnp.float32(0.0), params)
 
     @partial(jax.jit, static_argnums=(0, 3, 4))
+    @under_default_flags
     def render(
         self,
         state: EnvState,
@@ -237,6 +242,7 @@ class PixelEnv(ProgramConfig):
         return self.chain.change_frame(distractor_state, frame, backdrops)
 
     @partial(jax.jit, static_argnums=(0, 3, 4))
+    @under_default_flags
     def image(
         self,
         state: EnvState,

@@ -10,8 +10,10 @@ from typing import Any
 import jax
 from jax.sharding import AxisType, Mesh, PartitionSpec
 
+from pixelbrax_jax.envs.param_rows import split_params
 from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.envs.vector import VectorPixelEnv
+from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.types import EnvParams, EnvState, Timestep
 from pixelbrax_jax.validation import check_positive_int
 
@@ -82,18 +84,21 @@ class ShardedVectorEnv:
         self.__dict__.update(state | {"mesh": mesh})
 
     @partial(jax.jit, static_argnums=0)
+    @under_default_flags
     def reset(self, key: jax.Array, params: EnvParams) -> tuple[EnvState, Timestep]:
         """As ``VectorPixelEnv.reset``, of one key."""
         keys = self._local.env_keys(key, self.num_envs)
-        result: tuple[EnvState, Timestep] = self._shard(self._local.reset, 1)(keys, params)
+        result: tuple[EnvState, Timestep] = self._shard(self._local.reset, 1, params)(keys, params)
         return result
 
     @partial(jax.jit, static_argnums=0)
+    @under_default_flags
     def step(
         self, state: EnvState, action: jax.Array, params: EnvParams
     ) -> tuple[EnvState, Timestep]:
         """As ``VectorPixelEnv.step``."""
-        result: tuple[EnvState, Timestep] = self._shard(self._local.step, 2)(state, action, params)
+        shard = self._shard(self._local.step, 2, params)
+        result: tuple[EnvState, Timestep] = shard(state, action, params)
         return result
 
     def obs(self, state: EnvState) -> Any:
@@ -106,14 +111,17 @@ class ShardedVectorEnv:
         num_envs = self.num_envs // self.mesh.shape[AXIS]
         return VectorPixelEnv(self.env, num_envs, self.autoreset_mode)
 
-    def _shard(self, fn: Callable[..., Any], num_spread: int) -> Callable[..., Any]:
-        """Return ``fn`` on each device, of its rows of the first arguments and the same params."""
+    def _shard(
+        self, fn: Callable[..., Any], num_spread: int, params: EnvParams
+    ) -> Callable[..., Any]:
+        """Return ``fn`` on each device, of its rows of the first arguments and of the params."""
         spread, same = PartitionSpec(AXIS), PartitionSpec()
+        rows = split_params(params, self.num_envs)
         # Loops and branches inside differ between devices, which the checker cannot follow.
         return jax.shard_map(
             fn,
             mesh=self.mesh,
-            in_specs=(spread,) * num_spread + (same,),
+            in_specs=(spread,) * num_spread + (rows.mark(spread, same),),
             out_specs=spread,
             check_vma=False,
         )

@@ -13,7 +13,9 @@ import jax.numpy as jnp
 from pixelbrax_jax._cpu.chunks import step_rows
 from pixelbrax_jax.envs import observe
 from pixelbrax_jax.envs.autoreset import AUTORESET_MODES, replace_rows, reset_rows
+from pixelbrax_jax.envs.param_rows import ParamRows, split_params
 from pixelbrax_jax.envs.pixel_env import PixelEnv, check_key
+from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.types import EnvParams, EnvState, SimState, Timestep
 from pixelbrax_jax.validation import check_choice, check_positive_int
 
@@ -28,6 +30,9 @@ class VectorPixelEnv:
     A CPU steps the physics of more than 128 environments in equal chunks of 64 to 128, if N divides
     into such: prefer multiples of 128. To spread environments over several devices, take
     ``ShardedVectorEnv``.
+
+    Arrays of ``EnvParams`` may have a leading axis N, a row for each environment: cameras, colors,
+    lights, clips or time limits of their own. The others are the same for all.
 
     An ended episode is followed by the next one as ``autoreset_mode`` says, with Gymnasium's
     meanings:
@@ -62,30 +67,37 @@ class VectorPixelEnv:
         self.env.check_memory(self.num_envs)
 
     @partial(jax.jit, static_argnums=0)
+    @under_default_flags
     def reset(self, key: jax.Array, params: EnvParams) -> tuple[EnvState, Timestep]:
         """Reset all environments to episode 0.
 
         Args:
             key: a typed PRNG key, from which environment i gets ``fold_in(key, i)``; or (N,) keys,
                 one for each.
-            params: what may be randomised, the same for all.
+            params: what may be randomised; each array the same for all, or with a leading axis N
+                (see the class).
 
         Returns:
             The states and the first timesteps.
 
         Raises:
             TypeError: ``key`` is neither.
+            ValueError: an array of ``params`` has another shape; the message names it.
         """
-        keys = self._env_keys(key)
-        episode = jnp.zeros(self.num_envs, jnp.uint32)
-        sim = jax.vmap(self.env.reset_sim, in_axes=(0, 0, None))(keys, episode, params)
+        keys, rows = self._env_keys(key), self._rows(params)
+
+        def reset(key: jax.Array, episode: jax.Array, own: Any) -> SimState:
+            return self.env.reset_sim(key, episode, rows.join(own))
+
+        sim = jax.vmap(reset)(keys, jnp.zeros(self.num_envs, jnp.uint32), rows.own)
         blank = self.env.blank_frames()
         frames = jnp.broadcast_to(blank, (self.num_envs, *blank.shape))
-        frames = self._push_frames(frames, sim, params, jnp.ones(self.num_envs, bool))
+        frames = self._push_frames(frames, sim, rows, jnp.ones(self.num_envs, bool))
         state = EnvState(sim=sim, frames=frames, key=keys)
-        return state, self._timestep(state, jnp.zeros(self.num_envs), params)
+        return state, self._timestep(state, jnp.zeros(self.num_envs), rows)
 
     @partial(jax.jit, static_argnums=0)
+    @under_default_flags
     def reset_where(
         self,
         state: EnvState,
@@ -98,7 +110,7 @@ class VectorPixelEnv:
         Args:
             state: the present states.
             mask: (N,) bool, which ones to reset.
-            params: what may be randomised.
+            params: as in ``reset``.
             key: None goes on to each environment's next episode; else a key or (N,) keys as in
                 ``reset``, and episode 0.
 
@@ -108,22 +120,23 @@ class VectorPixelEnv:
 
         Raises:
             TypeError: ``key`` is of another kind.
-            ValueError: ``mask`` is not (N,) bool.
+            ValueError: ``mask`` is not (N,) bool, or ``params`` are others.
         """
         if mask.shape != (self.num_envs,) or mask.dtype != bool:
             raise ValueError(
                 f"mask must be bool of shape ({self.num_envs},), got {mask.dtype} of shape "
                 f"{tuple(mask.shape)}."
             )
-        episode = state.sim.episode + 1
+        episode, rows = state.sim.episode + 1, self._rows(params)
         if key is not None:
             keys = self._env_keys(key)
             state = state.replace(key=jnp.where(mask, keys, state.key))
             episode = jnp.zeros_like(episode)
-        state = self._reset_and_draw(state, mask, episode, params)
-        return state, self._timestep(state, jnp.zeros(self.num_envs), params)
+        state = self._reset_and_draw(state, mask, episode, rows)
+        return state, self._timestep(state, jnp.zeros(self.num_envs), rows)
 
     @partial(jax.jit, static_argnums=0)
+    @under_default_flags
     def step(
         self, state: EnvState, action: jax.Array, params: EnvParams
     ) -> tuple[EnvState, Timestep]:
@@ -132,35 +145,35 @@ class VectorPixelEnv:
         Args:
             state: the present states.
             action: (N, A) float, clipped to [-1, 1].
-            params: what may be randomised.
+            params: as in ``reset``.
 
         Returns:
             The next states and timesteps; ``info`` is that of ``PixelEnv.step``, and in mode
             ``"same_step"`` has ``final_obs`` and ``final_info`` besides.
 
         Raises:
-            ValueError: ``action`` has another shape.
+            ValueError: ``action`` has another shape, or an array of ``params``.
             TypeError: ``action`` is not floating point.
         """
         action = jnp.asarray(action)
         expected = (self.num_envs, self.env.action_size)
         if action.shape != expected:
             raise ValueError(f"action must have shape {expected}, got {tuple(action.shape)}.")
-        ended = state.done
-        sim, reward = self._advance(state.sim, state.key, action, params)
+        ended, rows = state.done, self._rows(params)
+        sim, reward = self._advance(state.sim, state.key, action, rows)
         state = state.replace(sim=sim)
         if self.autoreset_mode == "next_step":
-            state = state.replace(sim=self._reset_rows(state, ended, sim.episode + 1, params))
-            frames = self._push_frames(state.frames, state.sim, params, ended)
+            state = state.replace(sim=self._reset_rows(state, ended, sim.episode + 1, rows))
+            frames = self._push_frames(state.frames, state.sim, rows, ended)
             state = state.replace(frames=frames)
-            return state, self._timestep(state, jnp.where(ended, 0.0, reward), params)
-        frames = self._push_frames(state.frames, sim, params, jnp.zeros(self.num_envs, bool))
+            return state, self._timestep(state, jnp.where(ended, 0.0, reward), rows)
+        frames = self._push_frames(state.frames, sim, rows, jnp.zeros(self.num_envs, bool))
         state = state.replace(frames=frames)
-        timestep = self._timestep(state, reward, params)
+        timestep = self._timestep(state, reward, rows)
         if self.autoreset_mode == "disabled":
             return state, timestep
-        state = self._reset_and_draw(state, state.done, state.sim.episode + 1, params)
-        first = self._timestep(state, reward, params)
+        state = self._reset_and_draw(state, state.done, state.sim.episode + 1, rows)
+        first = self._timestep(state, reward, rows)
         info = {**first.info, "final_obs": timestep.obs, "final_info": timestep.info}
         return state, timestep.replace(obs=first.obs, info=info)
 
@@ -184,19 +197,23 @@ class VectorPixelEnv:
         warnings.warn("VectorPixelEnv.keys_of is env_keys now.", DeprecationWarning, stacklevel=2)
         return VectorPixelEnv.env_keys(key, num_envs)
 
+    def _rows(self, params: EnvParams) -> ParamRows:
+        return split_params(params, self.num_envs)
+
     def _advance(
-        self, sim: SimState, keys: jax.Array, action: jax.Array, params: EnvParams
+        self, sim: SimState, keys: jax.Array, action: jax.Array, params: ParamRows
     ) -> tuple[SimState, jax.Array]:
         """Return the states after their actions, with no episode reset, and the rewards."""
 
-        def step(sim: SimState, rows: tuple[Any, Any], params: EnvParams) -> Any:
-            key, action = rows
-            return self.env.advance(sim, key, action, params)
+        def step(sim: SimState, rows: tuple[Any, Any, Any], shared: Any) -> Any:
+            key, action, own = rows
+            return self.env.advance(sim, key, action, params.join(own, shared))
 
+        rows = keys, action, params.own
         if self._is_for_a_cpu():
             last = getattr(self.env.physics, "batch_last", True)
-            return step_rows(step, sim, (keys, action), params, last=last)
-        return jax.vmap(step, in_axes=(0, 0, None))(sim, (keys, action), params)
+            return step_rows(step, sim, rows, params.shared, last=last)
+        return jax.vmap(step, in_axes=(0, 0, None))(sim, rows, params.shared)
 
     def _env_keys(self, key: jax.Array) -> jax.Array:
         if getattr(key, "shape", ()) == ():
@@ -204,24 +221,30 @@ class VectorPixelEnv:
         check_key(key, (self.num_envs,))
         return key
 
-    def _timestep(self, state: EnvState, reward: jax.Array, params: EnvParams) -> Timestep:
-        return jax.vmap(self.env.timestep, in_axes=(0, 0, None))(state, reward, params)
+    def _timestep(self, state: EnvState, reward: jax.Array, params: ParamRows) -> Timestep:
+        def see(state: EnvState, reward: jax.Array, own: Any) -> Timestep:
+            return self.env.timestep(state, reward, params.join(own))
+
+        return jax.vmap(see)(state, reward, params.own)
 
     def _push_frames(
-        self, frames: jax.Array, sim: SimState, params: EnvParams, is_first: jax.Array
+        self, frames: jax.Array, sim: SimState, params: ParamRows, is_first: jax.Array
     ) -> jax.Array:
-        return jax.vmap(self.env.push_frame, in_axes=(0, 0, None, 0))(frames, sim, params, is_first)
+        def push(frames: jax.Array, sim: SimState, own: Any, is_first: jax.Array) -> jax.Array:
+            return self.env.push_frame(frames, sim, params.join(own), is_first)
+
+        return jax.vmap(push)(frames, sim, params.own, is_first)
 
     def _reset_rows(
-        self, state: EnvState, mask: jax.Array, episode: jax.Array, params: EnvParams
+        self, state: EnvState, mask: jax.Array, episode: jax.Array, params: ParamRows
     ) -> SimState:
         """Return the simulation states, those where ``mask`` at the start of an episode."""
 
-        def reset(key: jax.Array, episode: jax.Array) -> SimState:
-            return self.env.reset_sim(key, episode, params)
+        def reset(key: jax.Array, episode: jax.Array, own: Any) -> SimState:
+            return self.env.reset_sim(key, episode, params.join(own))
 
         replace = replace_rows if self._is_for_a_cpu() else reset_rows
-        sim: SimState = replace(reset, (state.key, episode), mask, state.sim)
+        sim: SimState = replace(reset, (state.key, episode, params.own), mask, state.sim)
         return sim
 
     def _is_for_a_cpu(self) -> bool:
@@ -232,7 +255,7 @@ class VectorPixelEnv:
         return self.env.physics_batching == "auto" and jax.default_backend() == "cpu"
 
     def _reset_and_draw(
-        self, state: EnvState, mask: jax.Array, episode: jax.Array, params: EnvParams
+        self, state: EnvState, mask: jax.Array, episode: jax.Array, params: ParamRows
     ) -> EnvState:
         """Return the states, reset and drawn where ``mask``; the others keep their frames."""
         sim = self._reset_rows(state, mask, episode, params)
@@ -240,7 +263,11 @@ class VectorPixelEnv:
         if self.env.obs_mode == "state":
             return state
         blank = jnp.zeros((self.num_envs, self.env.height, self.env.width), jnp.uint32)
-        newest = replace_rows(lambda row: self.env.draw(row, params), (sim,), mask, blank)
+
+        def draw(sim: SimState, own: Any) -> jax.Array:
+            return self.env.draw(sim, params.join(own))
+
+        newest = replace_rows(draw, (sim, params.own), mask, blank)
         first = jax.vmap(observe.push)(state.frames, newest, jnp.ones_like(mask))
         # Environments that go on keep their stack as it is: nothing new was drawn for them.
         return state.replace(frames=jnp.where(mask[:, None, None, None], first, state.frames))

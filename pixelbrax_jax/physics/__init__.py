@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from importlib import import_module
 
+from pixelbrax_jax.flags import default_flags
 from pixelbrax_jax.physics.base import Physics
 from pixelbrax_jax.physics.opengl import import_mujoco
 from pixelbrax_jax.tasks import TASKS
@@ -12,6 +13,7 @@ from pixelbrax_jax.validation import check_choice
 import_mujoco()  # before any module below does
 
 
+@default_flags()
 def make_physics(task: str, *, backend: str | None = None, reward_preset: str = "brax") -> Physics:
     """Make the physics of a built-in task, by the engine of its row.
 

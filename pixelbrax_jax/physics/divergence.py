@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.physics.recipe import Recipe
 from pixelbrax_jax.spatial import quat_normalize
 from pixelbrax_jax.types import PhysicsState
@@ -51,11 +52,13 @@ class GuardedPhysics(abc.ABC):
     # Traced once for equal objects, however many programs they are part of.
 
     @partial(jax.jit, static_argnums=0, inline=True)
+    @under_default_flags
     def reset(self, key: jax.Array) -> PhysicsState:
         """See ``Physics.reset``."""
         return self._guard_first(self._reset(key))
 
     @partial(jax.jit, static_argnums=0, inline=True)
+    @under_default_flags
     def step(self, state: PhysicsState, action: jax.Array) -> PhysicsState:
         """See ``Physics.step``."""
         after = self._step(state, action)

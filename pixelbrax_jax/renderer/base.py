@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.renderer import fused, kernel, reference
 from pixelbrax_jax.types import Frame, Scene
 from pixelbrax_jax.validation import check_choice
@@ -36,6 +37,7 @@ def check_renderer(renderer: object) -> str:
     return name
 
 
+@under_default_flags
 def render(
     scene: Scene,
     height: int,
@@ -99,6 +101,7 @@ def _fast(
 
 
 @_fast.defjvp
+@under_default_flags
 def _fast_jvp(
     height: int, width: int, num_rows: int, renderer: str, primals: tuple, tangents: tuple
 ) -> tuple[Frame, Frame]:

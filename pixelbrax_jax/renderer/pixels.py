@@ -27,7 +27,7 @@ from pixelbrax_jax.renderer import ground, shading
 from pixelbrax_jax.renderer.bounds import at_least, at_most, between
 from pixelbrax_jax.renderer.intersect import Axes, Hit, Vector, dot, intersect
 from pixelbrax_jax.renderer.shading import SHADOW_BIAS
-from pixelbrax_jax.types import Frame, GeomKind, Lamp, Look, Scene
+from pixelbrax_jax.types import FAR, Frame, GeomKind, Lamp, Look, Scene
 
 _INF_BITS = np.uint32(0x7F800000)
 
@@ -240,7 +240,7 @@ def see(view: View, ray: Vector, near: Near | None = None) -> Seen:
     for c in range(3):
         surface = between(0.0, color[c] * shade + gleam, 1.0)
         planes.append(jnp.where(sky, shading.sky(look, rise, c), surface))
-    depth = jnp.where(sky, jnp.inf, -t * ray[2])
+    depth = jnp.where(sky, FAR, -t * ray[2])
     return Seen(planes[0], planes[1], planes[2], depth, winner, on_ground)
 
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from pixelbrax_jax import spatial
 from pixelbrax_jax.renderer import ground
-from pixelbrax_jax.types import Camera, Frame, GeomKind, Lamp, Scene
+from pixelbrax_jax.types import FAR, Camera, Frame, GeomKind, Lamp, Scene
 
 _SHADOW_BIAS = 1e-3
 
@@ -89,7 +89,7 @@ def render(
         r=rgb[..., 0],
         g=rgb[..., 1],
         b=rgb[..., 2],
-        depth=jnp.where(hit, -t * (rays @ back), jnp.inf),
+        depth=jnp.where(hit, -t * (rays @ back), FAR),
         seg=jnp.where(hit, nearest, -1).astype(jnp.int32),
         ground=on_ground,
     )

@@ -7,11 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from pixelbrax_jax import spatial
+from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.scene import strings
 from pixelbrax_jax.scene.cameras import aim
 from pixelbrax_jax.types import CameraRig, Geoms, Look, Scene
 
 
+@under_default_flags
 def place(geoms: Geoms, rig: CameraRig, look: Look, xpos: jax.Array, xquat: jax.Array) -> Scene:
     """Carry every geom and lamp along with its link, stretch the strings, and aim the camera.
 

@@ -19,6 +19,8 @@ from pixelbrax_jax.envs.sharded import ShardedVectorEnv, make_env_mesh
 
 env, params = pb.make("inverted_pendulum", height=16, width=16, frame_stack=2, obs_mode="both")
 NUM_ENVS = 16
+# Rows of parameters go where their environments are.
+params = params.replace(episode_length=np.arange(NUM_ENVS, dtype=np.int32) % 5 + 3)
 actions = jax.random.uniform(jax.random.key(1), (8, NUM_ENVS, 1), minval=-1.0, maxval=1.0)
 
 def rollout(venv):
@@ -44,8 +46,9 @@ print(json.dumps({
     "devices": jax.device_count(),
     "far": far,
     "pixels_that_differ": float(np.mean([a != b for a, b in zip(pixels, others)])),
-    "flags": all(bool((np.asarray(a.terminated) == np.asarray(b.terminated)).all())
-                 for a, b in zip(steps, alone)),
+    "flags": all(bool((np.asarray(x) == np.asarray(y)).all()) for a, b in zip(steps, alone)
+                 for x, y in ((a.terminated, b.terminated), (a.truncated, b.truncated))),
+    "truncated": sum(int(np.asarray(a.truncated).sum()) for a in steps),
     "all_bytes": bytes_of((state, steps[-1]), lambda leaf: leaf.nbytes),
     "bytes_of_one": bytes_of((state, steps[-1]),
                              lambda leaf: leaf.addressable_shards[0].data.nbytes),
@@ -72,6 +75,7 @@ def told():
 def test_environments_are_the_same(told):
     assert told["devices"] == 8
     assert told["flags"]
+    assert told["truncated"] >= 16
     assert told["far"] < 1e-4
     assert told["pixels_that_differ"] < 0.01
 

@@ -9,6 +9,7 @@ import pytest
 
 import pixelbrax_jax as pb
 from pixelbrax_jax import PixelEnv, VectorPixelEnv
+from pixelbrax_jax.envs import param_rows
 from tests.envs import toy
 from tests.envs.toy import Ball
 
@@ -204,11 +205,114 @@ def test_a_step_that_ends_no_episode_computes_no_first_state():
     env, params = pb.make("inverted_pendulum", obs_mode="state")
     venv = VectorPixelEnv(env, 2)
     state, _ = jax.eval_shape(venv.reset, jax.random.key(0), params)
-    arguments = (state, state.done, state.sim.episode, params)
-    program = jax.jit(venv._reset_rows).lower(*arguments).compile().as_text()
+
+    def reset_rows(state, params):
+        return venv._reset_rows(state, state.done, state.sim.episode, venv._rows(params))
+
+    program = jax.jit(reset_rows).lower(state, params).compile().as_text()
     # XLA may take out of a loop what its turns have in common, such as physics at the first pose;
     # then every step pays for it.
     every_step = program[program.index("ENTRY") :]
     assert " while(" in every_step
     assert " dot(" not in every_step
     assert every_step.count(" fusion(") < 50
+
+
+def own_params(num_envs: int = 2) -> tuple[list[pb.EnvParams], pb.EnvParams]:
+    """Parameters of single environments, and the same of a batch: with rows where they differ."""
+    single = [
+        PARAMS.replace(
+            rig=PARAMS.rig.replace(eye=np.array([i, -4.0, 1.0], np.float32)),
+            look=PARAMS.look.replace(ambient=np.float32(0.2 + 0.3 * i)),
+            episode_length=np.int32(3 + 4 * i),
+        )
+        for i in range(num_envs)
+    ]
+    stacked = jax.tree.map(lambda *rows: np.stack(rows), *single)
+    batch = PARAMS.replace(
+        rig=PARAMS.rig.replace(eye=stacked.rig.eye),
+        look=PARAMS.look.replace(ambient=stacked.look.ambient),
+        episode_length=stacked.episode_length,
+    )
+    return single, batch
+
+
+def test_environments_may_have_parameters_of_their_own():
+    venv, (single, batch) = make("next_step", 2, obs_mode="both"), own_params()
+    actions = jnp.array([[0.1], [0.1]])
+    state, first = venv.reset(jax.random.key(0), batch)
+    steps, lengths = [first], []
+    for _ in range(6):
+        state, timestep = venv.step(state, actions, batch)
+        steps.append(timestep)
+        lengths.append(np.asarray(timestep.truncated))
+    # The time limits of 3 and 7 control steps.
+    assert np.argmax(np.array(lengths)[:, 0]) == 2
+    assert not np.array(lengths)[:, 1].any()
+    for i in range(2):
+        key = jax.random.fold_in(jax.random.key(0), i)
+        alone, expected = venv.env.reset(key, single[i])
+        for t in range(4):
+            if t:
+                alone, expected = venv.env.step(alone, actions[i], single[i])
+            actual = jax.tree.map(lambda x, i=i: x[i], steps[t])
+            assert float(actual.reward) == pytest.approx(float(expected.reward), abs=1e-5)
+            assert bool(actual.truncated) == bool(expected.truncated)
+            assert_same_pixels(actual.obs["pixels"], expected.obs["pixels"])
+    # They do look different.
+    assert np.abs(np.diff(np.asarray(first.obs["pixels"]).astype(int), axis=0)).mean() > 5
+
+
+def test_a_reset_of_some_draws_with_parameters_of_their_own():
+    venv, (single, batch) = make("disabled", 2), own_params()
+    state, _ = venv.reset(jax.random.key(0), batch)
+    mask = jnp.array([False, True])
+    _, timestep = venv.reset_where(state, mask, batch, jax.random.key(5))
+    key = jax.random.fold_in(jax.random.key(5), 1)
+    assert_same_pixels(timestep.obs[1], venv.env.reset(key, single[1])[1].obs)
+
+
+def test_a_batch_on_a_cpu_in_chunks_has_parameters_of_its_own():
+    venv = make("next_step", 256, obs_mode="state")
+    limits = np.arange(256, dtype=np.int32) % 3 + 1
+    params = PARAMS.replace(episode_length=limits)
+    state, _ = venv.reset(jax.random.key(0), params)
+    _, timestep = venv.step(state, jnp.zeros((256, 1)), params)
+    np.testing.assert_array_equal(timestep.truncated, limits == 1)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda p: p.replace(rig=p.rig.replace(eye=np.zeros((3, 3), np.float32))),
+            r"params\.rig\.eye must have shape \(3,\), the same for all environments, or \(2, 3\), "
+            r"a row for each of the num_envs=2; got \(3, 3\)",
+        ),
+        (
+            lambda p: p.replace(episode_length=np.ones((2, 1), np.int32)),
+            r"params\.episode_length must have shape \(\), .* or \(2,\), .* got \(2, 1\)",
+        ),
+        (
+            lambda p: p.replace(geoms=p.geoms.replace(rgb=np.zeros((2, 3, 2), np.float32))),
+            r"params\.geoms\.rgb must have shape \(M, 3\), .* or \(2, M, 3\), .* got \(2, 3, 2\)",
+        ),
+    ],
+    ids=["number of rows", "one axis too many", "rows last"],
+)
+def test_a_parameter_of_another_shape_is_named(change, message):
+    venv = make("next_step", 2)
+    with pytest.raises(ValueError, match=message):
+        venv.reset(jax.random.key(0), change(PARAMS))
+    state, _ = jax.eval_shape(venv.reset, jax.random.key(0), PARAMS)
+    with pytest.raises(ValueError, match=message):
+        jax.eval_shape(venv.step, state, ACTIONS[:2], change(PARAMS))
+
+
+def test_the_shape_of_every_parameter_is_known():
+    # It has strings, lamps and a headlight; with clips these are all fields but a light.
+    options = {"height": 12, "width": 12, "distractors": ("video",), "clips": "procedural"}
+    for known in (PARAMS, pb.make("dmc_ball_in_cup_catch", **options)[1]):
+        for path, leaf in jax.tree_util.tree_leaves_with_path(known):
+            name = ".".join(key.name for key in path if hasattr(key, "name"))
+            assert param_rows._fits(np.shape(leaf), param_rows._SHAPES[name]), name

@@ -31,6 +31,7 @@ from pixelbrax_jax.agents.core.networks import Dynamics
 from pixelbrax_jax.agents.core.optimizer import Networks, Optimizer
 from pixelbrax_jax.agents.core.train_state import TrainState, update_key
 from pixelbrax_jax.agents.core.update import update
+from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.types import EnvParams
 from pixelbrax_jax.validation import check_fraction, check_positive_int
 
@@ -119,6 +120,7 @@ class DCPG(Algorithm):
             networks["dynamics"] = Dynamics().init(dynamics_key, features, action, features)
         return networks
 
+    @under_default_flags
     def init(self, key: jax.Array, env_params: EnvParams) -> TrainState:
         """As ``Algorithm.init``, with an empty buffer."""
         state = super().init(key, env_params)
@@ -133,6 +135,7 @@ class DCPG(Algorithm):
             aux_opt_state=optimizer.init({n: p for n, p in networks.items() if n != "target"}),
         )
 
+    @under_default_flags
     def iterate(self, state: TrainState, env_params: EnvParams) -> tuple[TrainState, Metrics]:
         """Learn the policy, and keep the value where it was (the policy phase)."""
         config, agent = self.config, self.agent
@@ -177,6 +180,7 @@ class DCPG(Algorithm):
         rate = Optimizer(config).learning_rate(iteration)
         return state, metrics | update_metrics | {"learning_rate": rate}
 
+    @under_default_flags
     def auxiliary(self, state: TrainState) -> tuple[TrainState, Metrics]:
         """Learn the value from old returns, and keep the policy (the delayed phase)."""
         config, agent, dynamics = self.config, self.agent, Dynamics()

@@ -23,6 +23,7 @@ from pixelbrax_jax.agents.core.losses import (
 from pixelbrax_jax.agents.core.optimizer import Networks, Optimizer
 from pixelbrax_jax.agents.core.train_state import TrainState, update_key
 from pixelbrax_jax.agents.core.update import update
+from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.types import EnvParams
 from pixelbrax_jax.validation import check_choice, check_positive_int
 
@@ -102,6 +103,7 @@ class PPG(Algorithm):
             has_value=True,
         )
 
+    @under_default_flags
     def init(self, key: jax.Array, env_params: EnvParams) -> TrainState:
         """As ``Algorithm.init``, with an empty buffer."""
         state = super().init(key, env_params)
@@ -111,6 +113,7 @@ class PPG(Algorithm):
         )
         return state.replace(aux_opt_state=Optimizer(self.config).init(state.networks))
 
+    @under_default_flags
     def iterate(self, state: TrainState, env_params: EnvParams) -> tuple[TrainState, Metrics]:
         """Learn as PPO does (the policy phase), and remember the rollout."""
         config, agent = self.config, self.agent
@@ -168,6 +171,7 @@ class PPG(Algorithm):
         )
         return state, metrics | {"learning_rate": Optimizer(config).learning_rate(iteration)}
 
+    @under_default_flags
     def auxiliary(self, state: TrainState) -> tuple[TrainState, Metrics]:
         """Distil values into the actor's encoder, and keep its policy."""
         config, agent = self.config, self.agent

@@ -23,6 +23,7 @@ from pixelbrax_jax.agents.core.losses import (
 from pixelbrax_jax.agents.core.optimizer import Networks, Optimizer
 from pixelbrax_jax.agents.core.train_state import TrainState, update_key
 from pixelbrax_jax.agents.core.update import update
+from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.types import EnvParams
 from pixelbrax_jax.validation import check_choice, check_positive_int
 
@@ -75,6 +76,7 @@ class PPO(Algorithm):
         """Its networks."""
         return ActorCritic(self.config, self.envs, shared=self.config.layout == "shared")
 
+    @under_default_flags
     def iterate(self, state: TrainState, env_params: EnvParams) -> tuple[TrainState, Metrics]:
         """As ``Algorithm.iterate``."""
         config, agent = self.config, self.agent

@@ -17,6 +17,7 @@ from pixelbrax_jax.agents.core.returns import RewardScaler
 from pixelbrax_jax.agents.core.rollout import Environments
 from pixelbrax_jax.agents.core.train_state import TrainState, env_key, network_key
 from pixelbrax_jax.envs.vector import VectorPixelEnv
+from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.types import EnvParams
 
 
@@ -65,10 +66,12 @@ class Algorithm(ABC):
     def agent(self) -> Agent:
         """Its networks."""
 
+    @under_default_flags
     def init_networks(self, key: jax.Array) -> Networks:
         """Sample initial parameters, by name of the network."""
         return self.agent.init(key)
 
+    @under_default_flags
     def init(self, key: jax.Array, env_params: EnvParams) -> TrainState:
         """Return the state before the first iteration.
 
@@ -105,6 +108,7 @@ class Algorithm(ABC):
         """Learn from the rollouts of all iterations since the last auxiliary phase."""
         raise NotImplementedError(f"{self.name} has no auxiliary phase.")
 
+    @under_default_flags
     def act(self, networks: Networks, pixels: jax.Array, key: jax.Array | None = None) -> jax.Array:
         """Return actions.
 
@@ -204,6 +208,7 @@ def train_function(
         state, aux_metrics = algorithm.auxiliary(state)
         return state, (metrics, aux_metrics)
 
+    @under_default_flags
     def train(key: jax.Array) -> tuple[TrainState, Metrics]:
         state = algorithm.init(key, env_params)
         if not phases:

@@ -350,7 +350,7 @@ def read_networks(folder: str | Path, template: Tree, steps: int | None = None) 
         restored = reader.restore(
             path, args=ocp.args.PyTreeRestore(wanted, restore_args=as_numpy, partial_restore=True)
         )
-    leaves = {name: jnp.asarray(restored[name]) for name in wanted}
+    leaves = {name: jax.device_put(restored[name]) for name in wanted}
     return _typed({"networks": template}, leaves)["networks"]
 
 

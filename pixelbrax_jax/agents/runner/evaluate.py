@@ -22,6 +22,7 @@ from pixelbrax_jax.distractors.presets import resolve
 from pixelbrax_jax.distractors.video import Video
 from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.envs.vector import VectorPixelEnv
+from pixelbrax_jax.flags import default_flags
 from pixelbrax_jax.types import EnvParams, EnvState
 from pixelbrax_jax.validation import check_choice
 
@@ -222,7 +223,8 @@ class Evaluator:
         """
         envs = VectorPixelEnv(env, num_episodes, "disabled")
         self._play = partial(_play, envs, algorithm, deterministic)
-        self._key = jax.random.key(seed)
+        with default_flags():
+            self._key = jax.random.key(seed)
         self._params = env_params
 
     def __call__(self, networks: Networks) -> Result:

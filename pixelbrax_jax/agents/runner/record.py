@@ -17,6 +17,7 @@ from pixelbrax_jax.agents.runner.evaluate import SPLITS, make_split
 from pixelbrax_jax.agents.runner.trained import Trained, load_chosen, with_clips
 from pixelbrax_jax.compilation import compiler_options
 from pixelbrax_jax.envs.vector import VectorPixelEnv
+from pixelbrax_jax.flags import default_flags
 from pixelbrax_jax.validation import check_choice, check_positive_int
 from pixelbrax_jax.video import write_frames
 
@@ -96,10 +97,12 @@ def write_video(
         return state, draw(state)
 
     def frames() -> Iterator[np.ndarray]:
-        state, _ = envs.reset(jax.random.key(seed), params)
+        with default_flags():
+            key = jax.random.key(seed)
+        state, _ = envs.reset(key, params)
         for _ in range(num_frames):
             state, images = step(state, params)
-            tiles = np.asarray(images).reshape(grid, grid, size, size, 3)
+            tiles = jax.device_get(images).reshape(grid, grid, size, size, 3)
             yield np.concatenate(np.concatenate(tiles, axis=1), axis=1)
 
     fps = min(max(1, round(1.0 / env.dt)), 60)

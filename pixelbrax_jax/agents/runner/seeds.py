@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from pixelbrax_jax.agents.core.algorithm import Algorithm
 from pixelbrax_jax.agents.core.losses import Metrics
 from pixelbrax_jax.agents.core.train_state import TrainState
+from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.types import EnvParams
 
 
@@ -37,6 +38,7 @@ class Runs:
             return jax.random.key(seed)
         return jnp.stack([jax.random.key(seed + i) for i in range(self.num_seeds)])
 
+    @under_default_flags
     def init(self, seed: int | jax.Array, env_params: EnvParams) -> TrainState:
         """Return the state before the first iteration.
 

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from pixelbrax_jax.agents.core.algorithm import Algorithm
@@ -123,7 +122,7 @@ def _run(
     stop: StopRequest,
 ) -> Outcome:
     runs, mesh = Runs(algorithm, options.seeds), mesh_of(algorithm)
-    seed, clips = jnp.uint32(options.seed), env_params.clips
+    seed, clips = jax.device_put(np.uint32(options.seed)), env_params.clips
     if mesh is not None:
         env_params = replicate(mesh, env_params)
     template = jax.eval_shape(runs.init, seed, env_params)

@@ -30,6 +30,7 @@ from pixelbrax_jax.agents.runner.settings import (
 )
 from pixelbrax_jax.distractors.presets import as_tuple
 from pixelbrax_jax.envs.vector import VectorPixelEnv
+from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.policy import Policy, load_policy, read_pretrained
 
 
@@ -40,6 +41,7 @@ class Pretrained:
     config: TrainConfig
     policy: Policy
 
+    @under_default_flags
     def act(self, networks: Networks, pixels: jax.Array, key: jax.Array | None = None) -> jax.Array:
         """Return mean actions, (N, A), of (N, H, W, 3 K) pixels.
 

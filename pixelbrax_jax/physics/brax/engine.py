@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 from flax import struct
 
+from pixelbrax_jax.flags import as_by_default, default_flags, under_default_flags
 from pixelbrax_jax.physics.base import Kinematics, RewardFn
 from pixelbrax_jax.physics.brax.compatibility import accept_old_clip
 from pixelbrax_jax.physics.brax.pickling import with_modules, without_modules
@@ -73,6 +74,7 @@ class BraxPhysics(GuardedPhysics):
     after those of the bodies.
     """
 
+    @default_flags()
     def __init__(
         self,
         env: envs.Env,
@@ -107,6 +109,7 @@ class BraxPhysics(GuardedPhysics):
                 features its backend lacks, or has geoms that cannot be drawn.
         """
         _check_env(env)
+        env = _shorten(env)
         accept_old_clip(fluid)
         model: mujoco.MjModel = env.unwrapped.sys.mj_model
         self.geoms = read_geoms(
@@ -167,6 +170,7 @@ class BraxPhysics(GuardedPhysics):
         """See ``Physics.reset``. ``key`` may be typed, or uint32 as Brax's own are."""
         return self._first_state(self._env, key)
 
+    @under_default_flags
     def from_qpos(
         self, q: jax.Array, qd: jax.Array | None = None, *, key: jax.Array | None = None
     ) -> PhysicsState:
@@ -344,6 +348,16 @@ def _explained(backend: str) -> Iterator[None]:
         raise ValueError(
             f"the {backend!r} backend cannot simulate this model: {error}{fix}"
         ) from error
+
+
+def _shorten(env: envs.Env) -> envs.Env:
+    """Copy ``env``, down through its wrappers, with a system of 32 bits, whatever made it."""
+    clone = copy.copy(env)
+    if isinstance(env, envs.Wrapper):
+        clone.env = _shorten(env.env)
+    else:
+        clone.sys = jax.tree.map(as_by_default, env.sys)
+    return clone
 
 
 def _replace_init(env: envs.Env, init: Callable[..., Any]) -> envs.Env:

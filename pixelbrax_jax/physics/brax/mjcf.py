@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from pixelbrax_jax.flags import default_flags
 from pixelbrax_jax.physics.base import Kinematics, ResetFn, RewardFn
 from pixelbrax_jax.physics.brax.engine import BraxPhysics, kinematics
 from pixelbrax_jax.physics.brax.omissions import check_simulated
@@ -115,6 +116,7 @@ class MjcfEnv(envs.PipelineEnv):
         )
 
 
+@default_flags()
 def mjcf_physics(
     source: str | Path,
     *,

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from pixelbrax_jax.flags import default_flags
 from pixelbrax_jax.physics.divergence import GuardedPhysics
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics, MjxState
 from pixelbrax_jax.physics.mjx.snapshot import Snapshot
@@ -39,6 +40,7 @@ class MjxPhysics(GuardedPhysics):
 
     backend = "mjx"
 
+    @default_flags()
     def __init__(self, task: DmcTask, model: mujoco.MjModel, *, identity: Hashable):
         """Put the model on the device and read what is drawn; compile nothing.
 

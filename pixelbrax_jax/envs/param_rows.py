@@ -1,0 +1,125 @@
+"""Parameters of a batch, of which some arrays have a row for each environment."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import numpy as np
+
+from pixelbrax_jax.types import EnvParams
+
+_SHAPES: dict[str, tuple[int | str, ...]] = {
+    "geoms.size": ("G", 3),
+    "geoms.pos": ("G", 3),
+    "geoms.quat": ("G", 4),
+    "geoms.rgb": ("M", 3),
+    "geoms.strings.ends": (2, 3),
+    "geoms.strings.length": (),
+    "rig.track": (3,),
+    "rig.eye": (3,),
+    "rig.target": (3,),
+    "rig.up": (3,),
+    "rig.fovy": (),
+    "look.light": (3,),
+    "look.ambient": (),
+    "look.diffuse": (),
+    "look.specular": (),
+    "look.highlight": (),
+    "look.sky": ("2 or 3", 3),
+    "look.ground_rgb": (2, 3),
+    "look.ground_pitch": (),
+    "look.headlight": (),
+    "look.lamps.pos": (3,),
+    "look.lamps.axis": (3,),
+    "look.lamps.cos_cutoff": (),
+    "look.lamps.diffuse": (),
+    "look.lamps.highlight": (),
+    "clips.packed": ("T", "H", "W"),
+    "clips.first": ("C",),
+    "clips.length": ("C",),
+    "episode_length": (),
+}
+"""Shapes of the parameters of one environment, as ``types`` has them."""
+
+
+@dataclass(frozen=True)
+class ParamRows:
+    """Parameters taken apart.
+
+    Attributes:
+        own: arrays with a row for each environment.
+        shared: arrays that are the same for all.
+        is_own: which of the two each array of the parameters is in.
+        tree: structure of the parameters.
+    """
+
+    own: tuple[Any, ...]
+    shared: tuple[Any, ...]
+    is_own: tuple[bool, ...]
+    tree: Any
+
+    def join(self, own: Sequence[Any], shared: Sequence[Any] | None = None) -> EnvParams:
+        """Return the parameters of one environment.
+
+        Args:
+            own: its rows.
+            shared: what is the same for all, if it is passed as an argument.
+        """
+        rest = iter(self.shared if shared is None else shared)
+        rows = iter(own)
+        leaves = [next(rows) if is_own else next(rest) for is_own in self.is_own]
+        params: EnvParams = jax.tree.unflatten(self.tree, leaves)
+        return params
+
+    def mark(self, own: Any, shared: Any) -> Any:
+        """Return a tree like the parameters, of one value for rows and another for the rest."""
+        marks = [own if is_own else shared for is_own in self.is_own]
+        return jax.tree.unflatten(self.tree, marks)
+
+
+def split_params(params: EnvParams, num_envs: int) -> ParamRows:
+    """Take parameters apart.
+
+    Args:
+        params: each array as ``EnvParams`` has it, or with a leading axis N.
+        num_envs: N.
+
+    Raises:
+        ValueError: an array has neither shape; the message names it, and both.
+    """
+    found, tree = jax.tree_util.tree_flatten_with_path(params)
+    is_own = tuple(_has_rows(path, np.shape(leaf), num_envs) for path, leaf in found)
+    pairs = [(leaf, own) for (_, leaf), own in zip(found, is_own, strict=True)]
+    return ParamRows(
+        own=tuple(leaf for leaf, own in pairs if own),
+        shared=tuple(leaf for leaf, own in pairs if not own),
+        is_own=is_own,
+        tree=tree,
+    )
+
+
+def _has_rows(path: tuple[Any, ...], shape: tuple[int, ...], num_envs: int) -> bool:
+    names = [key.name for key in path if hasattr(key, "name")]
+    wanted = _SHAPES.get(".".join(names))
+    if wanted is None or _fits(shape, wanted):
+        return False
+    if _fits(shape, (num_envs, *wanted)):
+        return True
+    raise ValueError(
+        f"params{jax.tree_util.keystr(path)} must have shape {_written(wanted)}, the same for all "
+        f"environments, or {_written((num_envs, *wanted))}, a row for each of the "
+        f"num_envs={num_envs}; got {shape}."
+    )
+
+
+def _fits(shape: tuple[int, ...], wanted: tuple[int | str, ...]) -> bool:
+    return len(shape) == len(wanted) and all(
+        isinstance(size, str) or size == given for given, size in zip(shape, wanted, strict=True)
+    )
+
+
+def _written(shape: tuple[int | str, ...]) -> str:
+    return f"({', '.join(map(str, shape))}{',' * (len(shape) == 1)})"
