@@ -9,6 +9,7 @@ from gymnasium import error
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.preprocessing import is_image_space_channels_first
 from stable_baselines3.common.vec_env import (
     VecFrameStack,
     VecMonitor,
@@ -342,3 +343,27 @@ def test_channels_first_space_is_an_image_to_gymnasium(make_sb3):
     space = make_sb3(channels_first=True).observation_space
     assert isinstance(space, gymnasium.spaces.Box)
     assert space == gymnasium.spaces.Box(0, 255, (6, 12, 12), np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("size", "is_read"),
+    [
+        ({"height": 36, "width": 36, "frame_stack": 12}, False),
+        ({"height": 12, "width": 40, "frame_stack": 5}, False),
+        ({"height": 37, "width": 37, "frame_stack": 12}, True),
+        ({"height": 40, "width": 20, "frame_stack": 12, "obs_mode": "state"}, True),
+        ({"height": 36, "width": 36, "frame_stack": 12, "channels_first": True}, True),
+        ({"height": 35, "width": 40, "frame_stack": 12, "channels_first": True}, False),
+    ],
+)
+def test_images_are_read_as_they_are_or_refused(size, is_read):
+    def make():
+        return pixelbrax_gym.PixelBraxSB3VecEnv(TASK, 2, **size)
+
+    if not is_read:
+        with pytest.raises(ValueError, match="takes the shortest axis of an image for its chan"):
+            make()
+        return
+    space = make().observation_space
+    if len(space.shape) == 3:
+        assert is_image_space_channels_first(space) == size.get("channels_first", False)
