@@ -4,7 +4,8 @@ python -m tests.under_flags FLAGS PART [PART ...]
 
 FLAGS is JSON, names of ``jax.config`` and values. A part is
 ``env:TASK[,DISTRACTOR...][/RENDERER]``; ``program:`` of the same, compiled by nobody;
-``gymnasium``, ``sb3``, ``torchrl``; or ``train:ALGORITHM``. Digests, or the errors instead, are printed as JSON.
+``gymnasium``, ``sb3``, ``torchrl``; or ``train:ALGORITHM``. Digests, or the errors instead, are
+printed as JSON.
 """
 
 import contextlib
