@@ -2,9 +2,10 @@
 
 python -m tests.under_flags FLAGS PART [PART ...]
 
-FLAGS is JSON, names of ``jax.config`` and values. A part is ``env:TASK[,DISTRACTOR...]``;
-``program:TASK[,DISTRACTOR...][/RENDERER]``, compiled by nobody; ``gymnasium``, ``sb3``,
-``torchrl``; or ``train:ALGORITHM``. Digests, or the errors instead, are printed as JSON.
+FLAGS is JSON, names of ``jax.config`` and values. A part is
+``env:TASK[,DISTRACTOR...][/RENDERER]``; ``program:`` of the same, compiled by nobody;
+``gymnasium``, ``sb3``, ``torchrl``; or ``train:ALGORITHM``. Digests, or the errors instead, are
+printed as JSON.
 """
 
 import contextlib
@@ -39,12 +40,23 @@ def outputs(timestep: Any) -> Any:
     return jax.device_get((timestep.obs, timestep.reward, timestep.terminated, timestep.info))
 
 
+def make(name: str) -> tuple[Any, Any]:
+    """The environment of ``TASK[,DISTRACTOR...][/RENDERER]``."""
+    import pixelbrax_jax as pb
+
+    name, _, renderer = name.partition("/")
+    task, *distractors = name.split(",")
+    options = SIZE | {"distractors": tuple(distractors), "renderer": renderer or "auto"}
+    if any("video" in link or "dcs" in link for link in distractors):
+        options["clips"] = "procedural"
+    return pb.make(task, **options)
+
+
 def play_env(name: str) -> dict[str, Any]:
     """An environment alone, rendered, twice in a vector, and both in programs of the caller's."""
     import pixelbrax_jax as pb
 
-    task, *distractors = name.split(",")
-    env, params = pb.make(task, **SIZE, distractors=tuple(distractors))
+    env, params = make(name)
     params = jax.device_put(params)
     key = jax.jit(jax.random.key)(jax.device_put(np.uint32(0)))
     actions = np.linspace(-0.5, 0.5, NUM_STEPS * 2 * env.action_size)
@@ -79,12 +91,7 @@ def lower_env(name: str) -> dict[str, Any]:
     """
     import pixelbrax_jax as pb
 
-    name, _, renderer = name.partition("/")
-    task, *distractors = name.split(",")
-    options = SIZE | {"distractors": tuple(distractors), "renderer": renderer or "auto"}
-    if any("video" in link or "dcs" in link for link in distractors):
-        options["clips"] = "procedural"
-    env, params = pb.make(task, **options)
+    env, params = make(name)
     envs = pb.VectorPixelEnv(env, 2)
     state, _ = jax.eval_shape(envs.reset, KEY, params)
     action = jax.ShapeDtypeStruct((2, env.action_size), np.float32)
