@@ -29,8 +29,9 @@ def check_state(state: Any, expected: EnvState) -> None:
     given: Any = jax.tree.flatten(state)
     if given[1] != wanted[1]:
         raise ValueError(
-            "the state has other parts than those of this environment: is it of another task, "
-            "physics backend or distractor?"
+            f"the state has other parts than those of this environment, {len(given[0])} arrays and "
+            f"not {len(wanted[0])}, or others: take it from an environment of the same task, "
+            "physics backend, distractors and obs_mode."
         )
     for value, (path, spec) in zip(given[0], wanted[0], strict=True):
         shape, dtype = np.shape(value), getattr(value, "dtype", type(value).__name__)

@@ -38,7 +38,7 @@ def make_env(config: EnvConfig) -> tuple[PixelEnv, EnvParams]:
                 return env, params
         check_not_forked()
     env, params = make(config)
-    # Clips would be put on the device, which starts JAX.
+    # Clips take 100 MB, which this list would keep.
     if params.clips is None and not any(_is_equal(made, config) for made, _, _ in _made):
         _made.append((config, env, params))
     return env, params

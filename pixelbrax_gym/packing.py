@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import accumulate
 from typing import Any, NamedTuple
 
 import jax
@@ -41,7 +42,7 @@ def unpack(packed: Packed, like: EnvState) -> EnvState:
     """
     parts, tree = jax.tree.flatten(like.replace(frames=None))
     sizes = [jax.eval_shape(_words, part).size for part in parts]
-    ends = [sum(sizes[: i + 1]) for i in range(len(sizes))]
+    ends = accumulate(sizes)
     restored = [
         _from_words(packed.words[end - size : end], part)
         for part, size, end in zip(parts, sizes, ends, strict=True)

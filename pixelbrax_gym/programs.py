@@ -45,15 +45,23 @@ class Programs:
     def __init__(self, vector: VectorPixelEnv, single: bool) -> None:
         """Compile nothing yet."""
         self.vector, self.single = vector, single
+        self._specs: dict[Any, EnvState] = {}
 
     def __reduce__(self) -> Any:
         """Return what is pickled or copied: the options."""
         return programs_of, (self.vector, self.single)
 
     @compilation.jit(_env, static_argnums=0)
-    def reset(self, seeds: Array, params: EnvParams) -> Stepped:
-        """Reset all environments to episode 0 of their (N,) uint32 seeds."""
-        return self._stepped(*self.vector.reset(jax.vmap(jax.random.key)(seeds), params))
+    def reset(self, seeds: Array, params: EnvParams, offsets: Array | None) -> Stepped:
+        """Reset all environments to episode 0 of their (N,) uint32 seeds.
+
+        Args:
+            seeds: as above.
+            params: of all.
+            offsets: (N,) int32, new ``time_limit_offset`` of all; None keeps what a reset makes.
+        """
+        state, timestep = self.vector.reset(jax.vmap(jax.random.key)(seeds), params)
+        return self._stepped(_with_offsets(state, offsets), timestep)
 
     @_into_spare
     def reset_where(
@@ -63,6 +71,7 @@ class Programs:
         reported: Array,
         params: EnvParams,
         seeds: Array | None,
+        offsets: Array | None,
         spare: Array,
     ) -> Stepped:
         """Reset some environments; infos are about those that ``reported`` names, (N,) bool."""
@@ -70,7 +79,7 @@ class Programs:
         key = None if seeds is None else jax.vmap(jax.random.key)(seeds)
         state = self._state(packed, params)
         state, timestep = self.vector.reset_where(state, mask, params, key)
-        return self._stepped(state, timestep, reported)
+        return self._stepped(_with_offsets(state, offsets), timestep, reported)
 
     @_into_spare
     def step(self, packed: Packed, action: Array, params: EnvParams, spare: Array) -> Stepped:
@@ -101,14 +110,14 @@ class Programs:
         """Go on from given states, which lack the leading axis of a single environment."""
         if self.single:
             state = jax.tree.map(lambda x: x[None], state)
-        return self._present(state, params)
+        return self._started(state, params)
 
     @compilation.jit(_env, static_argnums=0)
     def start_where(
         self, packed: Packed, mask: Array, state: EnvState, params: EnvParams
     ) -> Stepped:
         """Go on from given states where (N,) ``mask``; the others stay as they are."""
-        return self._present(self._where(mask, state, self._state(packed, params)), params)
+        return self._started(self._where(mask, state, self._state(packed, params)), params)
 
     @compilation.jit(_env, static_argnums=(0, 3, 4))
     def images(self, packed: Packed, params: EnvParams, height: int, width: int) -> jax.Array:
@@ -125,6 +134,13 @@ class Programs:
         return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), spec)
 
     def _spec(self, params: EnvParams) -> Any:
+        leaves, tree = jax.tree.flatten(params)
+        key = tree, tuple((np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
+        if key not in self._specs:
+            self._specs[key] = self._make_spec(params)
+        return self._specs[key]
+
+    def _make_spec(self, params: EnvParams) -> Any:
         seeds = jax.ShapeDtypeStruct((self.vector.num_envs,), np.uint32)
         keys = jax.eval_shape(jax.vmap(jax.random.key), seeds)
         return jax.eval_shape(self.vector.reset, keys, params)[0]
@@ -132,19 +148,19 @@ class Programs:
     def _state(self, packed: Packed, params: EnvParams) -> EnvState:
         return unpack(packed, self._spec(params))
 
-    def _present(self, state: EnvState, params: EnvParams) -> Stepped:
+    def _started(self, state: EnvState, params: EnvParams) -> Stepped:
         rewards = jnp.zeros(self.vector.num_envs)
         see = jax.vmap(self.vector.env.timestep, in_axes=(0, 0, None))
         return self._stepped(state, see(state, rewards, params))
 
     def _stepped(
-        self, state: EnvState, timestep: Timestep, present: Array | None = None
+        self, state: EnvState, timestep: Timestep, reported: Array | None = None
     ) -> Stepped:
-        """Pack states, and return them and outputs; infos are about (N,) ``present``."""
+        """Pack states, and return them and outputs; infos are about (N,) ``reported``."""
         # Without a barrier, what computes the parts is compiled into the loop that packs them.
         state, timestep = jax.lax.optimization_barrier((state, timestep))
-        present = jnp.ones(self.vector.num_envs, bool) if present is None else present
-        return pack(state), self._outputs(timestep, present)
+        reported = jnp.ones(self.vector.num_envs, bool) if reported is None else reported
+        return pack(state), self._outputs(timestep, reported)
 
     @staticmethod
     def _where(mask: Array, state: EnvState, otherwise: EnvState) -> EnvState:
@@ -157,7 +173,7 @@ class Programs:
     def _step(self, state: EnvState, action: Array, params: EnvParams) -> tuple[EnvState, Timestep]:
         return self.vector.step(state, action[None] if self.single else action, params)
 
-    def _outputs(self, timestep: Timestep, present: Array) -> dict[str, Any]:
+    def _outputs(self, timestep: Timestep, reported: Array) -> dict[str, Any]:
         done = timestep.terminated | timestep.truncated
         outputs = {
             "obs": timestep.obs,
@@ -173,7 +189,7 @@ class Programs:
         ended: dict[str, Any] = {
             name: info.pop(name) for name in ("final_obs", "final_info") if name in info
         }
-        info = _with_masks(info, present)
+        info = _with_masks(info, reported)
         if ended:
             ended["final_info"] = _with_masks(ended["final_info"], done)
             info |= _with_masks(ended, done)
@@ -184,6 +200,12 @@ class Programs:
 def programs_of(vector: VectorPixelEnv, single: bool) -> Programs:
     """Return the programs of environments, the same object for equal ones."""
     return Programs(vector, single)
+
+
+def _with_offsets(state: EnvState, offsets: Array | None) -> EnvState:
+    if offsets is None:
+        return state
+    return state.replace(sim=state.sim.replace(time_limit_offset=offsets))
 
 
 def _with_masks(info: Mapping[str, Any], mask: Array) -> dict[str, Any]:

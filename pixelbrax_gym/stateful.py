@@ -23,12 +23,12 @@ from pixelbrax_jax.config import env_config
 from pixelbrax_jax.memory import check_fits
 from pixelbrax_jax.types import EnvState
 
-Keep = Callable[[dict[str, Any]], Any]
+ExtraOf = Callable[[dict[str, Any]], Any]
 """Makes of a call's outputs what an adapter keeps beside the state."""
 
 
 @dataclass(frozen=True)
-class _Held:
+class _Snapshot:
     """What is kept between two calls, replaced as a whole or not at all.
 
     Attributes:
@@ -36,14 +36,14 @@ class _Held:
         done: () or (N,) bool, whether episodes have ended.
         spare: frames that nothing reads any more; None if there are none.
         shared: whether somebody else may read ``packed``.
-        kept: what the adapter keeps.
+        extra: what the adapter keeps beside them.
     """
 
     packed: Packed
     done: Any
     spare: jax.Array | None = None
     shared: bool = False
-    kept: Any = None
+    extra: Any = None
 
 
 class StatefulEnv:
@@ -109,7 +109,7 @@ class StatefulEnv:
         self.episode_length = config.episode_length
         self._programs = programs_of(vector, single)
         self._must_reset = autoreset_mode == "disabled"
-        self._held: _Held | None = None
+        self._snapshot: _Snapshot | None = None
         self._device: jax.Device | None = None
         self._closed = False
 
@@ -123,7 +123,8 @@ class StatefulEnv:
         seed: int | Sequence[int | None] | None,
         rng: np.random.Generator | None = None,
         mask: np.ndarray | None = None,
-        keep: Keep | None = None,
+        time_limit_offsets: np.ndarray | None = None,
+        extra_of: ExtraOf | None = None,
     ) -> dict[str, Any]:
         """Reset environments.
 
@@ -133,7 +134,9 @@ class StatefulEnv:
                 environment, or draws a seed if there was none yet.
             rng: where seeds are drawn from; by default from the operating system.
             mask: (N,) bool, which ones to reset; None means all.
-            keep: see ``step``.
+            time_limit_offsets: (N,) int32, control steps by which the time limits of the episodes
+                come early, at least 0 and less than the limit; None means 0.
+            extra_of: see ``step``.
 
         Returns:
             Outputs with reward 0; unmasked environments repeat their observation and flags.
@@ -148,35 +151,34 @@ class StatefulEnv:
         self._check_usable()
         seeds = seeds_of(seed, self.num_envs)
         where = np.ones(self.num_envs, bool) if mask is None else mask.copy()
-        if self._held is None:
+        if self._snapshot is None:
             if not where.all():
                 raise error.ResetNeeded("the first reset must be of all environments.")
-            self._place_params()
             rng = np.random.default_rng() if rng is None else rng
             first = int(rng.integers(SEEDS - self.num_envs + 1))
             seeds = [first + i if s is None else s for i, s in enumerate(seeds)]
         given = np.array([s is not None for s in seeds]) & where
         numbers = np.array([s or 0 for s in seeds], np.uint32)
         if given.all():
-            packed, outputs = self._programs.reset(numbers, self.params)
-            self._hold(packed, outputs, keep)
+            packed, outputs = self._programs.reset(numbers, self.params, time_limit_offsets)
+            self._replace(packed, outputs, extra_of)
             return outputs
-        held = self._present
-        # One call unless some environments are seeded and others are not.
-        if (where & ~given).any() or not given.any():
-            packed, outputs = self._programs.reset_where(
-                held.packed, where & ~given, where, self.params, None, self._spare(held)
-            )
-            held = _Held(packed, outputs["done"])
+        before = self._latest
+        parts: list[tuple[np.ndarray, np.ndarray | None]] = [(where & ~given, None)]
         if given.any():
+            # Two calls where some environments are seeded and others are not.
+            parts = [part for part in parts if part[0].any()] + [(given, numbers)]
+        for mask, new_seeds in parts:
+            spare = self._spare(before)
             packed, outputs = self._programs.reset_where(
-                held.packed, given, where, self.params, numbers, self._spare(held)
+                before.packed, mask, where, self.params, new_seeds, time_limit_offsets, spare
             )
-        self._hold(packed, outputs, keep)
+            before = _Snapshot(packed, outputs["done"])
+        self._replace(packed, outputs, extra_of)
         return outputs
 
     def step(
-        self, action: Any, mask: np.ndarray | None = None, keep: Keep | None = None
+        self, action: Any, mask: np.ndarray | None = None, extra_of: ExtraOf | None = None
     ) -> dict[str, Any]:
         """Step all environments, or some.
 
@@ -184,7 +186,7 @@ class StatefulEnv:
             action: (N, A) or, of a single environment, (A,); see ``as_actions``.
             mask: (N,) bool, which ones to step; None means all. The others stay as they are.
                 Not for a single environment.
-            keep: makes of the outputs what ``kept`` returns until the next call; it and the
+            extra_of: makes of the outputs what ``extra`` returns until the next call; it and the
                 states are replaced at once.
 
         Returns:
@@ -204,26 +206,25 @@ class StatefulEnv:
             self._check_not_done()
         shape = (self.env.action_size,)
         action = as_actions(action, shape if self.single else (self.num_envs, *shape), self.device)
-        held = self._present
+        before = self._latest
+        spare = self._spare(before)
         if mask is None:
-            packed, outputs = self._programs.step(
-                held.packed, action, self.params, self._spare(held)
-            )
+            packed, outputs = self._programs.step(before.packed, action, self.params, spare)
         else:
             packed, outputs = self._programs.step_where(
-                held.packed, mask, action, self.params, self._spare(held)
+                before.packed, mask, action, self.params, spare
             )
-        self._hold(packed, outputs, keep)
+        self._replace(packed, outputs, extra_of)
         return outputs
 
     @property
-    def kept(self) -> Any:
-        """What ``keep`` made of the last call's outputs; None if there was none."""
-        return None if self._held is None else self._held.kept
+    def extra(self) -> Any:
+        """What ``extra_of`` made of the last call's outputs; None if there was none."""
+        return None if self._snapshot is None else self._snapshot.extra
 
-    def keep(self, kept: Any) -> None:
-        """Replace ``kept``, and nothing else."""
-        self._held = replace(self._present, kept=kept)
+    def replace_extra(self, extra: Any) -> None:
+        """Replace ``extra``, and nothing else."""
+        self._snapshot = replace(self._latest, extra=extra)
 
     def get_state(self) -> EnvState:
         """Return the present states, with which ``set_state`` goes on to the bit.
@@ -234,8 +235,8 @@ class StatefulEnv:
             RuntimeError: this process is a fork that cannot run JAX.
         """
         self._check_ready("get_state")
-        self._held = replace(self._present, shared=True)
-        return self._programs.state(self._held.packed, self.params)
+        self._snapshot = replace(self._latest, shared=True)
+        return self._programs.state(self._latest.packed, self.params)
 
     def set_state(self, state: Any, mask: np.ndarray | None = None) -> dict[str, Any]:
         """Go on from given states.
@@ -257,16 +258,15 @@ class StatefulEnv:
         """
         self._check_usable()
         check_state(state, self._programs.state_spec(self.params))
-        self._place_params()
         if mask is None:
             packed, outputs = self._programs.start(state, self.params)
-        elif self._held is None:
+        elif self._snapshot is None:
             raise error.ResetNeeded("the first reset must be of all environments.")
         else:
             packed, outputs = self._programs.start_where(
-                self._held.packed, mask, state, self.params
+                self._snapshot.packed, mask, state, self.params
             )
-        self._hold(packed, outputs, None)
+        self._replace(packed, outputs, None)
         return outputs
 
     def set_time_limit(self, control_steps: int) -> None:
@@ -288,21 +288,6 @@ class StatefulEnv:
         """Time limit in calls of ``step``, of which the last may make fewer control steps."""
         return -(-self.episode_length // self.env.action_repeat)
 
-    def offset_time_limits(self, control_steps: np.ndarray) -> None:
-        """Let the time limits of the present episodes come early.
-
-        Args:
-            control_steps: (N,) int, by how much, at least 0 and less than the limit.
-
-        Raises:
-            ResetNeeded: before the first reset.
-            ClosedEnvironmentError: after ``close``.
-            RuntimeError: this process is a fork that cannot run JAX.
-        """
-        state = self.get_state()
-        offset = np.asarray(control_steps, np.int32)
-        self.set_state(state.replace(sim=state.sim.replace(time_limit_offset=offset)))
-
     def render(self, height: int, width: int) -> jax.Array:
         """Draw the present states, at any size.
 
@@ -322,11 +307,11 @@ class StatefulEnv:
         self._check_ready("render")
         what = f"images of num_envs={self.num_envs}, height={height}, width={width}"
         check_fits(what, 3 * self.num_envs * height * width)
-        return self._programs.images(self._present.packed, self.params, height, width)
+        return self._programs.images(self._latest.packed, self.params, height, width)
 
     def forget(self) -> None:
         """Let go of the states; a ``reset`` comes next."""
-        self._held = None
+        self._snapshot = None
 
     def close(self) -> None:
         """Let go of the states; only another ``close`` may follow."""
@@ -342,75 +327,70 @@ class StatefulEnv:
 
     def __deepcopy__(self, memo: dict[int, Any]) -> StatefulEnv:
         """Return an environment that goes on by itself, and shares what neither writes to."""
-        if self._held is not None:
-            self._held = replace(self._held, shared=True)
         copied = memo[id(self)] = object.__new__(type(self))
+        if self._snapshot is not None:
+            self._snapshot = replace(self._snapshot, shared=True, spare=None)
         copied.__dict__.update(self.__dict__)
+        if self._snapshot is not None:
+            # It may be handed out, and written to then.
+            extra = jax.tree.map(lambda x: x.copy(), self._snapshot.extra)
+            copied._snapshot = replace(self._snapshot, extra=extra)
         return copied
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what is pickled: arrays in the host's memory, no device."""
-        held = self._held
-        if held is not None:
-            arrays = jax.tree.map(np.asarray, (held.packed, held.done, held.kept))
-            held = _Held(arrays[0], arrays[1], kept=arrays[2])
-        return self.__dict__ | {
-            "_held": held,
-            "_device": None,
-            "params": jax.tree.map(np.asarray, self.params),
-        }
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        held = self._held
-        if held is not None:
-            self._place_params()
-            arrays = jax.device_put((held.packed, held.done, held.kept))
-            self._held = _Held(arrays[0], arrays[1], kept=arrays[2])
+        snapshot = self._snapshot
+        if snapshot is not None:
+            arrays = jax.device_get((snapshot.packed, snapshot.done, snapshot.extra))
+            snapshot = _Snapshot(arrays[0], arrays[1], extra=arrays[2])
+        params = jax.device_get(self.params)
+        return self.__dict__ | {"_snapshot": snapshot, "_device": None, "params": params}
 
     def _check_usable(self) -> None:
         check_not_forked()
         if self._closed:
             raise error.ClosedEnvironmentError("the environment is closed; make a new one.")
+        self._place()
 
     @property
-    def _present(self) -> _Held:
-        assert self._held is not None
-        return self._held
+    def _latest(self) -> _Snapshot:
+        assert self._snapshot is not None
+        return self._snapshot
 
-    def _hold(self, packed: Packed, outputs: dict[str, Any], keep: Keep | None) -> None:
-        """Replace what is held by the states after a call."""
-        before = self._held
+    def _replace(self, packed: Packed, outputs: dict[str, Any], extra_of: ExtraOf | None) -> None:
+        """Take the states after a call in place of those before it."""
+        before = self._snapshot
         spare = None if before is None or before.shared else before.packed.frames
         read_under_guard(outputs)
-        kept = None if keep is None else keep(outputs)
-        self._held = _Held(packed, outputs["done"], spare, kept=kept)
+        extra = None if extra_of is None else extra_of(outputs)
+        self._snapshot = _Snapshot(packed, outputs["done"], spare, extra=extra)
 
     @staticmethod
-    def _spare(held: _Held) -> jax.Array:
+    def _spare(snapshot: _Snapshot) -> jax.Array:
         """Return memory for the next frames."""
-        # It was handed to a call whose results an exception has kept from arriving.
-        if held.spare is None or held.spare.is_deleted():
-            return jax.device_put(np.zeros(held.packed.frames.shape, np.uint8))
-        return held.spare
+        # An interrupted call has taken the spare and left nothing in its place.
+        if snapshot.spare is None or snapshot.spare.is_deleted():
+            return jax.device_put(np.zeros(snapshot.packed.frames.shape, np.uint8))
+        return snapshot.spare
 
-    def _place_params(self) -> None:
-        """Put the parameters on the device, once."""
+    def _place(self) -> None:
+        """Put what a pickle has brought on the device, and find out which one it is."""
         if self._device is not None:
             return
-        # Clips are there already, and once for all.
-        clips = self.params.clips
-        params = jax.device_put(self.params.replace(clips=None)).replace(clips=clips)
-        self._device = next(iter(params.episode_length.devices()))
-        self.params = params
+        snapshot = self._snapshot
+        if snapshot is not None:
+            packed, done, extra = jax.device_put((snapshot.packed, snapshot.done, snapshot.extra))
+            self._snapshot = _Snapshot(packed, done, extra=extra)
+        self.params = jax.device_put(self.params)
+        self._device = next(iter(self.params.episode_length.devices()))
 
     def _check_ready(self, what: str) -> None:
         self._check_usable()
-        if self._held is None:
+        if self._snapshot is None:
             raise error.ResetNeeded(f"call reset() before {what}().")
 
     def _check_not_done(self) -> None:
-        done = np.atleast_1d(np.asarray(self._present.done))
+        done = np.atleast_1d(np.asarray(self._latest.done))
         if not done.any():
             return
         if self.single:

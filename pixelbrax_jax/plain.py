@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import enum
 import os
 from collections.abc import Mapping
 from importlib import import_module
@@ -37,8 +38,10 @@ def to_plain(value: Any) -> Any:
         value: of an option of ``pixelbrax_jax.make`` or an environment of ``pixelbrax_gym``.
 
     Raises:
-        ValueError: JSON has nothing for it, such as a bank of clips.
+        ValueError: JSON has nothing for it, such as a bank of clips or a class that no module has.
     """
+    if isinstance(value, enum.Enum):
+        return to_plain(value.value)
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
     if isinstance(value, os.PathLike):
@@ -51,8 +54,9 @@ def to_plain(value: Any) -> Any:
         return np.asarray(value).tolist()
     cls = type(value)
     if cls in _NAMES or (isinstance(value, Distractor) and dataclasses.is_dataclass(value)):
-        name = _NAMES.get(cls, f"{cls.__module__}:{cls.__qualname__}")
-        parts = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+        name = _NAMES.get(cls) or _name_in_module(cls)
+        fields = [field.name for field in dataclasses.fields(value) if field.init]
+        parts = {name: getattr(value, name) for name in fields}
         return {TYPE: name} | {name: to_plain(part) for name, part in parts.items()}
     raise ValueError(f"JSON has nothing for a {cls.__name__}.")
 
@@ -75,16 +79,27 @@ def from_plain(value: Any) -> Any:
         )
     cls = _type_of(value[TYPE])
     parts = {name: part for name, part in value.items() if name != TYPE}
-    fields = {field.name: field for field in dataclasses.fields(cls)}
+    fields = {field.name: field for field in dataclasses.fields(cls) if field.init}
     check_options(parts, fields)
     return cls(**{name: _field(part, fields[name]) for name, part in parts.items()})
+
+
+def _name_in_module(cls: type) -> str:
+    name = f"{cls.__module__}:{cls.__qualname__}"
+    # Another process has another `__main__`, and none has what a function has made.
+    if cls.__module__ == "__main__" or "<locals>" in name:
+        raise ValueError(f"JSON has nothing for a class that no module has, such as {name}.")
+    return name
 
 
 def _type_of(name: Any) -> Any:
     if not isinstance(name, str) or ":" not in name:
         return _TYPES[check_choice(f"entry {TYPE!r}", name, _TYPES)]
     module, _, path = name.partition(":")
-    cls: Any = import_module(module)
+    try:
+        cls: Any = import_module(module)
+    except ModuleNotFoundError as error:
+        raise ValueError(f"{TYPE}={name!r}: {error}.") from error
     for part in path.split("."):
         cls = getattr(cls, part, None)
     if not (isinstance(cls, type) and issubclass(cls, Distractor)):

@@ -138,11 +138,10 @@ def make(task: str | EnvConfig, **options: Any) -> tuple[PixelEnv, EnvParams]:
         geoms=seen_from(physics.geoms, rig),
         rig=rig,
         look=_look(config, physics),
-        clips=_clips(config, env),
         episode_length=np.int32(config.episode_length),
     )
     # Here, so that no program has to: JAX may be told to refuse that (`jax.transfer_guard`).
-    return env, jax.device_put(params)
+    return env, jax.device_put(params).replace(clips=_clips(config, env))
 
 
 def _check_device() -> None:

@@ -110,6 +110,13 @@ def play_gymnasium() -> dict[str, Any]:
     env = gymnasium.make("PixelBrax/InvertedPendulum-v0", render_mode="rgb_array", **SIZE)
     found = {"reset": env.reset(seed=0), "step": env.step(np.full(1, 0.5))}
     found["render"] = env.render()
+    state = env.unwrapped.get_state()
+    env.step(np.full(1, 0.5))
+    found["state"] = env.reset(options={"state": state})
+    single = env.unwrapped._stateful
+    key = jax.jit(jax.random.key)(jax.device_put(np.uint32(0)))
+    pose = jax.device_put(np.array([0.1, 0.2]))
+    found["from_qpos"] = outputs(single.env.from_qpos(pose, None, key, single.params)[1])
     envs = gymnasium.make_vec("PixelBrax/InvertedPendulum-v0", num_envs=2, **SIZE)
     found["vector reset"] = envs.reset(seed=0)
     found["vector step"] = envs.step(np.full((2, 1), 0.5, np.float32))

@@ -224,6 +224,8 @@ class PixelBraxEnv(gymnasium.Env):
         calls = None if self._stateful.is_limited else time_limit_around(self)
         if calls is not None and calls > self._stateful.max_episode_steps:
             self._stateful.set_time_limit(calls * self._stateful.env.action_repeat)
+            if self._spec is not None:
+                self._spec.max_episode_steps = calls
 
     def _show(self) -> None:
         if self._window is not None:

@@ -37,8 +37,7 @@ def complete_spec(spec: EnvSpec | None, stateful: StatefulEnv, limited: bool) ->
     Args:
         spec: what Gymnasium knows of the environment.
         stateful: what was made.
-        limited: whether the limit in control steps belongs to it, besides the one in calls of
-            ``step``.
+        limited: whether ``episode_length`` is among the options of the spec.
 
     Returns:
         The spec with the time limit, and with options as what JSON has.
@@ -59,13 +58,13 @@ def complete_spec(spec: EnvSpec | None, stateful: StatefulEnv, limited: bool) ->
 
 
 def time_limit_around(env: gymnasium.Env) -> int | None:
-    """Return the limit of the ``TimeLimit`` wrappers through which a method of ``env`` is called.
+    """Return the limit of the ``TimeLimit`` wrappers through which ``env`` is reset.
 
     ``gymnasium.make`` tells its ``max_episode_steps`` to such a wrapper alone, so that an
     environment with a limit of its own cannot know otherwise that a longer one was asked for.
 
     Args:
-        env: an environment, called by its wrappers.
+        env: an environment, of which ``reset`` is running.
 
     Returns:
         Calls of ``step``, the least of several; None without such a wrapper.
@@ -73,9 +72,11 @@ def time_limit_around(env: gymnasium.Env) -> int | None:
     limits: list[int] = []
     frame: FrameType | None = sys._getframe(1)
     while frame is not None:
-        caller = frame.f_locals.get("self")
-        if isinstance(caller, TimeLimit) and caller.unwrapped is env:
-            limits.append(caller._max_episode_steps)
+        # Of no other frame: to look at its variables may keep them alive.
+        if frame.f_code is TimeLimit.reset.__code__:
+            wrapper = frame.f_locals["self"]
+            if wrapper.unwrapped is env:
+                limits.append(wrapper._max_episode_steps)
         frame = frame.f_back
     return min(limits, default=None)
 

@@ -145,7 +145,7 @@ class PixelBraxSB3VecEnv(VecEnv):
         # SB3's wrappers ask for a number here, beside its lists.
         self.metadata: dict[str, Any] = self.metadata | {"render_fps": self._stateful.fps}
         offsets = np.arange(num_envs) * self._stateful.episode_length // num_envs
-        self._time_limit_offsets = offsets if stagger else None
+        self._time_limit_offsets = offsets.astype(np.int32) if stagger else None
         self._actions: Any = None
 
     def reset(self) -> Any:
@@ -164,9 +164,7 @@ class PixelBraxSB3VecEnv(VecEnv):
         self._reset_options()
         for options in given:
             check_reset_options(options)
-        outputs = self._stateful.reset(self._seeds)
-        if self._time_limit_offsets is not None:
-            self._stateful.offset_time_limits(self._time_limit_offsets)
+        outputs = self._stateful.reset(self._seeds, time_limit_offsets=self._time_limit_offsets)
         self._reset_seeds()
         self.reset_infos = [{} for _ in range(self.num_envs)]
         return self._observations(outputs["obs"])

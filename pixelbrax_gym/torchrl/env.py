@@ -134,10 +134,10 @@ class PixelBraxTorchRLEnv(EnvBase):
             to_reset |= np.array([seed is not None for seed in seeds])
         # Handed out once, and so never shared by two who might write to it.
         if to_reset.any() or first_obs is None:
-            outputs = self._stateful.reset(seeds, mask=to_reset, keep=lambda _: (None, left))
+            outputs = self._stateful.reset(seeds, mask=to_reset, extra_of=lambda _: (None, left))
             first_obs = outputs["obs"]
         else:
-            self._stateful.keep((None, left))
+            self._stateful.replace_extra((None, left))
         if self._seeds is not None:
             later = [None if here else seed for seed, here in zip(self._seeds, mask, strict=True)]
             self._seeds = later if any(seed is not None for seed in later) else None
@@ -149,7 +149,7 @@ class PixelBraxTorchRLEnv(EnvBase):
 
         Kept with the state, so that an exception at any time leaves the two in step.
         """
-        first_obs, where = self._stateful.kept or (None, np.zeros(self._num_envs, bool))
+        first_obs, where = self._stateful.extra or (None, np.zeros(self._num_envs, bool))
         return first_obs, np.asarray(where)
 
     def _reset_proc_data(
@@ -195,7 +195,7 @@ class PixelBraxTorchRLEnv(EnvBase):
             where = outputs["info"]["_final_obs"]
             return outputs["obs"], where if mask is None else began | np.asarray(outputs["done"])
 
-        outputs = self._stateful.step(action.to(self._jax_device), mask, keep=begun)
+        outputs = self._stateful.step(action.to(self._jax_device), mask, extra_of=begun)
         infos = outputs["info"]
         names = ("reward", "done", "terminated", "truncated")
         exported = to_torch(

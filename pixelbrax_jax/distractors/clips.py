@@ -30,7 +30,14 @@ MAX_BYTES = 2 * 1024**3
 _CACHE_VERSION = 2
 """Raised when the same files would give other pixels."""
 
-_NOT_THE_USER = {"pixelbrax_jax", "pixelbrax_gym", "gymnasium", "stable_baselines3", "torchrl"}
+_NOT_THE_USER = {
+    "pixelbrax_jax",
+    "pixelbrax_gym",
+    "gymnasium",
+    "stable_baselines3",
+    "torchrl",
+    "contextlib",
+}
 """Packages between a user's line and ``load_clips``."""
 
 

@@ -180,6 +180,7 @@ class PixelEnv(ProgramConfig):
         return self._reset(state.key, state.sim.episode + 1, params)
 
     @partial(jax.jit, static_argnums=0)
+    @under_default_flags
     def from_qpos(
         self, qpos: jax.Array, qvel: jax.Array | None, key: jax.Array, params: EnvParams
     ) -> tuple[EnvState, Timestep]:

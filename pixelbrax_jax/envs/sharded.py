@@ -8,6 +8,7 @@ from functools import cached_property, partial
 from typing import Any
 
 import jax
+import numpy as np
 from jax.sharding import AxisType, Mesh, PartitionSpec
 
 from pixelbrax_jax.envs.param_rows import split_params
@@ -27,12 +28,8 @@ def make_env_mesh(num_devices: int | None = None) -> Mesh:
     Args:
         num_devices: how many; None takes all, those of other processes too.
     """
-    return _mesh(num_devices=jax.device_count() if num_devices is None else num_devices)
-
-
-def _mesh(devices: list[jax.Device] | None = None, *, num_devices: int = 0) -> Mesh:
-    shape = (len(devices) if devices else num_devices,)
-    return jax.make_mesh(shape, (AXIS,), axis_types=(AxisType.Auto,), devices=devices)
+    num_devices = jax.device_count() if num_devices is None else num_devices
+    return jax.make_mesh((num_devices,), (AXIS,), axis_types=(AxisType.Auto,))
 
 
 @dataclass(frozen=True)
@@ -80,7 +77,9 @@ class ShardedVectorEnv:
                 f"environments spread over devices {state['mesh']} need devices {missing}, which "
                 f"this process has not; it has {sorted(devices)}."
             )
-        mesh = _mesh([devices[i] for i in state["mesh"]])
+        # In their order, which `jax.make_mesh` might change.
+        own = np.array([devices[i] for i in state["mesh"]])
+        mesh = Mesh(own, (AXIS,), axis_types=(AxisType.Auto,))
         self.__dict__.update(state | {"mesh": mesh})
 
     @partial(jax.jit, static_argnums=0)

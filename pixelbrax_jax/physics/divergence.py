@@ -38,12 +38,12 @@ class GuardedPhysics(abc.ABC):
     def _watched(self, state: PhysicsState) -> Any:
         """Return a tree of what must be finite besides observation and reward."""
 
-    def __reduce__(self) -> Any:
+    def __reduce_ex__(self, protocol: Any) -> Any:
         """Return what is pickled: of a task of the package, how it is made."""
         identity = getattr(self, "_identity", None)
         if isinstance(identity, Recipe):
             return identity.make, identity.arguments
-        return super().__reduce_ex__(2)
+        return super().__reduce_ex__(protocol)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> GuardedPhysics:
         """Return the object itself, which nothing changes."""

@@ -82,7 +82,7 @@ def some_steps(env, count):
                 )["next"]
             seen.append({name: tensors[name] for name in ("pixels", "observation", "done")})
         else:
-            done = env._stateful._held.done
+            done = env._stateful._snapshot.done
             if env._stateful._must_reset and np.any(done):
                 seen.append(env.reset(options={"reset_mask": np.asarray(done)}))
             seen.append(env.step(np.full((3, 1), 0.1 * i, np.float32)))
@@ -114,11 +114,36 @@ def test_a_deep_copy_shares_what_nothing_writes_to():
     other = copy.deepcopy(env)
     assert other._stateful.params is env._stateful.params
     assert other._stateful._programs is env._stateful._programs
-    assert other._stateful._held is env._stateful._held
+    assert other._stateful._snapshot.packed is env._stateful._snapshot.packed
     # Both are the next to write, and neither into what the other reads.
-    frames = env._stateful._held.packed.frames
+    frames = env._stateful._snapshot.packed.frames
     some_steps(env, 4), some_steps(other, 4)
     assert not frames.is_deleted()
+
+
+def test_a_deep_copy_is_not_reached_by_what_torch_writes():
+    env, clean = torchrl(), torchrl()
+    while not env._begun[1].any():
+        some_steps(env, 1), some_steps(clean, 1)
+    twin = copy.deepcopy(env)
+    began = torch.tensor(env._begun[1])[:, None]
+    first = [e.reset(e.full_done_spec.zero().set("_reset", began)) for e in (clean, env)]
+    first[1]["pixels"].zero_()
+    after = twin.reset(twin.full_done_spec.zero().set("_reset", began))
+    assert torch.equal(after["pixels"], first[0]["pixels"])
+    assert after["pixels"].any()
+
+
+def test_clips_are_on_the_device_once_and_after_a_pickle_too():
+    options = {"height": 12, "width": 12, "distractors": "video", "clips": "procedural"}
+    envs = [gymnasium.make_vec(ID, num_envs=3, **options) for _ in range(2)]
+    packed = [env._stateful.params.clips.packed for env in envs]
+    assert packed[0].unsafe_buffer_pointer() == packed[1].unsafe_buffer_pointer()
+    envs[0].reset(seed=0)
+    restored = pickle.loads(pickle.dumps(envs[0]))
+    expected = some_steps(envs[0], 3)
+    assert some_steps(restored, 3) == expected
+    assert all(isinstance(x, jax.Array) for x in jax.tree.leaves(restored._stateful.params))
 
 
 @pytest.mark.parametrize("task", ["inverted_pendulum", "dmc_cartpole_swingup"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 import signal
 import sys
+import time
 
 import gymnasium
 import numpy as np
@@ -12,7 +13,11 @@ import pytest
 import torch
 
 import pixelbrax_gym
+from pixelbrax_jax import compilation
 from tests.gym.conftest import ID, SIZE, TASK
+
+# JAX calls Python from within, e.g. in callbacks of weak references: what is raised there is lost.
+pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 
 SIGNALS = 60
 """Of each adapter."""
@@ -28,7 +33,7 @@ def single():
     env = gymnasium.make(ID, **OPTIONS)
 
     def step():
-        if env.unwrapped._stateful._held.done:
+        if env.unwrapped._stateful._snapshot.done:
             env.reset()
         else:
             env.step(np.zeros(1, np.float32))
@@ -85,7 +90,7 @@ ADAPTERS = {
 
 def held(env):
     """The state that an adapter holds, and what it keeps beside it."""
-    now = env._stateful._held
+    now = env._stateful._snapshot
     begun = env._begun[1].tobytes() if hasattr(env, "_begun") else b""
     arrays = (np.asarray(array).tobytes() for array in now.packed)
     return b"".join(arrays) + np.asarray(now.done).tobytes() + begun
@@ -110,42 +115,43 @@ def test_a_signal_leaves_the_state_before_or_after_a_step(name, interrupt):
     reset()
     states = [held(env)]
     # Later steps take the ways of the earlier ones, with everything compiled.
-    for _ in range(40):
+    for _ in range(60):
+        start = time.perf_counter()
         step()
+        seconds = time.perf_counter() - start
         states.append(held(env))
     places = {state: i for i, state in enumerate(states)}
     assert len(places) == len(states)
-    delays = random.Random(0)
-    changed = 0
-    for _ in range(SIGNALS):
+    delays, arrived, moved = random.Random(0), 0, 0
+    while arrived < SIGNALS:
         reset()
-        count = -1
-        interrupt(10 ** delays.uniform(-4.5, -2.5))
+        count = 0
         try:
-            for count in range(40):  # noqa: B007
+            interrupt(seconds * delays.uniform(0.01, 20.0))
+            while count < 50:
                 step()
+                count += 1
             interrupt(0)
-        except InterruptedStepError:
-            pass
-        else:
             continue
+        except InterruptedStepError:
+            arrived += 1
         now = places[held(env)]
-        # `count` steps have returned, and perhaps one more, or the loop's own next was interrupted.
-        assert now in (max(count, 0), max(count, 0) + 1)
-        changed += now > 0
+        # `count` steps have been counted; one more may be done.
+        assert now in (count, count + 1)
+        moved += now > 0
         for _ in range(3):
             step()
-        assert held(env) == states[now + 3] if now + 3 < len(states) else True
-    assert changed > SIGNALS // 4
+        assert held(env) == states[now + 3]
+    assert moved > SIGNALS // 4
 
 
 def raising_at(last):
-    """A trace function that raises at a line of the package, after so many others."""
+    """A trace function that raises at a line that a step passes, after so many others."""
     seen = 0
 
     def trace(frame, event, argument):
         nonlocal seen
-        if not frame.f_code.co_filename.startswith(PACKAGE):
+        if not frame.f_code.co_filename.startswith((PACKAGE, compilation.__file__)):
             return None
         if event == "line":
             seen += 1
@@ -166,6 +172,7 @@ def test_an_exception_at_every_line_leaves_a_usable_environment(name):
     while True:
         reset()
         before = held(env)
+        former = sys.gettrace()
         try:
             sys.settrace(raising_at(lines))
             step()
@@ -173,7 +180,7 @@ def test_an_exception_at_every_line_leaves_a_usable_environment(name):
         except InterruptedStepError:
             pass
         finally:
-            sys.settrace(None)
+            sys.settrace(former)
         interrupted = held(env)
         if interrupted == before:
             step()
@@ -192,8 +199,8 @@ def test_learning_goes_on_after_interruptions(interrupt):
     model.learn(64)
     delays, interrupted = random.Random(0), 0
     while interrupted < 10:
-        interrupt(delays.uniform(0.001, 0.05))
         try:
+            interrupt(delays.uniform(0.001, 0.05))
             model.learn(10_000)
         except InterruptedStepError:
             interrupted += 1

@@ -58,7 +58,7 @@ def test_nothing_exported_is_part_of_the_state(make_vector, mode):
         stateful.step(ACTIONS),
         stateful.reset(None, np.random.default_rng(0), np.array([True, False, False])),
     ):
-        assert not pointers(outputs) & pointers(stateful._held.packed)
+        assert not pointers(outputs) & pointers(stateful._snapshot.packed)
 
 
 @pytest.mark.parametrize("mode", ["next_step", "same_step", "disabled"])

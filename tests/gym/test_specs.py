@@ -10,6 +10,7 @@ import jax
 import numpy as np
 import pytest
 from gymnasium.envs.registration import EnvSpec
+from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers import TimeLimit
 
 import pixelbrax_gym
@@ -43,6 +44,8 @@ def test_a_limit_beyond_the_default_is_heeded(options, expected):
     assert calls_until_truncated(gymnasium.make(env.spec)) == expected
     if "max_episode_steps" in options:
         assert env.spec.max_episode_steps == options["max_episode_steps"]
+        if "episode_length" not in options:
+            assert env.unwrapped.spec.max_episode_steps in (expected, 500)
     many = gymnasium.make_vec(ID, num_envs=2, vectorization_mode="sync", **options)
     many.reset(seed=0)
     for _ in range(expected):
@@ -108,6 +111,22 @@ def test_a_distractor_of_ones_own_and_a_folder_go_through_json():
     assert '"clips": "/nowhere"' in spec.to_json()
 
 
+def test_values_of_enumerations_go_through_json():
+    env = gymnasium.make_vec(ID, num_envs=2, autoreset_mode=AutoresetMode.SAME_STEP, **SIZE)
+    again = gymnasium.make_vec(EnvSpec.from_json(env.spec.to_json()))
+    assert again.autoreset_mode == AutoresetMode.SAME_STEP
+
+
+def test_a_class_of_no_module_is_named():
+    @dataclass(frozen=True)
+    class Local(distractors.Distractor):
+        kind = "local"
+        stream = 92
+
+    with pytest.raises(ValueError, match="distractors="):
+        gymnasium.make(ID, **SIZE, distractors=Local()).spec.to_json()
+
+
 def test_what_json_has_nothing_for_is_named():
     bank = pixelbrax_jax.load_clips("procedural", height=12, width=12, num_clips=1)
     env = gymnasium.make(ID, **SIZE, distractors="video", clips=bank)
@@ -122,6 +141,7 @@ def test_what_json_has_nothing_for_is_named():
         ({"look": {"ground": "grid"}}, ValueError, "needs an entry 'type', one of Camera,"),
         ({"look": {"type": "Lok"}}, ValueError, "unknown entry 'type': 'Lok'.*'Look'"),
         ({"distractors": {"type": "color", "scal": 1}}, TypeError, "'scal'.*'scale'"),
+        ({"distractors": [{"type": "no_such:Path"}]}, ValueError, "no_such:Path.*No module named"),
         ({"distractors": [{"type": "pathlib:Path"}]}, ValueError, "'pathlib:Path' is no distract"),
         ({"distractors": {"type": "color", "scale": -1.0}}, ValueError, "scale"),
         ({"camera": {"type": "color"}}, TypeError, "camera must be"),

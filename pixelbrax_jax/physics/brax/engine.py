@@ -153,10 +153,10 @@ class BraxPhysics(GuardedPhysics):
     def __hash__(self) -> int:
         return hash(self._identity)
 
-    def __reduce__(self) -> Any:
+    def __reduce_ex__(self, protocol: Any) -> Any:
         """Return what is pickled: how it is made, or of which environment."""
         if isinstance(self._identity, Recipe):
-            return super().__reduce__()
+            return super().__reduce_ex__(protocol)
         return _restore, (type(self), without_modules(self._source), self._options)
 
     def _read_cameras(self, model: mujoco.MjModel) -> None:
