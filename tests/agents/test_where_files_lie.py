@@ -6,6 +6,8 @@ import json
 import shutil
 import sys
 
+import jax
+import numpy as np
 import pytest
 
 from pixelbrax_jax import make, named_rigs, registry
