@@ -36,15 +36,17 @@ _ALLOCATOR = "XLA_PYTHON_CLIENT_ALLOCATOR"
 
 _XLA_FLAGS = "XLA_FLAGS"
 
+_PATIENCE = 120.0  # seconds; a GPU's driver takes tens of them
+
 
 @dataclass(frozen=True)
 class _Variable:
     """An environment variable that other tools leave behind.
 
     Attributes:
-        package: which reads it.
-        code: fails where it does.
-        level: of the finding, as in ``Finding``.
+        package: the package that reads it.
+        code: a program that fails if the package cannot work with the variable's value.
+        level: how bad that is, as in ``Finding``.
         text: what no longer works.
     """
 
@@ -361,12 +363,25 @@ def _broken_variables() -> dict[str, str]:
     for name, variable in _VARIABLES.items():
         if not os.environ.get(name) or _version(variable.package) is None:
             continue
-        command = [sys.executable, "-c", variable.code]
-        result = subprocess.run(command, capture_output=True, text=True, check=False)
-        if result.returncode:
-            lines = [line for line in result.stderr.splitlines() if line.strip()]
-            broken[name] = lines[-1][:200] if lines else f"exit status {result.returncode}"
+        without = {key: value for key, value in os.environ.items() if key != name}
+        why = _why_it_fails(variable.code, dict(os.environ))
+        # What fails in the same way without it has another cause.
+        if why and why != _why_it_fails(variable.code, without):
+            broken[name] = why
     return broken
+
+
+def _why_it_fails(code: str, environ: dict[str, str]) -> str:
+    """Return the last line of what a program says of its failure; empty if it passes."""
+    command = [sys.executable, "-c", code]
+    try:
+        result = subprocess.run(
+            command, env=environ, capture_output=True, text=True, check=False, timeout=_PATIENCE
+        )
+    except subprocess.TimeoutExpired:
+        return f"no end after {_PATIENCE:.0f} s"
+    said = result.stderr.strip().rpartition("\n")[2][:200]
+    return (said or f"exit status {result.returncode}") if result.returncode else ""
 
 
 def _why_no_cache() -> str:

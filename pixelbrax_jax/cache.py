@@ -13,7 +13,7 @@ def cache_folder(given: str | Path | None = None) -> Path:
         given: by the caller; None means ``$PIXELBRAX_CACHE``, else ``~/.cache/pixelbrax``.
 
     Raises:
-        FileNotFoundError: the user has no home folder, and it would be in it.
+        FileNotFoundError: the user has no home folder, and it would be in it; with the fix.
     """
     named = given or os.environ.get("PIXELBRAX_CACHE")
     if named:
@@ -21,7 +21,9 @@ def cache_folder(given: str | Path | None = None) -> Path:
     try:
         return Path.home() / ".cache" / "pixelbrax"
     except RuntimeError as error:  # as of a container's user that has no entry anywhere
-        raise FileNotFoundError("the user has no home folder") from error
+        raise FileNotFoundError(
+            "the user has no home folder; set HOME, or PIXELBRAX_CACHE to a folder"
+        ) from error
 
 
 def in_home(path: Path) -> Path:

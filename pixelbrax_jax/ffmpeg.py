@@ -23,8 +23,8 @@ def find_ffmpeg() -> str:
 
     Raises:
         ImportError: imageio-ffmpeg, which brings it, is not installed.
-        OSError: there is none for this machine, or ``IMAGEIO_FFMPEG_EXE`` names none; with the
-            fix.
+        OSError: there is none for this machine, it may not be started, or ``IMAGEIO_FFMPEG_EXE``
+            names none; with the fix.
     """
     import imageio_ffmpeg
 
@@ -35,6 +35,11 @@ def find_ffmpeg() -> str:
             f"there is no FFmpeg for this machine; install it, or name it in {_VARIABLE}."
         ) from error
     if shutil.which(program) is None:
+        if not os.environ.get(_VARIABLE):
+            raise FileNotFoundError(
+                f"the FFmpeg that imageio-ffmpeg brings, {program}, cannot be started; install "
+                "imageio-ffmpeg again."
+            )
         raise FileNotFoundError(
             f"the environment variable {_VARIABLE} is {program!r}, which is no program; unset it "
             "to use the FFmpeg that imageio-ffmpeg brings."
@@ -84,8 +89,10 @@ class Encoder:
         Raises:
             OSError: FFmpeg could not write it; with its reason.
         """
-        odd = [(0, side % 2) for side in frame.shape[:2]]
-        frame = np.ascontiguousarray(np.pad(frame, (*odd, (0, 0)), mode="edge"))
+        height, width = (side % 2 for side in frame.shape[:2])
+        if height or width:
+            frame = np.pad(frame, ((0, height), (0, width), (0, 0)), mode="edge")
+        frame = np.ascontiguousarray(frame)
         if self._process is None:
             self._start(*frame.shape[:2])
         assert self._process is not None
@@ -98,7 +105,9 @@ class Encoder:
 
     def _start(self, height: int, width: int) -> None:
         taken = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"]
-        given = ["-f", "mp4", "-pix_fmt", "yuv420p", str(self._path.absolute())]
+        # By name: an FFmpeg without it would write what few players play.
+        h264 = ["-c:v", "libx264", "-pix_fmt", "yuv420p"]
+        given = ["-f", "mp4", *h264, str(self._path.absolute())]
         # A file, as a pipe that nobody reads would stop FFmpeg once it is full.
         self._log = tempfile.TemporaryFile()  # noqa: SIM115
         self._process = _start(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import struct
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,10 @@ from pixelbrax_jax.extras import install_extra
 from pixelbrax_jax.ffmpeg import Decoder, Encoder
 
 SUFFIXES = (".gif", ".mp4")
+
+_LONGEST = 655_350.0
+"""Milliseconds for which a GIF can show one image: hundredths of a second, in 16 bits."""
+
 NO_WRITER = f"a video needs imageio-ffmpeg and Pillow; try: {install_extra('video')}"
 
 
@@ -32,8 +37,8 @@ def write_frames(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> 
         The path.
 
     Raises:
-        ValueError: the suffix is another, ``fps`` is not positive, there are no frames, or one is
-            of another shape or dtype.
+        ValueError: the suffix is another, ``fps`` is not positive, there are no frames, one is
+            of another shape or dtype, or a GIF would stand still for more than 655 s.
         ImportError: imageio-ffmpeg or Pillow is not installed, with the fix.
         OSError: the file cannot be written, or is not what was given; with the reason.
     """
@@ -61,7 +66,10 @@ def write_frames(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> 
             path.unlink()
     if shape is None:
         raise ValueError(f"{path} was not written: there are no frames.")
-    (_check_gif if gif else _check_mp4)(path, count, shape, fps)
+    if gif:
+        _check_gif(path, count, shape, fps)
+    else:
+        _check_mp4(path, count, shape)
     return path
 
 
@@ -77,12 +85,20 @@ class _Gif:
 
     def append(self, frame: np.ndarray) -> None:
         image = self._from_array(frame)
-        # Older releases of Pillow lose the time of equal images.
-        if self._images and image == self._images[-1]:
-            self._times[-1] += self._milliseconds
+        # Older releases of Pillow lose the time of equal images; newer ones add it up, too.
+        still = bool(self._images) and image == self._images[-1]
+        time = self._milliseconds + (self._times[-1] if still else 0.0)
+        if time > _LONGEST:
+            raise ValueError(
+                f"{self._path} is not whole: a GIF shows an image for at most "
+                f"{_LONGEST / 1000:.0f} s, and equal frames last longer; write an .mp4, or raise "
+                "fps."
+            )
+        if still:
+            self._times[-1] = time
         else:
             self._images.append(image)
-            self._times.append(self._milliseconds)
+            self._times.append(time)
 
     def close(self) -> None:
         if not self._images:
@@ -92,9 +108,12 @@ class _Gif:
         moving = {"save_all": True, "duration": times, "loop": 0}
         try:
             first.save(self._path, format="GIF", append_images=others, **moving)
-        except OSError as error:
-            self._path.unlink(missing_ok=True)
-            raise OSError(f"{self._path} was not written: {error}.") from error
+        except BaseException as error:
+            self._path.unlink(missing_ok=True)  # a part of a file that nothing shows
+            # Of a side or a time that 16 bits cannot hold.
+            if isinstance(error, (OSError, struct.error)):
+                raise OSError(f"{self._path} was not written: {error}.") from error
+            raise
 
 
 def _check_frame(frame: np.ndarray, first: tuple[int, int, int] | None) -> tuple[int, int, int]:
@@ -106,8 +125,7 @@ def _check_frame(frame: np.ndarray, first: tuple[int, int, int] | None) -> tuple
     return shape
 
 
-def _check_mp4(path: Path, count: int, shape: tuple[int, int, int], fps: float) -> None:
-    del fps
+def _check_mp4(path: Path, count: int, shape: tuple[int, int, int]) -> None:
     expected = (shape[0] + shape[0] % 2, shape[1] + shape[1] % 2, 3)
     decoder = Decoder(path)
     found = [frame.shape for frame in decoder]

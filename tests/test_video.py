@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from pixelbrax_jax import video
-from pixelbrax_jax.ffmpeg import Decoder
+from pixelbrax_jax.ffmpeg import Decoder, find_ffmpeg
 from pixelbrax_jax.video import write_frames
 
 ROOT = Path(__file__).parents[1]
@@ -77,6 +77,37 @@ def test_odd_sides_are_padded_with_their_last_pixels(tmp_path, height, width):
 def test_a_still_gif_lasts_as_long(tmp_path):
     path = write_frames(tmp_path / "a.gif", [np.zeros((8, 8, 3), np.uint8)] * 10, 25)
     assert imageio.immeta(path)["duration"] == 400, "milliseconds"
+
+
+def test_a_gif_that_stands_still_for_longer_than_it_can_say(tmp_path):
+    dark, bright = np.zeros((8, 8, 3), np.uint8), np.full((8, 8, 3), 255, np.uint8)
+    path = tmp_path / "a.gif"
+    write_frames(path, [bright] + [dark] * 655 + [bright] * 655, 1)
+    with pytest.raises(ValueError, match=r"a\.gif is not whole: .* at most 655 s.*write an \.mp4"):
+        write_frames(path, [bright] + [dark] * 656, 1)
+    read = imageio.imread(path, index=None)
+    assert read[:, 0, 0, 0].tolist() == [255, 0], "what came before is kept"
+    with pytest.raises(ValueError, match="raise fps"):
+        write_frames(tmp_path / "b.gif", [dark], 0.001)
+    assert not (tmp_path / "b.gif").exists()
+
+
+def test_a_gif_that_is_too_wide(tmp_path):
+    with pytest.raises(OSError, match=r"a\.gif was not written: .*65535"):
+        write_frames(tmp_path / "a.gif", flashes(2, 1, 65_536), 20)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
+def test_no_part_of_a_gif_is_left(tmp_path, monkeypatch, error):
+    def save(image, path, **options):
+        path.write_bytes(b"GIF89a")
+        raise error
+
+    monkeypatch.setattr("PIL.Image.Image.save", save)
+    with pytest.raises(error):
+        write_frames(tmp_path / "a.gif", flashes(2), 20)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("suffix", [".gif", ".mp4"])
@@ -152,6 +183,32 @@ def test_an_encoder_that_is_nowhere(tmp_path, monkeypatch):
     with pytest.raises(OSError, match=r"IMAGEIO_FFMPEG_EXE is '/nowhere/ffmpeg'.*unset it"):
         write_frames(tmp_path / "a.mp4", flashes(1), 20)
     write_frames(tmp_path / "a.gif", flashes(1), 20)
+
+
+def test_videos_are_h264(tmp_path):
+    path = write_frames(tmp_path / "a.mp4", flashes(2), 20)
+    look = subprocess.run([find_ffmpeg(), "-i", path], capture_output=True, text=True)
+    assert "Video: h264" in look.stderr
+    assert "yuv420p" in look.stderr
+
+
+@pytest.mark.skipif(os.name != "posix", reason="a script of the shell")
+def test_an_encoder_without_h264(tmp_path, monkeypatch):
+    program = tmp_path / "ffmpeg"
+    says = "echo \"Unknown encoder 'libx264'\" >&2; exit 1"
+    program.write_text(f'#!/bin/sh\ncase "$*" in *libx264*) {says}; esac\n')
+    program.chmod(0o755)
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(program))
+    with pytest.raises(OSError, match=r"a\.mp4 was not written: Unknown encoder 'libx264'\.$"):
+        write_frames(tmp_path / "a.mp4", flashes(1), 20)
+    assert not (tmp_path / "a.mp4").exists()
+
+
+def test_an_ffmpeg_of_imageios_that_cannot_be_started(monkeypatch):
+    monkeypatch.delenv("IMAGEIO_FFMPEG_EXE", raising=False)
+    monkeypatch.setattr("imageio_ffmpeg.get_ffmpeg_exe", lambda: "/nowhere/ffmpeg")
+    with pytest.raises(OSError, match=r"/nowhere/ffmpeg, cannot be .*install imageio-ffmpeg again"):
+        find_ffmpeg()
 
 
 def test_what_was_written_is_compared_with_what_was_given(tmp_path, monkeypatch):

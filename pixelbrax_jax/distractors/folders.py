@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable
+import warnings
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,7 +20,7 @@ ALL = "all"
 """The split of a folder without subfolders."""
 
 _FOR_TESTS = frozenset({"test", "val", "valid", "validation", "eval", "evaluation", "ood"})
-"""Splits that nobody trains on unasked."""
+"""Splits that are for tests; clips of theirs are trained on only if they are asked for by name."""
 
 # The split of the original PixelBrax, arXiv 2502.00021. It mixes DAVIS's own two.
 _PAPER = {
@@ -67,6 +68,7 @@ def find(folder: Path, split: str) -> tuple[list[Source], str]:
     ``"paper-train"`` and ``"paper-test"``. Any other folder holds video files, or folders of
     images, in subfolders named like the splits; without subfolders all are in split ``"all"``.
     Where there is one split, and its name is not that of a test, ``"train"`` stands for it too.
+    Subfolders that may not be read are left out, and a warning names them.
 
     Args:
         folder: where to look; the folder ``DAVIS``, the one above it, and its ``JPEGImages`` and
@@ -80,6 +82,7 @@ def find(folder: Path, split: str) -> tuple[list[Source], str]:
     Raises:
         FileNotFoundError: the folder, a split file or a listed clip is missing; the message
             names it and the layout that was expected.
+        PermissionError: the folder may not be read.
         ValueError: there is no such split, or it has no clips.
     """
     if folder.is_file():
@@ -143,8 +146,23 @@ def _davis(images: Path, split: str) -> list[Source]:
 
 def _plain(folder: Path, split: str) -> tuple[list[Source], str]:
     # A folder of images is a clip; one that holds clips is a split; others do not matter.
-    parts = [p.name for p in _entries(folder) if p.is_dir() and _clips(p)]
-    clips = _clips(folder)
+    closed: dict[Path, None] = {}
+
+    def clips_in(part: Path) -> list[Path]:
+        return _clips(part, closed)
+
+    parts = {
+        p.name: found
+        for p in _entries(folder)
+        if p.is_dir() and (found := _if_open(clips_in, p, closed))
+    }
+    clips = clips_in(folder)
+    if closed:
+        warnings.warn(
+            f"left out, as they may not be read: {', '.join(map(str, closed))}; if they have clips "
+            "that you want, allow it.",
+            stacklevel=4,  # whoever calls load_clips
+        )
     if parts and clips:
         raise ValueError(
             f"{folder} has clips beside the folders {', '.join(parts)} that hold clips too; move "
@@ -154,8 +172,8 @@ def _plain(folder: Path, split: str) -> tuple[list[Source], str]:
         kinds = ", ".join(sorted(VIDEOS))
         own = "; it has images itself, so give the folder above it" if _pictures(folder) else ""
         raise ValueError(f"{folder} has neither videos ({kinds}) nor folders of images{own}.")
-    present = _present(folder, split, parts or [ALL])
-    return [_source(p) for p in (_clips(folder / present) if parts else clips)], present
+    present = _present(folder, split, list(parts) or [ALL])
+    return [_source(p) for p in (parts[present] if parts else clips)], present
 
 
 def _present(folder: Path, split: str, splits: list[str]) -> str:
@@ -171,13 +189,29 @@ def _present(folder: Path, split: str, splits: list[str]) -> str:
     return check_choice(f"split of {folder}", split, splits)
 
 
-def _clips(folder: Path) -> list[Path]:
+def _clips(folder: Path, closed: dict[Path, None]) -> list[Path]:
     """Return what is a clip in a folder: videos, and folders of images."""
     return [
         entry
         for entry in _entries(folder)
-        if (_pictures(entry) if entry.is_dir() else entry.suffix.lower() in VIDEOS)
+        if (
+            _if_open(_pictures, entry, closed) if entry.is_dir() else entry.suffix.lower() in VIDEOS
+        )
     ]
+
+
+def _if_open(
+    look: Callable[[Path], list[Path]], folder: Path, closed: dict[Path, None]
+) -> list[Path]:
+    """Return what is in a folder; nothing, and the folder in ``closed``, if it may not be read.
+
+    The root of a disk has such folders, as ``lost+found``.
+    """
+    try:
+        return look(folder)
+    except PermissionError:
+        closed[folder] = None
+        return []
 
 
 def _source(clip: Path) -> Source:

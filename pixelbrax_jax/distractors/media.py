@@ -16,8 +16,13 @@ from pixelbrax_jax.ffmpeg import Decoder
 AGAIN = "get it again, or remove it"
 """What to do with a file that cannot be read, or lacks something."""
 
+
 _TOLERANCE = 2
 """Frames that a sound video may have less than its container says."""
+
+
+class _UnfitError(ValueError):
+    """A file that is whole and cannot be taken; the message is the reason and the fix."""
 
 
 def read_clip(
@@ -40,6 +45,8 @@ def read_clip(
 
     Raises:
         ValueError: a file cannot be read; the message has the file, the reason and the fix.
+        OSError: a file may not be read, or FFmpeg is not found, with the fix.
+        MemoryError: a file is too large for this machine's memory, or ``check_count`` says so.
         ImportError: Pillow or imageio-ffmpeg is missing, with the fix.
     """
     if not source.is_video:
@@ -98,7 +105,9 @@ def _read_gif(file: Path, keep: Callable[[Any], None]) -> str:
     except MemoryError:
         raise
     except Exception as error:  # Pillow's of damaged files are of every kind
-        return f"is cut short after {found} frames" if found else _say(error)
+        if not found:
+            raise ValueError(f"{file} cannot be read as a video: {_say(file, error)}.") from error
+        return f"is cut short after {found} frames"
 
 
 def _picture(file: Path, height: int, width: int) -> np.ndarray:
@@ -110,15 +119,27 @@ def _picture(file: Path, height: int, width: int) -> np.ndarray:
             count = getattr(image, "n_frames", 1)
             # Telephones put a preview beside the image.
             if count > 1 and image.format != "MPO":
-                raise ValueError(f"it has {count} images, and one is expected")
+                raise _UnfitError(
+                    f"it has {count} images, and one is expected; save each in a file of its own"
+                )
             return _fit(ImageOps.exif_transpose(image), height, width)
+    except MemoryError:
+        raise
     except Exception as error:  # Pillow's of damaged files are of every kind
-        why = _content(file) or _say(error)
-        raise ValueError(f"{file} cannot be read as an image: {why}; {AGAIN}.") from error
+        raise ValueError(f"{file} cannot be read as an image: {_say(file, error)}.") from error
 
 
-def _say(error: Exception) -> str:
-    return "it is no image" if type(error).__name__ == "UnidentifiedImageError" else str(error)
+def _say(file: Path, error: Exception) -> str:
+    """Return why Pillow cannot read a file, and the fix."""
+    image_module = pillow()
+    if isinstance(error, _UnfitError):
+        return str(error)
+    if isinstance(error, image_module.DecompressionBombError):
+        limit = f"{2 * image_module.MAX_IMAGE_PIXELS:,} pixels"
+        return f"it has more than {limit}; scale it down, or raise PIL.Image.MAX_IMAGE_PIXELS"
+    unknown = type(error).__name__ == "UnidentifiedImageError"
+    why = _content(file) or ("it is no image" if unknown else str(error).rstrip("."))
+    return f"{why}; {AGAIN}"
 
 
 def _content(file: Path) -> str:
@@ -148,9 +169,14 @@ def _to_rgb(image: Any) -> Any:
     if image.mode == "F" or image.mode.startswith("I"):
         values, top = np.asarray(image), 1 if image.mode == "F" else 65535
         if not 0 <= values.min() <= values.max() <= top:
-            raise ValueError(
-                f"its pixels lie in [{values.min()}, {values.max()}] and not in [0, {top}], so "
-                "save it with 8 bits"
+            raise _UnfitError(
+                f"its pixels lie in [{values.min()}, {values.max()}] and not in [0, {top}]; save "
+                "it with 8 bits"
+            )
+        if values.dtype.itemsize == 4 and top > 1 and 0 < values.max() <= 255:
+            raise _UnfitError(
+                f"its pixels of 32 bits lie in [{values.min()}, {values.max()}], which is black "
+                "as 16 bits and may be meant as 8; save it with 8 bits"
             )
         image = image_module.fromarray(np.rint(values * (255 / top)).astype(np.uint8))
     if image.has_transparency_data:

@@ -1,11 +1,18 @@
-"""MuJoCo without OpenGL, which nothing here needs, until somebody asks MuJoCo to draw."""
+"""MuJoCo without OpenGL, which nothing here needs, until somebody asks MuJoCo to draw.
+
+MuJoCo decides about OpenGL once, while it is imported; imported without, it would have no
+``GLContext`` for the rest of the process, and a user's own ``mujoco.Renderer`` would fail. So its
+modules are given a ``__getattr__``, which loads the context when it is first asked for.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import importlib
+import importlib.util
 import os
 import sys
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -20,9 +27,10 @@ def import_mujoco() -> None:
 
     MuJoCo cannot be imported where that is missing, or is no name that it knows. What it draws
     with, ``mujoco.GLContext``, is loaded when it is first used, by ``mujoco.Renderer`` too, as the
-    variable says then; it fails then as MuJoCo's import would have.
+    variable says then; it fails then as MuJoCo's import would have. A MuJoCo that loads OpenGL
+    elsewhere is left to be imported as it is.
     """
-    if "mujoco" in sys.modules:
+    if "mujoco" in sys.modules or not _is_there():
         return
     chosen = os.environ.get(_VARIABLE)
     os.environ[_VARIABLE] = "disable"
@@ -39,6 +47,14 @@ def import_mujoco() -> None:
     if home is not None:
         for module in (*modules, home):
             vars(module)["__getattr__"] = _load_of(module, home)
+
+
+def _is_there() -> bool:
+    """Return whether MuJoCo has the module that loads OpenGL, without importing anything."""
+    spec = importlib.util.find_spec("mujoco")
+    folders = (spec and spec.submodule_search_locations) or ()
+    place = Path(*_HOME.split(".")[1:]).with_suffix(".py")
+    return any(Path(folder, place).is_file() for folder in folders)
 
 
 def _load_of(module: ModuleType, home: ModuleType) -> Any:

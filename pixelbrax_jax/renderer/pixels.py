@@ -73,7 +73,7 @@ class Seen(NamedTuple):
 
     Attributes:
         r, g, b: float32 in [0, 1].
-        depth: float32, metres along the viewing axis, ``inf`` for the sky; exact to a relative
+        depth: float32, metres along the viewing axis, ``FAR`` for the sky; exact to a relative
             ``2**(b - 24)``, where b bits hold a rank.
         rank: int32, rank of the geom; their number for the sky.
         ground: bool, a plane that is ground is seen.

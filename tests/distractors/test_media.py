@@ -118,21 +118,47 @@ def test_what_is_no_image(tmp_path, name, content, why):
     [
         ("a.tif", Image.fromarray(ramp(1, np.float32)), r"\[0.0, 255.0\] and not in \[0, 1\]"),
         ("a.tif", Image.fromarray(ramp(-1, np.int32)), r"\[-255, 0\] and not in \[0, 65535\]"),
+        ("a.tif", Image.fromarray(ramp(1, np.int32)), r"32 bits lie in \[0, 255\], .*meant as 8"),
     ],
 )
 def test_pixels_of_unknown_range(tmp_path, name, image, why):
-    with pytest.raises(ValueError, match=why):
+    with pytest.raises(ValueError, match=rf"{why}; save it with 8 bits\.$"):
         read_image(tmp_path, name, lambda file: image.save(file))
+
+
+def test_32_bits_of_nothing_are_black(tmp_path):
+    image = Image.fromarray(ramp(0, np.int32))
+    assert read_image(tmp_path, "a.tif", lambda file: image.save(file)).max() == 0
 
 
 def test_several_images_in_one_file(tmp_path):
     image = Image.fromarray(ramp())
-    with pytest.raises(ValueError, match="it has 2 images, and one is expected"):
+    with pytest.raises(ValueError, match=r"2 images, and one is expected; save each in a file of"):
         read_image(
             tmp_path,
             "a.webp",
             lambda file: image.save(file, save_all=True, append_images=[image.transpose(0)]),
         )
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.gif"])
+def test_more_pixels_than_pillow_takes(tmp_path, monkeypatch, name):
+    file = tmp_path / "clips" / ("." if name == "a.gif" else "one") / name
+    file.parent.mkdir(parents=True)
+    Image.fromarray(ramp()).save(file)
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 100)
+    fix = "more than 200 pixels; scale it down, or raise PIL.Image.MAX_IMAGE_PIXELS"
+    with pytest.raises(ValueError, match=rf"a\.... cannot be read as .*: it has {fix}\.$"):
+        load_clips(tmp_path / "clips", "all", progress=False)
+
+
+def test_too_little_memory_is_no_fault_of_the_file(tmp_path, monkeypatch):
+    def convert(image, mode):
+        raise MemoryError
+
+    monkeypatch.setattr(Image.Image, "convert", convert)
+    with pytest.raises(MemoryError):
+        read_image(tmp_path, "a.bmp", lambda file: Image.fromarray(ramp()).save(file))
 
 
 def ffmpeg(*arguments):
@@ -281,12 +307,35 @@ def test_what_may_not_be_read(tmp_path):
         load(file)
 
 
+def test_subfolders_that_may_not_be_read_are_left_out(tmp_path, monkeypatch):
+    root = tmp_path / "clips"
+    for name in ("train/a", "train/closed", "test/a", "lost+found"):
+        (root / name).mkdir(parents=True)
+        Image.fromarray(ramp()).save(root / name / "0.png")
+    names = Path.iterdir
+
+    def iterdir(folder):
+        if folder.name in ("closed", "lost+found"):  # root may read anything
+            raise PermissionError(13, "Permission denied", str(folder))
+        return names(folder)
+
+    monkeypatch.setattr(Path, "iterdir", iterdir)
+    with pytest.warns(UserWarning, match="may not be read") as told:
+        bank = load_clips(root, "train", height=8, width=8, progress=False)
+    assert bank.names == ("a",)
+    (warning,) = told
+    assert f"{root / 'lost+found'}, {root / 'train' / 'closed'};" in str(warning.message)
+    assert warning.filename == __file__
+    with pytest.raises(PermissionError, match=r"lost\+found"):
+        load_clips(root / "lost+found", "all")
+
+
 def test_no_home(tmp_path, monkeypatch):
     make(tmp_path / "clips" / "a.mp4", "-frames:v", "3")
     for name in ("PIXELBRAX_CACHE", "HOME"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr("pwd.getpwuid", lambda uid: {}[uid])
-    with pytest.warns(UserWarning, match=r"no home folder\); name a folder in .*PIXELBRAX_CACHE"):
+    with pytest.warns(UserWarning, match=r"no home folder; set HOME.*\); name a folder in"):
         bank = load_clips(tmp_path / "clips", "all", height=8, width=8)
     assert bank.length.tolist() == [3]
     with pytest.raises(FileNotFoundError, match="set HOME, or give the whole path"):

@@ -192,13 +192,31 @@ def test_variables_that_other_tools_leave(monkeypatch):
     assert doctor._broken_variables() == {}
 
 
+def test_a_variable_is_not_blamed_for_another(monkeypatch):
+    def broken(code):
+        variable = doctor._Variable("jax", f"import os, sys, time\n{code}", "problem", "")
+        monkeypatch.setattr(doctor, "_VARIABLES", {"XLA_FLAGS": variable})
+        return doctor._broken_variables()
+
+    # JAX_PLATFORMS names what is not there, and the flags are fine.
+    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=false")
+    assert broken("sys.exit('no such platform')") == {}
+    assert broken("sys.exit('flag' if 'XLA_FLAGS' in os.environ else 0)") == {"XLA_FLAGS": "flag"}
+    # Both are wrong, and XLA would end the process because of the flags.
+    both = "sys.exit('flag' if 'XLA_FLAGS' in os.environ else 'no such platform')"
+    assert broken(both) == {"XLA_FLAGS": "flag"}
+    monkeypatch.setattr(doctor, "_PATIENCE", 1.0)
+    hangs = "time.sleep(60 * ('XLA_FLAGS' in os.environ))"
+    assert broken(hangs) == {"XLA_FLAGS": "no end after 1 s"}
+
+
 def test_a_cache_that_cannot_be_written(monkeypatch, tmp_path):
     monkeypatch.setenv("PIXELBRAX_CACHE", str(tmp_path / "made" / "later"))
     assert doctor._why_no_cache() == ""
     monkeypatch.delenv("PIXELBRAX_CACHE")
     monkeypatch.delenv("HOME", raising=False)
     monkeypatch.setattr("pwd.getpwuid", lambda uid: {}[uid])
-    assert "no home folder" in doctor._why_no_cache()
+    assert "set HOME, or PIXELBRAX_CACHE" in doctor._why_no_cache()
 
 
 @pytest.mark.parametrize(("broken", "status"), [(False, 0), (True, 1)])

@@ -5,14 +5,18 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
-IMPORT = """
+BEFORE = """
 import os
 before = dict(os.environ)
-import pixelbrax_jax.physics
 """
+FILE = Path(__file__).parents[2] / "pixelbrax_jax" / "physics" / "opengl.py"
+# The file by itself, as its package imports JAX.
+MUJOCO = f"import runpy\nrunpy.run_path({str(FILE)!r})['import_mujoco']()\n"
+PHYSICS = "import pixelbrax_jax.physics\n"
 MAKE = "pixelbrax_jax.make('inverted_pendulum', height=8, width=8)\n"
 LOOK = """
 assert dict(os.environ) == before, "the environment is as it was"
@@ -40,16 +44,26 @@ def output(code: str, value: str | None) -> str:
     return result.stdout.rstrip()
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="the names are those of Linux")
-@pytest.mark.parametrize("value", [None, "egl", "osmesa", "glfw", "garbage"])
-def test_environments_are_made_and_the_users_own_renderer_is_loaded_late(value):
-    made = MAKE if value == "osmesa" else ""
+needs_linux = pytest.mark.skipif(sys.platform != "linux", reason="the names are those of Linux")
+
+
+@needs_linux
+@pytest.mark.parametrize("value", ["glfw", "osmesa"])
+def test_the_users_own_renderer_is_loaded_late(value):
     # The same module, or the same error, as MuJoCo has by itself.
-    assert output(IMPORT + made + LOOK + ALONE, value) == output(ALONE, value)
+    assert output(BEFORE + MUJOCO + LOOK + ALONE, value) == output(ALONE, value)
+
+
+@needs_linux
+@pytest.mark.slow
+@pytest.mark.parametrize("value", [None, "egl", "osmesa", "glfw", "garbage"])
+def test_environments_are_made_without_opengl(value):
+    made = MAKE if value == "osmesa" else ""
+    assert output(BEFORE + PHYSICS + made + LOOK + ALONE, value) == output(ALONE, value)
 
 
 def test_a_renderer_that_is_chosen_later():
-    code = "import pixelbrax_jax.physics, os, mujoco.gl_context\n"
+    code = MUJOCO + "import os, mujoco.gl_context\n"
     code += "os.environ['MUJOCO_GL'] = 'garbage'\n"
     for place in ("mujoco", "mujoco.gl_context"):
         code += f"try: {place}.GLContext\nexcept RuntimeError as error: print(error)\n"
@@ -60,3 +74,12 @@ def test_a_renderer_that_is_chosen_later():
         "module 'mujoco' has no attribute 'absent'",
         "False",
     ]
+
+
+def test_a_mujoco_that_loads_opengl_elsewhere_is_left_as_it_is(tmp_path):
+    (tmp_path / "mujoco").mkdir()
+    own = "import os; GLContext = os.environ['MUJOCO_GL']"
+    (tmp_path / "mujoco" / "__init__.py").write_text(own)
+    code = f"import sys\nsys.path.insert(0, {str(tmp_path)!r})\n" + MUJOCO
+    code += "import mujoco\nprint(mujoco.GLContext, hasattr(mujoco, '__getattr__'))"
+    assert output(code, "egl") == "egl False"

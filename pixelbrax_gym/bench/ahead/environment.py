@@ -32,7 +32,7 @@ def folder(platform: str) -> Path:
     try:
         home = cache_folder()
     except FileNotFoundError as error:
-        raise AbsentError(f"{error}; name a cache in PIXELBRAX_CACHE") from error
+        raise AbsentError(str(error)) from error
     python = f"py{sys.version_info[0]}{sys.version_info[1]}"
     return home / "compilers" / f"{platform}-jax{version('jax')}-{python}"
 
