@@ -24,6 +24,15 @@ def cache_folder(given: str | Path | None = None) -> Path:
         raise FileNotFoundError("the user has no home folder") from error
 
 
+def whole_path(path: str | os.PathLike[str]) -> Path:
+    """Return a path from the root, with the home folder in place of ``~``.
+
+    Raises:
+        FileNotFoundError: there is no such home folder; with the fix.
+    """
+    return in_home(Path(path)).absolute()
+
+
 def in_home(path: Path) -> Path:
     """Return a path with the home folder in place of ``~``.
 
