@@ -26,6 +26,15 @@ def cache_folder(given: str | Path | None = None) -> Path:
         ) from error
 
 
+def whole_path(path: str | os.PathLike[str]) -> Path:
+    """Return a path from the root, with the home folder in place of ``~``.
+
+    Raises:
+        FileNotFoundError: there is no such home folder; with the fix.
+    """
+    return in_home(Path(path)).absolute()
+
+
 def in_home(path: Path) -> Path:
     """Return a path with the home folder in place of ``~``.
 

@@ -219,7 +219,8 @@ def _registered(config: EnvConfig) -> EnvConfig:
     try:
         found = importlib.import_module(module)
     except ImportError as error:
-        if not f"{module}.".startswith(f"{error.name}."):
+        missing = isinstance(error, ModuleNotFoundError)
+        if not (missing and f"{module}.".startswith(f"{error.name}.")):
             raise ImportError(
                 f"module {module!r} of task {task!r} cannot be imported: {error}"
             ) from error

@@ -18,7 +18,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from pixelbrax_jax.cache import cache_folder, in_home
+from pixelbrax_jax.cache import cache_folder, whole_path
 from pixelbrax_jax.distractors import folders, procedural
 from pixelbrax_jax.distractors.media import AGAIN, read_clip
 from pixelbrax_jax.types import Clips
@@ -166,7 +166,7 @@ def load_clips(
         names = procedural.names(split)[:num_clips]
         _check_size(len(names) * procedural.FRAMES, height, width, max_bytes)
         return _procedural(tuple(names), split, height, width)
-    folder = in_home(Path(source)).absolute()
+    folder = whole_path(source)
     sources, present = folders.find(folder, split)
     if present != split:
         warnings.warn(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +10,8 @@ import jax
 import numpy as np
 
 from pixelbrax_jax.types import EnvParams
+
+_TWO_OR_THREE = "2 or 3"
 
 _SHAPES: dict[str, tuple[int | str, ...]] = {
     "geoms.size": ("G", 3),
@@ -28,7 +30,7 @@ _SHAPES: dict[str, tuple[int | str, ...]] = {
     "look.diffuse": (),
     "look.specular": (),
     "look.highlight": (),
-    "look.sky": ("2 or 3", 3),
+    "look.sky": (_TWO_OR_THREE, 3),
     "look.ground_rgb": (2, 3),
     "look.ground_pitch": (),
     "look.headlight": (),
@@ -91,7 +93,9 @@ def split_params(params: EnvParams, num_envs: int) -> ParamRows:
         ValueError: an array has neither shape; the message names it, and both.
     """
     found, tree = jax.tree_util.tree_flatten_with_path(params)
-    is_own = tuple(_has_rows(path, np.shape(leaf), num_envs) for path, leaf in found)
+    geoms = params.geoms
+    sizes = {"G": len(geoms.kind), "M": max(geoms.material, default=-1) + 1}
+    is_own = tuple(_has_rows(path, np.shape(leaf), num_envs, sizes) for path, leaf in found)
     pairs = [(leaf, own) for (_, leaf), own in zip(found, is_own, strict=True)]
     return ParamRows(
         own=tuple(leaf for leaf, own in pairs if own),
@@ -101,10 +105,15 @@ def split_params(params: EnvParams, num_envs: int) -> ParamRows:
     )
 
 
-def _has_rows(path: tuple[Any, ...], shape: tuple[int, ...], num_envs: int) -> bool:
+def _has_rows(
+    path: tuple[Any, ...], shape: tuple[int, ...], num_envs: int, sizes: Mapping[str, int]
+) -> bool:
     names = [key.name for key in path if hasattr(key, "name")]
-    wanted = _SHAPES.get(".".join(names))
-    if wanted is None or _fits(shape, wanted):
+    by_name = _SHAPES.get(".".join(names))
+    if by_name is None:
+        return False
+    wanted = tuple(sizes.get(str(size), size) for size in by_name)
+    if _fits(shape, wanted):
         return False
     if _fits(shape, (num_envs, *wanted)):
         return True
@@ -117,7 +126,8 @@ def _has_rows(path: tuple[Any, ...], shape: tuple[int, ...], num_envs: int) -> b
 
 def _fits(shape: tuple[int, ...], wanted: tuple[int | str, ...]) -> bool:
     return len(shape) == len(wanted) and all(
-        isinstance(size, str) or size == given for given, size in zip(shape, wanted, strict=True)
+        given in (2, 3) if size == _TWO_OR_THREE else isinstance(size, str) or size == given
+        for given, size in zip(shape, wanted, strict=True)
     )
 
 

@@ -18,11 +18,10 @@ def check_pose(
         ValueError: for a wrong shape.
     """
     q = jnp.asarray(q, jnp.float32)
-    qd = jnp.zeros(model.nv) if qd is None else qd
-    qd = jnp.asarray(qd, jnp.float32)
+    qd = jnp.asarray(jnp.zeros(model.nv) if qd is None else qd, jnp.float32)
     if q.shape != (model.nq,) or qd.shape != (model.nv,):
         raise ValueError(
-            f"q and qd must have shapes ({model.nq},) and ({model.nv},), got {q.shape} and "
+            f"qpos and qvel must have shapes ({model.nq},) and ({model.nv},), got {q.shape} and "
             f"{qd.shape}"
         )
     return q, qd

@@ -26,6 +26,10 @@ def ppo(**changes) -> PPO:
     return PPO(PPOConfig(**SMALL, layout="shared", **changes), ball_envs())
 
 
+SINCE: dict[str, object] = {}
+"""Settings that release 0.2.0 lacks, and the values that it trained with."""
+
+
 @pytest.fixture
 def folder(tmp_path) -> Path:
     """The output folder of a run of 0.2.0."""
@@ -84,6 +88,14 @@ def test_a_setting_that_a_run_lacks_has_the_default_of_its_time(folder, monkeypa
     # Other algorithms need not have the setting.
     monkeypatch.setitem(settings.FORMER_DEFAULTS, "decoupled", True)
     assert "decoupled" not in settings.former_settings(PPGConfig)
+
+
+def test_a_default_of_0_2_0_that_changes_is_kept_for_older_runs(folder):
+    stored = read_about(folder / "checkpoints")["config"]
+    former = settings.former_settings(PPOConfig)
+    by_default = former.keys() - {*SMALL, "layout"}
+    expected = {name: stored[name] for name in by_default & stored.keys()} | SINCE
+    assert {name: former[name] for name in by_default} == expected
 
 
 def test_a_setting_of_a_later_release_is_refused_by_name(folder):

@@ -37,9 +37,13 @@ def home(tmp_path, monkeypatch):
     monkeypatch.setenv("PIXELBRAX_CACHE", str(tmp_path / "cache"))
     (tmp_path / "my_tasks.py").write_text(MODULE)
     (tmp_path / "broken.py").write_text("import no_such_library")
+    (tmp_path / "my_package").mkdir()
+    (tmp_path / "my_package" / "__init__.py").touch()
+    (tmp_path / "my_package" / "tasks.py").write_text("from my_package import missing")
     monkeypatch.chdir(tmp_path)
     yield tmp_path
-    sys.modules.pop("my_tasks", None)
+    for name in ("my_tasks", "my_package"):
+        sys.modules.pop(name, None)
 
 
 @pytest.mark.parametrize(
@@ -56,6 +60,11 @@ def home(tmp_path, monkeypatch):
         (
             "broken:my_ball",
             "module 'broken' of task 'broken:my_ball' cannot be imported: No module",
+        ),
+        (
+            "my_package.tasks:my_ball",
+            "module 'my_package.tasks' of task 'my_package.tasks:my_ball' cannot be imported: "
+            "cannot import name 'missing'",
         ),
     ],
 )
@@ -80,13 +89,22 @@ def rows(told: str) -> dict[str, dict]:
     return {row["split"]: row for row in found}
 
 
-def test_a_run_goes_on_wherever_its_clips_lie(home, monkeypatch, capsys):
+@pytest.fixture
+def train(home):
+    """The command that trains in ``run``, and has done so with clips that have a copy.
+
+    More options may follow.
+    """
     write_clips(home / "clips", "ab")
     write_clips(home / "others", "cd")
     shutil.copytree(home / "clips", home / "node" / "staged")
     line = ["train", "ppo", "--task", "my_tasks:my_ball", *SETTINGS, "--output-dir", "run"]
-    line += ["--distractors", "video", "--split", "all"]
-    assert main([*line, "--total-steps", "8", "--clips", "clips"]) == 0
+    line += ["--distractors", "video", "--split", "all", "--total-steps", "8"]
+    assert main([*line, "--clips", "clips"]) == 0
+    return line
+
+
+def test_a_run_goes_on_wherever_its_clips_lie(home, train, monkeypatch, capsys):
     about = read_about("run/checkpoints")
     assert about["config"]["clips"] == str(home / "clips")
     assert about["config"]["task"] == "my_tasks:my_ball"
@@ -94,17 +112,31 @@ def test_a_run_goes_on_wherever_its_clips_lie(home, monkeypatch, capsys):
     capsys.readouterr()
 
     # The content decides, and not the name.
-    line += ["--total-steps", "16", "--resume", "latest", "--clips"]
-    assert main([*line, "others"]) == 1
+    again = [*train, "--resume", "latest", "--clips"]
+    assert main([*again, "others"]) == 1
     told = capsys.readouterr().err
     assert f"clips: those of '{home}/clips' there, others in '{home}/others' here" in told
-    assert main([*line, "node/staged"]) == 0
+    assert main([*again, "node/staged"]) == 0
     assert "going on from the checkpoint of 8 steps" in capsys.readouterr().err
 
     # From another folder, where the path of the training would not be found.
+    (home / "elsewhere").mkdir()
+    monkeypatch.chdir(home / "elsewhere")
+    of_run = [str(home / "run"), "--split", "train", "--clips", "../others"]
+    for command in ("evaluate", "record"):
+        assert main([command, *of_run]) == 1
+        assert "are not those of the training" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_run_is_played_wherever_its_clips_lie(home, train, monkeypatch, capsys):
+    assert (
+        main([*train, "--total-steps", "16", "--resume", "latest", "--clips", "node/staged"]) == 0
+    )
     shutil.rmtree(home / "clips")
     (home / "elsewhere").mkdir()
     monkeypatch.chdir(home / "elsewhere")
+    capsys.readouterr()
     of_run = ["evaluate", str(home / "run"), "--episodes", "1"]
     assert main([*of_run, "--steps", "8"]) == 1
     told = capsys.readouterr()

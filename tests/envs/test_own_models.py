@@ -1,5 +1,7 @@
 """Models of the user's own as they are seen: goals, sites, cameras, chosen poses."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -219,7 +221,7 @@ def test_start_in_a_pose(made):
     after, _ = env.step(moving, jnp.zeros(2), params)
     assert after.sim.step_count == 1
     with pytest.raises(
-        ValueError, match=r"q and qd must have shapes \(5,\) and \(5,\), got \(4,\)"
+        ValueError, match=r"qpos and qvel must have shapes \(5,\) and \(5,\), got \(4,\)"
     ):
         env.from_qpos(pose[:4], None, key, params)
     with pytest.raises(TypeError, match=r"key must come from jax\.random\.key"):
@@ -235,6 +237,18 @@ def test_start_in_a_pose_with_the_episodes_target():
     np.testing.assert_array_equal(chosen.engine.target, drawn.target)
     np.testing.assert_array_equal(chosen.engine.qpos, pose)
     np.testing.assert_array_equal(chosen.obs[:2], pose)
+
+
+@pytest.mark.parametrize(
+    "flag", [partial(jax.enable_x64, True), partial(jax.numpy_rank_promotion, "raise")]
+)
+def test_a_pose_of_a_task_of_dm_control_under_flags_of_jax(flag):
+    pytest.importorskip("dm_control")
+    physics = pb.make("dmc_cartpole_swingup", obs_mode="state")[0].physics
+    with flag():
+        # A new function, whose trace JAX does not remember from another flag.
+        state = jax.eval_shape(lambda q: physics.from_qpos(q), np.zeros(2))
+    assert {leaf.dtype.itemsize for leaf in jax.tree.leaves(state)} <= {1, 4}
 
 
 def test_physics_without_poses():

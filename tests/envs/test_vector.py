@@ -295,10 +295,26 @@ def test_a_batch_on_a_cpu_in_chunks_has_parameters_of_its_own():
         ),
         (
             lambda p: p.replace(geoms=p.geoms.replace(rgb=np.zeros((2, 3, 2), np.float32))),
-            r"params\.geoms\.rgb must have shape \(M, 3\), .* or \(2, M, 3\), .* got \(2, 3, 2\)",
+            r"params\.geoms\.rgb must have shape \(2, 3\), .* or \(2, 2, 3\), .* got \(2, 3, 2\)",
+        ),
+        (
+            lambda p: p.replace(geoms=p.geoms.replace(rgb=np.zeros((5, 3), np.float32))),
+            r"params\.geoms\.rgb must have shape \(2, 3\), .* or \(2, 2, 3\), .* got \(5, 3\)",
+        ),
+        (
+            lambda p: p.replace(geoms=p.geoms.replace(pos=np.zeros((5, 3), np.float32))),
+            r"params\.geoms\.pos must have shape \(2, 3\), .* or \(2, 2, 3\), .* got \(5, 3\)",
+        ),
+        (
+            lambda p: p.replace(look=p.look.replace(sky=np.zeros((5, 3), np.float32))),
+            r"params\.look\.sky must have shape \(2 or 3, 3\), .* or \(2, 2 or 3, 3\), .* "
+            r"got \(5, 3\)",
         ),
     ],
-    ids=["number of rows", "one axis too many", "rows last"],
+    ids=[
+        *("number of rows", "one axis too many", "rows last"),
+        *("a color too many", "a geom too many", "a sky too many"),
+    ],
 )
 def test_a_parameter_of_another_shape_is_named(change, message):
     venv = make("next_step", 2)
@@ -316,3 +332,4 @@ def test_the_shape_of_every_parameter_is_known():
         for path, leaf in jax.tree_util.tree_leaves_with_path(known):
             name = ".".join(key.name for key in path if hasattr(key, "name"))
             assert param_rows._fits(np.shape(leaf), param_rows._SHAPES[name]), name
+        assert not any(param_rows.split_params(known, 7).is_own)

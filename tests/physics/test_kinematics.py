@@ -112,5 +112,5 @@ def test_chosen_pose_is_at_rest_unless_told_otherwise(program):
 
 @pytest.mark.parametrize(("q", "qd"), [(np.zeros(3), None), (np.zeros(2), np.zeros(1))])
 def test_chosen_pose_of_a_wrong_size(q, qd, program):
-    with pytest.raises(ValueError, match=r"q and qd must have shapes \(2,\) and \(2,\)"):
+    with pytest.raises(ValueError, match=r"qpos and qvel must have shapes \(2,\) and \(2,\)"):
         program("inverted_pendulum").physics.from_qpos(q, qd)

@@ -263,6 +263,17 @@ def test_everything_is_named_at_once_with_the_fix():
         check_simulated(build(changes), "mjx")
 
 
+def test_an_actuator_of_a_site_has_no_joint():
+    for joint, row in (("", "bodies without a joint"), ("<joint/>", "transmission")):
+        model = mujoco.MjModel.from_xml_string(
+            f"<mujoco><worldbody><body>{joint}<geom size='.1'/><site/><site/><site name='end'/>"
+            "</body></worldbody><actuator><motor name='pull' site='end'/></actuator></mujoco>"
+        )
+        found = [omission.feature for omission in omissions(model, "spring")]
+        assert found[-1] == "transmission to other than joints (actuator 'pull')"
+        assert found[0].startswith(row)
+
+
 def test_long_lists_end():
     crowd = "".join('<body><joint frictionloss="1"/><geom size=".1"/></body>' for _ in range(9))
     model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{crowd}</worldbody></mujoco>")

@@ -271,7 +271,7 @@ class Checkpoints:
         ]
         if other:
             more = f" and {len(other) - 3} more" if len(other) > 3 else ""
-            others = "; ".join(self.other_versions(steps)) or "of the same versions"
+            others = "; ".join(self.other_versions(steps)) or "the versions are the same"
             raise CheckpointError(
                 f"the checkpoint in {self.folder} has other arrays: {'; '.join(other[:3])}{more} "
                 f"({others}). Go on with what wrote it, or train anew in another --output-dir."

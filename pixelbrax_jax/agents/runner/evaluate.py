@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any, Protocol
 
 import jax
@@ -15,7 +14,7 @@ import numpy as np
 from pixelbrax_jax.agents.core.config import TrainConfig, make_env
 from pixelbrax_jax.agents.core.optimizer import Networks
 from pixelbrax_jax.agents.runner.settings import clip_digests, shared_clips
-from pixelbrax_jax.cache import in_home
+from pixelbrax_jax.cache import whole_path
 from pixelbrax_jax.compilation import jit
 from pixelbrax_jax.distractors import folders, procedural
 from pixelbrax_jax.distractors.presets import resolve
@@ -185,7 +184,7 @@ def _check_there(config: TrainConfig, split: str) -> None:
         if _source(config) == "procedural":
             check_choice("split of procedural clips", split, procedural.SPLITS)
         else:
-            folders.find(in_home(Path(_source(config))), split)
+            folders.find(whole_path(_source(config)), split)
     except (ValueError, FileNotFoundError) as error:
         raise NoSplitError(str(error)) from error
 

@@ -77,8 +77,11 @@ def write_video(
         The video's path.
 
     Raises:
-        ValueError: an option is out of range.
+        NoSplitError: the clips are not those of the split.
+        ValueError: an option is out of range, or the run has no such split.
+        FileNotFoundError: the folder of the clips is missing.
         ImportError: imageio-ffmpeg or Pillow is not installed, with the fix.
+        OSError: the file cannot be written, or is not what was drawn; with the reason.
     """
     check_positive_int("grid", grid)
     check_positive_int("size", size)

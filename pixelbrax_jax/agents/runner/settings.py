@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import MISSING, fields
 from importlib import metadata
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -16,12 +15,12 @@ import numpy as np
 from pixelbrax_jax.agents.core.algorithm import Algorithm
 from pixelbrax_jax.agents.core.config import TrainConfig, describe
 from pixelbrax_jax.agents.runner.run_config import RunConfig
-from pixelbrax_jax.cache import in_home
+from pixelbrax_jax.cache import whole_path
 from pixelbrax_jax.types import Clips
 
 FORMER_DEFAULTS: dict[str, Any] = {}
-"""What a stored run that lacks a setting was trained with, by name of the setting, where that is
-not the setting's default. Whoever changes a default that was new once writes the old one here."""
+"""Values, by name, of settings in runs that do not store them, where those are not the defaults. A
+default that changes is added here with its former value."""
 
 OF_RUNS = ("seed", "seeds")
 """Settings of ``RunConfig`` that decide the result of a run."""
@@ -40,7 +39,7 @@ def settings_of(algorithm: Algorithm, options: RunConfig) -> dict[str, Any]:
 
 
 def former_settings(kind: type[TrainConfig]) -> dict[str, Any]:
-    """Return what settings a stored run has had that lacks them, by name.
+    """Return the values that settings had in a stored run that lacks them, by name.
 
     Args:
         kind: the class of the run's settings.
@@ -111,18 +110,21 @@ def clip_digests(clips: Clips | None) -> list[str]:
     """Return a hash of the content of each clip, at its size, wherever it comes from."""
     if clips is None:
         return []
-    pixels = np.asarray(clips.packed)
-    parts = zip(np.asarray(clips.first), np.asarray(clips.length), strict=True)
-    return [_digest(pixels[first : first + length]) for first, length in parts]
+    pixels, *parts = jax.device_get((clips.packed, clips.first, clips.length))
+    return [_digest(pixels[first : first + length]) for first, length in zip(*parts, strict=True)]
 
 
-def stored_clips(config: TrainConfig, clips: Clips | None) -> list[str] | None:
+def stored_clips(config: TrainConfig, digests: Sequence[str]) -> Sequence[str] | None:
     """Return what is stored of a run's clips; None of those that are made, which their name tells.
 
     Made ones may differ in a pixel from one processor to the next.
+
+    Args:
+        config: of the run.
+        digests: of its clips.
     """
     made = config.clips is None or config.clips == "procedural"
-    return None if clips is None or made else clip_digests(clips)
+    return None if made else digests or None
 
 
 def shared_clips(some: Sequence[str], others: Sequence[str]) -> int:
@@ -140,4 +142,4 @@ def place_of(clips: str | None) -> str | None:
     """Return where clips are, whatever the current folder will be."""
     if clips is None or clips == "procedural":
         return clips
-    return str(in_home(Path(clips)).absolute())
+    return str(whole_path(clips))

@@ -122,7 +122,7 @@ def _run(
     stop: StopRequest,
 ) -> Outcome:
     runs, mesh = Runs(algorithm, options.seeds), mesh_of(algorithm)
-    seed, clips = jax.device_put(np.uint32(options.seed)), env_params.clips
+    seed, shown = jax.device_put(np.uint32(options.seed)), clip_digests(env_params.clips)
     if mesh is not None:
         env_params = replicate(mesh, env_params)
     template = jax.eval_shape(runs.init, seed, env_params)
@@ -139,7 +139,7 @@ def _run(
         algorithm.name,
         keep=options.keep_checkpoints,
         former=former_settings(type(algorithm.config)),
-        clips=stored_clips(algorithm.config, clips),
+        clips=stored_clips(algorithm.config, shown),
     )
     try:
         if _goes_on(checkpoints, options, report):
@@ -150,7 +150,7 @@ def _run(
         else:
             state = programs.init(runs, seed, env_params)
         if options.num_evals and splits is None:
-            splits = make_splits(algorithm.config, clip_digests(clips), report)
+            splits = make_splits(algorithm.config, shown, report)
         return _Run(runs, env_params, options, checkpoints, report, splits or {}, stop).train(state)
     finally:
         checkpoints.close()

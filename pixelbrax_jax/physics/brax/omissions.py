@@ -147,8 +147,7 @@ def _in_brax(model: mujoco.MjModel) -> Iterator[str]:
 def _of_actuators(model: mujoco.MjModel) -> Iterator[str]:
     on_joint = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
     yield from _of(model, "transmission to other than joints", "actuator", ~on_joint)
-    joint = np.where(on_joint, model.actuator_trnid[:, 0], 0)
-    on_free = on_joint & (model.jnt_type[joint] == _FREE)
+    on_free = _on_free_joint(model)
     fixed = model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_FIXED)
     unbiased = model.actuator_biastype == int(mujoco.mjtBias.mjBIAS_NONE)
     affine = model.actuator_biastype == int(mujoco.mjtBias.mjBIAS_AFFINE)
@@ -199,8 +198,7 @@ def _in_maximal(model: mujoco.MjModel) -> Iterator[str]:
         yield from _of(model, "damping", "joint", _joints(model, model.dof_damping))
         yield from _of(model, "armature", "joint", _joints(model, model.dof_armature))
         yield from _of(model, "stiffness", "joint", model.jnt_stiffness)
-    joint = np.maximum(model.actuator_trnid[:, 0], 0)
-    yield from _of(model, "forces on a free joint", "actuator", model.jnt_type[joint] == _FREE)
+    yield from _of(model, "forces on a free joint", "actuator", _on_free_joint(model))
     hinge = model.jnt_type == _HINGE
     wide = hinge & (model.jnt_limited == 1) & (np.abs(model.jnt_range) > np.pi).any(axis=1)
     yield from _of(model, "limits beyond half a turn", "joint", wide)
@@ -216,6 +214,13 @@ def _in_maximal(model: mujoco.MjModel) -> Iterator[str]:
     yield from _of(
         model, "joints of a body other than slides, then one hinge, at right angles", "body", bent
     )
+
+
+def _on_free_joint(model: mujoco.MjModel) -> np.ndarray:
+    """Return (actuators,) bool; what an actuator has hold of may also be a site or a tendon."""
+    chosen = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
+    chosen[chosen] = model.jnt_type[model.actuator_trnid[chosen, 0]] == _FREE
+    return chosen
 
 
 def _joints(model: mujoco.MjModel, of_dofs: np.ndarray) -> np.ndarray:

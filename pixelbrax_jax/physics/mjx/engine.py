@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from pixelbrax_jax.flags import default_flags
+from pixelbrax_jax.flags import default_flags, under_default_flags
 from pixelbrax_jax.physics.divergence import GuardedPhysics
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics, MjxState
 from pixelbrax_jax.physics.mjx.snapshot import Snapshot
@@ -137,6 +137,7 @@ class MjxPhysics(GuardedPhysics):
         """
         return self._settle(self._task.start(self.dynamics, key))
 
+    @under_default_flags
     def from_qpos(
         self, q: jax.Array, qd: jax.Array | None = None, *, key: jax.Array | None = None
     ) -> PhysicsState:
