@@ -157,8 +157,6 @@ class Programs:
         self, state: EnvState, timestep: Timestep, reported: Array | None = None
     ) -> Stepped:
         """Pack states, and return them and outputs; infos are about (N,) ``reported``."""
-        # Without a barrier, what computes the parts is compiled into the loop that packs them.
-        state, timestep = jax.lax.optimization_barrier((state, timestep))
         reported = jnp.ones(self.vector.num_envs, bool) if reported is None else reported
         return pack(state), self._outputs(timestep, reported)
 
