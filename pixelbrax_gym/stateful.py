@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from gymnasium import error
 
@@ -25,6 +27,10 @@ from pixelbrax_jax.types import EnvState
 
 ExtraOf = Callable[[dict[str, Any]], Any]
 """Makes of a call's outputs what an adapter keeps beside the state."""
+
+
+# Compiled, so that nothing is sent from the host.
+_new_frames = jax.jit(partial(jnp.zeros, dtype=jnp.uint8), static_argnums=0)
 
 
 @dataclass(frozen=True)
@@ -370,7 +376,7 @@ class StatefulEnv:
         """Return memory for the next frames."""
         # An interrupted call has taken the spare and left nothing in its place.
         if snapshot.spare is None or snapshot.spare.is_deleted():
-            return jax.device_put(np.zeros(snapshot.packed.frames.shape, np.uint8))
+            return _new_frames(snapshot.packed.frames.shape)
         return snapshot.spare
 
     def _place(self) -> None:
