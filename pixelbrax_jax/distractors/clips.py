@@ -147,7 +147,7 @@ def load_clips(
         max_bytes: device memory that the bank may take.
         cache_dir: where to cache; None means ``$PIXELBRAX_CACHE``, else
             ``~/.cache/pixelbrax``.
-        progress: whether a bar is shown while files are read, if tqdm is installed.
+        progress: whether a terminal shows a bar while files are read, if tqdm is installed.
 
     Returns:
         The bank.
@@ -259,7 +259,8 @@ def _with_progress(sources: list[folders.Source], progress: bool) -> Iterable[fo
         from tqdm import tqdm
     except ImportError:
         return sources
-    return tqdm(sources, desc="reading clips", unit="clip", leave=False)
+    # None: nothing where standard error is no terminal, such as a log.
+    return tqdm(sources, desc="reading clips", unit="clip", leave=False, disable=None)
 
 
 def _digest(sources: list[folders.Source], height: int, width: int) -> str:

@@ -71,6 +71,11 @@ def test_davis(davis):
                 assert np.abs(frame - color_of(name, index)).max() <= 4
 
 
+def test_a_log_has_no_bar(davis, capsys):
+    load_clips(davis, "train", height=12, width=20)
+    assert capsys.readouterr().err == ""
+
+
 def test_the_folder_above_will_do(davis):
     assert load_clips(davis.parent, "test", height=8, width=8).names == ("blackswan",)
 
