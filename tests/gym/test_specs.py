@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import gymnasium
@@ -17,15 +18,9 @@ import pixelbrax_gym
 import pixelbrax_jax
 from pixelbrax_jax import distractors
 from tests.gym.conftest import ID, TASK
+from tests.gym.test_registration import steps_until_truncated
 
-
-def calls_until_truncated(env):
-    env.reset(seed=0)
-    for count in range(1, 3000):
-        truncated = env.step(np.zeros(1, np.float32))[3]
-        if truncated:
-            return count
-    raise AssertionError("no end")
+until_truncated = partial(steps_until_truncated, at_most=3000)
 
 
 @pytest.mark.parametrize(
@@ -40,8 +35,8 @@ def calls_until_truncated(env):
 )
 def test_a_limit_beyond_the_default_is_heeded(options, expected):
     env = gymnasium.make(ID, obs_mode="state", **options)
-    assert calls_until_truncated(env) == expected
-    assert calls_until_truncated(gymnasium.make(env.spec)) == expected
+    assert until_truncated(env) == expected
+    assert until_truncated(gymnasium.make(env.spec)) == expected
     if "max_episode_steps" in options:
         assert env.spec.max_episode_steps == options["max_episode_steps"]
         if "episode_length" not in options:
@@ -56,12 +51,12 @@ def test_a_limit_beyond_the_default_is_heeded(options, expected):
 def test_a_time_limit_of_ones_own():
     bare = pixelbrax_gym.PixelBraxEnv(TASK, obs_mode="state")
     outer = TimeLimit(gymnasium.wrappers.TransformReward(TimeLimit(bare, 1300), abs), 1100)
-    assert calls_until_truncated(outer) == 1100
+    assert until_truncated(outer) == 1100
     # Of the environment itself nobody has asked for more.
     bare = pixelbrax_gym.PixelBraxEnv(TASK, obs_mode="state")
     other = TimeLimit(pixelbrax_gym.PixelBraxEnv(TASK, obs_mode="state"), 1100)
     other.reset(seed=0)
-    assert calls_until_truncated(bare) == 1000
+    assert until_truncated(bare) == 1000
 
 
 def through_json(env):
