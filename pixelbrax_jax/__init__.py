@@ -5,10 +5,6 @@ from __future__ import annotations
 from importlib import import_module, metadata
 from typing import TYPE_CHECKING, Any
 
-from pixelbrax_jax.deprecation import find_former_names
-
-find_former_names()
-
 if TYPE_CHECKING:
     from pixelbrax_jax import distractors as distractors
     from pixelbrax_jax.compilation import compiler_options as compiler_options

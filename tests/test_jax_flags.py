@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import pixelbrax_jax as pb
-from pixelbrax_jax.agents.algorithms.registry import ALGORITHMS
+from pixelbrax_jax.agents.registry import ALGORITHMS
 from pixelbrax_jax.distractors.presets import PRESETS
 from pixelbrax_jax.flags import PRNG, under_default_flags
 from pixelbrax_jax.tasks import TASKS

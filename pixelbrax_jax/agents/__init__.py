@@ -1,11 +1,11 @@
 """Agents that learn from pixels, written in JAX: PPO, PPG and DCPG."""
 
-from pixelbrax_jax.agents.algorithms.dcpg import DCPG, DCPGConfig
-from pixelbrax_jax.agents.algorithms.ppg import PPG, PPGConfig
-from pixelbrax_jax.agents.algorithms.ppo import PPO, PPOConfig
-from pixelbrax_jax.agents.algorithms.presets import preset
-from pixelbrax_jax.agents.algorithms.registry import ALGORITHMS, make_algorithm, make_train
-from pixelbrax_jax.agents.core.algorithm import Algorithm
+from pixelbrax_jax.agents.algorithm import Algorithm
+from pixelbrax_jax.agents.on_policy.dcpg import DCPG, DCPGConfig
+from pixelbrax_jax.agents.on_policy.ppg import PPG, PPGConfig
+from pixelbrax_jax.agents.on_policy.ppo import PPO, PPOConfig
+from pixelbrax_jax.agents.on_policy.presets import preset
+from pixelbrax_jax.agents.registry import ALGORITHMS, make_algorithm, make_train
 
 __all__ = [
     "ALGORITHMS",

@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from pixelbrax_jax._cpu.chunks import step_rows
+from pixelbrax_jax._platform.chunks import step_rows
 from pixelbrax_jax.envs import observe
 from pixelbrax_jax.envs.autoreset import AUTORESET_MODES, replace_rows, reset_rows
 from pixelbrax_jax.envs.param_rows import ParamRows, split_params

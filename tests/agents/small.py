@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from pixelbrax_jax import EnvParams, PixelEnv, VectorPixelEnv
-from pixelbrax_jax.agents.core.algorithm import Algorithm
-from pixelbrax_jax.agents.core.train_state import TrainState
+from pixelbrax_jax.agents.algorithm import Algorithm
+from pixelbrax_jax.agents.train_state import TrainState
 from tests.envs.toy import Ball, limited
 
 EPISODE_LENGTH = 5

@@ -8,11 +8,11 @@ from dataclasses import fields
 
 import pytest
 
-from pixelbrax_jax.agents.algorithms.dcpg import DCPGConfig
-from pixelbrax_jax.agents.algorithms.ppg import PPGConfig
-from pixelbrax_jax.agents.algorithms.ppo import PPO, PPOConfig
-from pixelbrax_jax.agents.algorithms.registry import ALGORITHMS, make_train
-from pixelbrax_jax.agents.core.config import TrainConfig, describe, make_env
+from pixelbrax_jax.agents.config import TrainConfig, describe, make_env
+from pixelbrax_jax.agents.on_policy.dcpg import DCPGConfig
+from pixelbrax_jax.agents.on_policy.ppg import PPGConfig
+from pixelbrax_jax.agents.on_policy.ppo import PPO, PPOConfig
+from pixelbrax_jax.agents.registry import ALGORITHMS, make_train
 from pixelbrax_jax.agents.runner.train import RunConfig
 from pixelbrax_jax.envs.vector import VectorPixelEnv
 from tests.agents.small import SMALL, ball_envs

@@ -8,16 +8,16 @@ import numpy as np
 import optax
 import pytest
 
-from pixelbrax_jax.agents.core.config import TrainConfig
-from pixelbrax_jax.agents.core.distributions import Normal
-from pixelbrax_jax.agents.core.losses import (
+from pixelbrax_jax.agents.config import TrainConfig
+from pixelbrax_jax.agents.networks.distributions import Normal
+from pixelbrax_jax.agents.on_policy.losses import (
     Batch,
     clipped_value_loss,
     normalized,
     policy_loss,
     value_loss,
 )
-from pixelbrax_jax.agents.core.optimizer import Optimizer
+from pixelbrax_jax.agents.optimizer import Optimizer
 
 B = 12
 CONFIG = TrainConfig(clip_coef=0.2, ent_coef=0.03, normalize_advantage="none")

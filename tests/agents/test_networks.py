@@ -13,9 +13,7 @@ import pytest
 from flax import linen as nn
 from scipy import integrate, stats
 
-from pixelbrax_jax.agents.core.convolution import convolve
-from pixelbrax_jax.agents.core.distributions import Normal
-from pixelbrax_jax.agents.core.networks import (
+from pixelbrax_jax.agents.networks.actor import (
     ENCODERS,
     POLICIES,
     SMALLEST,
@@ -23,6 +21,8 @@ from pixelbrax_jax.agents.core.networks import (
     Critic,
     max_pool,
 )
+from pixelbrax_jax.agents.networks.convolution import convolve
+from pixelbrax_jax.agents.networks.distributions import Normal
 
 
 def plain_max_pool(x):

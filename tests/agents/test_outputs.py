@@ -16,7 +16,7 @@ import pytest
 from tensorboardX.proto.event_pb2 import Event
 from tensorboardX.record_writer import masked_crc32c
 
-from pixelbrax_jax.agents.algorithms.ppo import PPO, PPOConfig
+from pixelbrax_jax.agents.on_policy.ppo import PPO, PPOConfig
 from pixelbrax_jax.agents.runner import interruption, metrics, saving, train
 from pixelbrax_jax.agents.runner.checkpoint import CheckpointError, Checkpoints
 from pixelbrax_jax.agents.runner.metrics import AppendedFile, MetricsWriter, read_metrics

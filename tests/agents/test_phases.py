@@ -9,13 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pixelbrax_jax.agents.algorithms.dcpg import DCPG, DCPGConfig, dynamics_loss
-from pixelbrax_jax.agents.algorithms.ppg import PPG, PPGConfig
-from pixelbrax_jax.agents.core import phasic
-from pixelbrax_jax.agents.core.actor_critic import ActorCritic
-from pixelbrax_jax.agents.core.losses import mean
-from pixelbrax_jax.agents.core.networks import Dynamics
-from pixelbrax_jax.agents.core.rollout import observations
+from pixelbrax_jax.agents.networks.actor import Dynamics
+from pixelbrax_jax.agents.on_policy import phasic
+from pixelbrax_jax.agents.on_policy.actor_critic import ActorCritic
+from pixelbrax_jax.agents.on_policy.dcpg import DCPG, DCPGConfig, dynamics_loss
+from pixelbrax_jax.agents.on_policy.losses import mean
+from pixelbrax_jax.agents.on_policy.ppg import PPG, PPGConfig
+from pixelbrax_jax.agents.on_policy.rollout import observations
 from tests.agents.small import PHASIC, SMALL, Agent, assert_close, ball_envs, same
 
 NUM_AUX_STEPS = PHASIC["aux_epochs"] * PHASIC["aux_minibatches"]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pixelbrax_jax import list_pretrained, load_policy, make, policy
-from pixelbrax_jax.agents.algorithms.registry import ALGORITHMS
+from pixelbrax_jax.agents.registry import ALGORITHMS
 from pixelbrax_jax.agents.runner.trained import load_pretrained
 from pixelbrax_jax.cli import main
 

@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 
 from pixelbrax_jax import PixelEnv, VectorPixelEnv
-from pixelbrax_jax.agents.algorithms.dcpg import DCPG, DCPGConfig
-from pixelbrax_jax.agents.algorithms.ppg import PPG, PPGConfig
-from pixelbrax_jax.agents.algorithms.ppo import PPO, PPOConfig
-from pixelbrax_jax.agents.core.networks import Actor, Critic
+from pixelbrax_jax.agents.networks.actor import Actor, Critic
+from pixelbrax_jax.agents.on_policy.dcpg import DCPG, DCPGConfig
+from pixelbrax_jax.agents.on_policy.ppg import PPG, PPGConfig
+from pixelbrax_jax.agents.on_policy.ppo import PPO, PPOConfig
 from tests.agents.probes import NAMES, TARGETS, TIME_LIMIT, Probes, true_values
 from tests.envs.toy import limited
 from tests.xla_flags import optimized

@@ -117,8 +117,8 @@ def test_frames_stay_on_their_devices(tmp_path):
     """What devices tell each other is gradients, not frames."""
     code = r"""
 import jax, re
-from pixelbrax_jax.agents.core.config import make_env
-from pixelbrax_jax.agents.algorithms.ppg import PPG, PPGConfig
+from pixelbrax_jax.agents.config import make_env
+from pixelbrax_jax.agents.on_policy.ppg import PPG, PPGConfig
 from pixelbrax_jax.agents.runner.sharding import replicate, state_shardings
 from pixelbrax_jax.envs.sharded import ShardedVectorEnv, make_env_mesh
 

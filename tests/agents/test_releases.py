@@ -9,8 +9,8 @@ from pathlib import Path
 import jax
 import pytest
 
-from pixelbrax_jax.agents.algorithms.ppg import PPGConfig
-from pixelbrax_jax.agents.algorithms.ppo import PPO, PPOConfig
+from pixelbrax_jax.agents.on_policy.ppg import PPGConfig
+from pixelbrax_jax.agents.on_policy.ppo import PPO, PPOConfig
 from pixelbrax_jax.agents.runner import settings
 from pixelbrax_jax.agents.runner.checkpoint import CheckpointError, Checkpoints, read_about
 from pixelbrax_jax.agents.runner.seeds import Runs

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from pixelbrax_jax import PixelEnv, VectorPixelEnv
-from pixelbrax_jax.agents.core import phasic
-from pixelbrax_jax.agents.core.config import TrainConfig
-from pixelbrax_jax.agents.core.distributions import Normal
-from pixelbrax_jax.agents.core.experience import Experience
-from pixelbrax_jax.agents.core.rollout import (
+from pixelbrax_jax.agents.config import TrainConfig
+from pixelbrax_jax.agents.networks.distributions import Normal
+from pixelbrax_jax.agents.on_policy import phasic
+from pixelbrax_jax.agents.on_policy.experience import Experience
+from pixelbrax_jax.agents.on_policy.rollout import (
     Decision,
     collect,
     minibatch_times,

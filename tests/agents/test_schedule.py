@@ -10,10 +10,10 @@ import pytest
 from flax import struct
 
 from pixelbrax_jax import PixelEnv, VectorPixelEnv
-from pixelbrax_jax.agents.algorithms.dcpg import DCPG, DCPGConfig
-from pixelbrax_jax.agents.algorithms.ppg import PPG, PPGConfig
-from pixelbrax_jax.agents.algorithms.ppo import PPO, PPOConfig
-from pixelbrax_jax.agents.core.env_axis import along_envs, as_declared, env_axes, without_envs
+from pixelbrax_jax.agents.env_axis import along_envs, as_declared, env_axes, without_envs
+from pixelbrax_jax.agents.on_policy.dcpg import DCPG, DCPGConfig
+from pixelbrax_jax.agents.on_policy.ppg import PPG, PPGConfig
+from pixelbrax_jax.agents.on_policy.ppo import PPO, PPOConfig
 from pixelbrax_jax.agents.runner import programs
 from pixelbrax_jax.agents.runner.evaluate import Evaluator
 from pixelbrax_jax.agents.runner.schedule import Schedule

@@ -10,7 +10,7 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 
-from pixelbrax_jax.agents.algorithms.ppo import PPOConfig
+from pixelbrax_jax.agents.on_policy.ppo import PPOConfig
 from pixelbrax_jax.agents.runner.evaluate import (
     NoSplitError,
     make_split,

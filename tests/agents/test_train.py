@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 from pixelbrax_jax import PixelEnv
-from pixelbrax_jax.agents.algorithms.ppg import PPG, PPGConfig
-from pixelbrax_jax.agents.core.config import describe
+from pixelbrax_jax.agents.config import describe
+from pixelbrax_jax.agents.on_policy.ppg import PPG, PPGConfig
 from pixelbrax_jax.agents.runner import train
 from pixelbrax_jax.agents.runner.checkpoint import (
     CheckpointError,

@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pixelbrax_jax.agents.algorithms.dcpg import DCPG, DCPGConfig
-from pixelbrax_jax.agents.algorithms.ppg import PPG, PPGConfig
-from pixelbrax_jax.agents.algorithms.ppo import PPO, PPOConfig
-from pixelbrax_jax.agents.core.actor_critic import ActorCritic
-from pixelbrax_jax.agents.core.algorithm import train_function
-from pixelbrax_jax.agents.core.losses import value_loss
+from pixelbrax_jax.agents.algorithm import train_function
+from pixelbrax_jax.agents.on_policy.actor_critic import ActorCritic
+from pixelbrax_jax.agents.on_policy.dcpg import DCPG, DCPGConfig
+from pixelbrax_jax.agents.on_policy.losses import value_loss
+from pixelbrax_jax.agents.on_policy.ppg import PPG, PPGConfig
+from pixelbrax_jax.agents.on_policy.ppo import PPO, PPOConfig
 from tests.agents.small import PARAMS, PHASIC, SMALL, Agent, assert_close, ball_envs, same
 
 ITERATIONS = 3

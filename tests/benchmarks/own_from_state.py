@@ -22,15 +22,15 @@ import numpy as np
 from flax import linen as nn
 
 from pixelbrax_jax import VectorPixelEnv, compiler_options
-from pixelbrax_jax.agents.algorithms.ppo import PPO, PPOConfig
-from pixelbrax_jax.agents.algorithms.presets import preset
-from pixelbrax_jax.agents.core.actor_critic import ActorCritic
-from pixelbrax_jax.agents.core.algorithm import train_function
-from pixelbrax_jax.agents.core.config import make_env
-from pixelbrax_jax.agents.core.distributions import Normal
-from pixelbrax_jax.agents.core.losses import Metrics
-from pixelbrax_jax.agents.core.networks import LOG_STD_RANGE, SMALLEST
-from pixelbrax_jax.agents.core.optimizer import Networks
+from pixelbrax_jax.agents.algorithm import train_function
+from pixelbrax_jax.agents.config import make_env
+from pixelbrax_jax.agents.networks.actor import LOG_STD_RANGE, SMALLEST
+from pixelbrax_jax.agents.networks.distributions import Normal
+from pixelbrax_jax.agents.on_policy.actor_critic import ActorCritic
+from pixelbrax_jax.agents.on_policy.losses import Metrics
+from pixelbrax_jax.agents.on_policy.ppo import PPO, PPOConfig
+from pixelbrax_jax.agents.on_policy.presets import preset
+from pixelbrax_jax.agents.optimizer import Networks
 from tests.benchmarks.experiments import TASKS
 from tests.benchmarks.results import FOLDER, task_key
 

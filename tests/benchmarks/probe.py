@@ -22,8 +22,8 @@ import optax
 from flax import linen as nn
 
 from pixelbrax_jax import VectorPixelEnv
-from pixelbrax_jax.agents.core.config import make_env
-from pixelbrax_jax.agents.core.networks import ENCODERS, scaled
+from pixelbrax_jax.agents.config import make_env
+from pixelbrax_jax.agents.networks.actor import ENCODERS, scaled
 from pixelbrax_jax.agents.runner.trained import load_trained
 
 

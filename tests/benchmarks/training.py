@@ -20,9 +20,9 @@ import jax
 import numpy as np
 
 from pixelbrax_jax import VectorPixelEnv, compiler_options
-from pixelbrax_jax.agents.algorithms.ppo import PPO, PPOConfig
-from pixelbrax_jax.agents.core.config import make_env
-from pixelbrax_jax.agents.core.networks import ENCODERS
+from pixelbrax_jax.agents.config import make_env
+from pixelbrax_jax.agents.networks.actor import ENCODERS
+from pixelbrax_jax.agents.on_policy.ppo import PPO, PPOConfig
 
 REPETITIONS = 5
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import pixelbrax_jax as pb
-from pixelbrax_jax._cpu import chunks
-from pixelbrax_jax._cpu.chunks import chunk_size, step_rows
+from pixelbrax_jax._platform import chunks
+from pixelbrax_jax._platform.chunks import chunk_size, step_rows
 from tests.envs.toy import PARAMS, Ball
 
 

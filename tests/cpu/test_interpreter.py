@@ -9,8 +9,8 @@ import pytest
 from jax.sharding import AxisType
 from jax.sharding import PartitionSpec as P
 
-from pixelbrax_jax._cpu import interpreter as module
-from pixelbrax_jax._cpu.interpreter import batch_last
+from pixelbrax_jax._platform import interpreter as module
+from pixelbrax_jax._platform.interpreter import batch_last
 from tests.cpu.equations import equations
 
 TABLE = jnp.arange(12.0).reshape(4, 3)

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import pytest
 
 import pixelbrax_jax as pb
-from pixelbrax_jax._cpu import interpreter
-from pixelbrax_jax._cpu.interpreter import batch_last
+from pixelbrax_jax._platform import interpreter
+from pixelbrax_jax._platform.interpreter import batch_last
 from pixelbrax_jax.tasks import BRAX_TASKS
 from tests.cpu.equations import equations
 

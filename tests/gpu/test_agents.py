@@ -20,7 +20,7 @@ pytestmark = pytest.mark.gpu
 
 @pytest.mark.parametrize("name", ["ppo", "ppg", "dcpg"])
 def test_the_same_key_gives_the_same_run(name):
-    from pixelbrax_jax.agents.algorithms.registry import ALGORITHMS
+    from pixelbrax_jax.agents.registry import ALGORITHMS
 
     settings = SMALL | ({} if name == "ppo" else PHASIC)
     agent = Agent(ALGORITHMS[name](ALGORITHMS[name].config_class(**settings), ball_envs()))
@@ -29,7 +29,7 @@ def test_the_same_key_gives_the_same_run(name):
 
 
 def test_an_exported_policy_acts_on_tensors_of_the_device(tmp_path, device):
-    from pixelbrax_jax.agents.algorithms.ppo import PPO, PPOConfig
+    from pixelbrax_jax.agents.on_policy.ppo import PPO, PPOConfig
 
     agent = Agent(PPO(PPOConfig(**SMALL), ball_envs()))
     networks = agent.init().networks

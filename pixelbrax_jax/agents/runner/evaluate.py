@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pixelbrax_jax.agents.core.config import TrainConfig, make_env
-from pixelbrax_jax.agents.core.optimizer import Networks
+from pixelbrax_jax.agents.config import TrainConfig, make_env
+from pixelbrax_jax.agents.optimizer import Networks
 from pixelbrax_jax.agents.runner.settings import clip_digests, shared_clips
 from pixelbrax_jax.cache import whole_path
 from pixelbrax_jax.compilation import jit

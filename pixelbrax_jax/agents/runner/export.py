@@ -7,8 +7,8 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
-from pixelbrax_jax.agents.core.algorithm import Algorithm
-from pixelbrax_jax.agents.core.optimizer import Networks
+from pixelbrax_jax.agents.algorithm import Algorithm
+from pixelbrax_jax.agents.optimizer import Networks
 
 PLATFORMS = ("cpu", "cuda", "tpu")
 

@@ -7,10 +7,10 @@ from collections.abc import Callable
 
 import jax
 
-from pixelbrax_jax.agents.core.algorithm import Algorithm
-from pixelbrax_jax.agents.core.train_state import TrainState
+from pixelbrax_jax.agents.algorithm import Algorithm
 from pixelbrax_jax.agents.runner.checkpoint import nbytes
 from pixelbrax_jax.agents.runner.sharding import any_process, mesh_of
+from pixelbrax_jax.agents.train_state import TrainState
 
 
 def check_memory(algorithm: Algorithm, template: TrainState, report: Callable[[str], None]) -> None:

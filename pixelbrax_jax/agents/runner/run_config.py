@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pixelbrax_jax.agents.core.config import check_count, check_positive
+from pixelbrax_jax.agents.config import check_count, check_positive
 from pixelbrax_jax.validation import check_choice, check_positive_int
 
 RESUME = ("never", "latest")

@@ -9,9 +9,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from pixelbrax_jax.agents.core.algorithm import Algorithm
-from pixelbrax_jax.agents.core.losses import Metrics
-from pixelbrax_jax.agents.core.train_state import TrainState
+from pixelbrax_jax.agents.algorithm import Algorithm
+from pixelbrax_jax.agents.on_policy.losses import Metrics
+from pixelbrax_jax.agents.train_state import TrainState
 from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.types import EnvParams
 

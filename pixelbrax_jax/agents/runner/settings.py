@@ -12,8 +12,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from pixelbrax_jax.agents.core.algorithm import Algorithm
-from pixelbrax_jax.agents.core.config import TrainConfig, describe
+from pixelbrax_jax.agents.algorithm import Algorithm
+from pixelbrax_jax.agents.config import TrainConfig, describe
 from pixelbrax_jax.agents.runner.run_config import RunConfig
 from pixelbrax_jax.cache import whole_path
 from pixelbrax_jax.types import Clips

@@ -14,8 +14,8 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from pixelbrax_jax.agents.core.algorithm import Algorithm
-from pixelbrax_jax.agents.core.env_axis import env_axes
+from pixelbrax_jax.agents.algorithm import Algorithm
+from pixelbrax_jax.agents.env_axis import env_axes
 from pixelbrax_jax.envs.sharded import AXIS
 
 

@@ -12,8 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from pixelbrax_jax.agents.core.algorithm import Algorithm
-from pixelbrax_jax.agents.core.train_state import TrainState
+from pixelbrax_jax.agents.algorithm import Algorithm
 from pixelbrax_jax.agents.runner import programs
 from pixelbrax_jax.agents.runner.checkpoint import CheckpointError, Checkpoints
 from pixelbrax_jax.agents.runner.evaluate import Evaluator, Result, interquartile_mean, make_splits
@@ -39,6 +38,7 @@ from pixelbrax_jax.agents.runner.sharding import (
     replicate,
     state_shardings,
 )
+from pixelbrax_jax.agents.train_state import TrainState
 from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.stop_signals import signal_name
 from pixelbrax_jax.types import EnvParams

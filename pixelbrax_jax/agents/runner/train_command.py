@@ -14,9 +14,9 @@ import jax
 import tyro
 from tqdm import tqdm
 
-from pixelbrax_jax.agents.algorithms.presets import PRESETS, preset
-from pixelbrax_jax.agents.algorithms.registry import ALGORITHMS, make_algorithm
-from pixelbrax_jax.agents.core.config import TrainConfig, make_env
+from pixelbrax_jax.agents.config import TrainConfig, make_env
+from pixelbrax_jax.agents.on_policy.presets import PRESETS, preset
+from pixelbrax_jax.agents.registry import ALGORITHMS, make_algorithm
 from pixelbrax_jax.agents.runner.checkpoint import CheckpointError, latest_steps
 from pixelbrax_jax.agents.runner.option_types import names_for_objects
 from pixelbrax_jax.agents.runner.run_config import RunConfig

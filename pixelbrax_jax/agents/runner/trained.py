@@ -11,9 +11,9 @@ from typing import Any
 
 import jax
 
-from pixelbrax_jax.agents.algorithms.registry import ALGORITHMS
-from pixelbrax_jax.agents.core.config import TrainConfig, make_env
-from pixelbrax_jax.agents.core.optimizer import Networks
+from pixelbrax_jax.agents.config import TrainConfig, make_env
+from pixelbrax_jax.agents.optimizer import Networks
+from pixelbrax_jax.agents.registry import ALGORITHMS
 from pixelbrax_jax.agents.runner.checkpoint import (
     CheckpointError,
     best_steps,

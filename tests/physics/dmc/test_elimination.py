@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pixelbrax_jax._cpu.interpreter import batch_last
+from pixelbrax_jax._platform.interpreter import batch_last
 from pixelbrax_jax.physics.mjx import elimination
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from mujoco.mjx._src import solver as theirs
 
-from pixelbrax_jax._cpu.interpreter import batch_last
+from pixelbrax_jax._platform.interpreter import batch_last
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics
 from pixelbrax_jax.physics.mjx.solver import is_supported
 

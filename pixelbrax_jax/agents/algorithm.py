@@ -10,12 +10,12 @@ from typing import ClassVar, Protocol
 import jax
 import jax.numpy as jnp
 
-from pixelbrax_jax.agents.core.config import TrainConfig, make_env
-from pixelbrax_jax.agents.core.losses import Metrics
-from pixelbrax_jax.agents.core.optimizer import Networks, Optimizer
-from pixelbrax_jax.agents.core.returns import RewardScaler
-from pixelbrax_jax.agents.core.rollout import Environments
-from pixelbrax_jax.agents.core.train_state import TrainState, env_key, network_key
+from pixelbrax_jax.agents.config import TrainConfig, make_env
+from pixelbrax_jax.agents.on_policy.losses import Metrics
+from pixelbrax_jax.agents.on_policy.returns import RewardScaler
+from pixelbrax_jax.agents.on_policy.rollout import Environments
+from pixelbrax_jax.agents.optimizer import Networks, Optimizer
+from pixelbrax_jax.agents.train_state import TrainState, env_key, network_key
 from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.types import EnvParams

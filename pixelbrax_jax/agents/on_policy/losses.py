@@ -7,9 +7,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from pixelbrax_jax.agents.core.config import TrainConfig
-from pixelbrax_jax.agents.core.distributions import Normal
-from pixelbrax_jax.agents.core.rollout import Rollout, at_times, observations
+from pixelbrax_jax.agents.config import TrainConfig
+from pixelbrax_jax.agents.networks.distributions import Normal
+from pixelbrax_jax.agents.on_policy.rollout import Rollout, at_times, observations
 
 Metrics = dict[str, jax.Array]
 

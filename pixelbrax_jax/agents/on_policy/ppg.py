@@ -8,21 +8,21 @@ from typing import ClassVar
 
 import jax
 
-from pixelbrax_jax.agents.core import phasic
-from pixelbrax_jax.agents.core.actor_critic import ActorCritic
-from pixelbrax_jax.agents.core.algorithm import Algorithm
-from pixelbrax_jax.agents.core.config import TrainConfig, check_count, check_positive
-from pixelbrax_jax.agents.core.experience import gather
-from pixelbrax_jax.agents.core.losses import (
+from pixelbrax_jax.agents.algorithm import Algorithm
+from pixelbrax_jax.agents.config import TrainConfig, check_count, check_positive
+from pixelbrax_jax.agents.on_policy import phasic
+from pixelbrax_jax.agents.on_policy.actor_critic import ActorCritic
+from pixelbrax_jax.agents.on_policy.experience import gather
+from pixelbrax_jax.agents.on_policy.losses import (
     Batch,
     Metrics,
     policy_loss,
     policy_metrics,
     value_loss,
 )
-from pixelbrax_jax.agents.core.optimizer import Networks, Optimizer
-from pixelbrax_jax.agents.core.train_state import TrainState, update_key
-from pixelbrax_jax.agents.core.update import update
+from pixelbrax_jax.agents.on_policy.update import update
+from pixelbrax_jax.agents.optimizer import Networks, Optimizer
+from pixelbrax_jax.agents.train_state import TrainState, update_key
 from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.types import EnvParams
 from pixelbrax_jax.validation import check_choice, check_positive_int

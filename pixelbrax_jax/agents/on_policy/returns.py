@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from pixelbrax_jax.agents.core.env_axis import along_envs, without_envs
+from pixelbrax_jax.agents.env_axis import along_envs, without_envs
 
 
 def gae(

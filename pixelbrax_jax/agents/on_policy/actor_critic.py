@@ -10,11 +10,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from pixelbrax_jax.agents.core.config import TrainConfig
-from pixelbrax_jax.agents.core.distributions import Normal
-from pixelbrax_jax.agents.core.networks import Actor, ActorOutput, Critic
-from pixelbrax_jax.agents.core.optimizer import Networks
-from pixelbrax_jax.agents.core.rollout import Decision, Environments
+from pixelbrax_jax.agents.config import TrainConfig
+from pixelbrax_jax.agents.networks.actor import Actor, ActorOutput, Critic
+from pixelbrax_jax.agents.networks.distributions import Normal
+from pixelbrax_jax.agents.on_policy.rollout import Decision, Environments
+from pixelbrax_jax.agents.optimizer import Networks
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from pixelbrax_jax._cpu.interpreter import batch_last
+from pixelbrax_jax._platform.interpreter import batch_last
 
 _CHUNK = 128
 """Largest chunk of rows that a CPU computes together; see `chunk_size`."""

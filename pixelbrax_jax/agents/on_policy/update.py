@@ -8,11 +8,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from pixelbrax_jax.agents.core.config import TrainConfig
-from pixelbrax_jax.agents.core.experience import Experience
-from pixelbrax_jax.agents.core.losses import Batch, Metrics, batch_at
-from pixelbrax_jax.agents.core.optimizer import Networks, Optimizer
-from pixelbrax_jax.agents.core.rollout import minibatch_times
+from pixelbrax_jax.agents.config import TrainConfig
+from pixelbrax_jax.agents.on_policy.experience import Experience
+from pixelbrax_jax.agents.on_policy.losses import Batch, Metrics, batch_at
+from pixelbrax_jax.agents.on_policy.rollout import minibatch_times
+from pixelbrax_jax.agents.optimizer import Networks, Optimizer
 
 Loss = Callable[[Networks, Batch, jax.Array], tuple[jax.Array, Metrics]]
 

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jax import lax
 from jax.extend import core
 
-from pixelbrax_jax._cpu.rules import FEW, RULES, Operand, bind, row_aval, rule, spread
+from pixelbrax_jax._platform.rules import FEW, RULES, Operand, bind, row_aval, rule, spread
 
 _LANES = 16
 """Rows are padded to a multiple, so that loops over vectors leave no scalar remainder."""

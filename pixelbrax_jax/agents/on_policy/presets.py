@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from pixelbrax_jax.agents.algorithms.registry import ALGORITHMS
-from pixelbrax_jax.agents.core.config import TrainConfig
+from pixelbrax_jax.agents.config import TrainConfig
+from pixelbrax_jax.agents.registry import ALGORITHMS
 from pixelbrax_jax.validation import check_choice
 
 _DEACREP = {

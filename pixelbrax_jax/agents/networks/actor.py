@@ -11,8 +11,8 @@ import jax.numpy as jnp
 from flax import linen as nn
 from flax import struct
 
-from pixelbrax_jax.agents.core.convolution import Conv
-from pixelbrax_jax.agents.core.distributions import Normal
+from pixelbrax_jax.agents.networks.convolution import Conv
+from pixelbrax_jax.agents.networks.distributions import Normal
 
 LOG_STD_RANGE = (-5.0, 2.0)
 """Between which logarithms of standard deviations are kept."""

@@ -13,22 +13,22 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from pixelbrax_jax.agents.core.actor_critic import ActorCritic
-from pixelbrax_jax.agents.core.config import TrainConfig, check_divides
-from pixelbrax_jax.agents.core.distributions import Normal
-from pixelbrax_jax.agents.core.env_axis import along_envs, as_declared
-from pixelbrax_jax.agents.core.experience import Experience, gather
-from pixelbrax_jax.agents.core.losses import Metrics, mean, value_loss
-from pixelbrax_jax.agents.core.networks import ActorOutput
-from pixelbrax_jax.agents.core.optimizer import Networks, Optimizer
-from pixelbrax_jax.agents.core.rollout import (
+from pixelbrax_jax.agents.config import TrainConfig, check_divides
+from pixelbrax_jax.agents.env_axis import along_envs, as_declared
+from pixelbrax_jax.agents.networks.actor import ActorOutput
+from pixelbrax_jax.agents.networks.distributions import Normal
+from pixelbrax_jax.agents.on_policy.actor_critic import ActorCritic
+from pixelbrax_jax.agents.on_policy.experience import Experience, gather
+from pixelbrax_jax.agents.on_policy.losses import Metrics, mean, value_loss
+from pixelbrax_jax.agents.on_policy.rollout import (
     Decision,
     Environments,
     Frames,
     minibatch_times,
     observations,
 )
-from pixelbrax_jax.agents.core.train_state import TrainState, auxiliary_key
+from pixelbrax_jax.agents.optimizer import Networks, Optimizer
+from pixelbrax_jax.agents.train_state import TrainState, auxiliary_key
 from pixelbrax_jax.types import EnvParams
 from pixelbrax_jax.validation import check_positive_int
 

@@ -8,11 +8,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from pixelbrax_jax.agents.core.config import TrainConfig
-from pixelbrax_jax.agents.core.losses import Metrics, mean, normalized
-from pixelbrax_jax.agents.core.returns import gae
-from pixelbrax_jax.agents.core.rollout import Decision, Environments, Rollout, collect
-from pixelbrax_jax.agents.core.train_state import TrainState, action_key
+from pixelbrax_jax.agents.config import TrainConfig
+from pixelbrax_jax.agents.on_policy.losses import Metrics, mean, normalized
+from pixelbrax_jax.agents.on_policy.returns import gae
+from pixelbrax_jax.agents.on_policy.rollout import Decision, Environments, Rollout, collect
+from pixelbrax_jax.agents.train_state import TrainState, action_key
 from pixelbrax_jax.types import EnvParams
 
 

@@ -8,7 +8,7 @@ from numbers import Integral, Real
 from types import NoneType
 from typing import Any
 
-from pixelbrax_jax.agents.core.networks import ENCODERS, LOG_STD_RANGE, POLICIES, SMALLEST
+from pixelbrax_jax.agents.networks.actor import ENCODERS, LOG_STD_RANGE, POLICIES, SMALLEST
 from pixelbrax_jax.config import EnvConfig
 from pixelbrax_jax.distractors.presets import as_tuple
 from pixelbrax_jax.envs.pixel_env import PixelEnv

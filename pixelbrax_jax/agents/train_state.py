@@ -8,9 +8,9 @@ from typing import Any
 import jax
 from flax import struct
 
-from pixelbrax_jax.agents.core.env_axis import along_envs, as_declared, without_envs
-from pixelbrax_jax.agents.core.optimizer import Networks
-from pixelbrax_jax.agents.core.returns import RewardScaler
+from pixelbrax_jax.agents.env_axis import along_envs, as_declared, without_envs
+from pixelbrax_jax.agents.on_policy.returns import RewardScaler
+from pixelbrax_jax.agents.optimizer import Networks
 from pixelbrax_jax.types import EnvState
 
 _ENVS, _NETWORKS, _ACTIONS, _UPDATES, _AUXILIARY = range(5)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from pixelbrax_jax.agents.core.config import TrainConfig
+from pixelbrax_jax.agents.config import TrainConfig
 
 Networks = dict[str, Any]
 """Parameters by name of the network."""

@@ -1,1 +1,0 @@
-"""One file for each algorithm, and the named settings of all."""

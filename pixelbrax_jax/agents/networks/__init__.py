@@ -1,0 +1,1 @@
+"""Networks of agents, and the distributions of their actions."""
