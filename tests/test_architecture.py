@@ -48,7 +48,7 @@ ALLOWED: dict[str, set[str]] = {
     "pixelbrax_jax.plain": _below("distractors"),
     "pixelbrax_jax.config": _below("plain", "scene", "renderer", "distractors"),
     # How a CPU runs a batch: it knows nothing of PixelBrax, and only `envs` knows of it.
-    "pixelbrax_jax._platform_platform": set(),
+    "pixelbrax_jax._platform": set(),
     "pixelbrax_jax.envs": _below("config", "_platform", *LAYERS),
     "pixelbrax_jax.registry": _below("config", "envs", *LAYERS),
     # The package itself, which names what is public.
