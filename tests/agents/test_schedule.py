@@ -10,7 +10,6 @@ import pytest
 from flax import struct
 
 from pixelbrax_jax import PixelEnv, VectorPixelEnv
-from pixelbrax_jax.agents.env_axis import along_envs, as_declared, env_axes, without_envs
 from pixelbrax_jax.agents.on_policy.dcpg import DCPG, DCPGConfig
 from pixelbrax_jax.agents.on_policy.ppg import PPG, PPGConfig
 from pixelbrax_jax.agents.on_policy.ppo import PPO, PPOConfig
@@ -18,6 +17,7 @@ from pixelbrax_jax.agents.runner import programs
 from pixelbrax_jax.agents.runner.evaluate import Evaluator
 from pixelbrax_jax.agents.runner.schedule import Schedule
 from pixelbrax_jax.agents.runner.seeds import Runs
+from pixelbrax_jax.agents.train_state import along_envs, as_declared, env_axes, without_envs
 from tests.agents.small import OPTIONS, PARAMS, PHASIC, SMALL, ball_envs
 from tests.compilations import counted
 from tests.envs.toy import Ball, limited

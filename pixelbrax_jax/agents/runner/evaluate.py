@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from pixelbrax_jax.agents.config import TrainConfig, make_env
-from pixelbrax_jax.agents.optimizer import Networks
 from pixelbrax_jax.agents.runner.settings import clip_digests, shared_clips
+from pixelbrax_jax.agents.train_state import Networks
 from pixelbrax_jax.cache import whole_path
 from pixelbrax_jax.compilation import jit
 from pixelbrax_jax.distractors import folders, procedural
@@ -37,6 +37,10 @@ WITHOUT_DISTRACTORS: dict[str, Any] = {"distractors": (), "clips": None, "split"
 
 class Player(Protocol):
     """What chooses actions; hashable. Every ``Algorithm`` does."""
+
+    @property
+    def acting(self) -> tuple[str, ...]:
+        """As ``Algorithm.acting``."""
 
     @property
     def config(self) -> TrainConfig:
@@ -222,14 +226,15 @@ class Evaluator:
         """
         envs = VectorPixelEnv(env, num_episodes, "disabled")
         self._play = partial(_play, envs, algorithm, deterministic)
+        self._acting = algorithm.acting
         with default_flags():
             self._key = jax.random.key(seed)
         self._params = env_params
 
     def __call__(self, networks: Networks) -> Result:
         """Play the episodes of a policy."""
-        actor = {"actor": networks["actor"]}
-        returns, lengths = jax.device_get(self._play(actor, self._key, self._params))
+        acting = {name: networks[name] for name in self._acting}
+        returns, lengths = jax.device_get(self._play(acting, self._key, self._params))
         return Result(returns=returns.astype(np.float64), lengths=lengths)
 
 

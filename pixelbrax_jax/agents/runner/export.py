@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax.agents.algorithm import Algorithm
-from pixelbrax_jax.agents.optimizer import Networks
+from pixelbrax_jax.agents.train_state import Networks
 
 PLATFORMS = ("cpu", "cuda", "tpu")
 
@@ -29,10 +29,10 @@ def save_policy(algorithm: Algorithm, networks: Networks, path: str | Path) -> P
     """
     spec = algorithm.envs.env.obs_spec
     spec = spec["pixels"] if isinstance(spec, dict) else spec
-    actor = {"actor": networks["actor"]}
+    acting = {name: networks[name] for name in algorithm.acting}
     (batch,) = jax.export.symbolic_shape("batch")
     exported = jax.export.export(
-        jax.jit(lambda pixels: algorithm.act(actor, pixels)), platforms=PLATFORMS
+        jax.jit(lambda pixels: algorithm.act(acting, pixels)), platforms=PLATFORMS
     )(jax.ShapeDtypeStruct((batch, *spec.shape), jnp.uint8))
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)

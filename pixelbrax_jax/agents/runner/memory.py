@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import fields
 
 import jax
 
 from pixelbrax_jax.agents.algorithm import Algorithm
 from pixelbrax_jax.agents.runner.checkpoint import nbytes
 from pixelbrax_jax.agents.runner.sharding import any_process, mesh_of
-from pixelbrax_jax.agents.train_state import TrainState
+from pixelbrax_jax.agents.train_state import TrainState, env_axes
 
 
 def check_memory(algorithm: Algorithm, template: TrainState, report: Callable[[str], None]) -> None:
@@ -25,24 +26,29 @@ def check_memory(algorithm: Algorithm, template: TrainState, report: Callable[[s
         MemoryError: it is more than ``memory_budget_gb``, or than the device has.
     """
     config = algorithm.config
-    frame = config.num_envs * config.height * config.width * 3
-    rollout = frame * (config.num_steps + config.frame_stack - 1) * template.iteration.size
-    buffer, parts = nbytes(template.buffer), _memories(algorithm)
-    # What belongs to environments is spread over the devices; the rest is the same on all.
-    alike = nbytes((template.networks, template.opt_state, template.aux_opt_state))
-    stored = alike + (rollout + nbytes(template) - alike) / parts
-    report(
-        f"stored: rollout {rollout / 1e9:.2f} GB, auxiliary buffer {buffer / 1e9:.2f} GB, all "
-        f"state {nbytes(template) / 1e9:.2f} GB"
+    frames = (
+        config.frames_per_iteration * config.height * config.width * 3 * template.iteration.size
     )
+    memories, total = _memories(algorithm), nbytes(template)
+    parts = {field.name: nbytes(getattr(template, field.name)) for field in fields(template)}
+    large = (f", {name} {n / 1e9:.2f} GB" for name, n in parts.items() if n > 0.01 * total)
+    report(
+        f"stored: frames of an iteration {frames / 1e9:.2f} GB, all state {total / 1e9:.2f} GB"
+        + "".join(large)
+    )
+    # What belongs to environments is spread over the devices; the rest is the same on all.
+    axes = jax.tree.leaves(env_axes(template))
+    leaves = zip(jax.tree.leaves(template), axes, strict=True)
+    alike = sum(nbytes(leaf) for leaf, axis in leaves if axis < 0)
+    needed = alike + (frames + total - alike) / memories
     budget = config.memory_budget_gb
     limit = budget * 1e9 if budget is not None else _device_memory()
-    if any_process(stored > limit):
-        where = f" in each of {parts} memories" if parts > 1 else ""
+    if any_process(needed > limit):
+        where = f" in each of {memories} memories" if memories > 1 else ""
         raise MemoryError(
-            f"rollout and state take {stored / 1e9:.2f} GB{where}, of {limit / 1e9:.2f} GB that "
-            f"may be used. Lower num_envs, num_steps{', num_policy_phases' if buffer else ''} or "
-            "the size of the images, or raise memory_budget_gb."
+            f"frames and state take {needed / 1e9:.2f} GB{where}, of {limit / 1e9:.2f} GB that "
+            f"may be used. Lower {', '.join(config.memory_settings)} or the size of the images, or "
+            "raise memory_budget_gb."
         )
 
 

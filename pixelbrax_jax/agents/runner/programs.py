@@ -6,10 +6,9 @@ from typing import Any
 
 import jax
 
-from pixelbrax_jax.agents.on_policy.losses import Metrics
 from pixelbrax_jax.agents.runner.seeds import Runs
 from pixelbrax_jax.agents.runner.sharding import mesh_of, replicated, state_shardings
-from pixelbrax_jax.agents.train_state import TrainState
+from pixelbrax_jax.agents.train_state import Metrics, TrainState
 from pixelbrax_jax.compilation import jit
 from pixelbrax_jax.types import EnvParams
 

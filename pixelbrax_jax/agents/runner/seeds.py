@@ -10,8 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax.agents.algorithm import Algorithm
-from pixelbrax_jax.agents.on_policy.losses import Metrics
-from pixelbrax_jax.agents.train_state import TrainState
+from pixelbrax_jax.agents.train_state import Metrics, TrainState
 from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.types import EnvParams
 

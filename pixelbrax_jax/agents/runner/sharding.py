@@ -15,7 +15,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from pixelbrax_jax.agents.algorithm import Algorithm
-from pixelbrax_jax.agents.env_axis import env_axes
+from pixelbrax_jax.agents.train_state import env_axes
 from pixelbrax_jax.envs.sharded import AXIS
 
 

@@ -38,7 +38,7 @@ from pixelbrax_jax.agents.runner.sharding import (
     replicate,
     state_shardings,
 )
-from pixelbrax_jax.agents.train_state import TrainState
+from pixelbrax_jax.agents.train_state import TrainState, kept, parts_not_kept
 from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.stop_signals import signal_name
 from pixelbrax_jax.types import EnvParams
@@ -143,7 +143,10 @@ def _run(
     )
     try:
         if _goes_on(checkpoints, options, report):
-            state = checkpoints.restore(template)
+            state = checkpoints.restore(kept(template))
+            if left_out := parts_not_kept(state):
+                fresh = programs.init(runs, seed, env_params)
+                state = state.replace(**{name: getattr(fresh, name) for name in left_out})
             if others := checkpoints.other_versions():
                 report(f"going on under other versions, so not to the bit: {', '.join(others)}")
             report(f"going on from the checkpoint of {_steps(algorithm, state)} steps")
@@ -203,7 +206,7 @@ class _Run:
         self._folder = Path(options.output_dir)
         self._schedule = Schedule(
             self._config.num_iterations,
-            runs.algorithm.num_phases,
+            runs.algorithm.auxiliary_every,
             options.log_every,
             options.num_evals,
         )
@@ -312,7 +315,7 @@ class _Run:
                         writer.write(steps, self._evaluate(state, steps))
                     case "save":
                         last = number == total or bool(stopped_by)
-                        saver.save(state, steps, self._score(steps), last=last)
+                        saver.save(kept(state), steps, self._score(steps), last=last)
                     case "report_stop":
                         self._report(
                             f"stopped by {signal_name(stopped_by)} after {steps} steps; go on with "

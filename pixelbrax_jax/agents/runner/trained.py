@@ -7,12 +7,11 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 
 from pixelbrax_jax.agents.config import TrainConfig, make_env
-from pixelbrax_jax.agents.optimizer import Networks
 from pixelbrax_jax.agents.registry import ALGORITHMS
 from pixelbrax_jax.agents.runner.checkpoint import (
     CheckpointError,
@@ -28,6 +27,7 @@ from pixelbrax_jax.agents.runner.settings import (
     former_settings,
     unknown_settings,
 )
+from pixelbrax_jax.agents.train_state import Networks
 from pixelbrax_jax.distractors.presets import as_tuple
 from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.flags import under_default_flags
@@ -40,6 +40,7 @@ class Pretrained:
 
     config: TrainConfig
     policy: Policy
+    acting: ClassVar[tuple[str, ...]] = ()
 
     @under_default_flags
     def act(self, networks: Networks, pixels: jax.Array, key: jax.Array | None = None) -> jax.Array:
@@ -85,7 +86,7 @@ def load_pretrained(name: str) -> Trained:
     """
     about = read_pretrained(name)
     player = Pretrained(load_config(about), load_policy(name))
-    return Trained(player, {"actor": {}}, about["steps"], about["config"].get("seed", 0))
+    return Trained(player, {}, about["steps"], about["config"].get("seed", 0))
 
 
 def load_chosen(options: argparse.Namespace) -> Trained:
