@@ -20,9 +20,9 @@ from pixelbrax_jax.physics.mjx import models
 from pixelbrax_jax.physics.mjx.elimination import LARGEST
 from pixelbrax_jax.physics.mjx.solver import is_supported
 from pixelbrax_jax.tasks import BRAX_TASKS, DMC_TASKS
-from tests.cpu.equations import equations
 from tests.physics.dmc import oracle
 from tests.physics.dmc.test_against_dm_control import FAST
+from tests.platform.equations import equations
 from tests.xla_flags import optimized
 
 EACH = [
