@@ -13,8 +13,9 @@ batched or randomised.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterable, Mapping
 from enum import IntEnum
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -26,14 +27,69 @@ FAR = float(np.finfo(np.float32).max)
 
 
 class GeomKind(IntEnum):
-    """Shapes the renderer draws, numbered as MuJoCo's ``mjtGeom``."""
+    """Shapes the renderer draws: one row each, beginning with MuJoCo's number (``mjtGeom``).
 
-    PLANE = 0
-    SPHERE = 2
-    CAPSULE = 3
-    ELLIPSOID = 4
-    CYLINDER = 5
-    BOX = 6
+    All but the plane are convex. Their formulas are in ``renderer.intersect`` and, for the renderer
+    that others are tested against, in ``renderer.reference``.
+
+    Attributes:
+        num_sizes: how many of a geom's three size numbers mean something.
+        reach: which sphere around its center a geom is inside of: its radius is ``first``, the
+            first size number; ``largest``, that of the three; ``diagonal``, their norm; or ``all``,
+            for what has no end.
+        is_long: whether that sphere is around both ends of the z axis, at the second size number.
+        has_far_form: whether float32 needs a longer formula where the camera is far away.
+    """
+
+    num_sizes: int
+    reach: str
+    is_long: bool
+    has_far_form: bool
+
+    def __new__(
+        cls,
+        number: int,
+        num_sizes: int,
+        reach: str,
+        is_long: bool = False,
+        has_far_form: bool = False,
+    ) -> GeomKind:
+        """Make a row, which is MuJoCo's number."""
+        kind = int.__new__(cls, number)
+        kind._value_ = number
+        kind.num_sizes, kind.reach = num_sizes, reach
+        kind.is_long, kind.has_far_form = is_long, has_far_form
+        return kind
+
+    PLANE = 0, 3, "all"
+    SPHERE = 2, 1, "first", False, True
+    CAPSULE = 3, 2, "first", True, True
+    ELLIPSOID = 4, 3, "largest"
+    CYLINDER = 5, 2, "first", True
+    BOX = 6, 3, "diagonal"
+
+
+_Formula = TypeVar("_Formula")
+
+
+def for_each_kind(
+    what: str, formulas: Mapping[GeomKind, _Formula], kinds: Iterable[GeomKind] = GeomKind
+) -> Mapping[GeomKind, _Formula]:
+    """Return a table with one entry for each kind of geom.
+
+    Args:
+        what: what the table has, for the message.
+        formulas: the table.
+        kinds: those that it must have.
+
+    Raises:
+        TypeError: it lacks a kind, or has one that it must not.
+    """
+    wrong = set(kinds) ^ set(formulas)
+    if wrong:
+        names = ", ".join(sorted(kind.name for kind in wrong))
+        raise TypeError(f"{what} must have one entry for each kind of geom; wrong for {names}.")
+    return formulas
 
 
 class String(struct.PyTreeNode):

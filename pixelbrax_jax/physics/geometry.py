@@ -5,25 +5,16 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
-from pixelbrax_jax.tasks import Color
+from pixelbrax_jax.physics.opengl import mujoco
+from pixelbrax_jax.physics.task import Color
 from pixelbrax_jax.types import GeomKind, Geoms
 from pixelbrax_jax.validation import check_choice
 
 # MuJoCo's viewer shows these groups by default.
 VISIBLE_GROUPS = (0, 1, 2)
 
-# How many of a geom's three size numbers mean something.
-SIZES: Mapping[GeomKind, int] = {
-    GeomKind.PLANE: 3,
-    GeomKind.SPHERE: 1,
-    GeomKind.CAPSULE: 2,
-    GeomKind.ELLIPSOID: 3,
-    GeomKind.CYLINDER: 2,
-    GeomKind.BOX: 3,
-}
 _DEFAULT_RGBA = np.array([0.5, 0.5, 0.5, 1.0], np.float32)
 
 
@@ -90,7 +81,7 @@ def read_geoms(
 
     size = np.array(model.geom_size[shown], np.float32)
     for row, i, kind in zip(size, shown, kinds, strict=True):
-        row[SIZES[kind] :] = 0
+        row[kind.num_sizes :] = 0
         row[0] = drawn_radius.get(names[i], row[0])
     return Geoms(
         kind=tuple(int(kind) for kind in kinds),

@@ -11,10 +11,10 @@ import warnings
 from collections.abc import Collection
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from pixelbrax_jax.physics.geometry import resolve_rgba
+from pixelbrax_jax.physics.opengl import mujoco
 from pixelbrax_jax.physics.viewpoints import follows_tracked
 from pixelbrax_jax.types import Lamp, Look
 

@@ -7,17 +7,16 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from pixelbrax_jax.physics.geometry import (
-    SIZES,
     VISIBLE_GROUPS,
     read_geoms,
     resolve_rgba,
     shown_geoms,
 )
 from pixelbrax_jax.physics.lighting import checker, mean_color, read_look
+from pixelbrax_jax.physics.opengl import mujoco
 from pixelbrax_jax.physics.viewpoints import read_rigs
 from pixelbrax_jax.physics.viewpoints import tracked_body as tracked_body
 from pixelbrax_jax.types import CameraRig, GeomKind, Geoms, Look, String
@@ -158,7 +157,7 @@ def with_sites(
             continue
         kind = GeomKind(int(model.site_type[i]))
         size = np.array(model.site_size[i], np.float32)
-        size[SIZES[kind] :] = 0
+        size[kind.num_sizes :] = 0
         rows.append(
             _Row(
                 kind=int(kind),

@@ -11,7 +11,8 @@ from types import ModuleType
 from typing import Any
 
 import jax
-import mujoco
+
+from pixelbrax_jax.physics.opengl import mujoco
 
 _KNOWN_WARNINGS: tuple[tuple[str, type[Warning]], ...] = (
     # Brax, at every load of a model.

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import mujoco
 import numpy as np
 
+from pixelbrax_jax.physics.opengl import mujoco
 from pixelbrax_jax.types import CameraRig
 
 _TRACK = int(mujoco.mjtCamLight.mjCAMLIGHT_TRACK)

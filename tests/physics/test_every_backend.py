@@ -6,9 +6,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from pixelbrax_jax.physics import make_physics
-from pixelbrax_jax.physics.brax.tasks import load_brax_env
-from pixelbrax_jax.tasks import BRAX_BACKENDS, BRAX_TASKS
+from pixelbrax_jax.physics.brax.loading import load_brax_env
+from pixelbrax_jax.physics.brax.tasks import BACKENDS as BRAX_BACKENDS
+from pixelbrax_jax.registry import make_physics
+from pixelbrax_jax.tasks import BRAX_TASKS
 
 ENVS = 2
 # MJX is slow on the pusher: its solver seems not to converge in float32 and to take all 20 x 50

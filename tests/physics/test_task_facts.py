@@ -6,9 +6,10 @@ import jax
 import numpy as np
 import pytest
 
-from pixelbrax_jax.physics import make_physics
 from pixelbrax_jax.physics.base import Physics
-from pixelbrax_jax.tasks import BRAX_BACKENDS, BRAX_TASKS
+from pixelbrax_jax.physics.brax.tasks import BACKENDS as BRAX_BACKENDS
+from pixelbrax_jax.registry import make_physics
+from pixelbrax_jax.tasks import BRAX_TASKS
 from pixelbrax_jax.types import GeomKind
 
 # task: (planes, capsules, spheres), actions, observations, dt by backend

@@ -10,7 +10,6 @@ from uuid import uuid4
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from flax import struct
 
@@ -18,15 +17,15 @@ from pixelbrax_jax.flags import as_by_default, default_flags, under_default_flag
 from pixelbrax_jax.physics.base import Kinematics, RewardFn
 from pixelbrax_jax.physics.brax.compatibility import accept_old_clip
 from pixelbrax_jax.physics.brax.pickling import with_modules, without_modules
-from pixelbrax_jax.physics.divergence import GuardedPhysics
+from pixelbrax_jax.physics.divergence import GuardedPhysics, Recipe
 from pixelbrax_jax.physics.geometry import VISIBLE_GROUPS, read_geoms
 from pixelbrax_jax.physics.model_scene import COM_LINK, tracked_body, with_sites
 from pixelbrax_jax.physics.mujoco_compatibility import import_silenced, known_warnings_silenced
+from pixelbrax_jax.physics.opengl import mujoco
 from pixelbrax_jax.physics.poses import check_pose, with_unit_rotations
-from pixelbrax_jax.physics.recipe import Recipe
+from pixelbrax_jax.physics.task import Color
 from pixelbrax_jax.physics.viewpoints import followed_body, read_rigs, unfit_cameras
 from pixelbrax_jax.spatial import quat_normalize, rotate
-from pixelbrax_jax.tasks import Color
 from pixelbrax_jax.types import CameraRig, PhysicsState
 
 with import_silenced():
@@ -69,9 +68,8 @@ class BraxPhysics(GuardedPhysics):
     On the ``"mjx"`` backend link poses are one physics step older than joint positions after a
     ``step`` (never after a ``reset``), because MuJoCo computes them before it integrates.
 
-    Beyond the interface it has ``followed_link``; and ``rigs`` and ``unfit_cameras``, of the
-    model's own cameras. If one of these follows a center of mass, there is a link ``camera/com``
-    after those of the bodies.
+    If one of the model's cameras follows a center of mass, there is a link ``camera/com`` after
+    those of the bodies.
     """
 
     @default_flags()
@@ -82,7 +80,7 @@ class BraxPhysics(GuardedPhysics):
         colors: Mapping[str, Color] | None = None,
         drawn_radius: Mapping[str, float] | None = None,
         geom_groups: Collection[int] = VISIBLE_GROUPS,
-        sites_and_cameras: bool = True,
+        rigs: Mapping[str, CameraRig] | None = None,
         unscale_actions: bool = False,
         reward: RewardFn | None = None,
         identity: Hashable | None = None,
@@ -94,7 +92,8 @@ class BraxPhysics(GuardedPhysics):
             colors: replacements for colors by geom name, see ``read_geoms``.
             drawn_radius: metres by name of a sphere to draw larger, see ``read_geoms``.
             geom_groups: MuJoCo's groups of geoms and sites that are visible.
-            sites_and_cameras: whether the model's sites are drawn and its cameras are viewpoints.
+            rigs: the task's viewpoints by name, in a picture without the model's sites; None draws
+                the sites and has the model's cameras as viewpoints.
             unscale_actions: for environments that map actions from [-1, 1] to the control
                 range: undo that map, so that costs and actuators see the action as given.
             reward: replaces the environment's reward; called with the state before the step,
@@ -122,11 +121,10 @@ class BraxPhysics(GuardedPhysics):
         self.link_names = tuple(
             model.body(i).name or f"link/{i - 1}" for i in range(1, model.nbody)
         )
-        self.followed_link = 0
-        self.rigs: dict[str, CameraRig] = {}
-        self.unfit_cameras: dict[str, str] = {}
         self._com_masses: np.ndarray | None = None
-        if sites_and_cameras:
+        if rigs is not None:
+            self.rigs = rigs
+        else:
             self.geoms = with_sites(model, self.geoms, geom_groups)
             self.followed_link = max(followed_body(model) - 1, 0)
             self._read_cameras(model)
@@ -135,23 +133,17 @@ class BraxPhysics(GuardedPhysics):
         self._env = _replace_init(env, self._init)
         self._reward = reward
         self._control_range = _control_range(model) if unscale_actions else None
-        self._identity: Hashable = uuid4() if identity is None else identity
+        self._identity = uuid4() if identity is None else identity
         self._options = {
             "colors": colors,
             "drawn_radius": drawn_radius,
             "geom_groups": geom_groups,
-            "sites_and_cameras": sites_and_cameras,
+            "rigs": rigs,
             "unscale_actions": unscale_actions,
             "reward": reward,
             "identity": self._identity,
         }
         self._check_shapes()
-
-    def __eq__(self, other: object) -> bool:
-        return type(self) is type(other) and self._identity == getattr(other, "_identity", None)
-
-    def __hash__(self) -> int:
-        return hash(self._identity)
 
     def __reduce_ex__(self, protocol: Any) -> Any:
         """Return what is pickled: how it is made, or of which environment."""

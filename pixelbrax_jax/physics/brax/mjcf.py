@@ -9,16 +9,17 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from pixelbrax_jax.flags import default_flags
 from pixelbrax_jax.physics.base import Kinematics, ResetFn, RewardFn
 from pixelbrax_jax.physics.brax.engine import BraxPhysics, kinematics
 from pixelbrax_jax.physics.brax.omissions import check_simulated
+from pixelbrax_jax.physics.brax.tasks import BACKENDS
 from pixelbrax_jax.physics.geometry import VISIBLE_GROUPS, read_geoms
 from pixelbrax_jax.physics.mujoco_compatibility import import_silenced, loading_silenced
-from pixelbrax_jax.tasks import BRAX_BACKENDS, Color
+from pixelbrax_jax.physics.opengl import mujoco
+from pixelbrax_jax.physics.task import Color
 
 with import_silenced():
     from brax import envs
@@ -164,7 +165,7 @@ def mjcf_physics(
             actuator, has what the backend would leave out, ``reset`` is given with ``init_q`` or
             ``reset_noise``, or a function returns the wrong shape or dtype.
     """
-    check_choice("backend", backend, BRAX_BACKENDS)
+    check_choice("backend", backend, BACKENDS)
     if reset is not None and (reset_noise is not None or init_q is not None):
         raise ValueError(
             "reset samples the whole initial state: leave reset_noise and init_q out, and add the "

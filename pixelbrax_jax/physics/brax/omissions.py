@@ -10,10 +10,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-import mujoco
 import numpy as np
 
 from pixelbrax_jax.physics.mujoco_compatibility import import_silenced
+from pixelbrax_jax.physics.opengl import mujoco
 
 with import_silenced():
     from mujoco.mjx._src.collision_driver import geom_pairs

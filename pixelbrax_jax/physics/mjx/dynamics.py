@@ -8,11 +8,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import mujoco
 from flax import struct
 
 from pixelbrax_jax.physics.mjx.substitutes import substituted
 from pixelbrax_jax.physics.mujoco_compatibility import import_silenced, load_onto_own_device
+from pixelbrax_jax.physics.opengl import mujoco
 
 with import_silenced():
     from mujoco import mjx

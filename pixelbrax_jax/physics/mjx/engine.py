@@ -3,26 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Hashable
+from types import MappingProxyType
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from pixelbrax_jax.flags import default_flags, under_default_flags
 from pixelbrax_jax.physics.divergence import GuardedPhysics
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics, MjxState
+from pixelbrax_jax.physics.mjx.formulas import Formulas, Start
 from pixelbrax_jax.physics.mjx.snapshot import Snapshot
-from pixelbrax_jax.physics.mjx.task import DmcTask, Start
 from pixelbrax_jax.physics.model_scene import COM_LINK, TARGET_LINK, read_scene, tracked_body
+from pixelbrax_jax.physics.opengl import mujoco
 from pixelbrax_jax.physics.poses import check_pose, with_unit_rotations
 from pixelbrax_jax.physics.viewpoints import unfit_cameras
 from pixelbrax_jax.types import PhysicsState
-
-# XLA's library for sums and products on a CPU, YNNPACK, takes longer for the small ones of these
-# models than the loops that XLA writes itself.
-_COMPILER_OPTIONS = {"xla_cpu_experimental_ynn_fusion_type": ""}
 
 _UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 
@@ -32,16 +29,15 @@ class MjxPhysics(GuardedPhysics):
 
     Links are the model's bodies without the world; then ``camera/com``, the centre of mass that
     cameras and lights follow, and ``target``, this episode's target, where a task has them.
-
-    Beyond the interface it has ``rigs``, the model's cameras by name, with the task's own as
-    ``default``; ``look``, the model's lights, sky and ground; ``batch_last``, whether a CPU
-    computes a batch faster with the environments as last axis; and ``compiler_options``.
     """
 
     backend = "mjx"
+    # XLA's library for sums and products on a CPU, YNNPACK, takes longer for the small ones of
+    # these models than the loops that XLA writes itself.
+    compiler_options = MappingProxyType({"xla_cpu_experimental_ynn_fusion_type": ""})
 
     @default_flags()
-    def __init__(self, task: DmcTask, model: mujoco.MjModel, *, identity: Hashable):
+    def __init__(self, task: Formulas, model: mujoco.MjModel, *, identity: Hashable):
         """Put the model on the device and read what is drawn; compile nothing.
 
         Args:
@@ -71,7 +67,6 @@ class MjxPhysics(GuardedPhysics):
         self.dt = float(f"{model.opt.timestep * task.substeps:.6g}")
         self.action_size = int(model.nu)
         self.batch_last = task.batch_last
-        self.compiler_options = _COMPILER_OPTIONS
         self._task = task
         self._model = model
         self._tracked_body = tracked_body(model)
@@ -82,12 +77,6 @@ class MjxPhysics(GuardedPhysics):
         self._control_range = low, high
         first = jax.eval_shape(self.reset, jax.random.key(0))
         self.state_size = int(first.obs.shape[0])
-
-    def __eq__(self, other: object) -> bool:
-        return type(self) is type(other) and self._identity == getattr(other, "_identity", None)
-
-    def __hash__(self) -> int:
-        return hash(self._identity)
 
     def control(self, action: jax.Array) -> jax.Array:
         """Return the controls that an action stands for.

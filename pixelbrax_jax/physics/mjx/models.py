@@ -11,10 +11,9 @@ from importlib.util import find_spec
 from pathlib import Path
 from xml.etree import ElementTree
 
-import mujoco
-
 from pixelbrax_jax.extras import install_extra
 from pixelbrax_jax.physics.mujoco_compatibility import loading_silenced
+from pixelbrax_jax.physics.opengl import mujoco
 
 KNOWN_VERSION = "1.0.50"
 """The release of dm_control whose models the tests compare with."""

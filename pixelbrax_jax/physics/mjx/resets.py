@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics
-from pixelbrax_jax.physics.mjx.task import Start
+from pixelbrax_jax.physics.mjx.formulas import Start
+from pixelbrax_jax.physics.opengl import mujoco
 
 MAX_ATTEMPTS = 1000
 """Draws of a pose after which one that touches something is taken."""

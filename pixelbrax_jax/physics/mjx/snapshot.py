@@ -7,8 +7,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
+
+from pixelbrax_jax.physics.opengl import mujoco
 
 
 @dataclass(frozen=True)

@@ -6,12 +6,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from pixelbrax_jax.physics.mjx import elimination
 from pixelbrax_jax.physics.mjx.cones import Cones
 from pixelbrax_jax.physics.mujoco_compatibility import import_silenced
+from pixelbrax_jax.physics.opengl import mujoco
 
 with import_silenced():
     from mujoco.mjx._src import support

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics
+from pixelbrax_jax.physics.mjx.formulas import Formulas, Start
 from pixelbrax_jax.physics.mjx.rewards import tolerance
 from pixelbrax_jax.physics.mjx.snapshot import Snapshot, joined
-from pixelbrax_jax.physics.mjx.task import DmcTask, Start
 
 
 def _start(dynamics: Dynamics, key: jax.Array) -> Start:
@@ -31,8 +31,8 @@ def _reward(seen: Snapshot, *, margin: float) -> jax.Array:
     return tolerance(distance, (0.0, radius), margin=margin)
 
 
-def _task(margin: float) -> DmcTask:
-    return DmcTask(
+def _task(margin: float) -> Formulas:
+    return Formulas(
         "acrobot",
         _start,
         _observe,

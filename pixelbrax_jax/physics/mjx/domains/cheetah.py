@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics
+from pixelbrax_jax.physics.mjx.formulas import Formulas, Start
 from pixelbrax_jax.physics.mjx.resets import random_joints
 from pixelbrax_jax.physics.mjx.rewards import tolerance
 from pixelbrax_jax.physics.mjx.snapshot import Snapshot, joined
-from pixelbrax_jax.physics.mjx.task import DmcTask, Start
+from pixelbrax_jax.physics.opengl import mujoco
 
 _RUN_SPEED = 10.0
 _SETTLING_STEPS = 200
@@ -52,4 +52,4 @@ def _reward(seen: Snapshot) -> jax.Array:
     )
 
 
-TASKS = {"run": DmcTask("cheetah", _start, _observe, _reward)}
+TASKS = {"run": Formulas("cheetah", _start, _observe, _reward)}

@@ -7,12 +7,12 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-import mujoco
 
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics
+from pixelbrax_jax.physics.mjx.formulas import Formulas, Start
 from pixelbrax_jax.physics.mjx.resets import free_of_contact, random_joints
 from pixelbrax_jax.physics.mjx.snapshot import Snapshot, joined
-from pixelbrax_jax.physics.mjx.task import DmcTask, Start
+from pixelbrax_jax.physics.opengl import mujoco
 
 _SPIN_VELOCITY = 15.0
 
@@ -89,8 +89,8 @@ def _task(
     reward: Callable[[Snapshot], jax.Array],
     edit: Callable[[mujoco.MjModel], None],
     movable: tuple[str, ...] = (),
-) -> DmcTask:
-    return DmcTask(
+) -> Formulas:
+    return Formulas(
         "finger",
         start,
         observe,
@@ -103,7 +103,7 @@ def _task(
     )
 
 
-def _turn(radius: float) -> DmcTask:
+def _turn(radius: float) -> Formulas:
     edit = partial(_resize_target, radius=radius)
     return _task(_start_turn, _observe_turn, _reward_turn, edit, movable=("target",))
 

@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics
+from pixelbrax_jax.physics.mjx.formulas import Formulas, Start
 from pixelbrax_jax.physics.mjx.resets import free_of_contact, random_joints
 from pixelbrax_jax.physics.mjx.rewards import tolerance
 from pixelbrax_jax.physics.mjx.snapshot import Snapshot, joined
-from pixelbrax_jax.physics.mjx.task import DmcTask, Start
 
 _STAND_HEIGHT = 1.4
 
@@ -61,8 +61,8 @@ def _reward(seen: Snapshot, *, speed: float) -> jax.Array:
     return stand * (5 * move + 1) / 6
 
 
-def _task(speed: float) -> DmcTask:
-    return DmcTask(
+def _task(speed: float) -> Formulas:
+    return Formulas(
         "humanoid", _start, _observe, partial(_reward, speed=speed), batch_last=False, substeps=5
     )
 

@@ -6,14 +6,14 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics
+from pixelbrax_jax.physics.mjx.formulas import Formulas, Start
 from pixelbrax_jax.physics.mjx.resets import random_rotation
 from pixelbrax_jax.physics.mjx.rewards import tolerance
 from pixelbrax_jax.physics.mjx.snapshot import Snapshot, joined
-from pixelbrax_jax.physics.mjx.task import DmcTask, Start
+from pixelbrax_jax.physics.opengl import mujoco
 
 _LIFT = 0.01
 """Metres between two heights that are tried."""
@@ -74,8 +74,8 @@ def _reward(seen: Snapshot, *, speed: float) -> jax.Array:
     return upright * move
 
 
-def _task(speed: float) -> DmcTask:
-    return DmcTask(
+def _task(speed: float) -> Formulas:
+    return Formulas(
         "quadruped",
         _start,
         _observe,

@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics
+from pixelbrax_jax.physics.mjx.formulas import Formulas, Start
 from pixelbrax_jax.physics.mjx.resets import random_joints
 from pixelbrax_jax.physics.mjx.rewards import tolerance
 from pixelbrax_jax.physics.mjx.snapshot import Snapshot, joined
-from pixelbrax_jax.physics.mjx.task import DmcTask, Start
 
 _FIRST_BODY_SENSOR = 12
 """Readings of nose, target and head's axes, which come before the bodies' velocities."""
@@ -44,8 +44,8 @@ def _reward(seen: Snapshot) -> jax.Array:
     return tolerance(distance, (0.0, radius), margin=5 * radius, sigmoid="long_tail")
 
 
-def _task(num_bodies: int) -> DmcTask:
-    return DmcTask(
+def _task(num_bodies: int) -> Formulas:
+    return Formulas(
         "swimmer",
         _start,
         _observe,

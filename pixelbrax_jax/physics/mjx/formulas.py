@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import jax
-import mujoco
 from flax import struct
 
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics
 from pixelbrax_jax.physics.mjx.snapshot import Snapshot
+from pixelbrax_jax.physics.opengl import mujoco
 
 
 class Start(struct.PyTreeNode):
@@ -34,7 +34,7 @@ def _unchanged(model: mujoco.MjModel) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class DmcTask:
+class Formulas:
     """One task: its model, how episodes begin, what is observed and rewarded.
 
     Attributes:
