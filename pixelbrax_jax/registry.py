@@ -12,7 +12,7 @@ from typing import Any
 
 from pixelbrax_jax.flags import default_flags
 from pixelbrax_jax.physics.base import Physics, check_physics
-from pixelbrax_jax.tasks import DMC_TASKS, SUITES, TASKS
+from pixelbrax_jax.tasks import SUITES, TASKS
 from pixelbrax_jax.types import Camera, CameraRig
 from pixelbrax_jax.validation import check_choice, suggest
 
@@ -101,7 +101,7 @@ def make_physics(task: str, **options: Any) -> Physics:
     for name, value in options.items():
         if suite is None or name not in suite.options:
             takers = [other.title for other in SUITES.values() if name in other.options]
-            fix = "leave it out" if own is None else "choose it where the task was registered"
+            fix = "leave it out" if own is None else "choose it where it was registered"
             raise ValueError(
                 f"{name}={value!r} is for {' and '.join(takers) or 'no task'} alone, and task "
                 f"{task!r} is none of these: {fix}."
@@ -161,10 +161,11 @@ def _import(module: str, task: str) -> ModuleType:
 
 
 def _meant(task: object) -> str | None:
-    """Return the task that is meant by Gymnasium's name, or by DM Control's in other libraries."""
-    for full, row in TASKS.items():
-        if task == row.gymnasium_id:
-            return full
-    name = str(task).lower().replace("-", "_").removeprefix("dmc_")
-    found = [full for full, row in DMC_TASKS.items() if name in (full, full[4:], row.task)]
+    """Return the one task that another library calls so."""
+    names = {own: map(_plain, row.other_names()) for own, row in TASKS.items()}
+    found = [own for own, others in names.items() if _plain(task) in others]
     return found[0] if len(found) == 1 else None
+
+
+def _plain(name: object) -> str:
+    return str(name).lower().replace("-", "_")

@@ -12,7 +12,6 @@ batched or randomised.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable, Mapping
 from enum import IntEnum
 from typing import Any, TypeVar
@@ -49,12 +48,18 @@ class GeomKind(IntEnum):
     def __new__(
         cls,
         number: int,
-        num_sizes: int,
-        reach: str,
+        num_sizes: int = 0,
+        reach: str = "",
         is_long: bool = False,
         has_far_form: bool = False,
     ) -> GeomKind:
-        """Make a row, which is MuJoCo's number."""
+        """Make a row, which is MuJoCo's number.
+
+        Raises:
+            TypeError: it does not say how far the kind reaches.
+        """
+        if not 1 <= num_sizes <= 3 or reach not in ("first", "largest", "diagonal", "all"):
+            raise TypeError(f"GeomKind {number} needs a number of sizes and a reach.")
         kind = int.__new__(cls, number)
         kind._value_ = number
         kind.num_sizes, kind.reach = num_sizes, reach
@@ -336,12 +341,6 @@ class Clips(struct.PyTreeNode):
     first: jax.Array
     length: jax.Array
 
-    @property
-    def words(self) -> jax.Array:
-        """The former name of ``packed``, which goes with the next release."""
-        warnings.warn("Clips.words is Clips.packed now.", DeprecationWarning, stacklevel=2)
-        return self.packed
-
 
 class EnvParams(struct.PyTreeNode):
     """The part of an environment that may be randomised; always a jit argument.
@@ -401,18 +400,6 @@ class EnvState(struct.PyTreeNode):
     def done(self) -> jax.Array:
         """() bool, the episode has ended and the next call must reset."""
         return self.sim.done
-
-    def __getattr__(self, name: str) -> Any:
-        """Look up a field of ``sim`` under the place and name that it had."""
-        new = {"head_start": "time_limit_offset", "distraction": "distractor_state"}.get(name, name)
-        if new not in SimState.__dataclass_fields__:
-            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-        warnings.warn(
-            f"EnvState.{name} is EnvState.sim.{new}; the short form goes with the next release.",
-            DeprecationWarning,
-            stacklevel=2,
-        )
-        return getattr(self.sim, new)
 
 
 class Timestep(struct.PyTreeNode):

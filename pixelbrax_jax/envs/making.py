@@ -142,8 +142,10 @@ def _rig(config: EnvConfig, physics: Physics) -> CameraRig:
 
 
 def _look(config: EnvConfig, physics: Physics) -> Look:
-    has_own = physics.look is not None and config.look in ("default", "dmc")
-    return make_look(physics.look if has_own else config.look, shadows=config.shadows)
+    look = config.look
+    if physics.look is not None and look in ("default", "dmc"):
+        look = physics.look
+    return make_look(look, shadows=config.shadows)
 
 
 def _check_device() -> None:

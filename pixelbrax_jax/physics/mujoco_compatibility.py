@@ -83,13 +83,10 @@ class _JaxOfThisProcess:
 
 
 def load_onto_own_device(module: ModuleType) -> None:
-    """Let one module put arrays on a device of this process.
+    """Let a module that knows JAX as ``jax`` put arrays on a device of this process.
 
     MuJoCo XLA puts models on ``jax.devices()[0]``, which in a run of several processes is a device
     of the first one, where no other process can read it.
-
-    Args:
-        module: a module that knows JAX as ``jax``.
     """
     if jax.process_count() > 1 and vars(module)["jax"] is jax:
         vars(module)["jax"] = _JaxOfThisProcess()

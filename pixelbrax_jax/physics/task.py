@@ -25,6 +25,10 @@ class Task:
     gymnasium_id: str
     summary: str
 
+    def other_names(self) -> tuple[str, ...]:
+        """Return what other libraries call the task, for the message about an unknown one."""
+        return (self.gymnasium_id,)
+
 
 _Task = TypeVar("_Task", bound=Task)
 

@@ -75,7 +75,7 @@ def _word(view: View, window: Window, kinds: Sequence[int], first: int) -> jax.A
     g = first + jnp.minimum(lane, len(kinds) - 1)
 
     def where(condition: Callable[[GeomKind], bool]) -> jax.Array:
-        mask = sum(1 << bit for bit, kind in enumerate(kinds) if condition(GeomKind(kind)))
+        mask = sum([1 << bit for bit, kind in enumerate(kinds) if condition(GeomKind(kind))])
         return ((np.int32(np.uint32(mask).view(np.int32)) >> lane) & 1) != 0
 
     size = [view.size[g, k] for k in range(3)]

@@ -57,9 +57,6 @@ def make_rig(
         track: how much of the link's position is followed, per world axis.
         up: the world direction that is up in the image.
 
-    Returns:
-        The rig, float32.
-
     Raises:
         ValueError: eye and target coincide, ``up`` is along the view, or ``fovy`` is outside
             (0, 180).
@@ -83,11 +80,7 @@ def make_rig(
 
 
 def with_sides(rigs: Mapping[str, CameraRig]) -> dict[str, CameraRig]:
-    """Return all rigs of a task by name: its ``default``, ``SIDES``, and its others.
-
-    Args:
-        rigs: the task's own, one of them ``default``; they come before ``SIDES`` of their name.
-    """
+    """Return a task's ``default``, ``SIDES``, and its other rigs, which come before ``SIDES``."""
     default = rigs["default"]
     sides = {name: _seen_from_side(default, side) for name, side in SIDES.items()}
     return {"default": default, **sides, **rigs}
@@ -105,13 +98,8 @@ def choose_rig(
 ) -> CameraRig:
     """Return a rig by name, the given one, or one that holds a camera at rest.
 
-    Args:
-        task: the task's name, for messages.
-        camera: a name, a ``CameraRig`` or a ``Camera``.
-        rigs: the task's, by name.
-
     Raises:
-        ValueError: the name is unknown.
+        ValueError: ``rigs``, those of the task, have no such name.
         TypeError: ``camera`` is of another type.
     """
     if isinstance(camera, CameraRig):
@@ -141,27 +129,14 @@ def rig_at_rest(camera: Camera) -> CameraRig:
 
 
 def aim(rig: CameraRig, xpos: jax.Array) -> Camera:
-    """Return the camera of a rig for the current link positions.
-
-    Args:
-        rig: the rig.
-        xpos: (L, 3) float32, metres, link origins in the world frame.
-
-    Returns:
-        The camera in the world frame.
-    """
+    """Return the world's camera of a rig, for link origins ``xpos`` (L, 3) in metres."""
     follow = rig.track * xpos[rig.link] if rig.link >= 0 else jnp.zeros(3)
     eye, target = rig.eye + follow, rig.target + follow
     return Camera(pos=eye, xmat=spatial.look_at(eye, target, rig.up), fovy=jnp.asarray(rig.fovy))
 
 
 def seen_from(geoms: Geoms, rig: CameraRig) -> Geoms:
-    """Return the geoms as a camera needs them, which may be very far away: see ``Geoms.distant``.
-
-    Args:
-        geoms: the shapes.
-        rig: the camera; its distance is taken from the link that it follows, or from the origin.
-    """
+    """Return the geoms as a rig needs them, which may be very far away: see ``Geoms.distant``."""
     with_far_form = [GeomKind(kind).has_far_form for kind in geoms.kind]
     radii = np.asarray(geoms.size)[with_far_form, 0]
     away = np.linalg.norm(np.asarray(rig.eye))
@@ -169,16 +144,13 @@ def seen_from(geoms: Geoms, rig: CameraRig) -> Geoms:
 
 
 def rig_from_corner(geoms: Geoms, xpos: np.ndarray, xquat: np.ndarray, link: int = 0) -> CameraRig:
-    """Make a rig that has all geoms but planes in view, for a task without a viewpoint of its own.
+    """Make a rig that has all geoms but planes in view, from a corner and slightly from above.
 
     Args:
         geoms: the shapes.
         xpos: (L, 3) metres, link origins in the world frame.
         xquat: (L, 4) unit, link orientations.
         link: index of the link whose x and y are followed.
-
-    Returns:
-        A rig that looks from a corner, slightly from above.
     """
     points = [
         geoms.pos[g] if of < 0 else xpos[of] + spatial.rotate(xquat[of], geoms.pos[g])

@@ -73,9 +73,6 @@ def make_look(look: str | Look = "default", *, shadows: bool | None = None) -> L
         look: ``"default"``, ``"original"``, ``"dmc"`` or a ``Look``.
         shadows: whether geoms cast shadows; None keeps the look's own choice.
 
-    Returns:
-        The look.
-
     Raises:
         ValueError: the name is unknown.
         TypeError: ``look`` is neither a string nor a ``Look``; ``shadows`` is no truth value.

@@ -38,9 +38,7 @@ _PAPER_REWARDS = {"distance_swum": distance_swum}
 def make_physics(
     task: str, *, backend: str | None = None, reward_preset: str = "brax"
 ) -> BraxPhysics:
-    """Make the physics of one of Brax's tasks.
-
-    Equal arguments give equal objects, and the same one as long as few others are asked for.
+    """Make the physics of one of Brax's tasks: equal objects for equal arguments.
 
     Args:
         task: a name in ``brax.tasks.TASKS``.
@@ -83,19 +81,21 @@ def rigs_of(task: BraxTask) -> dict[str, CameraRig]:
 
 
 def _rig(view: Viewpoint) -> CameraRig:
-    track = (1.0, 1.0, 0.0) if view.link >= 0 else (0.0, 0.0, 0.0)
-    numbers = (track, view.eye, view.target, view.up, view.fovy)
-    return CameraRig(view.link, *(np.asarray(number, np.float32) for number in numbers))
+    def f32(numbers: Any) -> Any:
+        return np.asarray(numbers, np.float32)
+
+    return CameraRig(
+        link=view.link,
+        track=f32((1.0, 1.0, 0.0) if view.link >= 0 else (0.0, 0.0, 0.0)),
+        eye=f32(view.eye),
+        target=f32(view.target),
+        up=f32(view.up),
+        fovy=f32(view.fovy),
+    )
 
 
 def load_brax_env(name: str, backend: str, **options: Any) -> envs.Env:
-    """Load one of Brax's own environments, bare, without its known warnings.
-
-    Args:
-        name: Brax's name of the task.
-        backend: Brax's name of the backend.
-        **options: further arguments of the environment's class.
-    """
+    """Load one of Brax's environments by its name, bare, without its known warnings."""
     load_onto_own_device(mjx_io)
     with loading_silenced():
         return envs.get_environment(name, backend=backend, **options)

@@ -39,5 +39,5 @@ def formulas_of(task: str) -> Formulas:
 @lru_cache(maxsize=16)
 def _load(task: str) -> MjxPhysics:
     formulas = formulas_of(task)
-    model = load_model(formulas.domain, **formulas.options)
+    model = load_model(TASKS[task].domain, **formulas.options)
     return MjxPhysics(formulas, model, identity=Recipe(_load, (task,)))

@@ -17,19 +17,12 @@ MAX_ATTEMPTS = 1000
 
 
 def random_joints(model: mujoco.MjModel, key: jax.Array) -> jax.Array:
-    """Draw joint positions as DM Control's ``randomize_limited_and_rotational_joints`` does.
+    """Draw joint positions (Q,) as DM Control's ``randomize_limited_and_rotational_joints`` does.
 
     Limited hinges and sliders are uniform in their range, other hinges in [-pi, pi]. A free joint
     keeps its place, and its quaternion is drawn uniformly from [0, 1]^4 and normalised, which is
     not uniform over rotations: DM Control keeps it so for the sake of its results. The suite's
     tasks that ask for it have no ball joints.
-
-    Args:
-        model: the compiled model.
-        key: PRNG key.
-
-    Returns:
-        (Q,) float32, metres, radians, unit quaternions.
     """
     low, high = np.array(model.qpos0), np.array(model.qpos0)
     rotations = []

@@ -32,13 +32,10 @@ _lock = threading.RLock()
 
 @contextmanager
 def substituted(model: mujoco.MjModel) -> Iterator[None]:
-    """Trace with contact frames, small equations, scans of long chains and solver of our own.
+    """Trace steps of a model with functions of our own in place of some of MuJoCo XLA's.
 
     What is traced elsewhere before and after is not affected; what another thread traces with
     MuJoCo XLA in the meantime, without this block, has them too.
-
-    Args:
-        model: whose steps are traced.
     """
     changes: list[tuple[dict[Any, Any], Any, Any]] = [
         (collision_driver._COLLISION_FUNC, PAIR, aligned_with_capsules),

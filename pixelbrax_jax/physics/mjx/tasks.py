@@ -19,6 +19,10 @@ class DmcTask(Task):
     domain: str
     task: str
 
+    def other_names(self) -> tuple[str, ...]:
+        """Return DM Control's names of it, with and without the domain."""
+        return (*super().other_names(), self.name, f"{self.domain}_{self.task}", self.task)
+
 
 def _dmc(domain: str, task: str, summary: str) -> DmcTask:
     words = f"{domain}_{task}".split("_")

@@ -8,9 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics
-from pixelbrax_jax.physics.mjx.formulas import Formulas, Start
-from pixelbrax_jax.physics.mjx.rewards import tolerance
-from pixelbrax_jax.physics.mjx.snapshot import Snapshot, joined
+from pixelbrax_jax.physics.mjx.formulas import Formulas, Snapshot, Start, joined, tolerance
 
 
 def _start(dynamics: Dynamics, key: jax.Array) -> Start:
@@ -33,7 +31,6 @@ def _reward(seen: Snapshot, *, margin: float) -> jax.Array:
 
 def _task(margin: float) -> Formulas:
     return Formulas(
-        "acrobot",
         _start,
         _observe,
         partial(_reward, margin=margin),

@@ -7,10 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics
-from pixelbrax_jax.physics.mjx.formulas import Formulas, Start
+from pixelbrax_jax.physics.mjx.formulas import Formulas, Snapshot, Start, joined, tolerance
 from pixelbrax_jax.physics.mjx.resets import random_joints
-from pixelbrax_jax.physics.mjx.rewards import tolerance
-from pixelbrax_jax.physics.mjx.snapshot import Snapshot, joined
 from pixelbrax_jax.physics.opengl import mujoco
 
 _RUN_SPEED = 10.0
@@ -52,4 +50,4 @@ def _reward(seen: Snapshot) -> jax.Array:
     )
 
 
-TASKS = {"run": Formulas("cheetah", _start, _observe, _reward)}
+TASKS = {"run": Formulas(_start, _observe, _reward)}

@@ -6,10 +6,8 @@ import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics
-from pixelbrax_jax.physics.mjx.formulas import Formulas, Start
+from pixelbrax_jax.physics.mjx.formulas import Formulas, Snapshot, Start, joined, tolerance
 from pixelbrax_jax.physics.mjx.resets import random_rotation
-from pixelbrax_jax.physics.mjx.rewards import tolerance
-from pixelbrax_jax.physics.mjx.snapshot import Snapshot, joined
 from pixelbrax_jax.physics.opengl import mujoco
 
 _JOINTS = (
@@ -75,9 +73,7 @@ def _hide_target(model: mujoco.MjModel) -> None:
 
 TASKS = {
     "upright": Formulas(
-        "fish", _start_upright, _observe_upright, _reward_upright, substeps=10, edit=_hide_target
+        _start_upright, _observe_upright, _reward_upright, substeps=10, edit=_hide_target
     ),
-    "swim": Formulas(
-        "fish", _start_swim, _observe_swim, _reward_swim, substeps=10, movable=("target",)
-    ),
+    "swim": Formulas(_start_swim, _observe_swim, _reward_swim, substeps=10, movable=("target",)),
 }

@@ -8,10 +8,8 @@ import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics
-from pixelbrax_jax.physics.mjx.formulas import Formulas, Start
+from pixelbrax_jax.physics.mjx.formulas import Formulas, Snapshot, Start, joined, tolerance
 from pixelbrax_jax.physics.mjx.resets import random_joints
-from pixelbrax_jax.physics.mjx.rewards import tolerance
-from pixelbrax_jax.physics.mjx.snapshot import Snapshot, joined
 
 _STAND_HEIGHT = 0.6
 _HOP_SPEED = 2.0
@@ -54,7 +52,6 @@ def _reward_hop(seen: Snapshot) -> jax.Array:
 
 def _task(reward: Callable[[Snapshot], jax.Array]) -> Formulas:
     return Formulas(
-        "hopper",
         _start,
         _observe,
         reward,

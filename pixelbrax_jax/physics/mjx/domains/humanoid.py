@@ -8,10 +8,8 @@ import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics
-from pixelbrax_jax.physics.mjx.formulas import Formulas, Start
+from pixelbrax_jax.physics.mjx.formulas import Formulas, Snapshot, Start, joined, tolerance
 from pixelbrax_jax.physics.mjx.resets import free_of_contact, random_joints
-from pixelbrax_jax.physics.mjx.rewards import tolerance
-from pixelbrax_jax.physics.mjx.snapshot import Snapshot, joined
 
 _STAND_HEIGHT = 1.4
 
@@ -62,9 +60,7 @@ def _reward(seen: Snapshot, *, speed: float) -> jax.Array:
 
 
 def _task(speed: float) -> Formulas:
-    return Formulas(
-        "humanoid", _start, _observe, partial(_reward, speed=speed), batch_last=False, substeps=5
-    )
+    return Formulas(_start, _observe, partial(_reward, speed=speed), batch_last=False, substeps=5)
 
 
 TASKS = {"stand": _task(0.0), "walk": _task(1.0), "run": _task(10.0)}

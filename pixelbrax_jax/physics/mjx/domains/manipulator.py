@@ -9,10 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics
-from pixelbrax_jax.physics.mjx.formulas import Formulas, Start
+from pixelbrax_jax.physics.mjx.formulas import Formulas, Snapshot, Start, joined, tolerance
 from pixelbrax_jax.physics.mjx.resets import free_of_contact
-from pixelbrax_jax.physics.mjx.rewards import tolerance
-from pixelbrax_jax.physics.mjx.snapshot import Snapshot, joined
 from pixelbrax_jax.physics.opengl import mujoco
 
 _ARM = (
@@ -121,7 +119,6 @@ def _reward(seen: Snapshot) -> jax.Array:
 
 TASKS = {
     "bring_ball": Formulas(
-        "manipulator",
         _start,
         _observe,
         _reward,

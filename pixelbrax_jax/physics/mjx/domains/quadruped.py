@@ -9,10 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics
-from pixelbrax_jax.physics.mjx.formulas import Formulas, Start
+from pixelbrax_jax.physics.mjx.formulas import Formulas, Snapshot, Start, joined, tolerance
 from pixelbrax_jax.physics.mjx.resets import random_rotation
-from pixelbrax_jax.physics.mjx.rewards import tolerance
-from pixelbrax_jax.physics.mjx.snapshot import Snapshot, joined
 from pixelbrax_jax.physics.opengl import mujoco
 
 _LIFT = 0.01
@@ -76,7 +74,6 @@ def _reward(seen: Snapshot, *, speed: float) -> jax.Array:
 
 def _task(speed: float) -> Formulas:
     return Formulas(
-        "quadruped",
         _start,
         _observe,
         partial(_reward, speed=speed),

@@ -8,10 +8,8 @@ import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics
-from pixelbrax_jax.physics.mjx.formulas import Formulas, Start
+from pixelbrax_jax.physics.mjx.formulas import Formulas, Snapshot, Start, joined, tolerance
 from pixelbrax_jax.physics.mjx.resets import random_joints
-from pixelbrax_jax.physics.mjx.rewards import tolerance
-from pixelbrax_jax.physics.mjx.snapshot import Snapshot, joined
 from pixelbrax_jax.physics.opengl import mujoco
 
 
@@ -47,7 +45,7 @@ def _resize_target(model: mujoco.MjModel, *, radius: float) -> None:
 
 def _task(radius: float) -> Formulas:
     edit = partial(_resize_target, radius=radius)
-    return Formulas("reacher", _start, _observe, _reward, edit=edit, movable=("target",))
+    return Formulas(_start, _observe, _reward, edit=edit, movable=("target",))
 
 
 TASKS = {"easy": _task(0.05), "hard": _task(0.015)}

@@ -6,10 +6,8 @@ import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics
-from pixelbrax_jax.physics.mjx.formulas import Formulas, Start
+from pixelbrax_jax.physics.mjx.formulas import Formulas, Snapshot, Start, joined, tolerance
 from pixelbrax_jax.physics.mjx.resets import random_joints
-from pixelbrax_jax.physics.mjx.rewards import tolerance
-from pixelbrax_jax.physics.mjx.snapshot import Snapshot, joined
 
 _FIRST_BODY_SENSOR = 12
 """Readings of nose, target and head's axes, which come before the bodies' velocities."""
@@ -46,7 +44,6 @@ def _reward(seen: Snapshot) -> jax.Array:
 
 def _task(num_bodies: int) -> Formulas:
     return Formulas(
-        "swimmer",
         _start,
         _observe,
         _reward,
