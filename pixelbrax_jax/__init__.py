@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from pixelbrax_jax.config import EnvConfig as EnvConfig
     from pixelbrax_jax.distractors import load_clips as load_clips
     from pixelbrax_jax.envs.autoreset import AUTORESET_MODES as AUTORESET_MODES
-    from pixelbrax_jax.envs.brax_env import BraxPixelEnv as BraxPixelEnv
+    from pixelbrax_jax.envs.brax_env import BraxEnv as BraxEnv
     from pixelbrax_jax.envs.brax_env import wrap_fresh_episodes as wrap_fresh_episodes
     from pixelbrax_jax.envs.check import check_env as check_env
     from pixelbrax_jax.envs.making import make as make
@@ -51,7 +51,7 @@ _PUBLIC = {
     "config": "EnvConfig",
     "distractors": "load_clips",
     "envs.autoreset": "AUTORESET_MODES",
-    "envs.brax_env": "BraxPixelEnv wrap_fresh_episodes",
+    "envs.brax_env": "BraxEnv wrap_fresh_episodes",
     "envs.check": "check_env",
     "envs.making": "make named_rigs",
     "envs.pixel_env": "PixelEnv",

@@ -16,7 +16,7 @@ from dataclasses import asdict, replace
 
 from brax.training.agents.ppo import train as ppo
 
-from pixelbrax_jax import BraxPixelEnv, make, wrap_fresh_episodes
+from pixelbrax_jax import BraxEnv, make, wrap_fresh_episodes
 from pixelbrax_jax.agents.config import TrainConfig
 from pixelbrax_jax.agents.on_policy.presets import preset
 from pixelbrax_jax.physics.brax.tasks import REWARD_PRESETS
@@ -31,7 +31,7 @@ def keep(config: TrainConfig) -> None:
 
     What is known of it is written with every evaluation.
     """
-    env = BraxPixelEnv(*make(config, obs_mode="state"))
+    env = BraxEnv(*make(config, obs_mode="state"))
     found: dict = {"steps": [], "seconds": [], "return": [], "length": []}
     began = time.monotonic()
 
