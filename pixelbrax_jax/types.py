@@ -1,13 +1,14 @@
 """Every value that crosses from one module of the package to the next.
 
-Shapes are those of ONE environment; a batch has the same fields with a leading axis.
-Letters: G geoms, M materials, L links, S state features, A actions, H and W pixels,
-K stacked frames. Lengths are metres, angles degrees, quaternions ``(w, x, y, z)``, colors
-linear in [0, 1]. The world is right-handed with z up. Row 0 of an image is its top.
+Shapes are those of ONE environment; a batch has the same fields with a leading axis. Letters: G
+geoms, M materials, L links, S state features, A actions, H and W pixels, K stacked frames. Arrays
+are float32 where nothing else is said. Lengths are metres, angles degrees, quaternions ``(w, x, y,
+z)`` of length 1, colors linear in [0, 1]. The world is right-handed with z up. Row 0 of an image is
+its top.
 
-Fields marked *static* are Python values: they decide which program is compiled, hence they
-are hashable and cannot be traced. All other fields are arrays and may be differentiated,
-batched or randomised.
+Fields marked *static* are Python values: they decide which program is compiled, hence they are
+hashable and cannot be traced. All other fields are arrays and may be differentiated, batched or
+randomised.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ class GeomKind(IntEnum):
         """Make a row, which is MuJoCo's number.
 
         Raises:
-            TypeError: it does not say how far the kind reaches.
+            TypeError: the number of sizes or the reach is missing or unknown.
         """
         if not 1 <= num_sizes <= 3 or reach not in ("first", "largest", "diagonal", "all"):
             raise TypeError(f"GeomKind {number} needs a number of sizes and a reach.")
@@ -103,8 +104,8 @@ class String(struct.PyTreeNode):
     Attributes:
         geoms: static, rows of ``Geoms`` that are its pieces, in order; all capsules on no link.
         link: (2,) static, indices of the links that carry its ends, -1 for the world.
-        ends: (2, 3) float32, metres, its ends in the frames of these links.
-        length: () float32, metres; a distance of the ends that is greater stretches it.
+        ends: (2, 3), its ends in the frames of these links.
+        length: (); a distance of the ends that is greater stretches it.
     """
 
     geoms: tuple[int, ...] = struct.field(pytree_node=False)
@@ -121,11 +122,10 @@ class Geoms(struct.PyTreeNode):
         link: (G,) static, index of the carrying link, -1 for the world.
         material: (G,) static, row of ``rgb`` that colors the geom.
         name: (G,) static, the model's geom name, or ``kind/index`` where it has none.
-        size: (G, 3) float32, metres, with MuJoCo's meaning per kind: radius, half length,
-            half extents.
-        pos: (G, 3) float32, metres, in the link's frame.
-        quat: (G, 4) float32, unit, in the link's frame.
-        rgb: (M, 3) float32, one color per material.
+        size: (G, 3), with MuJoCo's meaning per kind: radius, half length, half extents.
+        pos: (G, 3), in the link's frame.
+        quat: (G, 4), in the link's frame.
+        rgb: (M, 3), one color per material.
         bounded: (G,) static, planes that end at their size along their x and y, where a size of
             0 is no end. Empty where no plane ends, whatever its size.
         patterned: (G,) static, planes that are ground: drawn with the look's pattern, others in
@@ -166,10 +166,10 @@ class PhysicsState(struct.PyTreeNode):
 
     Attributes:
         engine: the engine's own state, opaque to everyone else.
-        xpos: (L, 3) float32, metres, link origins in the world frame.
-        xquat: (L, 4) float32, unit, link orientations in the world frame.
-        obs: (S,) float32, the task's state observation.
-        reward: () float32, reward of the step that led here, 0 after a reset.
+        xpos: (L, 3), link origins in the world frame.
+        xquat: (L, 4), link orientations in the world frame.
+        obs: (S,), the task's state observation.
+        reward: (), of the step that led here, 0 after a reset.
         terminated: () bool, the task ended (never a time limit).
         non_finite: () bool, the step diverged; the pose shown is then the last finite one.
     """
@@ -187,10 +187,10 @@ class Camera(struct.PyTreeNode):
     """A pinhole camera in the world frame.
 
     Attributes:
-        pos: (3,) float32, metres.
-        xmat: (3, 3) float32, columns are the camera's right, up and back directions; it looks
-            along minus its third column, as MuJoCo's and OpenGL's cameras do.
-        fovy: () float32, vertical field of view, degrees.
+        pos: (3,).
+        xmat: (3, 3), columns are the camera's right, up and back directions; it looks along
+            minus its third column, as MuJoCo's and OpenGL's cameras do.
+        fovy: (), vertical field of view.
     """
 
     pos: jax.Array
@@ -205,11 +205,11 @@ class CameraRig(struct.PyTreeNode):
 
     Attributes:
         link: static, index of the followed link, -1 to follow nothing.
-        track: (3,) float32, fraction of the link's position that is followed, per world axis.
-        eye: (3,) float32, metres.
-        target: (3,) float32, metres, the point looked at.
-        up: (3,) float32, the world direction that is up in the image.
-        fovy: () float32, vertical field of view, degrees.
+        track: (3,), fraction of the link's position that is followed, per world axis.
+        eye: (3,).
+        target: (3,), the point looked at.
+        up: (3,), the world direction that is up in the image.
+        fovy: (), vertical field of view.
     """
 
     link: int = struct.field(pytree_node=False)
@@ -230,10 +230,10 @@ class Lamp(struct.PyTreeNode):
     Attributes:
         link: static, index of the followed link, -1 for a lamp at rest.
         exponent: static int, at least 0.
-        pos: (3,) float32, metres, the offset; in a scene the place in the world.
-        axis: (3,) float32, unit, world direction in which it shines.
-        cos_cutoff: () float32, cosine of the angle at which its light ends; -1 for none.
-        diffuse, highlight: () float32 coefficients, as in ``Look``.
+        pos: (3,), the offset; in a scene the place in the world.
+        axis: (3,), unit, world direction in which it shines.
+        cos_cutoff: (), cosine of the angle at which its light ends; -1 for none.
+        diffuse, highlight: () coefficients, as in ``Look``.
     """
 
     link: int = struct.field(pytree_node=False)
@@ -296,8 +296,8 @@ class Scene(struct.PyTreeNode):
 
     Attributes:
         geoms: shapes, sizes and colors.
-        pos: (G, 3) float32, metres, geom centers.
-        xmat: (G, 3, 3) float32, geom orientations; columns are the geom's axes.
+        pos: (G, 3), geom centers.
+        xmat: (G, 3, 3), geom orientations; columns are the geom's axes.
         camera: the viewpoint.
         look: light, sky and ground.
     """
@@ -313,9 +313,9 @@ class Frame(struct.PyTreeNode):
     """One image. Color channels stay apart: stacking them early costs a CPU dearly.
 
     Attributes:
-        r, g, b: (H, W) float32 in [0, 1].
-        depth: (H, W) float32, metres along the camera's viewing axis (not along the ray),
-            ``FAR`` where nothing is hit.
+        r, g, b: (H, W) in [0, 1].
+        depth: (H, W), along the camera's viewing axis (not along the ray), ``FAR`` where nothing is
+            hit.
         seg: (H, W) int32, index of the geom seen, -1 for the sky.
         ground: (H, W) bool, a plane that is ground is seen; cheaper to ask than ``seg``.
     """
@@ -406,9 +406,9 @@ class Timestep(struct.PyTreeNode):
     """What an agent sees after a reset or a step.
 
     Attributes:
-        obs: uint8 (H, W, 3K) pixels, oldest frame first; or (S,) float32 state; or a dict of
-            both under ``"pixels"`` and ``"state"``, as ``obs_mode`` says.
-        reward: () float32, 0 after a reset.
+        obs: uint8 (H, W, 3K) pixels, oldest frame first; or (S,) state; or a dict of both under
+            ``"pixels"`` and ``"state"``, as ``obs_mode`` says.
+        reward: (), 0 after a reset.
         terminated: () bool, the task ended.
         truncated: () bool, the time limit was reached; never together with ``terminated``.
         info: dict with a fixed set of keys, see ``PixelEnv.step``.

@@ -153,6 +153,11 @@ def tolerance(
     return jnp.where(inside, 1.0, _SIGMOIDS[sigmoid](distance / margin, value_at_margin))
 
 
+def rising(x: jax.Array, bound: float, margin: float, value_at_margin: float = 0.0) -> jax.Array:
+    """Return 1 from a bound on, and linearly less below it; see ``tolerance``."""
+    return tolerance(x, (bound, math.inf), margin, "linear", value_at_margin)
+
+
 def _gaussian(x: jax.Array, value_at_1: float) -> jax.Array:
     return jnp.exp(-0.5 * (x * math.sqrt(-2 * math.log(value_at_1))) ** 2)
 

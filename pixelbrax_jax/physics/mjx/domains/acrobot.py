@@ -30,11 +30,7 @@ def _reward(seen: Snapshot, *, margin: float) -> jax.Array:
 
 
 def _task(margin: float) -> Formulas:
-    return Formulas(
-        _start,
-        _observe,
-        partial(_reward, margin=margin),
-    )
+    return Formulas(_start, _observe, partial(_reward, margin=margin))
 
 
 TASKS = {"swingup": _task(1.0), "swingup_sparse": _task(0.0)}

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics
-from pixelbrax_jax.physics.mjx.formulas import Formulas, Snapshot, Start, joined, tolerance
+from pixelbrax_jax.physics.mjx.formulas import Formulas, Snapshot, Start, joined, rising
 from pixelbrax_jax.physics.mjx.resets import random_joints
 from pixelbrax_jax.physics.opengl import mujoco
 
@@ -41,13 +41,7 @@ def _observe(seen: Snapshot) -> jax.Array:
 
 def _reward(seen: Snapshot) -> jax.Array:
     """Return the speed along x as a fraction of 10 m/s."""
-    return tolerance(
-        seen.sensor("torso_subtreelinvel")[0],
-        (_RUN_SPEED, jnp.inf),
-        margin=_RUN_SPEED,
-        value_at_margin=0.0,
-        sigmoid="linear",
-    )
+    return rising(seen.sensor("torso_subtreelinvel")[0], _RUN_SPEED, margin=_RUN_SPEED)
 
 
 TASKS = {"run": Formulas(_start, _observe, _reward)}

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics
-from pixelbrax_jax.physics.mjx.formulas import Formulas, Snapshot, Start, joined, tolerance
+from pixelbrax_jax.physics.mjx.formulas import Formulas, Snapshot, Start, joined, rising, tolerance
 from pixelbrax_jax.physics.mjx.resets import random_joints
 
 _STAND_HEIGHT = 1.2
@@ -31,13 +31,8 @@ def _reward(seen: Snapshot, *, speed: float) -> jax.Array:
     stand = (3 * standing + (1 + seen.xmat("torso")[2, 2]) / 2) / 4
     if speed == 0:
         return stand
-    move = tolerance(
-        seen.sensor("torso_subtreelinvel")[0],
-        (speed, jnp.inf),
-        margin=speed / 2,
-        value_at_margin=0.5,
-        sigmoid="linear",
-    )
+    x_speed = seen.sensor("torso_subtreelinvel")[0]
+    move = rising(x_speed, speed, speed / 2, value_at_margin=0.5)
     return stand * (5 * move + 1) / 6
 
 
