@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -56,11 +56,11 @@ class Algorithm(ABC):
         """
 
     @abstractmethod
-    def iterate(self, state: TrainState, env_params: EnvParams) -> tuple[TrainState, Metrics]:
+    def iterate(self, state: Any, env_params: EnvParams) -> tuple[TrainState, Metrics]:
         """Play ``config.steps_per_iteration`` control steps and learn.
 
         Args:
-            state: where training stands.
+            state: where training stands, of the class that ``init`` returns.
             env_params: of the environments.
 
         Returns:
@@ -86,7 +86,7 @@ class Algorithm(ABC):
         """Iterations from one auxiliary phase to the next; 0 has none."""
         return 0
 
-    def auxiliary(self, state: TrainState) -> tuple[TrainState, Metrics]:
+    def auxiliary(self, state: Any) -> tuple[TrainState, Metrics]:
         """Learn from what has been kept of all iterations since the last auxiliary phase."""
         raise NotImplementedError(f"{self.name} has no auxiliary phase.")
 
@@ -135,10 +135,10 @@ def check_environments(config: TrainConfig, envs: Environments) -> None:
         )
     found = {
         "num_envs": (config.num_envs, envs.num_envs),
-        "action_repeat": (config.action_repeat, envs.env.action_repeat),
-        "frame_stack": (config.frame_stack, pixels.shape[-1] // 3),
-        "height": (config.height, pixels.shape[0]),
-        "width": (config.width, pixels.shape[1]),
+        "action_repeat": (config.env.action_repeat, envs.env.action_repeat),
+        "frame_stack": (config.env.frame_stack, pixels.shape[-1] // 3),
+        "height": (config.env.height, pixels.shape[0]),
+        "width": (config.env.width, pixels.shape[1]),
     }
     for name, (expected, given) in found.items():
         if expected != given:

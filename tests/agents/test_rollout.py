@@ -14,6 +14,7 @@ from pixelbrax_jax.agents.on_policy import phasic
 from pixelbrax_jax.agents.on_policy.algorithm import Decision, Experience, minibatch_times
 from pixelbrax_jax.agents.on_policy.ppg import PPG, PPGConfig
 from pixelbrax_jax.agents.rollout import collect, observations, shifted
+from pixelbrax_jax.config import EnvConfig
 from tests.envs.toy import Ball, limited
 
 T, N = 15, 4
@@ -127,8 +128,8 @@ def test_the_last_observation_is_that_of_the_state_left_behind(played):
 def test_chunks_of_the_buffer_are_the_rollouts(played):
     parts = 3
     config = PPGConfig(
-        height=10, width=12, frame_stack=played.stack, num_envs=N, num_steps=T, encoder="impala",
-        random_shift=played.shift, num_minibatches=1, num_policy_phases=2,
+        env=EnvConfig(height=10, width=12, frame_stack=played.stack), num_envs=N, num_steps=T,
+        encoder="impala", random_shift=played.shift, num_minibatches=1, num_policy_phases=2,
         aux_minibatches=2 * parts,
     )  # fmt: skip
     entries = [phasic._entry(Experience(x, x.reward, x.reward)) for x in played.rollouts]

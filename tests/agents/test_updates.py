@@ -86,7 +86,7 @@ def test_the_step_size_of_a_run_falls_along_a_line(agent):
 
 def test_ppg_without_auxiliary_phases_is_ppo(ppo, ppg, envs):
     config = PPGConfig(**SMALL | PHASIC | {"aux_epochs": 0}, vf_coef=1.0)
-    assert PPG(config, envs).num_phases == 0
+    assert PPG(config, envs).auxiliary_every == 0
 
     def shared(networks):
         """All but the value head, which PPO's actor does not have."""

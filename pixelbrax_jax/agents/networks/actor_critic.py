@@ -135,13 +135,13 @@ class ActorCritic:
     def actor(self, params: Any, pixels: jax.Array, detach_value: bool = False) -> ActorOutput:
         """Return the actor's output for (B, H, W, 3 K) pixels."""
         output: Any = self.actor_module.apply(params, pixels, detach_value)
-        return output  # type: ignore[no-any-return]
+        return output
 
     def critic(self, params: Any, pixels: jax.Array, state: jax.Array | None) -> jax.Array:
         """Return (B,) values of the critic of its own."""
         assert self.critic_module is not None
         value: Any = self.critic_module.apply(params, pixels, state)
-        return value  # type: ignore[no-any-return]
+        return value
 
     def __call__(
         self, networks: Networks, pixels: jax.Array, state: jax.Array | None

@@ -64,9 +64,10 @@ class OnPolicyConfig(TrainConfig):
     @property
     def steps_per_iteration(self) -> int:
         """Control steps of one rollout, over all environments."""
-        return self.num_envs * self.num_steps * self.action_repeat
+        return self.num_envs * self.num_steps * self.env.action_repeat
 
     @property
-    def frames_per_iteration(self) -> int:
-        """Frames of one rollout, over all environments."""
-        return self.num_envs * (self.num_steps + self.frame_stack - 1)
+    def bytes_per_iteration(self) -> int:
+        """Bytes of the frames of one rollout, over all environments."""
+        frames = self.num_envs * (self.num_steps + self.env.frame_stack - 1)
+        return frames * self.env.height * self.env.width * 3

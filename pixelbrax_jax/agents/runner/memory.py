@@ -26,9 +26,7 @@ def check_memory(algorithm: Algorithm, template: TrainState, report: Callable[[s
         MemoryError: it is more than ``memory_budget_gb``, or than the device has.
     """
     config = algorithm.config
-    frames = (
-        config.frames_per_iteration * config.height * config.width * 3 * template.iteration.size
-    )
+    frames = config.bytes_per_iteration * template.iteration.size
     memories, total = _memories(algorithm), nbytes(template)
     parts = {field.name: nbytes(getattr(template, field.name)) for field in fields(template)}
     large = (f", {name} {n / 1e9:.2f} GB" for name, n in parts.items() if n > 0.01 * total)
