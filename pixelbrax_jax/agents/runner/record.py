@@ -13,8 +13,8 @@ import jax
 import numpy as np
 
 from pixelbrax_jax.agents.runner.checkpoint import CheckpointError
-from pixelbrax_jax.agents.runner.evaluate import SPLITS, make_split
-from pixelbrax_jax.agents.runner.trained import Trained, load_chosen, with_clips
+from pixelbrax_jax.agents.runner.splits import SPLITS, make_split
+from pixelbrax_jax.agents.runner.trained import Trained, load_agent, with_clips
 from pixelbrax_jax.compilation import compiler_options
 from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.flags import default_flags
@@ -29,7 +29,13 @@ def record(options: argparse.Namespace) -> int:
         The exit status.
     """
     try:
-        agent = load_chosen(options)
+        agent = load_agent(
+            options.folder,
+            options.pretrained,
+            steps=options.steps,
+            best=options.best,
+            run=options.run_index,
+        )
         split = options.split or ("train" if agent.algorithm.config.env.distractors else "clean")
         run = [f"run{options.run_index}"] if options.run_index else []
         name = "_".join([options.pretrained or str(agent.steps), split, *run])

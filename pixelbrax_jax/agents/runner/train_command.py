@@ -8,25 +8,58 @@ import os
 import sys
 from dataclasses import make_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import jax
 import tyro
 from tqdm import tqdm
+from tyro.constructors import (
+    ConstructorRegistry,
+    PrimitiveConstructorSpec,
+    PrimitiveTypeInfo,
+)
 
-from pixelbrax_jax.agents.config import TrainConfig, make_env
+from pixelbrax_jax.agents.config import TrainConfig
 from pixelbrax_jax.agents.on_policy.presets import PRESETS, preset
-from pixelbrax_jax.agents.registry import ALGORITHMS, make_algorithm
+from pixelbrax_jax.agents.registry import ALGORITHMS
+from pixelbrax_jax.agents.runner import train as training
 from pixelbrax_jax.agents.runner.checkpoint import CheckpointError, latest_steps
-from pixelbrax_jax.agents.runner.option_types import names_for_objects
-from pixelbrax_jax.agents.runner.run_config import RunConfig
-from pixelbrax_jax.agents.runner.train import TrainingDivergedError, run
-from pixelbrax_jax.envs.sharded import ShardedVectorEnv, make_env_mesh
-from pixelbrax_jax.envs.vector import VectorPixelEnv
+from pixelbrax_jax.agents.runner.settings import RunConfig
+from pixelbrax_jax.config import EnvConfig
 from pixelbrax_jax.validation import check_positive_int
 
 INTERRUPTED = 130
 """Exit status of a run that was stopped by Ctrl-C, as shells have it."""
+
+names_for_objects = ConstructorRegistry()
+"""As a context, lets ``tyro.cli`` read every field of ``EnvConfig``."""
+
+
+@names_for_objects.primitive_rule
+def _name(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+    types = get_type_hints(EnvConfig)
+    if info.type not in [types[name] for name in ("camera", "look", "clips")]:
+        return None
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="FOLDER" if info.type == types["clips"] else "NAME",
+        instance_from_str=lambda args: args[0],
+        is_instance=lambda value: value is None or isinstance(value, str),
+        str_from_instance=lambda value: [str(value)],
+    )
+
+
+@names_for_objects.primitive_rule
+def _names(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+    if info.type != get_type_hints(EnvConfig)["distractors"]:
+        return None
+    return PrimitiveConstructorSpec(
+        nargs="*",
+        metavar="[NAME ...]",
+        instance_from_str=tuple,
+        is_instance=lambda value: isinstance(value, tuple),
+        str_from_instance=list,
+    )
 
 
 def train(arguments: list[str]) -> int:
@@ -82,10 +115,11 @@ def _train(arguments: list[str]) -> int:
         if chosen.coordinator is not None:
             jax.distributed.initialize(*spread)
         config, options = parse(chosen.algorithm, chosen.preset, rest)
-        return _run(chosen.algorithm, config, options)
+        outcome = training.train(config, options, _report)
+        return 128 + outcome.signal if outcome.interrupted else 0
     except (
         CheckpointError,
-        TrainingDivergedError,
+        training.TrainingDivergedError,
         ValueError,
         OSError,
         MemoryError,
@@ -102,6 +136,12 @@ def _train(arguments: list[str]) -> int:
             kept = f"go on from the checkpoint of {latest} steps with --resume latest"
         _write(f"pixelbrax train: stopped at once; {kept}")
         return INTERRUPTED
+
+
+def _report(line: str) -> None:
+    """Write a line of a run above the bar."""
+    if jax.process_index() == 0:
+        tqdm.write(line, file=sys.stderr)
 
 
 def _write(line: str) -> None:
@@ -173,25 +213,3 @@ def parse(algorithm: str, name: str, arguments: list[str]) -> tuple[TrainConfig,
             args=arguments,
         )
     return parsed.config, parsed.options
-
-
-def _run(algorithm: str, config: TrainConfig, options: RunConfig) -> int:
-    def report(line: str) -> None:
-        if jax.process_index() == 0:
-            tqdm.write(line, file=sys.stderr)
-
-    env, env_params = make_env(config)
-    devices = jax.device_count()
-    if devices > 1:
-        envs: Any = ShardedVectorEnv(env, config.num_envs, make_env_mesh())
-    else:
-        envs = VectorPixelEnv(env, config.num_envs)
-    with contextlib.suppress(OSError):
-        report(
-            f"{algorithm} on {config.env.task}, {config.num_envs} environments, {devices} "
-            f"{jax.default_backend()} device{'s' * (devices > 1)}, {config.num_iterations} "
-            f"iterations of {config.steps_per_iteration} control steps; "
-            f"into {Path(options.output_dir).resolve()}"
-        )
-    outcome = run(make_algorithm(config, envs), env_params, options, report=report)
-    return 128 + outcome.signal if outcome.interrupted else 0

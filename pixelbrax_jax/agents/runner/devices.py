@@ -1,4 +1,4 @@
-"""A training state spread over several devices, and what all processes must agree on.
+"""Several devices and processes: how a state is spread, what all must agree on, what fits.
 
 What belongs to environments is spread along them; everything else is the same on every device. A
 minibatch has equally many steps of every environment, so that each device computes the gradient of
@@ -16,7 +16,10 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from pixelbrax_jax.agents.algorithm import Algorithm
 from pixelbrax_jax.agents.env_axis import env_axes
+from pixelbrax_jax.agents.runner.progress import Report
+from pixelbrax_jax.agents.train_state import TrainState
 from pixelbrax_jax.envs.sharded import AXIS
+from pixelbrax_jax.memory import device_memory
 
 
 def mesh_of(algorithm: Algorithm) -> Mesh | None:
@@ -67,3 +70,48 @@ def highest(*here: int) -> tuple[int, ...]:
         return here
     everyone = multihost_utils.process_allgather(np.array(here, np.int32))
     return tuple(int(number) for number in everyone.max(axis=0))
+
+
+def check_memory(algorithm: Algorithm, template: TrainState, report: Report) -> None:
+    """Report what will be stored, and reject what would not fit.
+
+    Args:
+        algorithm: with its settings.
+        template: ``jax.eval_shape`` of its state.
+        report: gets the figures.
+
+    Raises:
+        MemoryError: it is more than ``memory_budget_gb``, or than the device has.
+    """
+    config, env = algorithm.config, algorithm.config.env
+    frame = config.num_envs * env.height * env.width * 3
+    rollout = frame * (config.num_steps + env.frame_stack - 1) * template.iteration.size
+    buffer, state = _nbytes(template.buffer), _nbytes(template)
+    alike = _nbytes((template.networks, template.opt_state, template.aux_opt_state))
+    parts = _memories(algorithm)
+    stored = alike + (rollout + state - alike) / parts
+    report(
+        f"stored: rollout {rollout / 1e9:.2f} GB, auxiliary buffer {buffer / 1e9:.2f} GB, all "
+        f"state {state / 1e9:.2f} GB"
+    )
+    budget = config.memory_budget_gb
+    limit = budget * 1e9 if budget is not None else device_memory()
+    if any_process(stored > limit):
+        where = f" in each of {parts} memories" if parts > 1 else ""
+        raise MemoryError(
+            f"rollout and state take {stored / 1e9:.2f} GB{where}, of {limit / 1e9:.2f} GB that "
+            f"may be used. Lower num_envs, num_steps{', num_policy_phases' if buffer else ''} or "
+            "the size of the images, or raise memory_budget_gb."
+        )
+
+
+def _nbytes(tree: Any) -> int:
+    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
+
+
+def _memories(algorithm: Algorithm) -> int:
+    """Return memories over which environments are spread; devices of a CPU share one."""
+    mesh = mesh_of(algorithm)
+    if mesh is None:
+        return 1
+    return jax.process_count() if jax.default_backend() == "cpu" else int(mesh.size)
