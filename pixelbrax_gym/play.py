@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from pixelbrax_gym.gymnasium.single_env import PixelBraxEnv
+from pixelbrax_gym.gymnasium.env import GymnasiumEnv
 from pixelbrax_gym.gymnasium.window import Window
 from pixelbrax_jax.extras import install_extra
 from pixelbrax_jax.policy import load_policy
@@ -60,7 +60,7 @@ def play(options: argparse.Namespace) -> int:
     return 0
 
 
-def images(env: PixelBraxEnv, act: Act, seed: int, observed: int | None) -> Iterator[np.ndarray]:
+def images(env: GymnasiumEnv, act: Act, seed: int, observed: int | None) -> Iterator[np.ndarray]:
     """Play for ever, episode after episode.
 
     Args:
@@ -85,7 +85,7 @@ def images(env: PixelBraxEnv, act: Act, seed: int, observed: int | None) -> Iter
             obs, _ = env.reset()
 
 
-def _make(options: argparse.Namespace) -> tuple[PixelBraxEnv, Act]:
+def _make(options: argparse.Namespace) -> tuple[GymnasiumEnv, Act]:
     given = {name: getattr(options, name) for name in ENV_OPTIONS}
     given = {name: value for name, value in given.items() if value is not None}
     policy = None
@@ -93,7 +93,7 @@ def _make(options: argparse.Namespace) -> tuple[PixelBraxEnv, Act]:
         policy = load_policy(options.task)
         given = (policy.env_options or {}) | given
     task: Any = given.pop("task", options.task)
-    env = PixelBraxEnv(
+    env = GymnasiumEnv(
         task,
         render_mode="rgb_array",
         render_height=options.size,

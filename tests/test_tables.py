@@ -71,10 +71,10 @@ def test_every_task_has_its_animation():
 
 def test_the_options_of_adapters_are_listed():
     adapters = [
-        pixelbrax_gym.PixelBraxEnv,
-        pixelbrax_gym.PixelBraxVectorEnv,
-        pixelbrax_gym.PixelBraxTorchRLEnv,
-        pixelbrax_gym.PixelBraxSB3VecEnv,
+        pixelbrax_gym.GymnasiumEnv,
+        pixelbrax_gym.GymnasiumVectorEnv,
+        pixelbrax_gym.TorchRLEnv,
+        pixelbrax_gym.SB3VecEnv,
     ]
     taken = [
         set(inspect.signature(adapter.__init__).parameters) - {"self", "task", "options"}

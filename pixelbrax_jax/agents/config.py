@@ -11,8 +11,8 @@ from typing import Any, Self
 from pixelbrax_jax.agents.networks.actor import ENCODERS, LOG_STD_RANGE, POLICIES, SMALLEST
 from pixelbrax_jax.config import ENV_OPTIONS, EnvConfig
 from pixelbrax_jax.distractors.presets import as_tuple
+from pixelbrax_jax.envs.making import make
 from pixelbrax_jax.envs.pixel_env import PixelEnv
-from pixelbrax_jax.registry import make
 from pixelbrax_jax.types import EnvParams
 from pixelbrax_jax.validation import (
     check_choice,

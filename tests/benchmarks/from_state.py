@@ -15,10 +15,10 @@ import time
 
 from brax.training.agents.ppo import train as ppo
 
-from pixelbrax_jax import BraxPixelEnv, make, wrap_fresh_episodes
+from pixelbrax_jax import BraxEnv, make, wrap_fresh_episodes
 from pixelbrax_jax.agents.config import TrainConfig, describe
 from pixelbrax_jax.agents.on_policy.presets import preset
-from pixelbrax_jax.tasks import REWARD_PRESETS
+from pixelbrax_jax.physics.brax.tasks import REWARD_PRESETS
 from tests.benchmarks.experiments import TASKS
 from tests.benchmarks.results import FOLDER, task_key
 
@@ -30,7 +30,7 @@ def keep(config: TrainConfig) -> None:
 
     What is known of it is written with every evaluation.
     """
-    env = BraxPixelEnv(*make(config.env, obs_mode="state"))
+    env = BraxEnv(*make(config.env, obs_mode="state"))
     found: dict = {"steps": [], "seconds": [], "return": [], "length": []}
     began = time.monotonic()
 
