@@ -10,13 +10,13 @@ import pytest
 from flax import struct
 
 from pixelbrax_jax import PixelEnv, VectorPixelEnv
-from pixelbrax_jax.agents.env_axis import along_envs, as_declared, env_axes, without_envs
 from pixelbrax_jax.agents.on_policy.dcpg import DCPG, DCPGConfig
 from pixelbrax_jax.agents.on_policy.ppg import PPG, PPGConfig
 from pixelbrax_jax.agents.on_policy.ppo import PPO, PPOConfig
 from pixelbrax_jax.agents.runner.evaluate import Evaluator
 from pixelbrax_jax.agents.runner.programs import Runs
 from pixelbrax_jax.agents.runner.train import is_due
+from pixelbrax_jax.agents.train_state import along_envs, as_declared, env_axes, without_envs
 from tests.agents.small import OPTIONS, PARAMS, PHASIC, SMALL, ball_envs
 from tests.compilations import counted
 from tests.envs.toy import Ball, limited

@@ -344,7 +344,7 @@ def test_a_buffer_that_would_not_fit_is_told_with_figures(tmp_path):
     lines = []
     with pytest.raises(MemoryError, match=r"Lower num_envs, num_steps, num_policy_phases"):
         run(ppg(8, memory_budget_gb=1e-6), PARAMS, options(tmp_path), report=lines.append)
-    assert "auxiliary buffer" in lines[0]
+    assert ", buffer " in lines[0]
 
 
 def test_an_exported_policy_acts_without_the_package(whole, tmp_path):

@@ -15,6 +15,7 @@ import json
 import time
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,13 +25,12 @@ from flax import linen as nn
 from pixelbrax_jax import VectorPixelEnv, compiler_options
 from pixelbrax_jax.agents.algorithm import train_function
 from pixelbrax_jax.agents.config import describe, make_env
-from pixelbrax_jax.agents.networks.actor import LOG_STD_RANGE, SMALLEST
+from pixelbrax_jax.agents.networks.actor_critic import LOG_STD_RANGE, ActorCritic, Critic
 from pixelbrax_jax.agents.networks.distributions import Normal
-from pixelbrax_jax.agents.on_policy.actor_critic import ActorCritic
-from pixelbrax_jax.agents.on_policy.losses import Metrics
+from pixelbrax_jax.agents.networks.encoders import SMALLEST
 from pixelbrax_jax.agents.on_policy.ppo import PPO, PPOConfig
 from pixelbrax_jax.agents.on_policy.presets import preset
-from pixelbrax_jax.agents.optimizer import Networks
+from pixelbrax_jax.agents.train_state import Metrics, Networks
 from tests.benchmarks.experiments import TASKS
 from tests.benchmarks.results import FOLDER, task_key
 
@@ -59,28 +59,24 @@ class StateActor(nn.Module):
         )
 
 
-@dataclass(frozen=True)
 class StateActorCritic(ActorCritic):
-    """Policy and value of the state; for training, whose `decide` asks for both."""
+    """Policy and value of the state; for training, which asks for both."""
 
-    @cached_property
-    def _policy(self) -> StateActor:
-        return StateActor(self.envs.env.action_size, self.config.initial_std)
-
-    def init(self, key: jax.Array) -> Networks:
+    def init(self, key: jax.Array, pixels: Any, state: Any) -> Networks:
         """Sample initial parameters."""
-        state = jnp.zeros((1, *self.envs.env.obs_spec["state"].shape))
+        del pixels
+        state = jnp.zeros((1, *state.shape))
         keys = jax.random.split(key)
         return {
-            "actor": self._policy.init(keys[0], state),
-            "critic": self._critic.init(keys[1], None, state),
+            "actor": self.actor_module.init(keys[0], state),
+            "critic": self.critic_module.init(keys[1], None, state),
         }
 
     def __call__(
         self, networks: Networks, pixels: jax.Array, state: jax.Array | None
     ) -> tuple[Normal, jax.Array]:
         """Return policy and value of (B, S) states."""
-        policy: Normal = self._policy.apply(networks["actor"], state)  # type: ignore[assignment]
+        policy: Any = self.actor_module.apply(networks["actor"], state)
         return policy, self.critic(networks["critic"], pixels, state)
 
 
@@ -91,7 +87,8 @@ class StatePPO(PPO):
     @cached_property
     def agent(self) -> StateActorCritic:
         """Its networks."""
-        return StateActorCritic(self.config, self.envs, shared=False)
+        actor: Any = StateActor(self.envs.env.action_size, self.config.initial_std)
+        return StateActorCritic(actor, Critic("small", sees_state=True))
 
 
 def tenths(metrics: Metrics) -> list[float]:

@@ -23,7 +23,7 @@ from flax import linen as nn
 
 from pixelbrax_jax import VectorPixelEnv
 from pixelbrax_jax.agents.config import make_env
-from pixelbrax_jax.agents.networks.actor import ENCODERS, scaled
+from pixelbrax_jax.agents.networks.encoders import ENCODERS, scaled
 from pixelbrax_jax.agents.runner.trained import load_trained
 
 

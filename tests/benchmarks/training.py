@@ -21,7 +21,7 @@ import numpy as np
 
 from pixelbrax_jax import VectorPixelEnv, compiler_options
 from pixelbrax_jax.agents.config import make_env
-from pixelbrax_jax.agents.networks.actor import ENCODERS
+from pixelbrax_jax.agents.networks.encoders import ENCODERS
 from pixelbrax_jax.agents.on_policy.ppo import PPO, PPOConfig
 from pixelbrax_jax.config import EnvConfig
 

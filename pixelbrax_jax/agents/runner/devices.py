@@ -7,6 +7,7 @@ its own, and XLA adds them up.
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import Any
 
 import jax
@@ -15,9 +16,8 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from pixelbrax_jax.agents.algorithm import Algorithm
-from pixelbrax_jax.agents.env_axis import env_axes
 from pixelbrax_jax.agents.runner.progress import Report
-from pixelbrax_jax.agents.train_state import TrainState
+from pixelbrax_jax.agents.train_state import TrainState, env_axes
 from pixelbrax_jax.envs.sharded import AXIS
 from pixelbrax_jax.memory import device_memory
 
@@ -83,25 +83,27 @@ def check_memory(algorithm: Algorithm, template: TrainState, report: Report) -> 
     Raises:
         MemoryError: it is more than ``memory_budget_gb``, or than the device has.
     """
-    config, env = algorithm.config, algorithm.config.env
-    frame = config.num_envs * env.height * env.width * 3
-    rollout = frame * (config.num_steps + env.frame_stack - 1) * template.iteration.size
-    buffer, state = _nbytes(template.buffer), _nbytes(template)
-    alike = _nbytes((template.networks, template.opt_state, template.aux_opt_state))
-    parts = _memories(algorithm)
-    stored = alike + (rollout + state - alike) / parts
+    config = algorithm.config
+    frames = config.bytes_per_iteration * template.iteration.size
+    memories, total = _memories(algorithm), _nbytes(template)
+    parts = {field.name: _nbytes(getattr(template, field.name)) for field in fields(template)}
+    large = (f", {name} {n / 1e9:.2f} GB" for name, n in parts.items() if n > 0.01 * total)
     report(
-        f"stored: rollout {rollout / 1e9:.2f} GB, auxiliary buffer {buffer / 1e9:.2f} GB, all "
-        f"state {state / 1e9:.2f} GB"
+        f"stored: frames of an iteration {frames / 1e9:.2f} GB, all state {total / 1e9:.2f} GB"
+        + "".join(large)
     )
+    # What belongs to environments is spread over the devices; the rest is the same on all.
+    leaves = zip(jax.tree.leaves(template), jax.tree.leaves(env_axes(template)), strict=True)
+    alike = sum(_nbytes(leaf) for leaf, axis in leaves if axis < 0)
+    needed = alike + (frames + total - alike) / memories
     budget = config.memory_budget_gb
     limit = budget * 1e9 if budget is not None else device_memory()
-    if any_process(stored > limit):
-        where = f" in each of {parts} memories" if parts > 1 else ""
+    if any_process(needed > limit):
+        where = f" in each of {memories} memories" if memories > 1 else ""
         raise MemoryError(
-            f"rollout and state take {stored / 1e9:.2f} GB{where}, of {limit / 1e9:.2f} GB that "
-            f"may be used. Lower num_envs, num_steps{', num_policy_phases' if buffer else ''} or "
-            "the size of the images, or raise memory_budget_gb."
+            f"frames and state take {needed / 1e9:.2f} GB{where}, of {limit / 1e9:.2f} GB that "
+            f"may be used. Lower {', '.join(config.memory_settings)} or the size of the images, or "
+            "raise memory_budget_gb."
         )
 
 

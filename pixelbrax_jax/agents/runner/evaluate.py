@@ -11,11 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pixelbrax_jax.agents.optimizer import Networks
 from pixelbrax_jax.agents.runner.progress import Report, silent
 from pixelbrax_jax.agents.runner.settings import place_of
 from pixelbrax_jax.agents.runner.splits import make_splits
 from pixelbrax_jax.agents.runner.trained import Player, Trained, with_clips
+from pixelbrax_jax.agents.train_state import Networks
 from pixelbrax_jax.compilation import jit
 from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.flags import default_flags
@@ -77,14 +77,15 @@ class Evaluator:
         """
         envs = VectorPixelEnv(env, num_episodes, "disabled")
         self._play = partial(_play, envs, algorithm, deterministic)
+        self._acting = algorithm.acting
         with default_flags():
             self._key = jax.random.key(seed)
         self._params = env_params
 
     def __call__(self, networks: Networks) -> Result:
         """Play the episodes of a policy."""
-        actor = {"actor": networks["actor"]}
-        returns, lengths = jax.device_get(self._play(actor, self._key, self._params))
+        acting = {name: networks[name] for name in self._acting}
+        returns, lengths = jax.device_get(self._play(acting, self._key, self._params))
         return Result(returns=returns.astype(np.float64), lengths=lengths)
 
 

@@ -10,9 +10,8 @@ import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax.agents.algorithm import Algorithm
-from pixelbrax_jax.agents.on_policy.losses import Metrics
 from pixelbrax_jax.agents.runner.devices import mesh_of, replicated, state_shardings
-from pixelbrax_jax.agents.train_state import TrainState
+from pixelbrax_jax.agents.train_state import Metrics, TrainState
 from pixelbrax_jax.compilation import jit
 from pixelbrax_jax.types import EnvParams
 

@@ -36,7 +36,7 @@ from pixelbrax_jax.agents.runner.settings import (
 )
 from pixelbrax_jax.agents.runner.splits import make_splits
 from pixelbrax_jax.agents.runner.trained import save_policy
-from pixelbrax_jax.agents.train_state import TrainState
+from pixelbrax_jax.agents.train_state import TrainState, kept, parts_not_kept
 from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.envs.sharded import ShardedVectorEnv, make_env_mesh
 from pixelbrax_jax.envs.vector import VectorPixelEnv
@@ -139,10 +139,14 @@ def run(
             clips=stored_clips(algorithm.config, shown),
         )
         with closing(checkpoints):
+            seed = jax.device_put(np.uint32(options.seed))
             if _goes_on(checkpoints, options, messages):
                 state = _restored(checkpoints, template, algorithm, messages)
+                if left_out := parts_not_kept(state):
+                    fresh = runs.init(seed, env_params)
+                    state = state.replace(**{name: getattr(fresh, name) for name in left_out})
             else:
-                state = runs.init(jax.device_put(np.uint32(options.seed)), env_params)
+                state = runs.init(seed, env_params)
             if not options.num_evals:
                 splits = {}
             elif splits is None:
@@ -187,7 +191,7 @@ def _restored(
     Raises:
         CheckpointError: it is of another run, or behind the end of this one.
     """
-    state = checkpoints.restore(template)
+    state = checkpoints.restore(kept(template))
     steps, config = _steps(algorithm, state), algorithm.config
     if steps > config.num_iterations * config.steps_per_iteration:
         raise CheckpointError(
@@ -311,7 +315,7 @@ class _Run:
             if evaluates and not stopped_by:
                 writer.write(steps, self.evaluate(state, steps))
             if saves:
-                saver.save(state, steps, self.score(steps), last=last)
+                saver.save(kept(state), steps, self.score(steps), last=last)
             else:
                 saver.look_after()
             if stopped_by:
@@ -330,7 +334,7 @@ class _Run:
     def iterate(self, state: TrainState, number: int) -> TrainState:
         """Run iteration ``number``, and the auxiliary phase if it is due."""
         state, metrics = self.runs.iterate(state, self.env_params)
-        phases = self.algorithm.num_phases
+        phases = self.algorithm.auxiliary_every
         if phases and number % phases == 0:
             state, aux_metrics = self.runs.auxiliary(state)
             metrics |= aux_metrics

@@ -6,14 +6,13 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax.agents.algorithm import Algorithm
 from pixelbrax_jax.agents.config import TrainConfig, make_env
-from pixelbrax_jax.agents.optimizer import Networks
 from pixelbrax_jax.agents.registry import ALGORITHMS
 from pixelbrax_jax.agents.runner.checkpoint import (
     CheckpointError,
@@ -29,6 +28,7 @@ from pixelbrax_jax.agents.runner.settings import (
     unknown_settings,
 )
 from pixelbrax_jax.agents.runner.splits import WITHOUT_DISTRACTORS, splits_of
+from pixelbrax_jax.agents.train_state import Networks
 from pixelbrax_jax.distractors.presets import as_tuple
 from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.flags import under_default_flags
@@ -40,6 +40,10 @@ PLATFORMS = ("cpu", "cuda", "tpu")
 
 class Player(Protocol):
     """What chooses actions; hashable. Every ``Algorithm`` does."""
+
+    @property
+    def acting(self) -> tuple[str, ...]:
+        """As ``Algorithm.acting``."""
 
     @property
     def config(self) -> TrainConfig:
@@ -55,6 +59,7 @@ class Pretrained:
 
     config: TrainConfig
     policy: Policy
+    acting: ClassVar[tuple[str, ...]] = ()
 
     @under_default_flags
     def act(self, networks: Networks, pixels: jax.Array, key: jax.Array | None = None) -> jax.Array:
@@ -100,7 +105,7 @@ def load_pretrained(name: str) -> Trained:
     """
     about = read_pretrained(name)
     player = Pretrained(load_config(about), load_policy(name))
-    return Trained(player, {"actor": {}}, about["steps"], about["config"].get("seed", 0))
+    return Trained(player, {}, about["steps"], about["config"].get("seed", 0))
 
 
 def load_agent(
@@ -237,10 +242,10 @@ def save_policy(algorithm: Algorithm, networks: Networks, path: str | Path) -> P
     """
     spec = algorithm.envs.env.obs_spec
     spec = spec["pixels"] if isinstance(spec, dict) else spec
-    actor = {"actor": networks["actor"]}
+    acting = {name: networks[name] for name in algorithm.acting}
     (batch,) = jax.export.symbolic_shape("batch")
     exported = jax.export.export(
-        jax.jit(lambda pixels: algorithm.act(actor, pixels)), platforms=PLATFORMS
+        jax.jit(lambda pixels: algorithm.act(acting, pixels)), platforms=PLATFORMS
     )(jax.ShapeDtypeStruct((batch, *spec.shape), jnp.uint8))
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
