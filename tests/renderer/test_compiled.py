@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import pytest
 
 import pixelbrax_jax as pb
-from pixelbrax_gym.bench.throughput import operations
 from tests.renderer.test_lamps import LAMP
 from tests.renderer.test_planes import random_strip
 
