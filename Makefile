@@ -17,7 +17,7 @@ WORKERS := -n 2 --dist worksteal
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-slow test-newest test-oldest test-gpu test-programs test-clients bench-gpu lint format bench golden docs docs-serve clean
+.PHONY: help demo test test-all test-slow test-newest test-oldest test-gpu test-programs test-clients bench-gpu lint format bench golden docs docs-serve clean
 
 help: ## show this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1|/' | \
@@ -40,6 +40,15 @@ CUDA ?= cuda12
 
 test: $(VENV)/.installed-dev ## run the tests that take minutes at most
 	$(RUN) -m pytest $(WORKERS) -m "not slow and not gpu and not gpu_program" $(ARGS)
+
+# One after the other, to the last, whatever fails.
+LANES := test-slow test-newest test-oldest test-clients test-programs
+
+test-all: ## run everything else that needs no GPU: slow, newest and oldest releases, clients, programs
+	@failed=""; for lane in $(LANES); do began=$$(date +%s); \
+		$(MAKE) --no-print-directory $$lane || failed="$$failed $$lane"; \
+		echo "$$lane took $$(( $$(date +%s) - began )) s"; done; \
+		test -z "$$failed" || { echo "failed:$$failed"; exit 1; }
 
 test-slow: $(VENV)/.installed-dev ## run the tests that take longer
 	PIXELBRAX_TESTS_OPTIMIZE=1 $(RUN) -m pytest $(WORKERS) -m "slow and not gpu" $(ARGS)

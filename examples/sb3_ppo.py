@@ -23,12 +23,12 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
-from pixelbrax_gym import PixelBraxSB3VecEnv
+from pixelbrax_gym import SB3VecEnv
 
 
 def make_env(num_envs: int, seed: int, *, stagger: bool = False) -> VecMonitor:
     """Pixel environments that report the returns of their episodes."""
-    env = PixelBraxSB3VecEnv(
+    env = SB3VecEnv(
         "inverted_pendulum",
         num_envs,
         height=36,

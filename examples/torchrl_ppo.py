@@ -29,7 +29,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 from tqdm import tqdm
 
-from pixelbrax_gym import PixelBraxTorchRLEnv
+from pixelbrax_gym import TorchRLEnv
 
 SIZE, FRAMES = 32, 2
 
@@ -78,7 +78,7 @@ class Policy(nn.Module):
 
 def make_env(num_envs: int, seed: int, device: torch.device) -> TransformedEnv:
     """Pixel environments that sum up the rewards of their episodes."""
-    env = PixelBraxTorchRLEnv(
+    env = TorchRLEnv(
         "inverted_pendulum", num_envs, height=SIZE, width=SIZE, frame_stack=FRAMES, device=device
     )
     env.set_seed(seed)

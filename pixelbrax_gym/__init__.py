@@ -16,21 +16,21 @@ from pixelbrax_jax.tasks import TASKS
 
 if TYPE_CHECKING:
     from pixelbrax_gym.gymnasium.check import check_vector_env as check_vector_env
-    from pixelbrax_gym.gymnasium.single_env import PixelBraxEnv as PixelBraxEnv
-    from pixelbrax_gym.gymnasium.vector_env import PixelBraxVectorEnv as PixelBraxVectorEnv
+    from pixelbrax_gym.gymnasium.env import GymnasiumEnv as GymnasiumEnv
+    from pixelbrax_gym.gymnasium.vector_env import GymnasiumVectorEnv as GymnasiumVectorEnv
     from pixelbrax_gym.policy import TorchPolicy as TorchPolicy
-    from pixelbrax_gym.sb3.vec_env import PixelBraxSB3VecEnv as PixelBraxSB3VecEnv
-    from pixelbrax_gym.torchrl.env import PixelBraxTorchRLEnv as PixelBraxTorchRLEnv
+    from pixelbrax_gym.sb3.vec_env import SB3VecEnv as SB3VecEnv
+    from pixelbrax_gym.torchrl.env import TorchRLEnv as TorchRLEnv
 
 # What needs an extra is not here, lest a star import fail without it.
-__all__ = ["PixelBraxEnv", "PixelBraxVectorEnv", "check_vector_env", "register"]
+__all__ = ["GymnasiumEnv", "GymnasiumVectorEnv", "check_vector_env", "register"]
 
 _LAZY = {
-    "PixelBraxEnv": "pixelbrax_gym.gymnasium.single_env",
-    "PixelBraxSB3VecEnv": "pixelbrax_gym.sb3.vec_env",
-    "PixelBraxTorchRLEnv": "pixelbrax_gym.torchrl.env",
-    "PixelBraxVectorEnv": "pixelbrax_gym.gymnasium.vector_env",
+    "GymnasiumEnv": "pixelbrax_gym.gymnasium.env",
+    "GymnasiumVectorEnv": "pixelbrax_gym.gymnasium.vector_env",
+    "SB3VecEnv": "pixelbrax_gym.sb3.vec_env",
     "TorchPolicy": "pixelbrax_gym.policy",
+    "TorchRLEnv": "pixelbrax_gym.torchrl.env",
     "check_vector_env": "pixelbrax_gym.gymnasium.check",
 }
 
@@ -67,8 +67,8 @@ def _register(task: str, name: str) -> None:
     # TimeLimit on top would count calls of step(), which are fewer under action repeat.
     gym.register(
         id=name,
-        entry_point="pixelbrax_gym.gymnasium.single_env:PixelBraxEnv",
-        vector_entry_point="pixelbrax_gym.gymnasium.vector_env:PixelBraxVectorEnv",
+        entry_point="pixelbrax_gym.gymnasium.env:GymnasiumEnv",
+        vector_entry_point="pixelbrax_gym.gymnasium.vector_env:GymnasiumVectorEnv",
         kwargs={"task": task},
     )
 

@@ -210,16 +210,13 @@ def test_what_is_misspelt_or_left_empty_is_refused(workers, capsys):
         run.main(["--task", "antt"])
     with pytest.raises(ValueError, match="Did you mean 'peers'"):
         run.main(["--only", "peer"])
-    for line, status, told in (
-        (["--task", "antt"], 2, "antt"),
-        (["--only", "distractors"], 2, "--full"),
-        (["--task", "humanoid"], 1, "no case fits"),
-    ):
-        try:
-            assert pixelbrax(["bench", *line]) == status
-        except SystemExit as end:
-            assert end.code == status
-        assert told in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        pixelbrax(["bench", "--task", "antt"])
+    assert "antt" in capsys.readouterr().err
+    assert pixelbrax(["bench", "--only", "distractors"]) == 2
+    assert "--full" in capsys.readouterr().err
+    assert pixelbrax(["bench", "--task", "humanoid"]) == 1
+    assert "no case fits" in capsys.readouterr().err
 
 
 def test_the_page_has_every_table_and_right_ratios(workers, tmp_path, monkeypatch):

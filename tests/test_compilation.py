@@ -128,8 +128,8 @@ small = {"height": 24, "width": 24}
 envs = gymnasium.make_vec("PixelBrax/InvertedPendulum-v0", num_envs=2, **small)
 envs.reset(seed=0)
 envs.step(envs.action_space.sample())
-td = pixelbrax_gym.PixelBraxTorchRLEnv("inverted_pendulum", 2, **small).rollout(2)
-sb3 = pixelbrax_gym.PixelBraxSB3VecEnv("inverted_pendulum", 2, **small)
+td = pixelbrax_gym.TorchRLEnv("inverted_pendulum", 2, **small).rollout(2)
+sb3 = pixelbrax_gym.SB3VecEnv("inverted_pendulum", 2, **small)
 sb3.reset()
 sb3.step(np.zeros((2, 1), np.float32))
 folder = sys.argv[1]

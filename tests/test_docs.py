@@ -29,10 +29,10 @@ SNIPPET = re.compile(r"^\s*--8<-- \"([^:\"]+)(?::([\w-]+))?\"", re.MULTILINE)
 
 
 ADAPTERS = (
-    pixelbrax_gym.PixelBraxEnv,
-    pixelbrax_gym.PixelBraxVectorEnv,
-    pixelbrax_gym.PixelBraxTorchRLEnv,
-    pixelbrax_gym.PixelBraxSB3VecEnv,
+    pixelbrax_gym.GymnasiumEnv,
+    pixelbrax_gym.GymnasiumVectorEnv,
+    pixelbrax_gym.TorchRLEnv,
+    pixelbrax_gym.SB3VecEnv,
 )
 """In the order of the columns in docs/options.md."""
 

@@ -127,9 +127,9 @@ def play_gymnasium() -> dict[str, Any]:
 
 
 def play_sb3() -> dict[str, Any]:
-    from pixelbrax_gym.sb3.vec_env import PixelBraxSB3VecEnv
+    from pixelbrax_gym.sb3.vec_env import SB3VecEnv
 
-    envs = PixelBraxSB3VecEnv(TASK, num_envs=2, **SIZE)
+    envs = SB3VecEnv(TASK, num_envs=2, **SIZE)
     envs.seed(0)
     found = {"reset": envs.reset()}
     obs, reward, done, _ = envs.step(np.full((2, 1), 0.5, np.float32))
@@ -139,9 +139,9 @@ def play_sb3() -> dict[str, Any]:
 def play_torchrl() -> dict[str, Any]:
     import torch
 
-    from pixelbrax_gym.torchrl.env import PixelBraxTorchRLEnv
+    from pixelbrax_gym.torchrl.env import TorchRLEnv
 
-    env = PixelBraxTorchRLEnv(TASK, num_envs=2, **SIZE)
+    env = TorchRLEnv(TASK, num_envs=2, **SIZE)
     env.set_seed(0)
     td = env.reset()
     found = {"reset": td["pixels"].numpy()}

@@ -123,7 +123,7 @@ def _gymnasium(task: str, num_envs: int, output: str, actions: np.ndarray) -> Ru
 
 
 def _torchrl(task: str, num_envs: int, actions: np.ndarray) -> Run:
-    env = pixelbrax_gym.PixelBraxTorchRLEnv(task, num_envs)
+    env = pixelbrax_gym.TorchRLEnv(task, num_envs)
     env.set_seed(0)
     carry = {"td": env.reset()}
     own = _tensors(actions, env.device)
@@ -137,7 +137,7 @@ def _torchrl(task: str, num_envs: int, actions: np.ndarray) -> Run:
 
 
 def _sb3(task: str, num_envs: int, actions: np.ndarray) -> Run:
-    env = pixelbrax_gym.PixelBraxSB3VecEnv(task, num_envs)
+    env = pixelbrax_gym.SB3VecEnv(task, num_envs)
     env.seed(0)
     env.reset()
 

@@ -18,7 +18,7 @@ from pixelbrax_jax.extras import install_extra
 from pixelbrax_jax.validation import check_positive_int
 
 if TYPE_CHECKING:
-    from pixelbrax_gym.gymnasium.single_env import PixelBraxEnv
+    from pixelbrax_gym.gymnasium.env import GymnasiumEnv
 
 ENV_OPTIONS = ("backend", "camera", "look", "shadows", "distractors", "clips", "split")
 """Options of an environment that the command takes; one that is not given stays as it is."""
@@ -90,7 +90,7 @@ def run(arguments: Sequence[str]) -> int:
     return 0
 
 
-def images(env: PixelBraxEnv, act: Act, seed: int, observed: int | None) -> Iterator[np.ndarray]:
+def images(env: GymnasiumEnv, act: Act, seed: int, observed: int | None) -> Iterator[np.ndarray]:
     """Play for ever, episode after episode.
 
     Args:
@@ -115,10 +115,10 @@ def images(env: PixelBraxEnv, act: Act, seed: int, observed: int | None) -> Iter
             obs, _ = env.reset()
 
 
-def _make(options: Options) -> tuple[PixelBraxEnv, Act]:
+def _make(options: Options) -> tuple[GymnasiumEnv, Act]:
     import jax
 
-    from pixelbrax_gym.gymnasium.single_env import PixelBraxEnv
+    from pixelbrax_gym.gymnasium.env import GymnasiumEnv
     from pixelbrax_jax.policy import load_policy
 
     given = {name: getattr(options, name) for name in ENV_OPTIONS}
@@ -128,7 +128,7 @@ def _make(options: Options) -> tuple[PixelBraxEnv, Act]:
         policy = load_policy(options.task)
         given = (policy.env_options or {}) | given
     task: Any = given.pop("task", options.task)
-    env = PixelBraxEnv(
+    env = GymnasiumEnv(
         task,
         render_mode="rgb_array",
         render_height=options.size,

@@ -12,14 +12,14 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 
-from pixelbrax_gym.gymnasium.single_env import check_render_size
+from pixelbrax_gym.gymnasium.env import check_render_size
 from pixelbrax_gym.gymnasium.spaces import action_space, observation_space
 from pixelbrax_gym.gymnasium.specs import complete_spec
 from pixelbrax_gym.interop.export import exporter, to_numpy
-from pixelbrax_gym.member import Member, call_members
 from pixelbrax_gym.reset_options import check_reset_options, reset_mask
 from pixelbrax_gym.seeds import check_seed, check_unseeded
 from pixelbrax_gym.stateful import StatefulEnv
+from pixelbrax_gym.sub_env import SubEnv, call_sub_envs
 from pixelbrax_jax import AUTORESET_MODES
 from pixelbrax_jax.types import EnvState
 from pixelbrax_jax.validation import check_choice
@@ -35,7 +35,7 @@ _OWN_OPTIONS = (
 )
 
 
-class PixelBraxVectorEnv(gymnasium.vector.VectorEnv):
+class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
     """``num_envs`` copies of a Brax task seen through a camera, stepped together.
 
     Environment i seeded with s is the same whatever ``num_envs`` is and whoever its neighbors.
@@ -67,7 +67,7 @@ class PixelBraxVectorEnv(gymnasium.vector.VectorEnv):
     later result.
 
     ``call``, ``get_attr`` and ``set_attr`` are those of Gymnasium's own vector environments; what
-    they address is a ``Member`` that stands for one of the N.
+    they address is a ``SubEnv`` that stands for one of the N.
 
     Attributes:
         autoreset_mode: an ``AutoresetMode``, also in ``metadata``.
@@ -275,14 +275,14 @@ class PixelBraxVectorEnv(gymnasium.vector.VectorEnv):
             *args: of the method.
             **kwargs: of the method.
         """
-        return tuple(call_members(self._members, name, *args, **kwargs))
+        return tuple(call_sub_envs(self._sub_envs, name, *args, **kwargs))
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
         """Return the attribute of each environment."""
         return self.call(name)
 
     def set_attr(self, name: str, values: Any) -> None:
-        """Set an attribute of the environments' members.
+        """Set an attribute of the sub-environments.
 
         Args:
             name: of the attribute.
@@ -294,8 +294,8 @@ class PixelBraxVectorEnv(gymnasium.vector.VectorEnv):
         each = values if isinstance(values, (list, tuple)) else [values] * self.num_envs
         if len(each) != self.num_envs:
             raise ValueError(f"expected one value for each of {self.num_envs}, got {len(each)}.")
-        for member, value in zip(self._members, each, strict=True):
-            member.set_wrapper_attr(name, value)
+        for sub_env, value in zip(self._sub_envs, each, strict=True):
+            sub_env.set_wrapper_attr(name, value)
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -314,9 +314,9 @@ class PixelBraxVectorEnv(gymnasium.vector.VectorEnv):
             self._stateful.close()
 
     @cached_property
-    def _members(self) -> list[Member]:
+    def _sub_envs(self) -> list[SubEnv]:
         spaces = (self.single_observation_space, self.single_action_space)
-        return [Member(self, i, *spaces) for i in range(self.num_envs)]
+        return [SubEnv(self, i, *spaces) for i in range(self.num_envs)]
 
     def _infos(self, outputs: Mapping[str, Any]) -> dict[str, Any]:
         if self._output != "numpy":
@@ -353,7 +353,7 @@ def as_autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:
     """
     if isinstance(mode, AutoresetMode):
         return mode
-    by_value = {member.value: member for member in AutoresetMode}
+    by_value = {known.value: known for known in AutoresetMode}
     if isinstance(mode, str) and mode in by_value:
         return by_value[mode]
     return AutoresetMode[check_choice("autoreset_mode", mode, AUTORESET_MODES).upper()]

@@ -18,13 +18,13 @@ except ImportError as missing:
         f"Stable-Baselines3 is not installed; try: {install_extra('sb3')}"
     ) from missing
 
-from pixelbrax_gym.gymnasium.single_env import check_render_size
+from pixelbrax_gym.gymnasium.env import check_render_size
 from pixelbrax_gym.gymnasium.spaces import action_space, channels_first_space, observation_space
 from pixelbrax_gym.interop.export import to_numpy
-from pixelbrax_gym.member import Member, call_members
 from pixelbrax_gym.reset_options import check_reset_options
 from pixelbrax_gym.seeds import SEEDS, spread_seeds
 from pixelbrax_gym.stateful import StatefulEnv
+from pixelbrax_gym.sub_env import SubEnv, call_sub_envs
 from pixelbrax_jax import PixelEnv
 from pixelbrax_jax.validation import check_bool, check_choice
 
@@ -59,7 +59,7 @@ def check_channels(env: PixelEnv, channels_first: bool) -> None:
         )
 
 
-class PixelBraxSB3VecEnv(VecEnv):
+class SB3VecEnv(VecEnv):
     """``num_envs`` copies of a Brax task seen through a camera, stepped together.
 
     What Stable-Baselines3 expects: NumPy arrays, autoreset in the same step, and for each
@@ -71,12 +71,12 @@ class PixelBraxSB3VecEnv(VecEnv):
     from anywhere else, since Stable-Baselines3 takes NumPy arrays only. They may be written to:
     nothing reads them again.
 
-    Environment i seeded with s draws what environment i of a ``PixelBraxVectorEnv`` seeded with
+    Environment i seeded with s draws what environment i of a ``GymnasiumVectorEnv`` seeded with
     s draws. There is one environment object and not N: what ``get_attr``, ``set_attr`` and
-    ``env_method`` address is a ``Member`` that stands for one of them.
+    ``env_method`` address is a ``SubEnv`` that stands for one of them.
 
     Example:
-        >>> env = VecMonitor(PixelBraxSB3VecEnv("inverted_pendulum", num_envs=64))
+        >>> env = VecMonitor(SB3VecEnv("inverted_pendulum", num_envs=64))
         >>> PPO("CnnPolicy", env).learn(100_000)
     """
 
@@ -140,7 +140,7 @@ class PixelBraxSB3VecEnv(VecEnv):
         spaces = (space, action_space(env.action_size))
         # Stable-Baselines3 asks them for their render mode while it makes the rest.
         self.render_mode = render_mode
-        self._members = [Member(self, i, *spaces) for i in range(num_envs)]
+        self._sub_envs = [SubEnv(self, i, *spaces) for i in range(num_envs)]
         super().__init__(num_envs, *spaces)
         # SB3's wrappers ask for a number here, beside its lists.
         self.metadata: dict[str, Any] = self.metadata | {"render_fps": self._stateful.fps}
@@ -247,20 +247,20 @@ class PixelBraxSB3VecEnv(VecEnv):
         self._stateful.close()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """Return an attribute of the members."""
-        return [getattr(member, attr_name) for member in self._selected(indices)]
+        """Return an attribute of the sub-environments."""
+        return [getattr(sub_env, attr_name) for sub_env in self._selected(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Set an attribute of the members; the environments themselves know nothing of it."""
-        for member in self._selected(indices):
-            setattr(member, attr_name, value)
+        """Set an attribute of the sub-environments, which alone know of it."""
+        for sub_env in self._selected(indices):
+            setattr(sub_env, attr_name, value)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Return what a method of the members returns."""
-        members = self._selected(indices)
-        return call_members(members, method_name, *method_args, **method_kwargs)
+        """Return what a method of the sub-environments returns."""
+        sub_envs = self._selected(indices)
+        return call_sub_envs(sub_envs, method_name, *method_args, **method_kwargs)
 
     def env_is_wrapped(
         self, wrapper_class: type[gymnasium.Wrapper], indices: Any = None
@@ -269,8 +269,8 @@ class PixelBraxSB3VecEnv(VecEnv):
         del wrapper_class
         return [False for _ in self._selected(indices)]
 
-    def _selected(self, indices: int | Iterable[int] | None) -> list[Member]:
-        return [self._members[i] for i in self._get_indices(indices)]
+    def _selected(self, indices: int | Iterable[int] | None) -> list[SubEnv]:
+        return [self._sub_envs[i] for i in self._get_indices(indices)]
 
     def _observations(self, obs: Any) -> Any:
         arrays = to_numpy(obs)

@@ -17,7 +17,7 @@ try:
 except ImportError as missing:
     raise ImportError(f"TorchRL is not installed; try: {install_extra('torchrl')}") from missing
 
-from pixelbrax_gym.gymnasium.single_env import check_render_size
+from pixelbrax_gym.gymnasium.env import check_render_size
 from pixelbrax_gym.interop.actions import name_rows
 from pixelbrax_gym.interop.dlpack import as_device, default_torch_device, to_torch
 from pixelbrax_gym.interop.fork import check_not_forked
@@ -29,7 +29,7 @@ from pixelbrax_gym.torchrl.specs import action_spec, done_spec, observation_spec
 _OWN_OPTIONS = ("num_envs", "device", "render_height", "render_width")
 
 
-class PixelBraxTorchRLEnv(EnvBase):
+class TorchRLEnv(EnvBase):
     """``num_envs`` copies of a Brax task seen through a camera, stepped together.
 
     Batch size (N,). Keys: ``pixels``, (N, H, W, 3K) uint8, oldest frame first; ``observation``,
@@ -44,7 +44,7 @@ class PixelBraxTorchRLEnv(EnvBase):
     Tensors share memory with what JAX has computed. Nothing reads that again, hence an in-place
     operation changes nothing that comes later.
 
-    Environment i seeded with s draws what environment i of a ``PixelBraxVectorEnv`` seeded with
+    Environment i seeded with s draws what environment i of a ``GymnasiumVectorEnv`` seeded with
     s draws.
 
     Attributes:
@@ -54,7 +54,7 @@ class PixelBraxTorchRLEnv(EnvBase):
             distractors add.
 
     Example:
-        >>> env = PixelBraxTorchRLEnv("ant", num_envs=256)
+        >>> env = TorchRLEnv("ant", num_envs=256)
         >>> env.set_seed(0)
         >>> rollout = env.rollout(10, break_when_any_done=False)
     """

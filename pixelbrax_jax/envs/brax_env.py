@@ -29,7 +29,7 @@ _NO_LIMIT = 2**31 - 1
 """Control steps that no episode lasts."""
 
 
-class BraxPixelEnv(Env):
+class BraxEnv(Env):
     """A ``PixelEnv`` with its parameters as a ``brax.envs.Env``.
 
     As everywhere in Brax, the environment itself has no time limit: ``done`` is the task's own
@@ -43,7 +43,7 @@ class BraxPixelEnv(Env):
     ends; ``wrap_fresh_episodes`` goes on to the next ones instead.
 
     Example:
-        >>> env = BraxPixelEnv(*pixelbrax_jax.make("inverted_pendulum"))
+        >>> env = BraxEnv(*pixelbrax_jax.make("inverted_pendulum"))
         >>> ppo.train(env, 1_000_000, episode_length=env.episode_length, ...)
 
     Attributes:
@@ -160,7 +160,7 @@ class BraxPixelEnv(Env):
 
 
 def wrap_fresh_episodes(
-    env: BraxPixelEnv,
+    env: BraxEnv,
     episode_length: int = 1000,
     action_repeat: int = 1,
     randomization_fn: Any = None,
@@ -174,7 +174,7 @@ def wrap_fresh_episodes(
         env: the environment.
         episode_length: time limit in control steps as Brax counts them: calls of ``step`` of
             ``env``.
-        action_repeat: as in Brax; see ``BraxPixelEnv`` for why it should be 1.
+        action_repeat: as in Brax; see ``BraxEnv`` for why it should be 1.
         randomization_fn: must be None.
 
     Returns:
@@ -184,8 +184,8 @@ def wrap_fresh_episodes(
         ValueError: ``randomization_fn`` is given.
         TypeError: ``env`` is wrapped already.
     """
-    if not isinstance(env, BraxPixelEnv):
-        raise TypeError(f"env must be a bare BraxPixelEnv, got {type(env).__name__}.")
+    if not isinstance(env, BraxEnv):
+        raise TypeError(f"env must be a bare BraxEnv, got {type(env).__name__}.")
     if randomization_fn is not None:
         raise ValueError(
             "wrap_fresh_episodes resets all episodes with the same EnvParams: leave out "

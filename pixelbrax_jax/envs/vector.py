@@ -211,7 +211,7 @@ class VectorPixelEnv:
 
         rows = keys, action, params.own
         if self._is_for_a_cpu():
-            last = getattr(self.env.physics, "batch_last", True)
+            last = self.env.physics.batch_last
             return step_rows(step, sim, rows, params.shared, last=last)
         return jax.vmap(step, in_axes=(0, 0, None))(sim, rows, params.shared)
 

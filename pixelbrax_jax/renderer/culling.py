@@ -1,9 +1,8 @@
-"""Which geoms some pixels may see, from spheres around them.
+"""Which geoms some pixels may see, from spheres around them; ``GeomKind`` says which ones.
 
-A capsule or a cylinder is inside the convex hull of the spheres around its ends, any other geom
-inside one sphere. Along one axis of the image, a sphere at (c, d), d in front of the camera, covers
-the slopes s between its two tangents, ``|c - s d| = r sqrt(1 + s^2)``. A convex hull covers what is
-between.
+A long geom is inside the convex hull of the spheres around its ends, any other inside one sphere.
+Along one axis of the image, a sphere at (c, d), d in front of the camera, covers the slopes s
+between its two tangents, ``|c - s d| = r sqrt(1 + s^2)``. A convex hull covers what is between.
 """
 
 from __future__ import annotations
@@ -75,17 +74,17 @@ def _word(view: View, window: Window, kinds: Sequence[int], first: int) -> jax.A
     lane = jnp.arange(_GEOMS, dtype=jnp.int32)
     g = first + jnp.minimum(lane, len(kinds) - 1)
 
-    def one_of(*allowed: GeomKind) -> jax.Array:
-        mask = sum(1 << bit for bit, kind in enumerate(kinds) if kind in allowed)
+    def where(condition: Callable[[GeomKind], bool]) -> jax.Array:
+        mask = sum([1 << bit for bit, kind in enumerate(kinds) if condition(GeomKind(kind))])
         return ((np.int32(np.uint32(mask).view(np.int32)) >> lane) & 1) != 0
 
     size = [view.size[g, k] for k in range(3)]
-    long = one_of(GeomKind.CAPSULE, GeomKind.CYLINDER)
+    long = where(lambda kind: kind.is_long)
     half = jnp.where(long, size[1], 0.0)
     square = size[0] * size[0] + size[1] * size[1] + size[2] * size[2]
-    radius = jnp.where(one_of(GeomKind.BOX), jnp.sqrt(square), size[0])
+    radius = jnp.where(where(lambda kind: kind.reach == "diagonal"), jnp.sqrt(square), size[0])
     largest = at_least(at_least(size[0], size[1]), size[2])
-    radius = jnp.where(one_of(GeomKind.ELLIPSOID), largest, radius)
+    radius = jnp.where(where(lambda kind: kind.reach == "largest"), largest, radius)
 
     center = [view.pos[g, k] for k in range(3)]
     arm = [half * view.xmat[g, k, 2] for k in range(3)]

@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax.renderer.bounds import at_least, at_most, between
-from pixelbrax_jax.types import GeomKind
+from pixelbrax_jax.types import GeomKind, for_each_kind
 
 Vector = Sequence[Any]
 Axes = tuple[Vector, Vector, Vector]
@@ -182,16 +182,23 @@ def _box(ray: Vector, pos: Vector, axes: Axes, size: Vector) -> Hit:
     return Hit(t, normal_dot)
 
 
-_DISTANT = {GeomKind.SPHERE: _distant_sphere, GeomKind.CAPSULE: _distant_capsule}
+_BY_KIND = for_each_kind(
+    "renderer.intersect",
+    {
+        GeomKind.PLANE: _plane,
+        GeomKind.SPHERE: _sphere,
+        GeomKind.CAPSULE: _capsule,
+        GeomKind.ELLIPSOID: _ellipsoid,
+        GeomKind.CYLINDER: _cylinder,
+        GeomKind.BOX: _box,
+    },
+)
 
-_BY_KIND = {
-    GeomKind.PLANE: _plane,
-    GeomKind.SPHERE: _sphere,
-    GeomKind.CAPSULE: _capsule,
-    GeomKind.ELLIPSOID: _ellipsoid,
-    GeomKind.CYLINDER: _cylinder,
-    GeomKind.BOX: _box,
-}
+_FAR_FORMS = for_each_kind(
+    "renderer.intersect for distant cameras",
+    {GeomKind.SPHERE: _distant_sphere, GeomKind.CAPSULE: _distant_capsule},
+    [kind for kind in GeomKind if kind.has_far_form],
+)
 
 
 def intersect(
@@ -219,5 +226,6 @@ def intersect(
     """
     if bounded and kind == GeomKind.PLANE:
         return _rectangle(ray, pos, axes, size)
-    formulas = _BY_KIND | _DISTANT if distant else _BY_KIND
-    return formulas[GeomKind(kind)](ray, pos, axes, size)
+    kind = GeomKind(kind)
+    formulas = _FAR_FORMS if distant and kind.has_far_form else _BY_KIND
+    return formulas[kind](ray, pos, axes, size)

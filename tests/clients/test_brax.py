@@ -1,4 +1,4 @@
-"""Brax's trainers on our pixel environment, seen through `BraxPixelEnv`."""
+"""Brax's trainers on our pixel environment, seen through `BraxEnv`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.envs.toy import Ball, limited
 
 def make(**options):
     env = pb.PixelEnv(Ball(), height=16, width=16, frame_stack=1, **options)
-    return pb.BraxPixelEnv(env, limited(6))
+    return pb.BraxEnv(env, limited(6))
 
 
 def finite_and_changed(before, after):

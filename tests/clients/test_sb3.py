@@ -24,7 +24,7 @@ from stable_baselines3.common.vec_env import (
     VecExtractDictObs,
 )
 
-from pixelbrax_gym import PixelBraxSB3VecEnv
+from pixelbrax_gym import SB3VecEnv
 from tests.clients.ball import ACTIONS, ID, SIZE, TASK, make
 
 NUM_ENVS = 2
@@ -128,7 +128,7 @@ def as_stored(part):
 def make_env(name, obs_mode):
     """What the algorithm gets, around the witness where actions are no numbers."""
     if not ALGORITHMS[name][2]:
-        return Witness(PixelBraxSB3VecEnv(TASK, NUM_ENVS, obs_mode=obs_mode, **OPTIONS))
+        return Witness(SB3VecEnv(TASK, NUM_ENVS, obs_mode=obs_mode, **OPTIONS))
 
     def make_discrete():
         return WithMasks(DiscretizeAction(make(**OPTIONS, obs_mode=obs_mode), 3))
@@ -199,7 +199,7 @@ def test_a_masked_action_is_never_taken():
 
 
 def test_what_the_policy_earns_is_what_the_environment_pays():
-    env = Witness(PixelBraxSB3VecEnv(TASK, NUM_ENVS, obs_mode="state", **OPTIONS))
+    env = Witness(SB3VecEnv(TASK, NUM_ENVS, obs_mode="state", **OPTIONS))
     model = stable_baselines3.PPO("MlpPolicy", env, n_steps=8, batch_size=8, device="cpu")
     # It warns that nobody watches the episodes; the witness does.
     with pytest.warns(UserWarning, match="Monitor"):
@@ -232,7 +232,7 @@ def test_environments_of_stable_baselines_hand_out_the_same(kind):
             vec_env_cls=SubprocVecEnv,
             vec_env_kwargs={"start_method": "spawn"},
         )
-    ours = PixelBraxSB3VecEnv(TASK, NUM_ENVS, **OPTIONS)
+    ours = SB3VecEnv(TASK, NUM_ENVS, **OPTIONS)
     env.seed(3), ours.seed(3)
     assert_array_equal(env.reset(), ours.reset())
     for action in ACTIONS[:8]:
@@ -249,7 +249,7 @@ def test_environments_of_stable_baselines_hand_out_the_same(kind):
 
 
 def test_attributes_reach_the_members_as_in_a_dummy_vec_env():
-    ours = PixelBraxSB3VecEnv(TASK, NUM_ENVS, **OPTIONS)
+    ours = SB3VecEnv(TASK, NUM_ENVS, **OPTIONS)
     theirs = DummyVecEnv([lambda: make(**OPTIONS)] * NUM_ENVS)
     for env in (ours, theirs):
         env.set_attr("difficulty", 7, indices=1)
@@ -263,8 +263,8 @@ def test_attributes_reach_the_members_as_in_a_dummy_vec_env():
 
 
 def test_the_remaining_wrappers_hand_on_what_they_get():
-    env = PixelBraxSB3VecEnv(TASK, NUM_ENVS, obs_mode="both", **OPTIONS)
-    bare = PixelBraxSB3VecEnv(TASK, NUM_ENVS, obs_mode="both", **OPTIONS)
+    env = SB3VecEnv(TASK, NUM_ENVS, obs_mode="both", **OPTIONS)
+    bare = SB3VecEnv(TASK, NUM_ENVS, obs_mode="both", **OPTIONS)
     wrapped = VecCheckNan(VecExtractDictObs(env, key="pixels"), raise_exception=True)
     env.seed(0), bare.seed(0)
     assert_array_equal(wrapped.reset(), bare.reset()["pixels"])
@@ -280,7 +280,7 @@ def test_the_remaining_wrappers_hand_on_what_they_get():
 
 
 def test_frames_in_torch_are_those_of_the_environment():
-    env = Witness(PixelBraxSB3VecEnv(TASK, NUM_ENVS, **OPTIONS))
+    env = Witness(SB3VecEnv(TASK, NUM_ENVS, **OPTIONS))
     model = stable_baselines3.PPO("CnnPolicy", env, n_steps=8, batch_size=8, device="cpu")
     tensor, _ = model.policy.obs_to_tensor(env.reset())
     assert tensor.dtype == torch.uint8

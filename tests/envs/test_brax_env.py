@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from pixelbrax_jax import EnvParams, PixelEnv, VectorPixelEnv
-from pixelbrax_jax.envs.brax_env import PIXELS, BraxPixelEnv, wrap_fresh_episodes
+from pixelbrax_jax.envs.brax_env import PIXELS, BraxEnv, wrap_fresh_episodes
 from pixelbrax_jax.physics.brax.compatibility import accept_device_put_replicated
 from pixelbrax_jax.physics.brax.engine import training
 from tests.envs.toy import PARAMS, Ball, limited
@@ -27,8 +27,8 @@ def make(**options) -> PixelEnv:
     return PixelEnv(Ball(), **({"height": 16, "width": 16, "frame_stack": 2} | options))
 
 
-def make_brax(**options) -> BraxPixelEnv:
-    return BraxPixelEnv(make(**options), PARAMS)
+def make_brax(**options) -> BraxEnv:
+    return BraxEnv(make(**options), PARAMS)
 
 
 def keys(num_envs: int = NUM_ENVS) -> jax.Array:
@@ -193,7 +193,7 @@ def test_brax_itself_repeats_the_first_episode(limit):
 
 
 def test_the_time_limit_is_braxs_alone():
-    env = BraxPixelEnv(make(obs_mode="state", action_repeat=2), limited(5))
+    env = BraxEnv(make(obs_mode="state", action_repeat=2), limited(5))
     assert env.episode_length == 3  # calls, of which the last would have been cut short
     state = env.reset(jax.random.key(0))
     for _ in range(6):
@@ -229,9 +229,9 @@ def test_brax_randomises_the_parameters():
 
 def test_what_does_not_fit_is_told():
     env = make_brax()
-    with pytest.raises(TypeError, match="env must be a PixelEnv, got BraxPixelEnv"):
-        BraxPixelEnv(env, PARAMS)
-    with pytest.raises(TypeError, match="bare BraxPixelEnv, got VmapWrapper"):
+    with pytest.raises(TypeError, match="env must be a PixelEnv, got BraxEnv"):
+        BraxEnv(env, PARAMS)
+    with pytest.raises(TypeError, match="bare BraxEnv, got VmapWrapper"):
         wrap_fresh_episodes(training.VmapWrapper(env))
     with pytest.raises(ValueError, match="leave out randomization_fn"):
         wrap_fresh_episodes(env, randomization_fn=lambda sys, rng: (sys, None))

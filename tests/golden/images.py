@@ -1,6 +1,7 @@
 """Draw the golden images; ``python -m tests.golden.images`` rewrites those that are kept.
 
-One PNG a task: a row for each look, a column for each camera.
+One PNG for each of Brax's tasks: a row for each look, a column for each camera. One PNG for each
+model of the DM Control Suite: its task's own camera and look.
 """
 
 from __future__ import annotations
@@ -14,37 +15,59 @@ import numpy as np
 from PIL import Image
 
 import pixelbrax_jax as pb
-from pixelbrax_jax.tasks import BRAX_TASKS
+from pixelbrax_jax.physics.model_scene import COM_LINK
+from pixelbrax_jax.tasks import BRAX_TASKS, DMC_TASKS
 
 FOLDER = Path(__file__).parent
-LOOKS = ("default", "original")
-SIZE = 48
+LOOKS = {"brax": ("default", "original"), "dmc": ("default",)}
+SIZE = {"brax": 48, "dmc": 84}
 """Pixels of an image, each way."""
+TARGET = (0.1, -0.05, 0.1)
+"""Metres, where the target is in tasks that have one."""
+
+DMC_MODELS = {
+    **{row.domain: name for name, row in reversed(DMC_TASKS.items())},
+    "swimmer15": "dmc_swimmer_swimmer15",
+}
+"""A task of each model."""
+TASKS = (*BRAX_TASKS, *DMC_MODELS.values())
 
 
 def draw(task: str) -> np.ndarray:
-    """Draw a task from all its cameras in all looks, in a pose that MuJoCo computes.
+    """Draw a task from its cameras in its looks, in a pose that MuJoCo computes.
 
     Returns:
-        (48 looks, 48 cameras, 3) uint8.
+        (size looks, size cameras, 3) uint8.
     """
+    suite = "brax" if task in BRAX_TASKS else "dmc"
     env, params = pb.make(task, obs_mode="state")
-    model = env.physics._model
-    data = mujoco.MjData(model)
-    data.qpos[:] = model.qpos0 + 0.2 * np.sin(1.0 + np.arange(model.nq))
-    mujoco.mj_kinematics(model, data)
-    xpos, xquat = data.xpos[1:].astype(np.float32), data.xquat[1:].astype(np.float32)
+    rigs = list(pb.named_rigs(task).values()) if suite == "brax" else [params.rig]
+    looks = [params.look if look == "default" else pb.make_look(look) for look in LOOKS[suite]]
+    xpos, xquat = pose(env.physics)
+    size = SIZE[suite]
 
     @jax.jit
     def image(rig: pb.CameraRig, look: pb.Look) -> jax.Array:
-        frame = pb.render(pb.place(params.geoms, rig, look, xpos, xquat), SIZE, SIZE)
+        frame = pb.render(pb.place(params.geoms, rig, look, xpos, xquat), size, size)
         return jax.numpy.stack([frame.r, frame.g, frame.b], axis=-1)
 
-    rows = [
-        np.concatenate([image(rig, look) for rig in pb.named_rigs(task).values()], axis=1)
-        for look in map(pb.make_look, LOOKS)
-    ]
+    rows = [np.concatenate([image(rig, look) for rig in rigs], axis=1) for look in looks]
     return np.round(255 * np.clip(np.concatenate(rows), 0, 1)).astype(np.uint8)
+
+
+def pose(physics: pb.Physics) -> tuple[np.ndarray, np.ndarray]:
+    """Return (L, 3) positions and (L, 4) orientations of the links, all joints bent a little."""
+    model = physics._model
+    data = mujoco.MjData(model)
+    data.qpos[:] = model.qpos0 + 0.2 * np.sin(1.0 + np.arange(model.nq))
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    xpos, xquat = [*data.xpos[1:]], [*data.xquat[1:]]
+    for link in physics.link_names[model.nbody - 1 :]:
+        com = data.subtree_com[physics._tracked_body] if link == COM_LINK else TARGET
+        xpos.append(np.asarray(com))
+        xquat.append(np.asarray([1.0, 0, 0, 0]))
+    return np.asarray(xpos, np.float32), np.asarray(xquat, np.float32)
 
 
 def kept(task: str) -> np.ndarray:
@@ -55,7 +78,7 @@ def kept(task: str) -> np.ndarray:
 def main() -> None:
     """Rewrite the images of some tasks, or of all."""
     parser = argparse.ArgumentParser(description=main.__doc__)
-    parser.add_argument("tasks", nargs="*", default=sorted(BRAX_TASKS), metavar="task")
+    parser.add_argument("tasks", nargs="*", default=TASKS, metavar="task")
     for task in parser.parse_args().tasks:
         Image.fromarray(draw(task)).save(FOLDER / f"{task}.png", optimize=True)
 

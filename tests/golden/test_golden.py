@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pixelbrax_jax.tasks import BRAX_TASKS
-from tests.golden.images import draw, kept
+from tests.golden.images import TASKS, draw, kept
 
 ROUNDING = 2
 """Of 255: a color computed in another order of operations is rounded to a neighbor."""
@@ -21,7 +20,7 @@ def fraction_changed(one: np.ndarray, other: np.ndarray) -> float:
     return float((difference > ROUNDING).mean())
 
 
-@pytest.mark.parametrize("task", BRAX_TASKS)
+@pytest.mark.parametrize("task", TASKS)
 def test_images_are_those_that_were_accepted(task):
     image, golden = draw(task), kept(task)
     assert image.shape == golden.shape

@@ -116,13 +116,11 @@ def test_writing_to_a_frame_changes_no_later_one(device):
 
 def test_torchrl(device):
     pytest.importorskip("torchrl")
-    env = pixelbrax_gym.PixelBraxTorchRLEnv("inverted_pendulum", 8, height=32, width=32)
+    env = pixelbrax_gym.TorchRLEnv("inverted_pendulum", 8, height=32, width=32)
     env.set_seed(0)
     rollout = env.rollout(10, break_when_any_done=False)
     assert rollout["pixels"].device.type == device
-    host = pixelbrax_gym.PixelBraxTorchRLEnv(
-        "inverted_pendulum", 8, height=32, width=32, device="cpu"
-    )
+    host = pixelbrax_gym.TorchRLEnv("inverted_pendulum", 8, height=32, width=32, device="cpu")
     host.set_seed(0)
     assert host.rollout(2)["pixels"].device.type == "cpu"
 

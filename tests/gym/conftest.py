@@ -30,7 +30,7 @@ def make_single():
     made = []
 
     def make(**options):
-        made.append(pixelbrax_gym.PixelBraxEnv(TASK, **(SIZE | options)))
+        made.append(pixelbrax_gym.GymnasiumEnv(TASK, **(SIZE | options)))
         return made[-1]
 
     yield make
@@ -57,7 +57,7 @@ def make_torchrl():
 
     def make(num_envs=3, seed=0, **options):
         options = SIZE | {"episode_length": 20} | options
-        made.append(pixelbrax_gym.PixelBraxTorchRLEnv(TASK, num_envs, **options))
+        made.append(pixelbrax_gym.TorchRLEnv(TASK, num_envs, **options))
         if seed is not None:
             made[-1].set_seed(seed)
         return made[-1]
@@ -73,7 +73,7 @@ def make_sb3():
 
     def make(num_envs=3, seed=0, **options):
         options = SIZE | {"episode_length": 20} | options
-        made.append(pixelbrax_gym.PixelBraxSB3VecEnv(TASK, num_envs, **options))
+        made.append(pixelbrax_gym.SB3VecEnv(TASK, num_envs, **options))
         made[-1].seed(seed)
         return made[-1]
 

@@ -40,14 +40,14 @@ def vector(**options):
 
 
 def sb3():
-    env = pixelbrax_gym.PixelBraxSB3VecEnv(TASK, 3, **OPTIONS)
+    env = pixelbrax_gym.SB3VecEnv(TASK, 3, **OPTIONS)
     env.seed(3)
     env.reset()
     return env
 
 
 def torchrl():
-    env = pixelbrax_gym.PixelBraxTorchRLEnv(TASK, 3, **OPTIONS)
+    env = pixelbrax_gym.TorchRLEnv(TASK, 3, **OPTIONS)
     env.set_seed(3)
     env.reset()
     return env
@@ -72,7 +72,7 @@ def some_steps(env, count):
             seen.append(env.step(np.full(1, 0.1 * i, np.float32)))
             if seen[-1][2] or seen[-1][3]:
                 seen.append(env.reset())
-        elif isinstance(env, pixelbrax_gym.PixelBraxTorchRLEnv):
+        elif isinstance(env, pixelbrax_gym.TorchRLEnv):
             began = torch.tensor(env._begun[1])[:, None]
             if began.any():
                 tensors = env.reset(env.full_done_spec.zero().set("_reset", began))
@@ -195,7 +195,7 @@ def faster(before, after, action):
 
 
 def test_physics_of_your_own():
-    from pixelbrax_jax.physics.brax.tasks import load_brax_env
+    from pixelbrax_jax.physics.brax.loading import load_brax_env
 
     physics = pixelbrax_jax.BraxPhysics(load_brax_env("inverted_pendulum", "spring"), reward=faster)
     other = pickle.loads(pickle.dumps(physics))

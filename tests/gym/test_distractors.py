@@ -74,16 +74,16 @@ def test_render_shows_them(make_vector):
 )
 def test_mistakes_are_told_before_anything_is_compiled(options, message):
     with pytest.raises((ValueError, FileNotFoundError), match=message):
-        pixelbrax_gym.PixelBraxVectorEnv(TASK, 2, **SIZE, **options)
+        pixelbrax_gym.GymnasiumVectorEnv(TASK, 2, **SIZE, **options)
 
 
 @pytest.mark.parametrize(
     "make",
     [
-        lambda **options: pixelbrax_gym.PixelBraxEnv(TASK, **options),
-        lambda **options: pixelbrax_gym.PixelBraxVectorEnv(TASK, 2, **options),
-        lambda **options: pixelbrax_gym.PixelBraxTorchRLEnv(TASK, 2, **options),
-        lambda **options: pixelbrax_gym.PixelBraxSB3VecEnv(TASK, 2, **options),
+        lambda **options: pixelbrax_gym.GymnasiumEnv(TASK, **options),
+        lambda **options: pixelbrax_gym.GymnasiumVectorEnv(TASK, 2, **options),
+        lambda **options: pixelbrax_gym.TorchRLEnv(TASK, 2, **options),
+        lambda **options: pixelbrax_gym.SB3VecEnv(TASK, 2, **options),
         lambda **options: gymnasium.make(ID, **options),
         lambda **options: gymnasium.make_vec(ID, num_envs=2, **options),
         lambda **options: gymnasium.make_vec(ID, num_envs=1, vectorization_mode="sync", **options),

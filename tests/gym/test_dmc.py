@@ -72,14 +72,14 @@ def check_vector(task, mode):
 
 @pytest.mark.parametrize("task", every_task(*FAST))
 def test_checker_of_torchrl(task):
-    env = pixelbrax_gym.PixelBraxTorchRLEnv(task, 2, obs_mode="both", **SIZE)
+    env = pixelbrax_gym.TorchRLEnv(task, 2, obs_mode="both", **SIZE)
     check_env_specs(env)
     env.close()
 
 
 @pytest.mark.parametrize("task", every_task(*FAST))
 def test_stable_baselines_vector_environments(task):
-    env = pixelbrax_gym.PixelBraxSB3VecEnv(task, 2, obs_mode="both", episode_length=3, **SIZE)
+    env = pixelbrax_gym.SB3VecEnv(task, 2, obs_mode="both", episode_length=3, **SIZE)
     env.seed(0)
     draw = np.random.default_rng(0)
     first = env.reset()

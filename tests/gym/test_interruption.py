@@ -50,7 +50,7 @@ def vector(output):
 
 
 def sb3():
-    env = pixelbrax_gym.PixelBraxSB3VecEnv(TASK, 3, **OPTIONS)
+    env = pixelbrax_gym.SB3VecEnv(TASK, 3, **OPTIONS)
 
     def reset():
         env.seed(0)
@@ -60,7 +60,7 @@ def sb3():
 
 
 def torchrl():
-    env = pixelbrax_gym.PixelBraxTorchRLEnv(TASK, 3, **OPTIONS)
+    env = pixelbrax_gym.TorchRLEnv(TASK, 3, **OPTIONS)
     zeros = torch.zeros(3, 1)
     latest = [None]
 
@@ -194,7 +194,7 @@ def test_an_exception_at_every_line_leaves_a_usable_environment(name):
 
 def test_learning_goes_on_after_interruptions(interrupt):
     stable_baselines3 = pytest.importorskip("stable_baselines3")
-    env = pixelbrax_gym.PixelBraxSB3VecEnv(TASK, 4, obs_mode="state", episode_length=7)
+    env = pixelbrax_gym.SB3VecEnv(TASK, 4, obs_mode="state", episode_length=7)
     model = stable_baselines3.PPO("MlpPolicy", env, n_steps=8, batch_size=32, n_epochs=1, seed=0)
     model.learn(64)
     delays, interrupted = random.Random(0), 0

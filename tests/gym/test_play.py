@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pixelbrax_gym.cli import main, play
-from pixelbrax_gym.gymnasium.single_env import PixelBraxEnv
+from pixelbrax_gym.gymnasium.env import GymnasiumEnv
 from pixelbrax_gym.gymnasium.window import Window
 
 TASK = "inverted_pendulum"
@@ -75,7 +75,7 @@ def test_a_file_shows_what_the_environment_draws(tmp_path):
     path = tmp_path / "a.gif"
     line = ["--policy", "zero", "--look", "original", "--camera", "original", "--gif", str(path)]
     assert main(["play", TASK, *SHORT, "--seed", "3", *line]) == 0
-    env = PixelBraxEnv(
+    env = GymnasiumEnv(
         TASK,
         look="original",
         camera="original",
@@ -91,7 +91,7 @@ def test_a_file_shows_what_the_environment_draws(tmp_path):
 
 
 def test_the_observation_is_its_newest_frame_enlarged():
-    env = PixelBraxEnv(TASK, height=20, width=20, frame_stack=2, render_mode="rgb_array")
+    env = GymnasiumEnv(TASK, height=20, width=20, frame_stack=2, render_mode="rgb_array")
     first, second = islice(play.images(env, lambda obs: np.ones(1, np.float32), 0, 60), 2)
     assert second.shape == (60, 60, 3)
     env.reset(seed=0)

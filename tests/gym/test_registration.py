@@ -46,8 +46,8 @@ def test_importing_loads_neither_jax_nor_torch():
 
 
 def test_lazy_names():
-    assert issubclass(pixelbrax_gym.PixelBraxEnv, gymnasium.Env)
-    assert issubclass(pixelbrax_gym.PixelBraxVectorEnv, gymnasium.vector.VectorEnv)
+    assert issubclass(pixelbrax_gym.GymnasiumEnv, gymnasium.Env)
+    assert issubclass(pixelbrax_gym.GymnasiumVectorEnv, gymnasium.vector.VectorEnv)
     assert callable(pixelbrax_gym.check_vector_env)
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         _ = pixelbrax_gym.nothing
@@ -196,7 +196,7 @@ def test_sync_and_vector_doors_agree():
 
 
 def test_spaces_cost_nothing_and_print_fast():
-    env = pixelbrax_gym.PixelBraxVectorEnv(TASK, 4096)
+    env = pixelbrax_gym.GymnasiumVectorEnv(TASK, 4096)
     assert env.observation_space.shape == (4096, 84, 84, 9)
     assert env.observation_space.low.strides == (0, 0, 0, 0)
     assert repr(env.observation_space) == "Box(0, 255, (4096, 84, 84, 9), uint8)"

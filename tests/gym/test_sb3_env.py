@@ -157,7 +157,7 @@ def test_seeds(make_sb3):
     assert env.seed() == drawn
 
 
-def test_members(make_sb3):
+def test_sub_envs(make_sb3):
     env = make_sb3(render_mode="rgb_array", render_height=8, render_width=8)
     env.reset()
     assert env.get_attr("render_mode") == ["rgb_array"] * 3
@@ -324,10 +324,10 @@ def test_use_out_of_order(make_sb3):
 )
 def test_options_are_checked(options, error, message):
     with pytest.raises(error, match=message):
-        pixelbrax_gym.PixelBraxSB3VecEnv(TASK, **options)
+        pixelbrax_gym.SB3VecEnv(TASK, **options)
 
 
-def test_members_have_the_attributes_of_gymnasium(make_sb3):
+def test_sub_envs_have_the_attributes_of_gymnasium(make_sb3):
     env = make_sb3(render_mode="rgb_array", render_height=8, render_width=8)
     env.reset()
     assert env.env_method("has_wrapper_attr", "level") == [False] * 3
@@ -358,7 +358,7 @@ def test_channels_first_space_is_an_image_to_gymnasium(make_sb3):
 )
 def test_images_are_read_as_they_are_or_refused(size, is_read):
     def make():
-        return pixelbrax_gym.PixelBraxSB3VecEnv(TASK, 2, **size)
+        return pixelbrax_gym.SB3VecEnv(TASK, 2, **size)
 
     if not is_read:
         with pytest.raises(ValueError, match="takes the shortest axis of an image for its chan"):

@@ -1,4 +1,4 @@
-"""PixelBraxEnv: what it returns, and that Gymnasium's own checker is content."""
+"""GymnasiumEnv: what it returns, and that Gymnasium's own checker is content."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ import pytest
 from gymnasium.spaces import Box, Dict, Tuple
 from gymnasium.vector.utils import batch_differing_spaces, batch_space, concatenate, iterate
 
-from pixelbrax_gym import PixelBraxSB3VecEnv
+from pixelbrax_gym import SB3VecEnv
 from pixelbrax_gym.gymnasium.spaces import BroadcastBox, action_space, observation_space
 from tests.gym.conftest import ID, SIZE, TASK
 
@@ -22,7 +22,7 @@ def test_spaces_of_one_environment_are_plain_boxes(make_single, make_vector, obs
     env, envs = make_single(obs_mode=obs_mode), make_vector(obs_mode=obs_mode)
     spaces = [env.observation_space, env.action_space]
     spaces += [envs.single_observation_space, envs.single_action_space]
-    sb3 = PixelBraxSB3VecEnv(TASK, 2, channels_first=True, obs_mode=obs_mode, **SIZE)
+    sb3 = SB3VecEnv(TASK, 2, channels_first=True, obs_mode=obs_mode, **SIZE)
     spaces += [sb3.observation_space, sb3.action_space]
     for box in [box for space in spaces for box in boxes(space)]:
         assert type(box) is Box

@@ -49,12 +49,12 @@ def test_a_limit_beyond_the_default_is_heeded(options, expected):
 
 
 def test_a_time_limit_of_ones_own():
-    bare = pixelbrax_gym.PixelBraxEnv(TASK, obs_mode="state")
+    bare = pixelbrax_gym.GymnasiumEnv(TASK, obs_mode="state")
     outer = TimeLimit(gymnasium.wrappers.TransformReward(TimeLimit(bare, 1300), abs), 1100)
     assert until_truncated(outer) == 1100
     # Of the environment itself nobody has asked for more.
-    bare = pixelbrax_gym.PixelBraxEnv(TASK, obs_mode="state")
-    other = TimeLimit(pixelbrax_gym.PixelBraxEnv(TASK, obs_mode="state"), 1100)
+    bare = pixelbrax_gym.GymnasiumEnv(TASK, obs_mode="state")
+    other = TimeLimit(pixelbrax_gym.GymnasiumEnv(TASK, obs_mode="state"), 1100)
     other.reset(seed=0)
     assert until_truncated(bare) == 1000
 
@@ -65,7 +65,7 @@ def through_json(env):
 
 OBJECTS = {
     "distractors": (distractors.Color(scale=0.2), "camera"),
-    "camera": pixelbrax_jax.rig((0.0, -3.0, 1.0), (0.0, 0.0, 0.1), 45.0),
+    "camera": pixelbrax_jax.make_rig((0.0, -3.0, 1.0), (0.0, 0.0, 0.1), 45.0),
     "look": pixelbrax_jax.make_look("dmc", shadows=False),
 }
 SIZE = {"height": 12, "width": 12, "frame_stack": 1}

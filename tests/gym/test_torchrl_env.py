@@ -56,7 +56,7 @@ def test_specs(make_torchrl, obs_mode):
 @pytest.mark.parametrize("task", BRAX_TASKS)
 @pytest.mark.parametrize("obs_mode", ["pixels", "both"])
 def test_specs_of_every_task(task, obs_mode):
-    env = pixelbrax_gym.PixelBraxTorchRLEnv(task, 2, height=16, width=16, obs_mode=obs_mode)
+    env = pixelbrax_gym.TorchRLEnv(task, 2, height=16, width=16, obs_mode=obs_mode)
     check_env_specs(env)
     env.close()
 
@@ -389,11 +389,11 @@ def test_recording(make_torchrl, tmp_path):
 PROCESSES = """
 from functools import partial
 from torchrl.collectors import MultiSyncCollector
-from pixelbrax_gym import PixelBraxTorchRLEnv
+from pixelbrax_gym import TorchRLEnv
 
 if __name__ == "__main__":
     options = {"height": 8, "width": 8, "obs_mode": "both"}
-    make = partial(PixelBraxTorchRLEnv, "inverted_pendulum", 2, **options)
+    make = partial(TorchRLEnv, "inverted_pendulum", 2, **options)
     collector = MultiSyncCollector([make, make], frames_per_batch=40, total_frames=80)
     collector.set_seed(0)
     for batch in collector:
@@ -503,11 +503,11 @@ def test_masks_are_bool(make_torchrl, name, dtype):
 @pytest.mark.skipif(torch.cuda.is_available(), reason="the last one is there")
 def test_device_that_is_not_there(device):
     with pytest.raises(ValueError, match=f"device='{device}' is not there"):
-        pixelbrax_gym.PixelBraxTorchRLEnv(TASK, 2, device=device)
+        pixelbrax_gym.TorchRLEnv(TASK, 2, device=device)
 
 
 def test_repr_names_task_number_and_device(make_torchrl):
-    expected = f"PixelBraxTorchRLEnv({TASK!r}, num_envs=3, device={{}})"
+    expected = f"TorchRLEnv({TASK!r}, num_envs=3, device={{}})"
     assert repr(make_torchrl()) == expected.format(torch_device(jax.devices()[0]))
     assert repr(make_torchrl(device="cpu")) == expected.format("cpu")
 
@@ -516,7 +516,7 @@ def test_torchrls_own_gym_environment_takes_ours():
     from torchrl.envs import GymEnv
 
     env = GymEnv(ID, frame_skip=2, obs_mode="state", episode_length=20)
-    plain = pixelbrax_gym.PixelBraxEnv(TASK, obs_mode="state", episode_length=20)
+    plain = pixelbrax_gym.GymnasiumEnv(TASK, obs_mode="state", episode_length=20)
     # Seeding is a reset of its own there.
     env.set_seed(3), plain.reset(seed=3)
     td, (obs, _) = env.reset(), plain.reset()
@@ -532,7 +532,7 @@ def test_options_are_checked():
     with pytest.raises(
         TypeError, match=r"unexpected keyword argument 'heigth'.*Did you mean 'height'"
     ):
-        pixelbrax_gym.PixelBraxTorchRLEnv(TASK, 2, heigth=12)
+        pixelbrax_gym.TorchRLEnv(TASK, 2, heigth=12)
 
 
 def test_pixel_specs_have_no_tensors():

@@ -1,4 +1,4 @@
-"""PixelBraxVectorEnv: the three autoreset modes, masks, and independence of environments."""
+"""GymnasiumVectorEnv: the three autoreset modes, masks, and independence of environments."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 import torch
 from gymnasium.vector import AutoresetMode
 
-from pixelbrax_gym import PixelBraxEnv, PixelBraxVectorEnv, check_vector_env
+from pixelbrax_gym import GymnasiumEnv, GymnasiumVectorEnv, check_vector_env
 from pixelbrax_gym.interop.export import to_numpy
 from tests.gym.conftest import SIZE, TASK
 from tests.gym.test_registration import TASKS
@@ -56,7 +56,7 @@ def episodes(env, num_steps, seed=0):
 
 
 def single_episodes(row, num_steps, seed=0, **options):
-    env = PixelBraxEnv(TASK, **(SIZE | LONG | options))
+    env = GymnasiumEnv(TASK, **(SIZE | LONG | options))
     found = [[(env.reset(seed=seed + row)[0], 0.0, False, False, 0)]]
     for _ in range(num_steps):
         if found[-1][-1][2] or found[-1][-1][3]:
@@ -200,7 +200,7 @@ def test_results_may_be_written_to(make_vector, mode):
 
 
 def test_observations_outlive_their_environment():
-    env = PixelBraxVectorEnv(TASK, 3, **SIZE)
+    env = GymnasiumVectorEnv(TASK, 3, **SIZE)
     obs, _ = env.reset(seed=0)
     kept, before = obs[1], obs[1].copy()
     env.close()
@@ -210,7 +210,7 @@ def test_observations_outlive_their_environment():
     np.testing.assert_array_equal(kept, before)
 
 
-def test_members_are_addressed_as_in_gymnasium(make_vector):
+def test_sub_envs_are_addressed_as_in_gymnasium(make_vector):
     env = make_vector(render_mode="rgb_array", render_height=8, render_width=8)
     env.reset(seed=0)
     images = env.call("render")

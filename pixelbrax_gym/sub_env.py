@@ -11,10 +11,10 @@ import numpy as np
 from pixelbrax_jax.validation import suggest
 
 
-class Member:
-    """Stands for one environment of a ``PixelBraxVectorEnv`` or ``PixelBraxSB3VecEnv``.
+class SubEnv:
+    """Stands for one environment of a ``GymnasiumVectorEnv`` or ``SB3VecEnv``.
 
-    There is one object for all environments, and no object for each. What is set on a member is
+    There is one object for all environments, and no object for each. What is set on a ``SubEnv`` is
     kept there; the environments themselves know nothing of it.
 
     Attributes:
@@ -46,15 +46,15 @@ class Member:
         self.observation_space, self.action_space = observation_space, action_space
 
     def __getattr__(self, name: str) -> Any:
-        """Return what all environments share, as long as a member has none of its own."""
+        """Return what all environments share, as long as this one has none of its own."""
         if name in ("metadata", "spec"):
             return getattr(self.owner, name, None)
         names = [known for known in dir(type(self)) if not known.startswith("_")]
         raise AttributeError(f"environments have no attribute {name!r}.{suggest(name, names)}")
 
     @property
-    def unwrapped(self) -> Member:
-        """Return the member itself: there is nothing around it."""
+    def unwrapped(self) -> SubEnv:
+        """Return this object: there is nothing around it."""
         return self
 
     def has_wrapper_attr(self, name: str) -> bool:
@@ -86,18 +86,18 @@ class Member:
         return self.owner.get_images()[self.index]
 
 
-def call_members(members: Sequence[Member], name: str, *args: Any, **kwargs: Any) -> list[Any]:
-    """Return an attribute of each member, or what it returns if it can be called.
+def call_sub_envs(sub_envs: Sequence[SubEnv], name: str, *args: Any, **kwargs: Any) -> list[Any]:
+    """Return an attribute of each sub-environment, or what it returns if it can be called.
 
     Args:
-        members: of one environment.
+        sub_envs: of one environment.
         name: of the attribute or method.
         *args: of the method.
         **kwargs: of the method.
     """
-    if name == "render" and members:
+    if name == "render" and sub_envs:
         # Drawn once for all, not once for each.
-        images = members[0].owner.get_images()
-        return [images[member.index] for member in members]
-    values = [getattr(member, name) for member in members]
+        images = sub_envs[0].owner.get_images()
+        return [images[sub_env.index] for sub_env in sub_envs]
+    values = [getattr(sub_env, name) for sub_env in sub_envs]
     return [value(*args, **kwargs) if callable(value) else value for value in values]

@@ -11,7 +11,7 @@ from jax.sharding import PartitionSpec as P
 
 from pixelbrax_jax._platform import interpreter as module
 from pixelbrax_jax._platform.interpreter import batch_last
-from tests.cpu.equations import equations
+from tests.platform.equations import equations
 
 TABLE = jnp.arange(12.0).reshape(4, 3)
 

@@ -10,7 +10,7 @@ import pixelbrax_jax as pb
 from pixelbrax_jax._platform import interpreter
 from pixelbrax_jax._platform.interpreter import batch_last
 from pixelbrax_jax.tasks import BRAX_TASKS
-from tests.cpu.equations import equations
+from tests.platform.equations import equations
 
 NUM_ENVS = 48
 """No other length in any task, and a multiple of the lanes."""

@@ -24,10 +24,10 @@ RENDER_MODES = ("human", "rgb_array")
 _OWN_OPTIONS = ("output", "render_mode", "render_height", "render_width", "max_episode_steps")
 
 
-class PixelBraxEnv(gymnasium.Env):
+class GymnasiumEnv(gymnasium.Env):
     """A Brax task seen through a camera.
 
-    Seeded with s it is bitwise environment 0 of a ``PixelBraxVectorEnv`` that is seeded with s,
+    Seeded with s it is bitwise environment 0 of a ``GymnasiumVectorEnv`` that is seeded with s,
     as far as the two compiled programs agree in their last bit.
 
     ``reset()`` without a seed goes on to the next episode, whose initial state depends on nothing
