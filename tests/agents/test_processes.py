@@ -32,7 +32,7 @@ FOUR_DEVICES = {"XLA_FLAGS": "--xla_force_host_platform_device_count=4"}
 
 def command(algorithm: str, folder: Path, options: str) -> list[str]:
     return [
-        *(sys.executable, "-m", "pixelbrax_jax.cli", "train", algorithm),
+        *(sys.executable, "-m", "pixelbrax_gym.cli", "train", algorithm),
         *f"{TINY} {EXTRA[algorithm]} {options}".split(),
         *("--output-dir", str(folder)),
     ]

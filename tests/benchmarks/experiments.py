@@ -182,7 +182,7 @@ def offer(task: str, folder: Path, kept: dict) -> None:
 
 def run(arguments: list[str], folder: Path, until: float) -> int:
     """Make a run, or go on with it; its exit status, above 128 if it was stopped."""
-    command = [sys.executable, "-m", "pixelbrax_jax.cli", *arguments]
+    command = [sys.executable, "-m", "pixelbrax_gym.cli", *arguments]
     command += ["--resume", "latest", "--output-dir", str(folder)]
     with subprocess.Popen(["nice", "-n", "19", *command], start_new_session=True) as process:
         stop = lambda *_: process.terminate()  # noqa: E731

@@ -10,31 +10,18 @@ LAUNCH_SECONDS = 1.5e-6
 
 @dataclass(frozen=True)
 class Card:
-    """An NVIDIA GPU; figures are those of its data sheet and of CUDA's tables of capabilities.
+    """An NVIDIA GPU; figures are those of its data sheet and of CUDA's tables of capabilities."""
 
-    Attributes:
-        kind: name, as its driver tells it.
-        capability: compute capability, major and minor.
-        cores: streaming multiprocessors.
-        fp32_per_core: float32 units of each.
-        bandwidth: bytes per second of its memory.
-        memory: bytes.
-        l2: bytes of the second-level cache.
-        shared_per_core: bytes of shared memory of a multiprocessor.
-        shared_per_block: bytes of it that a block may ask for.
-        clock: GHz.
-    """
-
-    kind: str
+    kind: str  # as its driver names it
     capability: tuple[int, int]
-    cores: int
+    cores: int  # streaming multiprocessors
     fp32_per_core: int
-    bandwidth: int
-    memory: int
+    bandwidth: int  # bytes per second
+    memory: int  # bytes, as what follows
     l2: int
     shared_per_core: int
     shared_per_block: int
-    clock: float
+    clock: float  # GHz
 
     @property
     def architecture(self) -> str:

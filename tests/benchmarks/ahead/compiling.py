@@ -1,6 +1,6 @@
 """Compiles one program ahead of time, and tells what XLA made of it.
 
-Runs in a process with what `environment.py` installs, under the variables of its ``AheadCase``.
+Runs in a process under the variables of its ``AheadCase``.
 """
 
 from __future__ import annotations
@@ -8,23 +8,30 @@ from __future__ import annotations
 import os
 import re
 import shutil
+import subprocess
 import time
+from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jax.experimental import topologies
 
-from pixelbrax_gym.bench.ahead.case import DUMP
-from pixelbrax_gym.bench.ahead.hlo import parse
-from pixelbrax_gym.bench.ahead.kernels import kernels, longest_chain, loops
-from pixelbrax_gym.bench.ahead.programs import make_program
-from pixelbrax_gym.bench.ahead.registers import assemble
-from pixelbrax_gym.bench.ahead.targets import CARDS, LAUNCH_SECONDS, TPU_TOPOLOGY, Card
+import pixelbrax_jax as pb
 from pixelbrax_jax.compilation import compiler_options
+from pixelbrax_jax.validation import check_choice
+from tests.benchmarks.ahead.case import DUMP, PROGRAMS
+from tests.benchmarks.ahead.hlo import kernels, longest_chain, loops, parse
+from tests.benchmarks.ahead.targets import CARDS, LAUNCH_SECONDS, TPU_TOPOLOGY, Card
 
 _ASSEMBLED = 8
-"""Files of kernels that are assembled, those of most code: they need the most registers."""
+"""Files of kernels that are assembled."""
+SCAN_LENGTH = 16
+_USED = re.compile(
+    r"(\d+) bytes spill stores, (\d+) bytes spill loads.*?Used (\d+) registers", re.S
+)
 
 
 def gpu(
@@ -32,17 +39,9 @@ def gpu(
 ) -> dict[str, Any]:
     """Compile a program for an NVIDIA GPU.
 
-    Args:
-        task: the task.
-        program: one of ``programs.PROGRAMS``.
-        num_envs: environments.
-        card: one of ``targets.CARDS``.
-        **options: further ones of ``pixelbrax_jax.make``.
-
-    Returns:
-        What the table shows. Bytes read and written count every kernel's operands and results
-        once; ``large_kernels`` are those that write at least a tenth of the output;
-        ``host_steps`` is what the host does one after the other: 1 is one CUDA graph.
+    Bytes read and written count every kernel's operands and results once; ``large_kernels`` are
+    those that write at least a tenth of the output; ``host_steps`` is what the host does one after
+    the other: 1 is one CUDA graph.
     """
     try:
         return _gpu(CARDS[card], *make_program(program, task, num_envs, **options))
@@ -89,7 +88,7 @@ def _gpu(about: Card, function: Any, arguments: Any) -> dict[str, Any]:
                 for k in found
             ),
         },
-        **_registers(about),
+        **assemble(_dumped("ptx"), about.architecture),
     }
 
 
@@ -136,7 +135,67 @@ def _host_steps() -> int | None:
     return len(re.findall(r"^\d+: k\w+", files[-1].read_text("utf-8"), re.M))
 
 
-def _registers(card: Card) -> dict[str, int | None]:
-    sources = sorted(_dumped("ptx"), key=lambda file: -file.stat().st_size)
-    most = assemble(sources[:_ASSEMBLED], card.architecture)
-    return dict(most) if most else {"registers": None, "spilled": None}
+def make_program(
+    name: str, task: str, num_envs: int, **options: Any
+) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+    """One of ``PROGRAMS``, with the shapes of its arguments; nothing is computed."""
+    check_choice("program", name, PROGRAMS)
+    obs_mode = "state" if name == "state step" else "pixels"
+    if name == "plain renderer":
+        options = {"renderer": "fused", **options}
+    # The batch as for any device: "auto" is for the one that JAX computes on.
+    env, params = pb.make(task, obs_mode=obs_mode, physics_batching="vmap", **options)
+    envs = pb.VectorPixelEnv(env, num_envs)
+    state, _ = jax.eval_shape(envs.reset, jax.eval_shape(lambda: jax.random.key(0)), params)
+    params = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct(jnp.shape(x), jnp.asarray(x).dtype), params
+    )
+    action = jax.ShapeDtypeStruct((num_envs, env.action_size), jnp.float32)
+    if name.endswith("renderer"):
+        return jax.vmap(env.draw, in_axes=(0, None)), (state.sim, params)
+    if name != "scan":
+        return envs.step, (state, action, params)
+
+    def scan(state: Any, x: jax.Array, p: Any) -> Any:
+        def step(state: Any, _: None) -> tuple[Any, jax.Array]:
+            state, timestep = envs.step(state, x, p)
+            return state, timestep.reward
+
+        return jax.lax.scan(step, state, None, length=SCAN_LENGTH)
+
+    return scan, (state, action, params)
+
+
+def find_assembler() -> str | None:
+    """Return the path of ``ptxas`` of the wheel ``nvidia-cuda-nvcc-cu12`` or of the system."""
+    try:
+        spec = find_spec("nvidia.cuda_nvcc")
+    except ModuleNotFoundError:
+        spec = None
+    for folder in (spec.submodule_search_locations or ()) if spec else ():
+        found = Path(folder) / "bin" / "ptxas"
+        if found.exists():
+            # pip unpacks programs of wheels without the right to run them into a target folder.
+            found.chmod(0o755)
+            return str(found)
+    return shutil.which("ptxas")
+
+
+def assemble(sources: list[Path], architecture: str) -> dict[str, int | None]:
+    """The registers of the kernel that needs most, and the bytes of the one that spills most.
+
+    None where there is no assembler that takes these kernels.
+    """
+    assembler, found = find_assembler(), []
+    # Those of most code need the most registers.
+    largest = sorted(sources, key=lambda file: -file.stat().st_size)[:_ASSEMBLED]
+    for source in largest if assembler else ():
+        command = [str(assembler), "-v", f"-arch={architecture}", "-o", "/dev/null", str(source)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode:
+            return {"registers": None, "spilled": None}
+        found += [tuple(map(int, kernel)) for kernel in _USED.findall(done.stderr)]
+    return {
+        "registers": max((registers for *_, registers in found), default=None),
+        "spilled": max((stores + loads for stores, loads, _ in found), default=None),
+    }
