@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-import argparse
+import json
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
 from pixelbrax_gym.cli import needs_extra, parse
+
+if TYPE_CHECKING:
+    from pixelbrax_jax.agents.runner.trained import Trained
 
 
 @dataclass(frozen=True)
@@ -48,6 +52,37 @@ class Options(AgentOptions):
 def run(arguments: Sequence[str]) -> int:
     """Run the command."""
     options = parse("evaluate", Options, arguments)
+    agent = load(options)
+    from pixelbrax_jax.agents.runner.evaluate import evaluate
+
+    for row in evaluate(
+        agent,
+        episodes=options.episodes,
+        splits=options.split,
+        clips=options.clips,
+        report=lambda line: sys.stderr.write(f"{line}\n"),
+    ):
+        sys.stdout.write(json.dumps(row) + "\n")
+        sys.stdout.flush()
+    return 0
+
+
+def load(options: AgentOptions) -> Trained:
+    """Return the agent that options choose.
+
+    Raises:
+        ValueError: there is none, or options do not go together.
+    """
     with needs_extra("train"):
-        from pixelbrax_jax.agents.runner.evaluate_command import evaluate
-    return evaluate(argparse.Namespace(**vars(options)))
+        from pixelbrax_jax.agents.runner.checkpoint import CheckpointError
+        from pixelbrax_jax.agents.runner.trained import load_agent
+    try:
+        return load_agent(
+            options.folder,
+            options.pretrained,
+            steps=options.steps,
+            best=options.best,
+            run=options.run_index,
+        )
+    except CheckpointError as error:
+        raise ValueError(str(error)) from error

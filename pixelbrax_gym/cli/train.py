@@ -10,5 +10,5 @@ from pixelbrax_gym.cli import needs_extra
 def run(arguments: Sequence[str]) -> int:
     """Run the command."""
     with needs_extra("train"):
-        from pixelbrax_jax.agents.runner.train_command import train
+        from pixelbrax_gym.cli._train import train
     return train(list(arguments))

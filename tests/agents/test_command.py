@@ -9,12 +9,12 @@ import imageio.v3 as imageio
 import jax
 import pytest
 
+from pixelbrax_gym.cli import _train as command
 from pixelbrax_gym.cli import main
+from pixelbrax_gym.cli._train import parse
 from pixelbrax_jax.agents.config import describe
 from pixelbrax_jax.agents.on_policy.presets import PRESETS, TASK_SETTINGS, preset
 from pixelbrax_jax.agents.registry import ALGORITHMS
-from pixelbrax_jax.agents.runner import train_command as command
-from pixelbrax_jax.agents.runner.train_command import parse
 from pixelbrax_jax.agents.runner.trained import load_config
 from pixelbrax_jax.tasks import TASKS
 from tests.benchmarks.experiments import (

@@ -1,10 +1,9 @@
-"""``pixelbrax train``: settings from the command line, then a run."""
+"""Settings of a training run from the command line, and its exit status."""
 
 from __future__ import annotations
 
 import argparse
 import contextlib
-import os
 import sys
 from dataclasses import make_dataclass
 from pathlib import Path
@@ -73,14 +72,6 @@ def train(arguments: list[str]) -> int:
         that was stopped 128 plus the signal's number, as shells have it: 130 for Ctrl-C, 143 for
         SIGTERM, 138 for SIGUSR1 on most systems.
     """
-    try:
-        return _train(arguments)
-    finally:
-        for stream in filter(None, (sys.stdout, sys.stderr)):
-            _flush(stream)
-
-
-def _train(arguments: list[str]) -> int:
     first = argparse.ArgumentParser(
         prog="pixelbrax train", add_help=False, usage="pixelbrax train ALGORITHM [options]"
     )
@@ -148,17 +139,6 @@ def _write(line: str) -> None:
     """Write a line above the bar, if anybody is left to read it."""
     with contextlib.suppress(OSError, ValueError):
         tqdm.write(line, file=sys.stderr)
-
-
-def _flush(stream: Any) -> None:
-    """Empty a stream, or give up its text: Python would exit with 120 on account of it."""
-    try:
-        stream.flush()
-    except ValueError:  # It is closed.
-        return
-    except OSError:
-        with Path(os.devnull).open("wb") as nowhere, contextlib.suppress(OSError):
-            os.dup2(nowhere.fileno(), stream.fileno())
 
 
 def _emulate(cpu_devices: int) -> None:
