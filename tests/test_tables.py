@@ -10,9 +10,10 @@ from pathlib import Path
 import gymnasium
 
 import pixelbrax_gym
-import pixelbrax_jax as pb
 from pixelbrax_jax.config import EnvConfig
 from pixelbrax_jax.tasks import BRAX_TASKS
+from tests.benchmarks import task_table
+from tests.benchmarks.pages import drawn
 
 ROOT = Path(__file__).parents[1]
 
@@ -42,20 +43,7 @@ def test_every_option_is_listed_with_its_default():
 
 
 def test_every_task_is_listed():
-    expected = [
-        [
-            f"`{task.gymnasium_id}`",
-            f"`{name}`",
-            str(pb.make(name)[0].action_size),
-            task.default_backend,
-            task.summary,
-        ]
-        for name, task in BRAX_TASKS.items()
-    ]
-    assert table("docs/tasks.md", "| Gymnasium id |") == expected, "\n".join(
-        "| " + " | ".join(row) + " |" for row in expected
-    )
-
+    assert drawn(task_table.PAGE, "tasks") == task_table.tasks()
     for name, task in BRAX_TASKS.items():
         assert gymnasium.spec(task.gymnasium_id).kwargs == {"task": name}
 
