@@ -116,7 +116,7 @@ def test_every_distractor_and_renderer_is_the_same_program():
     parts = [f"program:{TASK},{distractor}" for distractor in PRESETS]
     parts += [f"program:{TASK}/{renderer}" for renderer in ("fused", "reference")]
     # Loops of the third count, and index, with 64 bits.
-    parts += [f"env:{TASK}/pallas-interpret"]
+    parts += [f"env:{TASK}/pallas"]
     assert under(TRACED, *parts) == without(*parts)
 
 

@@ -19,7 +19,7 @@ from pixelbrax_jax.envs.pixel_env import PixelEnv
 from tests.distractors.conftest import SIZE, make_bank, make_clips
 from tests.envs.toy import PARAMS, Ball
 
-ALL = (distractors.Color(), distractors.Camera(scale=0.3), distractors.Video())
+ALL = (distractors.Color(), distractors.MovingCamera(scale=0.3), distractors.Video())
 WITH_CLIPS = PARAMS.replace(clips=make_clips())
 ACTIONS = np.random.default_rng(0).uniform(-1, 1, (30, 8, 1)).astype(np.float32)
 

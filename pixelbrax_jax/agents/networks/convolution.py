@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
+from pixelbrax_jax._platform.lowering import by_platform
+
 Pads = tuple[tuple[int, int], tuple[int, int]]
 
 
@@ -51,7 +53,7 @@ def convolve(x: jax.Array, kernel: jax.Array, stride: int, pads: Pads) -> jax.Ar
             x, kernel, (stride, stride), pads, dimension_numbers=("NHWC", "HWIO", "NHWC")
         )
 
-    result: jax.Array = jax.lax.platform_dependent(x, kernel, cpu=products, default=native)
+    result: jax.Array = by_platform(x, kernel, cpu=products, default=native)
     return result
 
 

@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import jax
 
+from pixelbrax_jax._platform.lowering import default_platform
 from pixelbrax_jax.agents.algorithm import Algorithm
 from pixelbrax_jax.agents.runner.checkpoint import nbytes
 from pixelbrax_jax.agents.runner.sharding import any_process, mesh_of
@@ -51,7 +52,7 @@ def _memories(algorithm: Algorithm) -> int:
     mesh = mesh_of(algorithm)
     if mesh is None:
         return 1
-    return jax.process_count() if jax.default_backend() == "cpu" else int(mesh.size)
+    return jax.process_count() if default_platform() == "cpu" else int(mesh.size)
 
 
 def _device_memory() -> float:

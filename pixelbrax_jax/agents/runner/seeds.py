@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from pixelbrax_jax._platform.batches import map_runs
 from pixelbrax_jax.agents.algorithm import Algorithm
 from pixelbrax_jax.agents.on_policy.losses import Metrics
 from pixelbrax_jax.agents.train_state import TrainState
@@ -70,4 +71,4 @@ class Runs:
         def one(first: Any) -> Any:
             return function(first, *others)
 
-        return jax.lax.map(one, first) if jax.default_backend() == "cpu" else jax.vmap(one)(first)
+        return map_runs(one, first)

@@ -28,6 +28,9 @@ OF_RUNS = ("seed", "seeds")
 _PACKAGES = ("pixelbrax", "jax", "jaxlib", "brax", "mujoco", "flax", "optax")
 """Packages whose versions a run's last bits depend on."""
 
+_GONE = {"physics_batching"}
+"""Settings of former releases that changed no result."""
+
 _FREE = ("total_steps", "memory_budget_gb")
 """Settings that a run may go on with although they differ."""
 
@@ -92,7 +95,7 @@ def differences(about: Mapping[str, Any], own: Mapping[str, Any]) -> list[str]:
         f"{name}: {old.get(name)!r} there, {new[name]!r} here"
         if name in new
         else f"{name}: {old[name]!r} there, unknown here"
-        for name in sorted((old.keys() | new.keys()) - free - {"clips"})
+        for name in sorted((old.keys() | new.keys()) - free - _GONE - {"clips"})
         if name not in new or old.get(name) != new[name]
     ]
     there, here = (place_of(settings.get("clips")) or "procedural" for settings in (old, new))

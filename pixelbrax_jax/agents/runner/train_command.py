@@ -14,6 +14,7 @@ import jax
 import tyro
 from tqdm import tqdm
 
+from pixelbrax_jax._platform.lowering import default_platform
 from pixelbrax_jax.agents.config import TrainConfig, make_env
 from pixelbrax_jax.agents.on_policy.presets import PRESETS, preset
 from pixelbrax_jax.agents.registry import ALGORITHMS, make_algorithm
@@ -189,7 +190,7 @@ def _run(algorithm: str, config: TrainConfig, options: RunConfig) -> int:
     with contextlib.suppress(OSError):
         report(
             f"{algorithm} on {config.task}, {config.num_envs} environments, {devices} "
-            f"{jax.default_backend()} device{'s' * (devices > 1)}, {config.num_iterations} "
+            f"{default_platform()} device{'s' * (devices > 1)}, {config.num_iterations} "
             f"iterations of {config.steps_per_iteration} control steps; "
             f"into {Path(options.output_dir).resolve()}"
         )
