@@ -35,14 +35,8 @@ def batch_last(fn: Callable[..., Any], in_axes: Sequence[int | None]) -> Callabl
     parameters are others, all of ``fn`` is computed by ``jax.vmap``, with a RuntimeWarning once in
     a process. Side effects, such as those of ``jax.debug.print``, may happen twice then.
 
-    Args:
-        fn: a function of trees of arrays, of one row.
-        in_axes: for each argument 0, a row in each entry of its arrays' first axis, or None, the
-            same for all rows. At least one is 0.
-
-    Returns:
-        The function of all rows; its results have rows along their first axis. It raises a
-        ValueError if arguments have different numbers of rows.
+    An argument's axis is 0 or None; at least one is 0. If arguments have different numbers of rows,
+    the function raises a ValueError.
     """
 
     def rows_of(*args: Any) -> Any:

@@ -22,13 +22,8 @@ def reset_rows(
 
     A CPU resets the masked rows alone, in a loop whose length depends on the mask. An accelerator
     would wait for the host in every turn of such a loop: it resets all rows and selects. A reset
-    that tries until it succeeds waits in any case, and is done for masked rows alone.
-
-    Args:
-        fn: the reset of one row, otherwise as in ``replace_rows``.
-        arguments: as there.
-        mask: as there.
-        rows: as there.
+    that tries until it succeeds waits in any case, and is done for masked rows alone. Arguments
+    are those of ``replace_rows``.
     """
     fn = trace_once(fn)
     row = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), arguments)

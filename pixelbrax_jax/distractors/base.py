@@ -17,7 +17,7 @@ class Distractor:
     for it decides which program is compiled. Whatever varies is in its *state*, a pytree that
     ``reset`` samples at an episode's reset and ``advance`` carries from frame to frame.
 
-    ``change_params`` acts before the image is drawn, ``change_frame`` after. Each is a no-op
+    ``change_params`` acts before the image is rendered, ``change_frame`` after. Each is a no-op
     unless it is overridden.
 
     Attributes:
@@ -29,22 +29,13 @@ class Distractor:
     stream: ClassVar[int]
 
     def reset(self, key: jax.Array, params: EnvParams) -> Any:
-        """Sample the state at the first frame of an episode.
-
-        Args:
-            key: a key of this episode and this distractor alone.
-            params: of the environment.
-        """
+        """Sample the state at the first frame of an episode, by a key of its own."""
         raise NotImplementedError
 
     def advance(self, state: Any, key: jax.Array, frame: jax.Array, params: EnvParams) -> Any:
-        """Return the state at the next frame.
+        """Return the state at the next frame, () int32 ``frame`` of its episode, 0 first.
 
-        Args:
-            state: at the frame before.
-            key: a key of this frame and this distractor alone.
-            frame: () int32, index of the frame in its episode, 0 first.
-            params: of the environment.
+        The key is that of this frame and this distractor alone.
         """
         del key, frame, params
         return state
@@ -57,29 +48,18 @@ class Distractor:
     def backdrop(
         self, state: Any, params: EnvParams, rows: jax.Array, height: int, width: int
     ) -> jax.Array | None:
-        """Return rows of an image that ``change_frame`` mixes in.
+        """Return ``rows``, (R,) int32, of an image that ``change_frame`` mixes in.
 
-        Args:
-            state: at this frame.
-            params: of the environment.
-            rows: (R,) int32, which rows, in [0, height).
-            height: pixels of the whole image.
-            width: pixels.
-
-        Returns:
-            (R, width) uint32 packed pixels, or None.
+        They are numbered in [0, height), and are (R, width) uint32 packed pixels; None for none.
         """
         del state, params, rows, height, width
         return None
 
     def change_frame(self, state: Any, frame: Frame, backdrop: jax.Array | None) -> Frame:
-        """Return the image with other colors, all in [0, 1].
+        """Return some rows of the image, or all, with other colors, all in [0, 1].
 
-        Args:
-            state: at this frame.
-            frame: some rows of the image, or all.
-            backdrop: the same rows of the backdrop, if there is one. What differs from pixel to
-                pixel, such as noise, belongs there.
+        ``backdrop`` are the same rows of the backdrop, if there is one. What differs from pixel to
+        pixel, such as noise, belongs there.
         """
         del state, backdrop
         return frame
@@ -102,11 +82,8 @@ class Chain:
     def __init__(self, distractors: Iterable[object] = ()) -> None:
         """Sort and check.
 
-        Args:
-            distractors: any of them.
-
         Raises:
-            ValueError: two are of one kind or draw from one stream.
+            ValueError: two are of one kind, or have one stream.
             TypeError: one is no distractor, or cannot be hashed.
         """
         links = [_checked(distractor) for distractor in distractors]

@@ -81,7 +81,7 @@ class MovingCamera(Distractor):
         check_fraction("scale of MovingCamera", self.scale)
 
     def reset(self, key: jax.Array, params: EnvParams) -> CameraState:
-        """Return a place drawn from the box, and a velocity."""
+        """Return a place sampled from the box, and a velocity."""
         low, high = self._box(params.rig)
         place_key, direction_key, speed_key, roll_key = jax.random.split(key, 4)
         place = jax.random.uniform(place_key, (4,), minval=low, maxval=high)

@@ -153,7 +153,7 @@ class Color(Distractor):
         low, high = -rgb, 1.0 - rgb
         plane = _plane_material(params)
         if plane is not None:
-            # Planes are drawn in the ground's colors, not in their own.
+            # Planes show the ground's colors, not in their own.
             ground = jnp.asarray(params.look.ground_rgb)
             low, high = low.at[plane].set(-ground.min(0)), high.at[plane].set(1 - ground.max(0))
         names = params.geoms.material_name

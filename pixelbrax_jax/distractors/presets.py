@@ -58,7 +58,7 @@ def preset(name: str, task: str) -> tuple[Distractor, ...]:
     * ``"dcs-easy"``, ``"dcs-medium"``, ``"dcs-hard"``, and each with ``"-static"``: color, video
       and camera of the Distracting Control Suite, arXiv 2101.02722.
     * ``"color-easy"``, ``"color-hard"``, ``"video-easy"``, ``"video-hard"``: of the DMControl
-      Generalization Benchmark, arXiv 2011.13389; colors are drawn, see ``Color``.
+      Generalization Benchmark, arXiv 2011.13389; colors are sampled, see ``Color``.
 
     Args:
         name: one of ``PRESETS``.

@@ -238,7 +238,7 @@ class VectorPixelEnv:
     def _reset_and_draw(
         self, state: EnvState, mask: jax.Array, episode: jax.Array, params: ParamRows
     ) -> EnvState:
-        """Return the states, reset and drawn where ``mask``; the others keep their frames."""
+        """Return the states, reset and rendered where ``mask``; the others keep their frames."""
         sim = self._reset_rows(state, mask, episode, params)
         state = state.replace(sim=sim)
         if self.env.obs_mode == "state":
@@ -250,5 +250,5 @@ class VectorPixelEnv:
 
         newest = replace_rows(draw, (sim, params.own), mask, blank)
         first = jax.vmap(push)(state.frames, newest, jnp.ones_like(mask))
-        # Environments that go on keep their stack as it is: nothing new was drawn for them.
+        # Environments that go on keep their stack as it is: nothing new was rendered for them.
         return state.replace(frames=jnp.where(mask[:, None, None, None], first, state.frames))

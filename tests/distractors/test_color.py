@@ -109,7 +109,7 @@ def test_geom_colors_change_things_and_not_the_sky():
 
 
 def test_the_ground_has_room_of_its_own():
-    """A plane's own color is not drawn: white as it may be, the ground lightens and darkens."""
+    """A plane's own color is not shown: white as it may be, the ground lightens and darkens."""
     white = PARAMS.geoms.rgb.copy()
     white[0] = 1.0
     params = PARAMS.replace(geoms=PARAMS.geoms.replace(rgb=white))

@@ -72,8 +72,8 @@ def test_one_wrong_pixel_is_refused(plane, value, told):
         frame = plain(scene, height, width)
         # Of one of the two images.
         which = scene.camera.pos[0] > 0
-        drawn = getattr(frame, plane)
-        return frame.replace(**{plane: jnp.where(which, drawn.at[7, 11].set(value), drawn)})
+        right = getattr(frame, plane)
+        return frame.replace(**{plane: jnp.where(which, right.at[7, 11].set(value), right)})
 
     check = choice.compare(wrong)
     assert not check.passed
