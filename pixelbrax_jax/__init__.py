@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from pixelbrax_jax.envs.brax_env import BraxEnv as BraxEnv
     from pixelbrax_jax.envs.brax_env import wrap_fresh_episodes as wrap_fresh_episodes
     from pixelbrax_jax.envs.check import check_env as check_env
+    from pixelbrax_jax.envs.making import make as make
+    from pixelbrax_jax.envs.making import named_rigs as named_rigs
     from pixelbrax_jax.envs.pixel_env import PixelEnv as PixelEnv
     from pixelbrax_jax.envs.sharded import ShardedVectorEnv as ShardedVectorEnv
     from pixelbrax_jax.envs.vector import AUTORESET_MODES as AUTORESET_MODES
@@ -23,11 +25,9 @@ if TYPE_CHECKING:
     from pixelbrax_jax.policy import list_pretrained as list_pretrained
     from pixelbrax_jax.policy import load_policy as load_policy
     from pixelbrax_jax.registry import list_envs as list_envs
-    from pixelbrax_jax.registry import make as make
-    from pixelbrax_jax.registry import named_rigs as named_rigs
     from pixelbrax_jax.registry import register as register
     from pixelbrax_jax.renderer.base import render as render
-    from pixelbrax_jax.scene.cameras import rig as rig
+    from pixelbrax_jax.scene.cameras import make_rig as make_rig
     from pixelbrax_jax.scene.look import make_look as make_look
     from pixelbrax_jax.scene.place import place as place
     from pixelbrax_jax.types import Camera as Camera
@@ -51,6 +51,7 @@ _PUBLIC = {
     "distractors": "load_clips",
     "envs.brax_env": "BraxEnv wrap_fresh_episodes",
     "envs.check": "check_env",
+    "envs.making": "make named_rigs",
     "envs.pixel_env": "PixelEnv",
     "envs.sharded": "ShardedVectorEnv",
     "envs.vector": "AUTORESET_MODES VectorPixelEnv",
@@ -58,9 +59,9 @@ _PUBLIC = {
     "physics.brax.engine": "BraxPhysics",
     "physics.brax.mjcf": "mjcf_physics",
     "policy": "list_pretrained load_policy",
-    "registry": "list_envs make named_rigs register",
+    "registry": "list_envs register",
     "renderer.base": "render",
-    "scene.cameras": "rig",
+    "scene.cameras": "make_rig",
     "scene.look": "make_look",
     "scene.place": "place",
     "types": (

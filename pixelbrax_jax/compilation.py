@@ -116,8 +116,8 @@ def _options(physics: Any, platform: str | None = None) -> dict[str, Any]:
     if platform == "gpu" and _COMMANDS not in flags:
         chosen: dict[str, Any] = {_COMMANDS: _CAPTURED}
     elif platform == "cpu" and _WIDTH not in flags:
-        chosen = {_WIDTH: 512, **getattr(physics, "compiler_options", {})}
-        if _intersections(physics) > _MOST_INTERSECTIONS:
+        chosen = {_WIDTH: 512, **(physics.compiler_options if physics else {})}
+        if physics is not None and _intersections(physics) > _MOST_INTERSECTIONS:
             # The newer ones cut long loops up, and compute what the parts share again in each of
             # them: drawing DM Control's swimmer15 takes 250 times as long.
             chosen.setdefault(_EMITTERS, False)
@@ -127,10 +127,7 @@ def _options(physics: Any, platform: str | None = None) -> dict[str, Any]:
 
 
 def _intersections(physics: Any) -> int:
-    geoms, look = getattr(physics, "geoms", None), getattr(physics, "look", None)
-    if geoms is None:
-        return 0
-    return len(geoms.kind) * (1 + len(look.lamps if look else ()))
+    return len(physics.geoms.kind) * (1 + len(physics.look.lamps if physics.look else ()))
 
 
 @cache

@@ -12,10 +12,10 @@ import jax
 from pixelbrax_jax.distractors.base import Distractor
 from pixelbrax_jax.distractors.clips import ClipBank
 from pixelbrax_jax.distractors.presets import as_tuple
+from pixelbrax_jax.physics.brax.tasks import BraxOptions
 from pixelbrax_jax.plain import from_plain
 from pixelbrax_jax.renderer.base import check_renderer
 from pixelbrax_jax.scene.look import make_look
-from pixelbrax_jax.tasks import REWARD_PRESETS
 from pixelbrax_jax.types import Camera, CameraRig, Look
 from pixelbrax_jax.validation import check_bool, check_choice, check_options, check_positive_int
 
@@ -83,8 +83,11 @@ class ProgramConfig:
         object.__setattr__(self, name, value)
 
 
+_SUITE_OPTIONS = fields(BraxOptions)
+
+
 @dataclass(frozen=True)
-class EnvConfig(ProgramConfig):
+class EnvConfig(ProgramConfig, BraxOptions):
     """All options of an environment; ``pixelbrax_jax.make(task, **options)`` takes them.
 
     Raises:
@@ -95,11 +98,6 @@ class EnvConfig(ProgramConfig):
     task: str = "ant"
     """Task, one of ``pixelbrax_jax.list_envs()``; or ``module:name``, which imports the module that
     registers it."""
-    backend: str | None = None
-    """Physics backend: ``spring``, ``positional``, ``generalized`` or ``mjx``; None means the
-    task's own, which is all that tasks of the DM Control Suite have."""
-    reward_preset: str = "brax"
-    """``brax``, or ``paper`` for the rewards of arXiv 2502.00021; for Brax's tasks alone."""
     camera: str | CameraRig | Camera = "default"
     """Viewpoint: a name of ``named_rigs``, a ``CameraRig`` or a ``Camera``."""
     look: str | Look = "default"
@@ -118,9 +116,9 @@ class EnvConfig(ProgramConfig):
     def __post_init__(self) -> None:
         """Check the options, and store them as Python's own types."""
         super().__post_init__()
-        for name in ("task", "backend", "split"):
+        for name in ("task", "split", *(option.name for option in _SUITE_OPTIONS)):
             self._static(name)
-        check_choice("reward_preset", self._static("reward_preset"), REWARD_PRESETS)
+        BraxOptions.__post_init__(self)
         episode_length = check_positive_int("episode_length", self._static("episode_length"))
         self._store("episode_length", episode_length)
         if self.shadows is not None:
@@ -132,6 +130,11 @@ class EnvConfig(ProgramConfig):
             raise TypeError(
                 f"clips must be a folder, 'procedural' or a bank of load_clips, got {self.clips!r}."
             )
+
+    def suite_options(self) -> dict[str, Any]:
+        """Return those options of single suites that are not at their defaults."""
+        values = {option.name: getattr(self, option.name) for option in _SUITE_OPTIONS}
+        return {o.name: values[o.name] for o in _SUITE_OPTIONS if values[o.name] != o.default}
 
 
 PROGRAM_OPTIONS = tuple(field.name for field in fields(ProgramConfig))

@@ -25,7 +25,6 @@ FOUNDATIONS = {
     "flags",
     "memory",
     "stop_signals",
-    "tasks",
     "video",
     "ffmpeg",
     "cache",
@@ -47,19 +46,24 @@ ALLOWED: dict[str, set[str]] = {
     "pixelbrax_jax.video": {"pixelbrax_jax.extras", "pixelbrax_jax.ffmpeg"},
     "pixelbrax_jax.policy": {"pixelbrax_jax.extras", "pixelbrax_jax.validation"},
     **{f"pixelbrax_jax.{name}": _below() for name in LAYERS},
+    # The list of tasks, which loads no physics.
+    "pixelbrax_jax.tasks": _below("physics"),
     "pixelbrax_jax.plain": _below("distractors"),
-    "pixelbrax_jax.config": _below("plain", "scene", "renderer", "distractors"),
+    "pixelbrax_jax.config": _below("plain", *LAYERS),
     # What differs by device: it knows nothing of PixelBrax.
     "pixelbrax_jax._platform": set(),
-    "pixelbrax_jax.envs": _below("config", *LAYERS),
-    "pixelbrax_jax.registry": _below("config", "envs", *LAYERS),
+    "pixelbrax_jax.registry": _below("tasks", "physics"),
+    "pixelbrax_jax.envs": _below("config", "registry", *LAYERS),
     # The package itself, which names what is public.
     "pixelbrax_jax": _below("config", "envs", "registry", "policy", *LAYERS),
     "pixelbrax_jax.agents": {
         "pixelbrax_jax",
         *_below("config", "envs", "policy", "registry", "distractors"),
     },
-    "pixelbrax_gym": {"pixelbrax_jax", *_below("config", "plain", "registry", "policy", "renderer")}
+    "pixelbrax_gym": {
+        "pixelbrax_jax",
+        *_below("config", "plain", "registry", "tasks", "policy", "renderer"),
+    }
     - {"pixelbrax_jax._platform"},
 }
 """Package -> the packages that it may import besides itself."""

@@ -175,6 +175,14 @@ def _cond(eqn: core.JaxprEqn, inputs: Sequence[Operand], size: int) -> list[Any]
 
     branches = [partial(branch, closed) for closed in eqn.params["branches"]]
     values = [x.value for x in operands]
+    platforms = eqn.params.get("branches_platforms")
+    if platforms is not None:
+        # Of `by_platform`: batches have this form on a CPU alone.
+        return next(
+            take(*values)
+            for take, names in zip(branches, platforms, strict=True)
+            if names is None or "cpu" in names
+        )
     if not index.batched:
         return list(lax.switch(index.value, branches, *values))
     # Rows differ in their branch: all are computed, as under `jax.vmap`.

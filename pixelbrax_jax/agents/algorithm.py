@@ -169,10 +169,10 @@ def check_environments(config: TrainConfig, envs: Environments) -> None:
         )
     found = {
         "num_envs": (config.num_envs, envs.num_envs),
-        "action_repeat": (config.action_repeat, envs.env.action_repeat),
-        "frame_stack": (config.frame_stack, spec.shape[-1] // 3),
-        "height": (config.height, spec.shape[0]),
-        "width": (config.width, spec.shape[1]),
+        "action_repeat": (config.env.action_repeat, envs.env.action_repeat),
+        "frame_stack": (config.env.frame_stack, spec.shape[-1] // 3),
+        "height": (config.env.height, spec.shape[0]),
+        "width": (config.env.width, spec.shape[1]),
     }
     for name, (expected, given) in found.items():
         if expected != given:

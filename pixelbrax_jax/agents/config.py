@@ -1,27 +1,35 @@
-"""What all algorithms have in common: the task, the rollout, the networks."""
+"""Settings that all algorithms have: the environment, the rollout, the networks."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from numbers import Integral, Real
 from types import NoneType
-from typing import Any
+from typing import Any, Self
 
 from pixelbrax_jax.agents.networks.actor import ENCODERS, LOG_STD_RANGE, POLICIES, SMALLEST
-from pixelbrax_jax.config import EnvConfig
+from pixelbrax_jax.config import ENV_OPTIONS, EnvConfig
 from pixelbrax_jax.distractors.presets import as_tuple
+from pixelbrax_jax.envs.making import make
 from pixelbrax_jax.envs.pixel_env import PixelEnv
-from pixelbrax_jax.registry import make
 from pixelbrax_jax.types import EnvParams
-from pixelbrax_jax.validation import check_choice, check_fraction, check_positive_int
+from pixelbrax_jax.validation import (
+    check_choice,
+    check_fraction,
+    check_options,
+    check_positive_int,
+)
 
 ADVANTAGE_NORMS = ("batch", "minibatch", "none")
 
 
 @dataclass(frozen=True)
-class TrainConfig(EnvConfig):
-    """Settings that every algorithm has, beside the options of the environment."""
+class TrainConfig:
+    """Settings that every algorithm has."""
+
+    env: EnvConfig = EnvConfig()  # noqa: RUF009 (it is frozen)
+    """Options of the environment; camera, look, clips and distractors as names."""
 
     total_steps: int = 25_000_000
     """Control steps of the whole run, over all environments; rounded up to whole rollouts."""
@@ -72,20 +80,7 @@ class TrainConfig(EnvConfig):
         Raises:
             ValueError: a setting is out of range; the message says what is allowed.
         """
-        super().__post_init__()
-        # Settings are compared, and kept as JSON beside checkpoints.
-        for name, kind in (("camera", str), ("look", str), ("clips", (str, NoneType))):
-            if not isinstance(value := getattr(self, name), kind):
-                raise TypeError(f"{name} of training settings must be a name, got {value!r}.")
-        if not all(isinstance(item, str) for item in as_tuple(self.distractors)):
-            raise TypeError(
-                f"distractors of training settings must be names, got {self.distractors!r}."
-            )
-        if self.obs_mode != "pixels":
-            raise ValueError(
-                f"obs_mode of training settings must be 'pixels', got {self.obs_mode!r}; a critic "
-                "sees the simulator's state with state_critic=True."
-            )
+        _check_env(self.env)
         for name in ("total_steps", "num_envs", "num_steps", "num_minibatches"):
             check_positive_int(name, getattr(self, name))
         check_choice("encoder", self.encoder, ENCODERS)
@@ -107,22 +102,56 @@ class TrainConfig(EnvConfig):
         if self.memory_budget_gb is not None:
             check_positive("memory_budget_gb", self.memory_budget_gb)
         smallest = SMALLEST[self.encoder]
-        if min(self.height, self.width) < smallest:
+        if min(self.env.height, self.env.width) < smallest:
             raise ValueError(
                 f"encoder {self.encoder!r} needs images of at least {smallest} x {smallest} "
-                f"pixels, got {self.height} x {self.width}; another encoder takes smaller ones."
+                f"pixels, got {self.env.height} x {self.env.width}; another encoder takes smaller "
+                "ones."
             )
         check_divides("num_steps", self.num_steps, "num_minibatches", self.num_minibatches)
 
     @property
     def steps_per_iteration(self) -> int:
         """Control steps that one rollout counts."""
-        return self.num_envs * self.num_steps * self.action_repeat
+        return self.num_envs * self.num_steps * self.env.action_repeat
 
     @property
     def num_iterations(self) -> int:
         """Rollouts of the whole run."""
         return -(-self.total_steps // self.steps_per_iteration)
+
+    def replace(self, **settings: Any) -> Self:
+        """Return these settings with others, those of the environment among them by their names.
+
+        Args:
+            **settings: as ``num_envs=64`` and ``height=64``, which is that of ``env``.
+
+        Raises:
+            TypeError: a name is unknown; the message lists those there are.
+            ValueError: a setting is out of range; the message says what is allowed.
+        """
+        own = [field.name for field in fields(self)]
+        check_options(settings, [*own, *ENV_OPTIONS])
+        of_env = {name: settings.pop(name) for name in ENV_OPTIONS if name in settings}
+        if of_env:
+            settings["env"] = replace(settings.get("env", self.env), **of_env)
+        return replace(self, **settings)
+
+
+def _check_env(env: EnvConfig) -> None:
+    """Reject an environment whose options JSON has nothing for, or that shows no pixels."""
+    if not isinstance(env, EnvConfig):
+        raise TypeError(f"env must be an EnvConfig, got {env!r}.")
+    for name, kind in (("camera", str), ("look", str), ("clips", (str, NoneType))):
+        if not isinstance(value := getattr(env, name), kind):
+            raise TypeError(f"{name} of training settings must be a name, got {value!r}.")
+    if not all(isinstance(item, str) for item in as_tuple(env.distractors)):
+        raise TypeError(f"distractors of training settings must be names, got {env.distractors!r}.")
+    if env.obs_mode != "pixels":
+        raise ValueError(
+            f"obs_mode of training settings must be 'pixels', got {env.obs_mode!r}; a critic "
+            "sees the simulator's state with state_critic=True."
+        )
 
 
 def make_env(config: TrainConfig, **changes: Any) -> tuple[PixelEnv, EnvParams]:
@@ -133,12 +162,14 @@ def make_env(config: TrainConfig, **changes: Any) -> tuple[PixelEnv, EnvParams]:
         **changes: fields of ``EnvConfig`` that shall be others.
     """
     obs_mode = "both" if config.state_critic else "pixels"
-    return make(config, **({"obs_mode": obs_mode} | changes))
+    return make(config.env, **({"obs_mode": obs_mode} | changes))
 
 
 def describe(config: TrainConfig) -> dict[str, Any]:
-    """Return all settings by name, as JSON has them."""
-    values = {field.name: getattr(config, field.name) for field in fields(config)}
+    """Return all settings by name, those of the environment among them, as JSON has them."""
+    names = [field.name for field in fields(config) if field.name != "env"]
+    values = {name: getattr(config.env, name) for name in ENV_OPTIONS}
+    values |= {name: getattr(config, name) for name in names}
     return {name: list(v) if isinstance(v, tuple) else v for name, v in values.items()}
 
 

@@ -15,7 +15,7 @@ from pixelbrax_jax.distractors.base import Chain
 from pixelbrax_jax.distractors.presets import as_tuple
 from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.memory import check_fits
-from pixelbrax_jax.physics.base import Physics
+from pixelbrax_jax.physics.base import Physics, check_physics
 from pixelbrax_jax.renderer.base import draw, render
 from pixelbrax_jax.renderer.choice import why_no_kernel
 from pixelbrax_jax.scene.place import place
@@ -58,6 +58,7 @@ class PixelEnv(ProgramConfig):
     def __post_init__(self) -> None:
         """Check the fields."""
         super().__post_init__()
+        check_physics(self.physics)
         try:
             hash(self.physics)
         except TypeError as error:
@@ -191,11 +192,6 @@ class PixelEnv(ProgramConfig):
             TypeError: ``key`` is not a single typed key, or the physics has no ``from_qpos``.
         """
         check_key(key)
-        if not hasattr(self.physics, "from_qpos"):
-            raise TypeError(
-                f"{type(self.physics).__name__} cannot start in a chosen pose: give it a function "
-                "from_qpos(q, qd, *, key) that returns the first state of an episode."
-            )
         return self._reset(key, jnp.uint32(0), params, (qpos, qvel))
 
     def _reset(

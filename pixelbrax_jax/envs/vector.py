@@ -201,7 +201,7 @@ class VectorPixelEnv:
             key, action, own = rows
             return self.env.advance(sim, key, action, params.join(own, shared))
 
-        last = getattr(self.env.physics, "batch_last", True)
+        last = self.env.physics.batch_last
         return step_rows(step, sim, (keys, action, params.own), params.shared, last=last)
 
     def _env_keys(self, key: jax.Array) -> jax.Array:

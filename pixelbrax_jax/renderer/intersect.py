@@ -18,12 +18,12 @@ instruction. Their derivative is that of what they give, of the bound where both
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from pixelbrax_jax.types import GeomKind
+from pixelbrax_jax.types import GeomKind, for_each_kind
 
 Vector = Sequence[Any]
 Axes = tuple[Vector, Vector, Vector]
@@ -200,60 +200,22 @@ def _box(ray: Vector, pos: Vector, axes: Axes, size: Vector) -> Hit:
     return Hit(t, normal_dot)
 
 
-def _first(size: Vector) -> Any:
-    return size[0]
-
-
-def _longest(size: Vector) -> jax.Array:
-    return at_least(at_least(size[0], size[1]), size[2])
-
-
-def _diagonal(size: Vector) -> jax.Array:
-    return jnp.sqrt(size[0] * size[0] + size[1] * size[1] + size[2] * size[2])
-
-
-class Primitive(NamedTuple):
-    """The formulas of one kind of geom.
-
-    Attributes:
-        enter: ``enter(ray, pos, axes, size)``, where a ray enters it.
-        radius: of a sphere around it, from its three size numbers. The kernel leaves out geoms of
-            which it sees no part of the sphere; planes are never left out.
-        is_long: whether it is within the convex hull of two such spheres at its ends, ``size[1]``
-            from its center along its z axis.
-        enter_distant: as ``enter``, for geoms that are far away; None if the same.
-    """
-
-    enter: Callable[[Vector, Vector, Axes, Vector], Hit]
-    radius: Callable[[Vector], Any] = _first
-    is_long: bool = False
-    enter_distant: Callable[[Vector, Vector, Axes, Vector], Hit] | None = None
-
-
-_T = TypeVar("_T")
-
-
-def for_every_kind(table: dict[GeomKind, _T]) -> dict[GeomKind, _T]:
-    """Return a table with a row for each kind of geom.
-
-    Raises:
-        KeyError: a kind has none.
-    """
-    missing = [kind.name for kind in GeomKind if kind not in table]
-    if missing:
-        raise KeyError(f"the renderer has no formulas for {', '.join(missing)}; add a row.")
-    return table
-
-
-PRIMITIVES = for_every_kind(
+_BY_KIND = for_each_kind(
+    "renderer.intersect",
     {
-        GeomKind.PLANE: Primitive(_plane),
-        GeomKind.SPHERE: Primitive(_sphere, enter_distant=_distant_sphere),
-        GeomKind.CAPSULE: Primitive(_capsule, is_long=True, enter_distant=_distant_capsule),
-        GeomKind.ELLIPSOID: Primitive(_ellipsoid, _longest),
-        GeomKind.CYLINDER: Primitive(_cylinder, is_long=True),
-        GeomKind.BOX: Primitive(_box, _diagonal),
-    }
+        GeomKind.PLANE: _plane,
+        GeomKind.SPHERE: _sphere,
+        GeomKind.CAPSULE: _capsule,
+        GeomKind.ELLIPSOID: _ellipsoid,
+        GeomKind.CYLINDER: _cylinder,
+        GeomKind.BOX: _box,
+    },
+)
+
+_FAR_FORMS = for_each_kind(
+    "renderer.intersect for distant cameras",
+    {GeomKind.SPHERE: _distant_sphere, GeomKind.CAPSULE: _distant_capsule},
+    [kind for kind in GeomKind if kind.has_far_form],
 )
 
 
@@ -273,6 +235,6 @@ def intersect(
     """
     if bounded and kind == GeomKind.PLANE:
         return _rectangle(ray, pos, axes, size)
-    primitive = PRIMITIVES[GeomKind(kind)]
-    enter = (distant and primitive.enter_distant) or primitive.enter
-    return enter(ray, pos, axes, size)
+    kind = GeomKind(kind)
+    formulas = _FAR_FORMS if distant and kind.has_far_form else _BY_KIND
+    return formulas[kind](ray, pos, axes, size)

@@ -5,9 +5,9 @@ planes of pixels between the parts. Here the same code is traced into a kernel: 
 computes some pixels from references to the scene's numbers, changes their colors if asked to, and
 writes each of them once.
 
-A block leaves out geoms that it cannot see, by spheres around them: `intersect.Primitive` has their
-radii. Along one axis of the image, a sphere at (c, d), d in front of the camera, covers the slopes
-s between its two tangents, ``|c - s d| = r sqrt(1 + s^2)``. A convex hull covers what is between.
+A block leaves out geoms that it cannot see, by spheres around them (`GeomKind.reach`). Along one
+axis of the image, a sphere at (c, d), d in front of the camera, covers the slopes s between its two
+tangents, ``|c - s d| = r sqrt(1 + s^2)``. A convex hull covers what is between.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton
 
 from pixelbrax_jax.renderer.fused import Near, Seen, View, rays, see, view_of
-from pixelbrax_jax.renderer.intersect import PRIMITIVES, at_least, at_most
+from pixelbrax_jax.renderer.intersect import at_least, at_most
 from pixelbrax_jax.renderer.per_pixel import per_pixel
 from pixelbrax_jax.types import Frame, GeomKind, Scene
 
@@ -255,19 +255,21 @@ def may_see(view: View, window: Window) -> Callable[[int], jax.Array]:
 
 def _word(view: View, window: Window, kinds: Sequence[int], first: int) -> jax.Array:
     """Return one bit for each of the geoms from ``first`` on."""
-    primitives = [PRIMITIVES[GeomKind(kind)] for kind in kinds[first : first + _GEOMS]]
+    kinds = kinds[first : first + _GEOMS]
     lane = jnp.arange(_GEOMS, dtype=jnp.int32)
-    g = first + jnp.minimum(lane, len(primitives) - 1)
+    g = first + jnp.minimum(lane, len(kinds) - 1)
 
-    def where(flags: Sequence[bool]) -> jax.Array:
-        mask = sum(1 << bit for bit, flag in enumerate(flags) if flag)
+    def where(condition: Callable[[GeomKind], bool]) -> jax.Array:
+        mask = sum([1 << bit for bit, kind in enumerate(kinds) if condition(GeomKind(kind))])
         return ((np.int32(np.uint32(mask).view(np.int32)) >> lane) & 1) != 0
 
     size = [view.size[g, k] for k in range(3)]
-    half = jnp.where(where([p.is_long for p in primitives]), size[1], 0.0)
-    radius = size[0]
-    for formula in {p.radius: None for p in primitives}:
-        radius = jnp.where(where([p.radius is formula for p in primitives]), formula(size), radius)
+    long = where(lambda kind: kind.is_long)
+    half = jnp.where(long, size[1], 0.0)
+    square = size[0] * size[0] + size[1] * size[1] + size[2] * size[2]
+    radius = jnp.where(where(lambda kind: kind.reach == "diagonal"), jnp.sqrt(square), size[0])
+    largest = at_least(at_least(size[0], size[1]), size[2])
+    radius = jnp.where(where(lambda kind: kind.reach == "largest"), largest, radius)
 
     center = [view.pos[g, k] for k in range(3)]
     arm = [half * view.xmat[g, k, 2] for k in range(3)]

@@ -12,8 +12,7 @@ import jax.numpy as jnp
 
 from pixelbrax_jax import spatial
 from pixelbrax_jax.renderer import shading
-from pixelbrax_jax.renderer.intersect import for_every_kind
-from pixelbrax_jax.types import FAR, Camera, Frame, GeomKind, Lamp, Scene
+from pixelbrax_jax.types import FAR, Camera, Frame, GeomKind, Lamp, Scene, for_each_kind
 
 
 def render(
@@ -239,7 +238,8 @@ def _box(o: jax.Array, d: jax.Array, size: jax.Array) -> tuple[jax.Array, jax.Ar
     return t, jax.nn.one_hot(face, 3, dtype=d.dtype) * outward
 
 
-_LOCAL = for_every_kind(
+_LOCAL = for_each_kind(
+    "renderer.reference",
     {
         GeomKind.PLANE: _plane,
         GeomKind.SPHERE: _sphere,
@@ -247,7 +247,7 @@ _LOCAL = for_every_kind(
         GeomKind.ELLIPSOID: _ellipsoid,
         GeomKind.CYLINDER: _cylinder,
         GeomKind.BOX: _box,
-    }
+    },
 )
 
 

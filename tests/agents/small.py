@@ -13,13 +13,14 @@ import numpy as np
 from pixelbrax_jax import EnvParams, PixelEnv, VectorPixelEnv
 from pixelbrax_jax.agents.algorithm import Algorithm
 from pixelbrax_jax.agents.train_state import TrainState
+from pixelbrax_jax.config import EnvConfig
 from tests.envs.toy import Ball, limited
 
 EPISODE_LENGTH = 5
 PARAMS = limited(EPISODE_LENGTH)
 OPTIONS = {"height": 18, "width": 18, "frame_stack": 2}
-SMALL = OPTIONS | {
-    "episode_length": EPISODE_LENGTH,
+SMALL: dict[str, Any] = {
+    "env": EnvConfig(**OPTIONS, episode_length=EPISODE_LENGTH),
     "encoder": "small",
     "num_envs": 4,
     "num_steps": 8,

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import fields
 
+import numpy as np
 import pytest
 
 from pixelbrax_jax.agents.config import TrainConfig, describe, make_env
@@ -14,7 +14,10 @@ from pixelbrax_jax.agents.on_policy.ppg import PPGConfig
 from pixelbrax_jax.agents.on_policy.ppo import PPO, PPOConfig
 from pixelbrax_jax.agents.registry import ALGORITHMS, make_train
 from pixelbrax_jax.agents.runner.train import RunConfig
+from pixelbrax_jax.config import EnvConfig
+from pixelbrax_jax.distractors.video import Video
 from pixelbrax_jax.envs.vector import VectorPixelEnv
+from pixelbrax_jax.types import Camera
 from tests.agents.small import SMALL, ball_envs
 
 CONFIGS = (PPOConfig, PPGConfig, DCPGConfig)
@@ -83,7 +86,7 @@ def test_a_bad_setting_is_named_with_its_value_and_what_is_allowed(settings, val
     for name, configs in settings.items():
         for config in configs:
             with pytest.raises(ValueError, match=allowed) as info:
-                config(**{name: value})
+                config().replace(**{name: value})
             assert name in str(info.value)
             assert repr(value) in str(info.value)
 
@@ -100,7 +103,7 @@ def test_every_number_and_choice_is_checked():
     checked = {(c, name) for group in groups for name, configs in group.items() for c in configs}
     # DCPG's delayed phase is what it learns values in: it cannot be left out.
     checked |= {(DCPGConfig, "aux_epochs")}
-    all_of_them = {(c, field.name) for c in CONFIGS for field in fields(c)}
+    all_of_them = {(c, name) for c in CONFIGS for name in describe(c())}
     assert {name for _, name in all_of_them - checked} == unchecked
 
 
@@ -171,7 +174,21 @@ def test_dcpg_needs_its_delayed_phase():
 )
 def test_settings_that_contradict_each_other_are_told(config, settings, message):
     with pytest.raises(ValueError, match=re.escape(message)):
-        config(**settings)
+        config().replace(**settings)
+
+
+def test_what_training_cannot_use_of_an_environment_is_told():
+    camera = Camera(np.zeros(3), np.eye(3), np.float32(45.0))
+    with pytest.raises(TypeError, match="camera of training settings must be a name, got Camera"):
+        PPOConfig(env=EnvConfig(camera=camera))
+    with pytest.raises(TypeError, match=r"distractors of training settings must be names, got \("):
+        PPOConfig(env=EnvConfig(distractors=Video()))
+    with pytest.raises(ValueError, match="obs_mode of training settings must be 'pixels', got"):
+        PPOConfig(env=EnvConfig(obs_mode="both"))
+    with pytest.raises(TypeError, match="env must be an EnvConfig, got 'ant'"):
+        PPOConfig(env="ant")
+    with pytest.raises(TypeError, match=r"argument 'heigth'; allowed: .*Did you mean 'height'"):
+        PPOConfig().replace(heigth=64)
 
 
 def test_a_misspelt_choice_is_told_the_nearest():
@@ -185,24 +202,27 @@ def test_a_run_too_short_for_an_auxiliary_phase_may_do_without_one():
 
 
 def test_iterations_are_rounded_up_and_count_control_steps():
-    config = TrainConfig(num_envs=3, num_steps=16, action_repeat=4, total_steps=3 * 16 * 4 + 1)
+    config = TrainConfig(
+        env=EnvConfig(action_repeat=4), num_envs=3, num_steps=16, total_steps=3 * 16 * 4 + 1
+    )
     assert config.steps_per_iteration == 192
     assert config.num_iterations == 2
 
 
 @pytest.mark.parametrize("config", CONFIGS)
 def test_a_description_is_json_and_gives_the_settings_back(config):
-    settings = describe(config(distractors=("video", "dcs-easy"), num_envs=7))
-    assert json.loads(json.dumps(settings)) == settings
-    assert config(**settings) == config(**settings)
+    changed = config().replace(distractors=("video", "dcs-easy"), num_envs=7)
+    settings = json.loads(json.dumps(describe(changed)))
     assert settings["num_envs"] == 7
+    assert config().replace(**settings) == changed
 
 
 def test_the_environment_is_the_one_that_is_described():
-    config = TrainConfig(
+    wanted = EnvConfig(
         task="inverted_pendulum", height=20, width=24, frame_stack=2, action_repeat=3,
-        episode_length=50, encoder="small", state_critic=True,
+        episode_length=50,
     )  # fmt: skip
+    config = TrainConfig(env=wanted, encoder="small", state_critic=True)
     env, params = make_env(config)
     assert env.obs_spec["pixels"].shape == (20, 24, 6)
     assert (env.action_repeat, params.episode_length) == (3, 50)
@@ -221,9 +241,9 @@ def test_the_environment_is_the_one_that_is_described():
 )
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_environments_that_are_not_those_of_the_settings_are_told(name, changes, message):
-    config = ALGORITHMS[name].config_class(**SMALL | {"total_steps": 10_000_000} | changes)
+    config = ALGORITHMS[name].config_class(**SMALL | {"total_steps": 10_000_000})
     with pytest.raises(ValueError, match=re.escape(message)):
-        ALGORITHMS[name](config, ball_envs())
+        ALGORITHMS[name](config.replace(**changes), ball_envs())
 
 
 def test_environments_must_begin_episodes_in_steps_of_their_own():

@@ -26,7 +26,7 @@ def test_a_pretrained_policy_is_small_and_fits_its_environment(name):
     assert action.shape == (3, env.action_size)
     assert np.all(np.isfinite(action))
     agent = load_pretrained(name)
-    assert agent.algorithm.config.task == name
+    assert agent.algorithm.config.env.task == name
     assert about["algorithm"] in ALGORITHMS
     assert agent.steps == about["steps"]
 

@@ -120,12 +120,13 @@ import jax, re
 from pixelbrax_jax.agents.config import make_env
 from pixelbrax_jax.agents.on_policy.ppg import PPG, PPGConfig
 from pixelbrax_jax.agents.runner.sharding import replicate, state_shardings
+from pixelbrax_jax.config import EnvConfig
 from pixelbrax_jax.envs.sharded import ShardedVectorEnv, make_env_mesh
 
 config = PPGConfig(
-    task="inverted_pendulum", height=18, width=18, frame_stack=2, encoder="small", num_envs=8,
-    num_steps=8, num_minibatches=2, num_policy_phases=2, aux_minibatches=4, total_steps=1024,
-    random_shift=1,
+    env=EnvConfig(task="inverted_pendulum", height=18, width=18, frame_stack=2),
+    encoder="small", num_envs=8, num_steps=8, num_minibatches=2, num_policy_phases=2,
+    aux_minibatches=4, total_steps=1024, random_shift=1,
 )
 env, params = make_env(config)
 mesh = make_env_mesh()

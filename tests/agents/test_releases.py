@@ -16,7 +16,7 @@ from pixelbrax_jax.agents.runner.checkpoint import CheckpointError, Checkpoints,
 from pixelbrax_jax.agents.runner.seeds import Runs
 from pixelbrax_jax.agents.runner.train import RunConfig, run
 from pixelbrax_jax.agents.runner.trained import load_config
-from tests.agents.small import PARAMS, SMALL, ball_envs, same
+from tests.agents.small import OPTIONS, PARAMS, SMALL, ball_envs, same
 
 ARCHIVE = Path(__file__).with_name("run_0_2_0.zip")
 """The checkpoint of release 0.2.0 after the first of five iterations of PPO, with ``SMALL``."""
@@ -93,7 +93,7 @@ def test_a_setting_that_a_run_lacks_has_the_default_of_its_time(folder, monkeypa
 def test_a_default_of_0_2_0_that_changes_is_kept_for_older_runs(folder):
     stored = read_about(folder / "checkpoints")["config"]
     former = settings.former_settings(PPOConfig)
-    by_default = former.keys() - {*SMALL, "layout"}
+    by_default = former.keys() - {*SMALL, *OPTIONS, "episode_length", "layout"}
     expected = {name: stored[name] for name in by_default & stored.keys()} | SINCE
     assert {name: former[name] for name in by_default} == expected
 

@@ -21,6 +21,7 @@ from pixelbrax_jax.agents.on_policy.rollout import (
     observations,
     shifted,
 )
+from pixelbrax_jax.config import EnvConfig
 from tests.envs.toy import Ball, limited
 
 T, N = 15, 4
@@ -146,8 +147,8 @@ def test_the_last_observation_is_that_of_the_state_left_behind(played):
 
 def test_chunks_of_the_buffer_are_the_rollouts(played):
     config = TrainConfig(
-        height=10, width=12, frame_stack=played.stack, num_envs=N, num_steps=T, encoder="impala",
-        random_shift=played.shift, num_minibatches=1,
+        env=EnvConfig(height=10, width=12, frame_stack=played.stack), num_envs=N, num_steps=T,
+        encoder="impala", random_shift=played.shift, num_minibatches=1,
     )  # fmt: skip
     experiences = [Experience(x, x.reward, x.reward) for x in played.rollouts]
     buffer = jax.tree.map(

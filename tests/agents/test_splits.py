@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import imageio.v3 as imageio
@@ -40,7 +39,7 @@ def write_clips(folder: Path, names: str) -> Path:
 
 
 def config(clips: Path | str | None, split: str = "train", distractors: str = "video") -> PPOConfig:
-    return PPOConfig(
+    return PPOConfig().replace(
         task="inverted_pendulum",
         distractors=distractors,
         clips=None if clips is None else str(clips),
@@ -104,11 +103,11 @@ def test_clips_of_another_folder_are_those_of_training_by_their_content(tmp_path
     write_clips(tmp_path / "copy", "ab")
     write_clips(tmp_path / "others", "cd")
     of_run = config(tmp_path / "there", "all")
-    here = replace(of_run, clips=str(tmp_path / "copy"))
+    here = of_run.replace(clips=str(tmp_path / "copy"))
     assert shown(make_split(here, "train", trained)) == trained
     with pytest.raises(NoSplitError, match="training plays 2"):
         make_split(here, "test", trained)
-    here = replace(of_run, clips=str(tmp_path / "others"))
+    here = of_run.replace(clips=str(tmp_path / "others"))
     assert shown(make_split(here, "test", trained)) == digests(tmp_path / "others", "all")
     with pytest.raises(NoSplitError, match="others are not those of the training"):
         make_split(here, "train", trained)

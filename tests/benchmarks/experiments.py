@@ -23,7 +23,6 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
@@ -160,7 +159,7 @@ def offer(task: str, folder: Path, kept: dict) -> None:
     Returns by other rewards compare with none of the preset's.
     """
     about, last = PRETRAINED / f"{task}.json", kept["evaluations"][-1]
-    reward = preset(kept["algorithm"], "cpu", task).reward_preset
+    reward = preset(kept["algorithm"], "cpu", task).env.reward_preset
     if kept["config"]["reward_preset"] != reward:
         return
     before = json.loads(about.read_text()) if about.exists() else None
@@ -214,7 +213,7 @@ def is_made(path: Path, arguments: list[str]) -> bool:
         return False
     kept, wanted = json.loads(path.read_text()), config_of(arguments)
     # All renderers draw the same.
-    config = replace(load_config(kept), renderer=wanted.renderer)
+    config = load_config(kept).replace(renderer=wanted.env.renderer)
     return kept["revision"] == REVISION and config == wanted
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import jax
@@ -23,7 +23,7 @@ from flax import linen as nn
 
 from pixelbrax_jax import VectorPixelEnv, compiler_options
 from pixelbrax_jax.agents.algorithm import train_function
-from pixelbrax_jax.agents.config import make_env
+from pixelbrax_jax.agents.config import describe, make_env
 from pixelbrax_jax.agents.networks.actor import LOG_STD_RANGE, SMALLEST
 from pixelbrax_jax.agents.networks.distributions import Normal
 from pixelbrax_jax.agents.on_policy.actor_critic import ActorCritic
@@ -115,8 +115,7 @@ def main() -> None:
     options = parser.parse_args()
     given = preset("ppo", "cpu", options.task)
     assert isinstance(given, PPOConfig)
-    config = replace(
-        given,
+    config = given.replace(
         initial_std=given.initial_std if options.initial_std is None else options.initial_std,
         encoder="small",
         height=SMALLEST["small"],
@@ -135,7 +134,7 @@ def main() -> None:
         "return in each tenth": tenths(metrics),
         "last std": round(float(metrics["policy/std_mean"][-1]), 3),
     }
-    name = f"{task_key(asdict(config))} std {config.initial_std} seed {options.seed}"
+    name = f"{task_key(describe(config))} std {config.initial_std} seed {options.seed}"
     known = json.loads(OUTPUT.read_text()) if OUTPUT.exists() else {}
     OUTPUT.write_text(json.dumps(known | {name: found}, indent=1) + "\n")
     print(name, json.dumps(found))

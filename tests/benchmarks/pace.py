@@ -36,7 +36,7 @@ def measure(algorithm: str, task: str) -> dict[str, float]:
         control step afterwards, over whole phases.
     """
     config = preset(algorithm, "cpu", task)
-    steps = ITERATIONS * config.num_envs * config.num_steps * config.action_repeat
+    steps = ITERATIONS * config.num_envs * config.num_steps * config.env.action_repeat
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "pixelbrax_jax.cli", "train", algorithm, "--task", task]
         command += ["--preset", "cpu", "--total-steps", str(steps), "--num-evals", "0"]

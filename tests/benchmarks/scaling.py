@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import sys
-from dataclasses import replace
 from typing import Any
 
 import jax
@@ -64,7 +63,7 @@ def training(task: str, num_devices: int, cores: int, num_envs: int) -> dict[str
         sys.exit(ABSENT)
     # Before JAX makes its threads.
     os.sched_setaffinity(0, allowed[:cores])
-    config = replace(preset("ppo", "ci"), task=task, num_envs=num_envs)  # type: ignore[arg-type]
+    config = preset("ppo", "ci", task, num_envs=num_envs)
     env, params = make_env(config)
     mesh = make_env_mesh(num_devices)
     algorithm = PPO(config, ShardedVectorEnv(env, num_envs, mesh))  # type: ignore[arg-type]

@@ -23,6 +23,7 @@ from pixelbrax_jax import VectorPixelEnv, compiler_options
 from pixelbrax_jax.agents.config import make_env
 from pixelbrax_jax.agents.networks.actor import ENCODERS
 from pixelbrax_jax.agents.on_policy.ppo import PPO, PPOConfig
+from pixelbrax_jax.config import EnvConfig
 
 REPETITIONS = 5
 
@@ -30,7 +31,7 @@ REPETITIONS = 5
 def measure(encoder: str, num_envs: int, num_steps: int) -> dict[str, Any]:
     """Steps per second of training and of the environments alone, taking turns."""
     config = PPOConfig(
-        task="halfcheetah",
+        env=EnvConfig(task="halfcheetah"),
         encoder=encoder,
         layout="shared",
         num_envs=num_envs,

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 from pixelbrax_jax import distractors, make, place
-from pixelbrax_jax.scene.cameras import aim, rig, rigs_of
+from pixelbrax_jax.physics.brax.loading import rigs_of
+from pixelbrax_jax.scene.cameras import aim, make_rig, with_sides
 from pixelbrax_jax.tasks import BRAX_TASKS
 from tests.distractors.conftest import walk
 from tests.envs.toy import PARAMS
 
 SCALES = {"easy": 0.1, "medium": 0.2, "hard": 0.3}
-RIG = rig((0.0, -4.0, 1.0), (0.0, 0.0, 0.0), 50.0)
+RIG = make_rig((0.0, -4.0, 1.0), (0.0, 0.0, 0.0), 50.0)
 STEPS = 10_000
 
 
@@ -112,7 +113,7 @@ def test_nothing_moves_at_scale_zero():
     )
 
 
-DOWN = rig((0.3, 0.1, 0.75), (0.3, 0.1, 0.01), 45.0, up=(0.0, 1.0, 0.0))
+DOWN = make_rig((0.3, 0.1, 0.75), (0.3, 0.1, 0.01), 45.0, up=(0.0, 1.0, 0.0))
 """As DM Control's reacher and point_mass are seen, and its fish from above."""
 
 
@@ -150,7 +151,7 @@ def test_a_camera_that_looks_straight_down():
     ],
 )
 def test_rigs_of_all_kinds_yield_sound_cameras(task, name):
-    base = rigs_of(task)[name]
+    base = with_sides(rigs_of(BRAX_TASKS[task]))[name]
     params = PARAMS.replace(rig=base)
     camera = distractors.MovingCamera(scale=0.3)
     states = walk(camera, params, 200, num=4)
@@ -207,7 +208,7 @@ def test_roll_turns_the_picture():
 
 
 def test_gradients_are_finite_straight_above():
-    above = rig((0.0, 0.0, 3.0), (0.0, 0.0, 0.0), 50.0, up=(0.0, 1.0, 0.0))
+    above = make_rig((0.0, 0.0, 3.0), (0.0, 0.0, 0.0), 50.0, up=(0.0, 1.0, 0.0))
     camera = distractors.MovingCamera(scale=0.3)
 
     def place_of_eye(eye):

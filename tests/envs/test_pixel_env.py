@@ -265,7 +265,7 @@ class TestMake:
         assert set(parameters) == {field.name for field in dataclasses.fields(EnvConfig)}
 
     def test_a_rig_must_follow_a_link_that_exists(self):
-        rig = pixelbrax_jax.rig((0, -3, 1), (0, 0, 0), 40.0, link=99)
+        rig = pixelbrax_jax.make_rig((0, -3, 1), (0, 0, 0), 40.0, link=99)
         with pytest.raises(ValueError, match="follows link 99, but task 'ant' has only 9 links"):
             pixelbrax_jax.make("ant", camera=rig)
 

@@ -65,7 +65,7 @@ def through_json(env):
 
 OBJECTS = {
     "distractors": (distractors.Color(scale=0.2), "camera"),
-    "camera": pixelbrax_jax.rig((0.0, -3.0, 1.0), (0.0, 0.0, 0.1), 45.0),
+    "camera": pixelbrax_jax.make_rig((0.0, -3.0, 1.0), (0.0, 0.0, 0.1), 45.0),
     "look": pixelbrax_jax.make_look("dmc", shadows=False),
 }
 SIZE = {"height": 12, "width": 12, "frame_stack": 1}

@@ -10,7 +10,7 @@ import pytest
 from brax.io import mjcf
 
 from pixelbrax_jax.physics.brax.engine import BraxPhysics, envs, training
-from pixelbrax_jax.physics.brax.tasks import load_brax_env
+from pixelbrax_jax.physics.brax.loading import load_brax_env
 from pixelbrax_jax.physics.mujoco_compatibility import loading_silenced
 
 SLIDER = """
@@ -215,7 +215,7 @@ def test_scan_and_loop_agree(slider):
 
 
 QUIET = """
-from pixelbrax_jax.physics import make_physics
+from pixelbrax_jax.registry import make_physics
 physics = make_physics("halfcheetah")
 import jax
 jax.eval_shape(physics.reset, jax.random.key(0))

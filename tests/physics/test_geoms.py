@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from pixelbrax_jax.physics.geometry import read_geoms
+from pixelbrax_jax.physics.geometry import as_geoms, geom_shapes
 from pixelbrax_jax.tasks import BRAX_TASKS
 from pixelbrax_jax.types import GeomKind
 
@@ -32,6 +32,10 @@ LOOKS = """
   </worldbody>
 </mujoco>
 """
+
+
+def read_geoms(model, **options):
+    return as_geoms(geom_shapes(model, **options))
 
 
 def viewer(model):

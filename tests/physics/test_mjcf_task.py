@@ -8,7 +8,7 @@ import pytest
 
 from pixelbrax_jax.physics.base import Kinematics, Physics
 from pixelbrax_jax.physics.brax.mjcf import mjcf_physics
-from pixelbrax_jax.tasks import BRAX_BACKENDS
+from pixelbrax_jax.physics.brax.tasks import BACKENDS as BRAX_BACKENDS
 
 # A cart with a leaning pole; the knob is a body without a joint, rotated by Euler angles.
 CART = """

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pixelbrax_jax.physics.brax.omissions import check_simulated, omissions
-from pixelbrax_jax.tasks import BRAX_BACKENDS
+from pixelbrax_jax.physics.brax.tasks import BACKENDS as BRAX_BACKENDS
 
 ARM = """
 <mujoco>

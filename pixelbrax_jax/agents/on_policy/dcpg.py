@@ -113,7 +113,8 @@ class DCPG(Algorithm):
         if config.decoupled:
             networks["target"] = networks["actor"]
         if config.dynamics_coef:
-            pixels = jnp.zeros((1, config.height, config.width, 3 * config.frame_stack), jnp.uint8)
+            env = config.env
+            pixels = jnp.zeros((1, env.height, env.width, 3 * env.frame_stack), jnp.uint8)
             features = self.agent.actor(networks["actor"], pixels).features
             action = jnp.zeros((1, self.envs.env.action_size))
             dynamics_key = jax.random.fold_in(key, 2)

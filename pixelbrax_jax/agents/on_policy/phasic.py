@@ -270,7 +270,7 @@ def _chunk(
 
     frames = buffer.frames
     seen = Frames(
-        pixels=cut(frames.pixels, config.frame_stack - 1),
+        pixels=cut(frames.pixels, config.env.frame_stack - 1),
         age=cut(frames.age),
         shift=frames.shift[rollout, jnp.arange(config.num_envs)],
         state=None,

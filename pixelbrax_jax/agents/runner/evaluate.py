@@ -108,9 +108,11 @@ def make_splits(
 
 def splits_of(config: TrainConfig) -> tuple[str, ...]:
     """Return names of the splits that there may be."""
-    if not config.distractors:
+    if not config.env.distractors:
         return SPLITS[:1]
-    plays = any(isinstance(link, Video) for link in resolve(config.distractors, config.task))
+    plays = any(
+        isinstance(link, Video) for link in resolve(config.env.distractors, config.env.task)
+    )
     return SPLITS if plays else SPLITS[:2]
 
 
@@ -133,9 +135,8 @@ def make_split(
     check_choice("split", name, SPLITS)
     names = splits_of(config)
     if name not in names:
-        lacks = (
-            "clips, and the run played" if config.distractors else "distractors, and the run had"
-        )
+        has_any = bool(config.env.distractors)
+        lacks = "clips, and the run played" if has_any else "distractors, and the run had"
         raise ValueError(
             f"split {name!r} is for {lacks} none; there is only {' and '.join(map(repr, names))}."
         )
@@ -145,11 +146,11 @@ def make_split(
         env, params = _make(config)
         if shown and clip_digests(params.clips) != list(shown):
             raise NoSplitError(
-                f"the clips of split {config.split!r} of {_source(config)} are not those of the "
-                "training."
+                f"the clips of split {config.env.split!r} of {_source(config)} are not those of "
+                "the training."
             )
         return env, params
-    split = HELD_OUT.get(config.split, config.split)
+    split = HELD_OUT.get(config.env.split, config.env.split)
     _check_there(config, split)
     shown = shown or clip_digests(_make(config)[1].clips)
     env, params = _make(config, split=split)
@@ -190,7 +191,7 @@ def _check_there(config: TrainConfig, split: str) -> None:
 
 
 def _source(config: TrainConfig) -> str:
-    return str(config.clips or "procedural")
+    return str(config.env.clips or "procedural")
 
 
 class Evaluator:

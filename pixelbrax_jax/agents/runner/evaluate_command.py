@@ -47,7 +47,7 @@ def evaluate(options: argparse.Namespace) -> int:
                 "length": float(result.lengths.mean()),
             }
             if params.clips is not None:
-                line["clips"] = place_of(str(config.clips or "procedural"))
+                line["clips"] = place_of(str(config.env.clips or "procedural"))
             if options.episodes > 1:
                 line["standard_error"] = result.standard_error
             sys.stdout.write(json.dumps(line) + "\n")

@@ -26,8 +26,8 @@ def check_memory(algorithm: Algorithm, template: TrainState, report: Callable[[s
         MemoryError: it is more than ``memory_budget_gb``, or than the device has.
     """
     config = algorithm.config
-    frame = config.num_envs * config.height * config.width * 3
-    rollout = frame * (config.num_steps + config.frame_stack - 1) * template.iteration.size
+    frame = config.num_envs * config.env.height * config.env.width * 3
+    rollout = frame * (config.num_steps + config.env.frame_stack - 1) * template.iteration.size
     buffer, parts = nbytes(template.buffer), _memories(algorithm)
     # What belongs to environments is spread over the devices; the rest is the same on all.
     alike = nbytes((template.networks, template.opt_state, template.aux_opt_state))

@@ -30,7 +30,7 @@ def record(options: argparse.Namespace) -> int:
     """
     try:
         agent = load_chosen(options)
-        split = options.split or ("train" if agent.algorithm.config.distractors else "clean")
+        split = options.split or ("train" if agent.algorithm.config.env.distractors else "clean")
         run = [f"run{options.run_index}"] if options.run_index else []
         name = "_".join([options.pretrained or str(agent.steps), split, *run])
         path = write_video(

@@ -16,6 +16,7 @@ from pixelbrax_jax.agents.algorithm import Algorithm
 from pixelbrax_jax.agents.config import TrainConfig, describe
 from pixelbrax_jax.agents.runner.run_config import RunConfig
 from pixelbrax_jax.cache import whole_path
+from pixelbrax_jax.config import ENV_OPTIONS
 from pixelbrax_jax.types import Clips
 
 FORMER_DEFAULTS: dict[str, Any] = {}
@@ -48,9 +49,9 @@ def former_settings(kind: type[TrainConfig]) -> dict[str, Any]:
         kind: the class of the run's settings.
     """
     defaults = {field.name: field.default for field in (*fields(kind), *fields(RunConfig))}
-    names = {*(field.name for field in fields(kind)), *OF_RUNS}
-    known = {n: v for n, v in (defaults | FORMER_DEFAULTS).items() if n in names}
-    plain = {n: list(v) if isinstance(v, tuple) else v for n, v in known.items()}
+    names = {*ENV_OPTIONS, *(field.name for field in fields(kind)), *OF_RUNS} - {"env"}
+    known = vars(defaults["env"]) | defaults | FORMER_DEFAULTS
+    plain = {n: list(v) if isinstance(v, tuple) else v for n, v in known.items() if n in names}
     return {name: value for name, value in plain.items() if value is not MISSING}
 
 
@@ -126,7 +127,7 @@ def stored_clips(config: TrainConfig, digests: Sequence[str]) -> Sequence[str] |
         config: of the run.
         digests: of its clips.
     """
-    made = config.clips is None or config.clips == "procedural"
+    made = config.env.clips is None or config.env.clips == "procedural"
     return None if made else digests or None
 
 

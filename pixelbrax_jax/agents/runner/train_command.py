@@ -189,7 +189,7 @@ def _run(algorithm: str, config: TrainConfig, options: RunConfig) -> int:
         envs = VectorPixelEnv(env, config.num_envs)
     with contextlib.suppress(OSError):
         report(
-            f"{algorithm} on {config.task}, {config.num_envs} environments, {devices} "
+            f"{algorithm} on {config.env.task}, {config.num_envs} environments, {devices} "
             f"{default_platform()} device{'s' * (devices > 1)}, {config.num_iterations} "
             f"iterations of {config.steps_per_iteration} control steps; "
             f"into {Path(options.output_dir).resolve()}"

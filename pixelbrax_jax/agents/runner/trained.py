@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -173,12 +173,12 @@ def with_clips(agent: Trained, clips: str | None) -> tuple[TrainConfig, tuple[st
     if "test" not in splits_of(config):
         raise ValueError(
             f"--clips {clips} is given, but no distractor of the run plays clips; it had "
-            f"{', '.join(map(str, as_tuple(config.distractors))) or 'none'}."
+            f"{', '.join(map(str, as_tuple(config.env.distractors))) or 'none'}."
         )
     if shown is None:
         with suppress(FileNotFoundError):
             shown = tuple(clip_digests(make_env(config)[1].clips))
-    return replace(config, clips=clips), shown
+    return config.replace(clips=clips), shown
 
 
 def load_config(about: Mapping[str, Any]) -> TrainConfig:
@@ -197,9 +197,5 @@ def load_config(about: Mapping[str, Any]) -> TrainConfig:
     former = former_settings(kind)
     if unknown := unknown_settings(about, former):
         raise CheckpointError(unknown.strip())
-    values: dict[str, Any] = {
-        name: tuple(value) if isinstance(value, list) else value
-        for name, value in (former | about["config"]).items()
-        if name not in OF_RUNS
-    }
-    return kind(**values)
+    stored = former | about["config"]
+    return kind().replace(**{n: value for n, value in stored.items() if n not in OF_RUNS})

@@ -6,30 +6,23 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics
-from pixelbrax_jax.physics.mjx.task import Start
+from pixelbrax_jax.physics.mjx.formulas import Start
+from pixelbrax_jax.physics.opengl import mujoco
 
 MAX_ATTEMPTS = 1000
 """Draws of a pose after which one that touches something is taken."""
 
 
 def random_joints(model: mujoco.MjModel, key: jax.Array) -> jax.Array:
-    """Draw joint positions as DM Control's ``randomize_limited_and_rotational_joints`` does.
+    """Draw joint positions (Q,) as DM Control's ``randomize_limited_and_rotational_joints`` does.
 
     Limited hinges and sliders are uniform in their range, other hinges in [-pi, pi]. A free joint
     keeps its place, and its quaternion is drawn uniformly from [0, 1]^4 and normalised, which is
     not uniform over rotations: DM Control keeps it so for the sake of its results. The suite's
     tasks that ask for it have no ball joints.
-
-    Args:
-        model: the compiled model.
-        key: PRNG key.
-
-    Returns:
-        (Q,) float32, metres, radians, unit quaternions.
     """
     low, high = np.array(model.qpos0), np.array(model.qpos0)
     rotations = []

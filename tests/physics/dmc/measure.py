@@ -19,8 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
-from pixelbrax_jax.physics import make_physics
 from pixelbrax_jax.physics.mjx.dynamics import MjxState
+from pixelbrax_jax.registry import make_physics
 from pixelbrax_jax.tasks import DMC_TASKS
 from tests.physics.dmc import oracle
 

@@ -6,9 +6,8 @@ import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics
+from pixelbrax_jax.physics.mjx.formulas import Formulas, Snapshot, Start, joined
 from pixelbrax_jax.physics.mjx.resets import free_of_contact
-from pixelbrax_jax.physics.mjx.snapshot import Snapshot, joined
-from pixelbrax_jax.physics.mjx.task import DmcTask, Start
 
 
 def _start(dynamics: Dynamics, key: jax.Array) -> Start:
@@ -37,4 +36,4 @@ def _reward(seen: Snapshot) -> jax.Array:
     return jnp.where((offset[0] < size[0]) & (offset[2] < size[2]), 1.0, 0.0)
 
 
-TASKS = {"catch": DmcTask("ball_in_cup", _start, _observe, _reward, substeps=10)}
+TASKS = {"catch": Formulas(_start, _observe, _reward, substeps=10)}

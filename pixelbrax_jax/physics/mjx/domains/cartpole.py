@@ -6,9 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics
-from pixelbrax_jax.physics.mjx.rewards import tolerance
-from pixelbrax_jax.physics.mjx.snapshot import Snapshot, joined
-from pixelbrax_jax.physics.mjx.task import DmcTask, Start
+from pixelbrax_jax.physics.mjx.formulas import Formulas, Snapshot, Start, joined, tolerance
 
 
 def _start_hanging(dynamics: Dynamics, key: jax.Array) -> Start:
@@ -47,8 +45,8 @@ def _reward_sparse(seen: Snapshot) -> jax.Array:
 
 
 TASKS = {
-    "balance": DmcTask("cartpole", _start_upright, _observe, _reward),
-    "balance_sparse": DmcTask("cartpole", _start_upright, _observe, _reward_sparse),
-    "swingup": DmcTask("cartpole", _start_hanging, _observe, _reward),
-    "swingup_sparse": DmcTask("cartpole", _start_hanging, _observe, _reward_sparse),
+    "balance": Formulas(_start_upright, _observe, _reward),
+    "balance_sparse": Formulas(_start_upright, _observe, _reward_sparse),
+    "swingup": Formulas(_start_hanging, _observe, _reward),
+    "swingup_sparse": Formulas(_start_hanging, _observe, _reward_sparse),
 }

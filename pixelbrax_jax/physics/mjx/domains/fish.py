@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-import mujoco
 
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics
+from pixelbrax_jax.physics.mjx.formulas import Formulas, Snapshot, Start, joined, tolerance
 from pixelbrax_jax.physics.mjx.resets import random_rotation
-from pixelbrax_jax.physics.mjx.rewards import tolerance
-from pixelbrax_jax.physics.mjx.snapshot import Snapshot, joined
-from pixelbrax_jax.physics.mjx.task import DmcTask, Start
+from pixelbrax_jax.physics.opengl import mujoco
 
 _JOINTS = (
     "tail1",
@@ -74,10 +72,8 @@ def _hide_target(model: mujoco.MjModel) -> None:
 
 
 TASKS = {
-    "upright": DmcTask(
-        "fish", _start_upright, _observe_upright, _reward_upright, substeps=10, edit=_hide_target
+    "upright": Formulas(
+        _start_upright, _observe_upright, _reward_upright, substeps=10, edit=_hide_target
     ),
-    "swim": DmcTask(
-        "fish", _start_swim, _observe_swim, _reward_swim, substeps=10, movable=("target",)
-    ),
+    "swim": Formulas(_start_swim, _observe_swim, _reward_swim, substeps=10, movable=("target",)),
 }

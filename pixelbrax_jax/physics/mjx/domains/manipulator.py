@@ -6,14 +6,12 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics
+from pixelbrax_jax.physics.mjx.formulas import Formulas, Snapshot, Start, joined, tolerance
 from pixelbrax_jax.physics.mjx.resets import free_of_contact
-from pixelbrax_jax.physics.mjx.rewards import tolerance
-from pixelbrax_jax.physics.mjx.snapshot import Snapshot, joined
-from pixelbrax_jax.physics.mjx.task import DmcTask, Start
+from pixelbrax_jax.physics.opengl import mujoco
 
 _ARM = (
     "arm_root",
@@ -120,8 +118,7 @@ def _reward(seen: Snapshot) -> jax.Array:
 
 
 TASKS = {
-    "bring_ball": DmcTask(
-        "manipulator",
+    "bring_ball": Formulas(
         _start,
         _observe,
         _reward,
