@@ -81,8 +81,12 @@ def without(*parts: str) -> dict[str, str]:
 
 @pytest.mark.parametrize(
     ("flags", "part"),
-    [(X64, PARTS[0]), (X64 | RULES, PARTS[1]), (CHECKS, "gymnasium")],
-    ids=["x64", "rules", "checks"],
+    [
+        (X64 | RULES, f"env:{TASK}"),
+        (TRACED, "program:dmc_cartpole_swingup,color"),
+        (CHECKS, "gymnasium"),
+    ],
+    ids=["rules", "program", "checks"],
 )
 def test_environments_are_the_same(flags, part):
     assert under(flags, part) == without(part)

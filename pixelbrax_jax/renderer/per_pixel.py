@@ -7,6 +7,7 @@ on the frame, as a random offset or an image to mix in, is computed before.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -57,11 +58,14 @@ class PerPixel:
     """
 
     shape: tuple[int, ...]
+    num_planes: int
     numbers: list[jax.Array] = field(default_factory=list)
     images: list[jax.Array] = field(default_factory=list)
     _steps: list[tuple[core.JaxprEqn, list[_Pixel | _Given]]] = field(default_factory=list)
-    _num_planes: int = 0
-    _spread: dict[int, tuple[Any, Any]] = field(default_factory=dict)
+    # By the id of an array, with the array, so that no other one gets that id.
+    _scalars: dict[int, tuple[Any, Any]] = field(default_factory=dict)
+    _equations: dict[int, tuple[Any, core.JaxprEqn, list[Any]]] = field(default_factory=dict)
+    _found: dict[int, tuple[Any, _Pixel | _Given]] = field(default_factory=dict)
 
     def apply(self, frame: Frame, numbers: Sequence[Any], images: Sequence[Any]) -> jax.Array:
         """Return the result for some pixels of a frame, given the same pixels of the images."""
@@ -90,26 +94,43 @@ class PerPixel:
         return list(map(value, closed.jaxpr.outvars))
 
     def _read_equation(self, eqn: core.JaxprEqn, operands: list[Any]) -> list[Any]:
-        name = eqn.primitive.name
-        if not any(isinstance(x, _Pixel) for x in operands):
-            results = bind(eqn, *operands)
-            if name == "broadcast_in_dim" and jnp.ndim(operands[0]) == 0:
-                self._spread[id(results[0])] = (results[0], operands[0])
-            return results
-        if name == "jit":
+        if eqn.primitive.name == "jit":
             return self.read(eqn.params["jaxpr"], operands)
+        if any(isinstance(x, _Pixel) for x in operands):
+            return [self._add(eqn, operands)]
+        results = bind(eqn, *operands)
+        if eqn.primitive.name == "broadcast_in_dim" and jnp.ndim(operands[0]) == 0:
+            self._scalars[id(results[0])] = (results[0], operands[0])
+        elif self._is_elementwise(eqn):
+            # Of an image, as its red: the kernel computes it if it is needed there.
+            self._equations[id(results[0])] = (results[0], eqn, operands)
+        return results
+
+    def _is_elementwise(self, eqn: core.JaxprEqn) -> bool:
         aval: Any = eqn.outvars[0].aval
-        if name not in _ELEMENTWISE or aval.shape != self.shape or aval.dtype.name not in _DTYPES:
+        fits = aval.shape == self.shape and aval.dtype.name in _DTYPES
+        return eqn.primitive.name in _ELEMENTWISE and fits
+
+    def _add(self, eqn: core.JaxprEqn, operands: Sequence[Any]) -> _Pixel:
+        if not self._is_elementwise(eqn):
             raise _NotPerPixelError
         self._steps.append((eqn, list(map(self._operand, operands))))
-        return [_Pixel(self._num_planes + len(self._steps) - 1)]
+        return _Pixel(self.num_planes + len(self._steps) - 1)
 
     def _operand(self, x: Any) -> _Pixel | _Given:
         if isinstance(x, _Pixel):
             return x
-        _, x = self._spread.get(id(x), (x, x))
+        _, x = self._scalars.get(id(x), (x, x))
         if not isinstance(x, jax.Array) and jnp.ndim(x) == 0:
             return _Given("constant", x)
+        if id(x) not in self._found:
+            self._found[id(x)] = (x, self._find(x))
+        return self._found[id(x)][1]
+
+    def _find(self, x: Any) -> _Pixel | _Given:
+        if id(x) in self._equations:
+            with suppress(_NotPerPixelError):  # then the image itself may be read
+                return self._add(*self._equations[id(x)][1:])
         if x.shape not in ((), self.shape) or x.dtype.name not in _DTYPES[:-1]:
             raise _NotPerPixelError
         group, array = ("image", self.images) if x.shape else ("number", self.numbers)
@@ -126,7 +147,7 @@ def per_pixel(change: Callable[[Frame], jax.Array], frame: Frame) -> PerPixel | 
     """
     closed = jax.make_jaxpr(change)(frame)
     planes = [_Pixel(place) for place in range(len(closed.jaxpr.invars))]
-    found = PerPixel(frame.r.shape, _num_planes=len(planes))
+    found = PerPixel(frame.r.shape, len(planes))
     try:
         (result,) = found.read(closed, planes)
     except _NotPerPixelError:

@@ -41,10 +41,17 @@ def mixed(frame):
     return frame.replace(b=kept * frame.b + (1.0 - kept) * NOISE)
 
 
+def blended(frame):
+    """Reads one packed image, and what is computed of its pixels."""
+    packed = (NOISE * 2.0**24).astype(jnp.uint32)
+    red, green = ((packed >> shift & 0xFF).astype(jnp.float32) / 255.0 for shift in (0, 8))
+    return frame.replace(r=jnp.where(red > 0.5, red, frame.r), g=0.5 * (frame.g + green))
+
+
 @pytest.mark.parametrize(
     ("change", "numbers", "images"),
-    [(lambda frame: frame, 0, 0), (shifted, 2, 0), (mixed, 1, 1), (striped, 0, 1)],
-    ids=["none", "shifted", "mixed", "striped"],
+    [(lambda frame: frame, 0, 0), (shifted, 2, 0), (mixed, 1, 1), (striped, 0, 1), (blended, 0, 1)],
+    ids=["none", "shifted", "mixed", "striped", "blended"],
 )
 def test_pixels_change_one_by_one_as_the_image_does(change, numbers, images):
     whole = frame()
