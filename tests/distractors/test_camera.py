@@ -218,8 +218,3 @@ def test_gradients_are_finite_straight_above():
         return camera.change_params(state, params).rig.eye.sum()
 
     assert np.isfinite(jax.grad(place_of_eye)(jnp.asarray(above.eye))).all()
-
-
-def test_scale_is_checked():
-    with pytest.raises(ValueError, match=r"scale of MovingCamera must lie in \[0, 1\], got -1"):
-        distractors.MovingCamera(scale=-1)
