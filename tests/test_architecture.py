@@ -60,7 +60,10 @@ ALLOWED: dict[str, set[str]] = {
         "pixelbrax_jax",
         *_below("config", "envs", "policy", "registry", "distractors"),
     },
-    "pixelbrax_gym": {"pixelbrax_jax", *_below("config", "plain", "registry", "tasks", "policy")}
+    "pixelbrax_gym": {
+        "pixelbrax_jax",
+        *_below("config", "plain", "registry", "tasks", "policy", "envs"),
+    }
     - {"pixelbrax_jax._platform"},
     # The command line joins everything, and nothing imports it.
     "pixelbrax_gym.cli": {

@@ -13,7 +13,7 @@ from typing import Literal
 
 from pixelbrax_gym.bench.case import Case, Group
 from pixelbrax_gym.bench.cases import FULL, QUICK
-from pixelbrax_gym.cli import UsageError, parse
+from pixelbrax_gym.cli import CommandError, UsageError, parse
 from pixelbrax_jax.extras import install_extra
 from pixelbrax_jax.stop_signals import signal_name
 
@@ -86,7 +86,7 @@ def measure_groups(options: Options, groups: Mapping[str, Group], chosen: Sequen
         )
         return int(128 + number)
     except (RuntimeError, SubprocessError) as error:
-        raise ValueError(str(error)) from error
+        raise CommandError(str(error)) from error
     page, picture = file.with_suffix(".md"), file.with_suffix(".png")
     if groups is QUICK:
         sys.stdout.write(f"\n{page.read_text('utf-8')}\n")

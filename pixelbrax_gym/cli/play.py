@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from tyro.conf import Positional, arg
 
-from pixelbrax_gym.cli import parse
+from pixelbrax_gym.cli import CommandError, parse, say
 from pixelbrax_jax.extras import install_extra
 from pixelbrax_jax.validation import check_positive_int
 
@@ -70,7 +70,7 @@ def run(arguments: Sequence[str]) -> int:
     try:
         env, act = _make(options)
     except TypeError as error:
-        raise ValueError(str(error)) from error
+        raise CommandError(str(error)) from error
     lacking = "" if options.gif else _why_no_window()
     # Of a task module:name, not all systems have files so called.
     name = options.task.rpartition(":")[2]
@@ -78,8 +78,8 @@ def run(arguments: Sequence[str]) -> int:
     if written and None in map(find_spec, ("imageio_ffmpeg", "PIL")):
         raise ImportError(f"{lacking}; {NO_WRITER}" if lacking else NO_WRITER)
     if lacking:
-        sys.stderr.write(f"pixelbrax play: {lacking}; writing {written} in its place\n")
-    sys.stderr.write("pixelbrax play: compiling, which may take two minutes\n")
+        say("play", f"{lacking}; writing {written} in its place")
+    say("play", "compiling, which may take two minutes")
     shown = images(env, act, options.seed, options.size if options.observation else None)
     fps = env.metadata["render_fps"]
     if written is None:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import argparse
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
-from pixelbrax_gym.cli import needs_extra, parse
+from pixelbrax_gym.cli import parse
 from pixelbrax_gym.cli.evaluate import AgentOptions
 
 
@@ -31,6 +32,21 @@ class Options(AgentOptions):
 def run(arguments: Sequence[str]) -> int:
     """Run the command."""
     options = parse("record", Options, arguments)
-    with needs_extra("train"):
-        from pixelbrax_jax.agents.runner.record import record
-    return record(argparse.Namespace(**vars(options)))
+    agent = options.load()
+    from pixelbrax_jax.agents.runner.record import write_video
+
+    split = options.split or ("train" if agent.algorithm.config.env.distractors else "clean")
+    run = [f"run{options.run_index}"] if options.run_index else []
+    name = "_".join([options.pretrained or str(agent.steps), split, *run])
+    path = write_video(
+        agent,
+        options.output or Path(options.folder or "") / "videos" / f"{name}.mp4",
+        split=split,
+        clips=options.clips,
+        grid=options.grid,
+        size=options.size,
+        num_frames=options.num_frames,
+        seed=options.seed,
+    )
+    sys.stdout.write(f"{path}\n")
+    return 0

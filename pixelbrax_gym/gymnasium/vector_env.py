@@ -20,7 +20,7 @@ from pixelbrax_gym.reset_options import check_reset_options, reset_mask
 from pixelbrax_gym.seeds import check_seed, check_unseeded
 from pixelbrax_gym.stateful import StatefulEnv
 from pixelbrax_gym.sub_env import SubEnv, call_sub_envs
-from pixelbrax_jax import AUTORESET_MODES
+from pixelbrax_jax.envs.autoreset import AUTORESET_MODES
 from pixelbrax_jax.types import EnvState
 from pixelbrax_jax.validation import check_choice
 

@@ -7,7 +7,9 @@ python -m tests.benchmarks.figures --plots    plots, too
 from __future__ import annotations
 
 import ast
+import importlib
 import inspect
+import itertools
 import json
 import sys
 from dataclasses import fields
@@ -16,7 +18,6 @@ from pathlib import Path
 import pixelbrax_jax as pb
 from pixelbrax_gym.bench import report
 from pixelbrax_gym.bench.tables import table
-from pixelbrax_jax import config
 from pixelbrax_jax.tasks import BRAX_TASKS
 from tests.benchmarks import dmc_page, performance, results
 from tests.benchmarks.cases import GROUPS
@@ -43,11 +44,11 @@ def brax_tasks() -> str:
 def options() -> str:
     """Every option of an environment, with its default and its documentation."""
     about = {}
-    for kind in ast.parse(inspect.getsource(config)).body:
-        if isinstance(kind, ast.ClassDef):
-            for field, text in zip(kind.body, kind.body[1:], strict=False):
-                if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
-                    about[field.target.id] = ast.literal_eval(text.value)  # type: ignore[union-attr]
+    for kind in pb.EnvConfig.__mro__[:-1]:
+        lines = ast.parse(inspect.getsource(kind)).body[0].body
+        for field, text in itertools.pairwise(lines):
+            if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
+                about[field.target.id] = ast.literal_eval(text.value)
     lines = [
         [
             f"`{field.name}`",
@@ -58,6 +59,21 @@ def options() -> str:
         if field.name != "task"
     ]
     return table(("option", "default", "meaning"), lines)
+
+
+def public(package: str, *more: str) -> Figures:
+    """What is importable from a package, for ``mkdocstrings``, by the package's name."""
+
+    def directives() -> str:
+        root = importlib.import_module(package)
+        named = {name: getattr(root, name) for name in sorted({*root.__all__, *more})}
+        return "".join(
+            f"\n::: {getattr(value, '__module__', package)}.{name}\n"
+            for name, value in named.items()
+            if not inspect.ismodule(value)
+        )
+
+    return {package.replace(".", "-").replace("_", "-"): directives}
 
 
 PAGES: dict[str, Figures] = {
@@ -72,6 +88,12 @@ PAGES: dict[str, Figures] = {
     "docs/dmc.md": dmc_page.FIGURES,
     "docs/tasks.md": {"tasks": brax_tasks},
     "docs/options.md": {"options": options},
+    "docs/api.md": {
+        **public("pixelbrax_jax"),
+        **public("pixelbrax_jax.distractors"),
+        **public("pixelbrax_jax.agents"),
+        **public("pixelbrax_gym", "SB3VecEnv", "TorchPolicy", "TorchRLEnv"),
+    },
 }
 """Page -> its tables and figures, by name."""
 

@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 
 import pixelbrax_jax as pb
-from pixelbrax_jax import GeomKind, make_look, render
+from pixelbrax_jax import GeomKind, make_look
 from pixelbrax_jax.distractors import Color, Distractor
 from pixelbrax_jax.renderer import base, kernel
+from pixelbrax_jax.renderer.base import render
 from pixelbrax_jax.renderer.culling import may_see, window_of
 from pixelbrax_jax.renderer.pixels import view_of
 from pixelbrax_jax.tasks import BRAX_TASKS

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -86,24 +85,6 @@ def load_pretrained(name: str) -> Trained:
     about = read_pretrained(name)
     player = Pretrained(load_config(about), load_policy(name))
     return Trained(player, {"actor": {}}, about["steps"], about["config"].get("seed", 0))
-
-
-def load_chosen(options: argparse.Namespace) -> Trained:
-    """Return what the options of a command choose: a run's checkpoint, or a pretrained policy.
-
-    Raises:
-        CheckpointError: there is no such checkpoint.
-        ValueError: options do not go together, or are out of range.
-    """
-    if (options.folder is None) == (options.pretrained is None):
-        raise ValueError("give the folder of a run, or --pretrained and a name: one of the two.")
-    if options.pretrained is None:
-        return load_trained(
-            options.folder, steps=options.steps, best=options.best, run=options.run_index
-        )
-    if options.steps is not None or options.best or options.run_index:
-        raise ValueError("--steps, --best and --run choose of a run's folder, not of --pretrained.")
-    return load_pretrained(options.pretrained)
 
 
 def load_trained(
