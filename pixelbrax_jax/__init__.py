@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from pixelbrax_jax.envs.making import named_rigs as named_rigs
     from pixelbrax_jax.envs.pixel_env import PixelEnv as PixelEnv
     from pixelbrax_jax.envs.sharded import ShardedVectorEnv as ShardedVectorEnv
+    from pixelbrax_jax.envs.vector import AUTORESET_MODES as AUTORESET_MODES
     from pixelbrax_jax.envs.vector import VectorPixelEnv as VectorPixelEnv
     from pixelbrax_jax.physics.base import Physics as Physics
     from pixelbrax_jax.physics.brax.engine import BraxPhysics as BraxPhysics
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
     from pixelbrax_jax.policy import load_policy as load_policy
     from pixelbrax_jax.registry import list_envs as list_envs
     from pixelbrax_jax.registry import register as register
-    from pixelbrax_jax.renderer.kernel import auto_renderer as auto_renderer
     from pixelbrax_jax.scene.cameras import make_rig as make_rig
     from pixelbrax_jax.scene.look import make_look as make_look
     from pixelbrax_jax.types import Camera as Camera
@@ -48,13 +48,12 @@ _PUBLIC = {
     "envs.making": "make named_rigs",
     "envs.pixel_env": "PixelEnv",
     "envs.sharded": "ShardedVectorEnv",
-    "envs.vector": "VectorPixelEnv",
+    "envs.vector": "AUTORESET_MODES VectorPixelEnv",
     "physics.base": "Physics",
     "physics.brax.engine": "BraxPhysics",
     "physics.brax.mjcf": "mjcf_physics",
     "policy": "list_pretrained load_policy",
     "registry": "list_envs register",
-    "renderer.kernel": "auto_renderer",
     "scene.cameras": "make_rig",
     "scene.look": "make_look",
     "types": "Camera CameraRig EnvParams EnvState GeomKind Geoms Look PhysicsState Timestep",

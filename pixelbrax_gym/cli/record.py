@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pixelbrax_gym.cli import parse
-from pixelbrax_gym.cli.evaluate import AgentOptions
+from pixelbrax_gym.cli.evaluate import AgentOptions, load
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Options(AgentOptions):
 def run(arguments: Sequence[str]) -> int:
     """Run the command."""
     options = parse("record", Options, arguments)
-    agent = options.load()
+    agent = load(options)
     from pixelbrax_jax.agents.runner.record import write_video
 
     split = options.split or ("train" if agent.algorithm.config.env.distractors else "clean")

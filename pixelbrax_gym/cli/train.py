@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, make_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_type_hints
@@ -17,7 +17,7 @@ from pixelbrax_jax.validation import check_choice, check_positive_int
 
 if TYPE_CHECKING:
     from pixelbrax_jax.agents.config import TrainConfig
-    from pixelbrax_jax.agents.runner.run_config import RunConfig
+    from pixelbrax_jax.agents.runner.settings import RunConfig
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def run(arguments: Sequence[str]) -> int:
     with needs_extra("train"):
         from pixelbrax_jax.agents.on_policy.presets import PRESETS
         from pixelbrax_jax.agents.registry import ALGORITHMS
-        from pixelbrax_jax.agents.runner import train  # noqa: F401  # for what it imports
+        from pixelbrax_jax.agents.runner import train
     algorithms, presets = ",".join(ALGORITHMS), ",".join(PRESETS)
     if not arguments or arguments[0] in ("-h", "--help"):
         sys.stdout.write(
@@ -89,7 +89,8 @@ def run(arguments: Sequence[str]) -> int:
     first.start()
     config, options = settings(algorithm, first, rest)
     with _errors(options):
-        return _train(algorithm, config, options)
+        outcome = train.train(config, options, _report)
+        return 128 + outcome.signal if outcome.interrupted else 0
 
 
 def read_first(arguments: Sequence[str]) -> tuple[First, list[str]]:
@@ -114,7 +115,7 @@ def settings(
         SystemExit: an option is unknown.
     """
     from pixelbrax_jax.agents.on_policy.presets import PRESETS, preset
-    from pixelbrax_jax.agents.runner.run_config import RunConfig
+    from pixelbrax_jax.agents.runner.settings import RunConfig
 
     defaults = {
         "config": preset(algorithm, first.preset, first.task),
@@ -194,32 +195,10 @@ def _errors(options: RunConfig) -> Iterator[None]:
         raise
 
 
-def _train(algorithm: str, config: TrainConfig, options: RunConfig) -> int:
+def _report(line: str) -> None:
+    """Write a line of a run above the bar."""
     import jax
     from tqdm import tqdm
 
-    from pixelbrax_jax.agents.config import make_env
-    from pixelbrax_jax.agents.registry import make_algorithm
-    from pixelbrax_jax.agents.runner import train
-    from pixelbrax_jax.envs.sharded import ShardedVectorEnv, make_env_mesh
-    from pixelbrax_jax.envs.vector import VectorPixelEnv
-
-    def report(line: str) -> None:
-        if jax.process_index() == 0:
-            tqdm.write(line, file=sys.stderr)
-
-    env, env_params = make_env(config)
-    devices = jax.device_count()
-    if devices > 1:
-        envs: Any = ShardedVectorEnv(env, config.num_envs, make_env_mesh())
-    else:
-        envs = VectorPixelEnv(env, config.num_envs)
-    with suppress(OSError):
-        report(
-            f"{algorithm} on {config.env.task}, {config.num_envs} environments, {devices} "
-            f"{jax.default_backend()} device{'s' * (devices > 1)}, {config.num_iterations} "
-            f"iterations of {config.steps_per_iteration} control steps; "
-            f"into {Path(options.output_dir).resolve()}"
-        )
-    outcome = train.run(make_algorithm(config, envs), env_params, options, report=report)
-    return 128 + outcome.signal if outcome.interrupted else 0
+    if jax.process_index() == 0:
+        tqdm.write(line, file=sys.stderr)

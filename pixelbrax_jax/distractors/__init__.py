@@ -1,7 +1,7 @@
 """What an agent must learn to ignore: changes of color, background and viewpoint."""
 
 from pixelbrax_jax.distractors.base import Distractor
-from pixelbrax_jax.distractors.camera import Camera
+from pixelbrax_jax.distractors.camera import MovingCamera
 from pixelbrax_jax.distractors.clips import (
     ClipBank,
     OnlySplitWarning,
@@ -14,10 +14,10 @@ from pixelbrax_jax.distractors.video import Video
 
 __all__ = [
     "PRESETS",
-    "Camera",
     "ClipBank",
     "Color",
     "Distractor",
+    "MovingCamera",
     "OnlySplitWarning",
     "ProceduralClipsWarning",
     "Video",

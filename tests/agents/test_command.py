@@ -151,7 +151,7 @@ def test_stopped_at_once_it_says_what_is_left(monkeypatch, capsys, tmp_path):
     def stopped(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(train, "run", stopped)
+    monkeypatch.setattr(train, "train", stopped)
     line = ["train", "ppo", *TINY, "--output-dir", str(tmp_path)]
     assert main(line) == 130
     assert "stopped at once; there is no checkpoint" in capsys.readouterr().err

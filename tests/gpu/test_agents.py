@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from pixelbrax_gym import TorchPolicy
-from pixelbrax_jax.agents.runner.export import save_policy
+from pixelbrax_jax.agents.runner.trained import save_policy
 from tests.agents.small import PHASIC, SMALL, Agent, ball_envs, same
 from tests.gpu.processes import deterministic
 

@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from pixelbrax_jax.agents.runner.evaluate import SPLITS, make_split
+from pixelbrax_jax.agents.runner.splits import SPLITS, make_split
 from pixelbrax_jax.agents.runner.trained import Trained, with_clips
 from pixelbrax_jax.compilation import compiler_options
 from pixelbrax_jax.envs.vector import VectorPixelEnv

@@ -6,14 +6,19 @@ again by index when it is needed.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Callable
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
-from pixelbrax_jax.agents.env_axis import along_envs
+from pixelbrax_jax.agents.train_state import Metrics, along_envs
 from pixelbrax_jax.types import EnvParams, EnvState, Timestep
+
+Choose = Callable[[jax.Array, jax.Array | None, jax.Array], tuple[jax.Array, Any]]
+"""``choose(pixels, state, key) -> (action, choice)``: actions of N observations, and any tree of
+arrays (N, ...) that learning needs of the choice."""
 
 
 class Environments(Protocol):
@@ -65,10 +70,8 @@ class Rollout(struct.PyTreeNode):
 
     Attributes:
         frames: what was seen.
-        unclipped_action: (T, N, A) float32.
-        log_prob: (T, N) float32, of the actions when they were drawn.
-        value: (T, N) float32, of the observations, at that time.
-        last_value: (N,) float32, of the observation after the last step.
+        choice: what ``choose`` returned beside the actions, (T, N, ...).
+        last_choice: the same for the observation after the last step, (N, ...).
         reward: (T, N) float32.
         terminated: (T, N) bool.
         truncated: (T, N) bool.
@@ -79,10 +82,8 @@ class Rollout(struct.PyTreeNode):
     """
 
     frames: Frames
-    unclipped_action: jax.Array
-    log_prob: jax.Array
-    value: jax.Array
-    last_value: jax.Array
+    choice: Any
+    last_choice: Any
     reward: jax.Array
     terminated: jax.Array
     truncated: jax.Array
@@ -95,24 +96,24 @@ class Rollout(struct.PyTreeNode):
         """(T, N) bool, an episode ended."""
         return self.terminated | self.truncated
 
-
-class Decision(NamedTuple):
-    """What an agent does about N observations: its actions, their log-probabilities, values."""
-
-    unclipped_action: jax.Array
-    action: jax.Array
-    log_prob: jax.Array
-    value: jax.Array
+    def episode_metrics(self) -> Metrics:
+        """Return what runs log of episodes: sums, which add up over iterations without loss."""
+        done = self.done
+        return {
+            "episode/count": jnp.sum(done, dtype=jnp.int32),
+            "episode/return_sum": jnp.sum(jnp.where(done, self.episode_return, 0.0)),
+            "episode/length_sum": jnp.sum(jnp.where(done, self.episode_length, 0)),
+        }
 
 
 def collect(
     envs: Environments,
     env_state: EnvState,
     env_params: EnvParams,
-    decide: Any,
+    choose: Choose,
     key: jax.Array,
     num_steps: int,
-    random_shift: int,
+    random_shift: int = 0,
 ) -> tuple[EnvState, Rollout]:
     """Play ``num_steps`` steps.
 
@@ -120,7 +121,7 @@ def collect(
         envs: the environments.
         env_state: where they are.
         env_params: of the environments.
-        decide: ``decide(pixels, state, key) -> Decision``.
+        choose: chooses actions.
         key: of this rollout alone.
         num_steps: T.
         random_shift: pixels by which observations are shifted at most.
@@ -139,18 +140,17 @@ def collect(
     stack = first.shape[-1] // 3
     before = jnp.moveaxis(first.reshape(*first.shape[:-1], stack, 3), -2, 0)[:-1]
 
-    def step(carry: tuple[EnvState, jax.Array], number: jax.Array) -> tuple[Any, Any]:
-        env_state, age = carry
+    def choose_at(env_state: EnvState, number: Any) -> tuple[Any, ...]:
         pixels, state = split_obs(envs.obs(env_state))
         seen = shifted(pixels, shift, random_shift)
-        choice = decide(seen, state, jax.random.fold_in(key, number))
+        return pixels, state, *choose(seen, state, jax.random.fold_in(key, number))
+
+    def step(carry: tuple[EnvState, jax.Array], number: jax.Array) -> tuple[Any, Any]:
+        env_state, age = carry
+        pixels, state, action, choice = choose_at(env_state, number)
         begins = env_state.done
-        env_state, timestep = envs.step(env_state, choice.action, env_params)
-        kept = (pixels[..., -3:], age, state)
+        env_state, timestep = envs.step(env_state, action, env_params)
         outcome = (
-            choice.unclipped_action,
-            choice.log_prob,
-            choice.value,
             timestep.reward,
             timestep.terminated,
             timestep.truncated,
@@ -158,20 +158,18 @@ def collect(
             timestep.info["episode_return"],
             timestep.info["episode_length"],
         )
+        kept = (pixels[..., -3:], age, state)
         age = jnp.where(begins, 0, jnp.minimum(age + 1, stack - 1))
-        return (env_state, age), (kept, outcome)
+        return (env_state, age), (kept, choice, outcome)
 
     # The stack that is there already needs no frames of before to be left out: an episode that
     # has just begun repeats its first frame in it.
     start = (env_state, jnp.full(num_envs, stack - 1))
-    (env_state, _), (kept, outcome) = jax.lax.scan(step, start, jnp.arange(num_steps))
+    (env_state, _), (kept, choice, outcome) = jax.lax.scan(step, start, jnp.arange(num_steps))
     newest, age, state = kept
-    pixels, last_state = split_obs(envs.obs(env_state))
-    last_seen = shifted(pixels, shift, random_shift)
-    last = decide(last_seen, last_state, jax.random.fold_in(key, num_steps))
+    *_, last_choice = choose_at(env_state, num_steps)
     frames = Frames(pixels=jnp.concatenate([before, newest]), age=age, shift=shift, state=state)
-    unclipped_action, log_prob, value, *rest = outcome
-    return env_state, Rollout(frames, unclipped_action, log_prob, value, last.value, *rest)
+    return env_state, Rollout(frames, choice, last_choice, *outcome)
 
 
 def observations(frames: Frames, times: jax.Array, random_shift: int = 0) -> jax.Array:
@@ -199,44 +197,18 @@ def observations(frames: Frames, times: jax.Array, random_shift: int = 0) -> jax
 
 
 def at_times(rows: jax.Array, times: jax.Array) -> jax.Array:
-    """Return rows of some times.
+    """Map (T, N, ...) rows and (B, N) int32 times to (N B, ...), one environment after the other.
 
-    Args:
-        rows: (T, N, ...).
-        times: (B, N) int32.
-
-    Returns:
-        (N B, ...), one environment after the other: what is spread over devices along
-        environments then stays where it is.
+    What is spread over devices along environments then stays where it is.
     """
     picked = jax.vmap(lambda rows, index: rows[index], in_axes=1)(rows, times)
     return picked.reshape(-1, *rows.shape[2:])
 
 
-def minibatch_times(key: jax.Array, num_steps: int, num_envs: int, parts: int) -> jax.Array:
-    """Return a random partition of a rollout into minibatches.
-
-    Every minibatch has equally many steps of each environment. So a minibatch is cut along the
-    environments alike, on however many devices they live.
-
-    Args:
-        key: of this epoch alone.
-        num_steps: T.
-        num_envs: N.
-        parts: number of minibatches M, a divisor of T.
-
-    Returns:
-        (M, T / M, N) int32.
-    """
-    keys = jax.vmap(lambda i: jax.random.fold_in(key, i))(jnp.arange(num_envs))
-    order = jax.vmap(lambda key: jax.random.permutation(key, num_steps), out_axes=1)(keys)
-    return order.reshape(parts, num_steps // parts, num_envs)
-
-
-def split_obs(obs: Any) -> tuple[jax.Array, jax.Array | None]:
-    """Return pixels and state of an observation; None for a state that is not there."""
+def split_obs(obs: Any) -> tuple[Any, Any]:
+    """Return pixels and state of an observation, or of its spec; None for a state not there."""
     if isinstance(obs, dict):
-        return obs["pixels"], obs["state"]
+        return obs.get("pixels"), obs.get("state")
     return obs, None
 
 
@@ -253,10 +225,7 @@ def shifted(pixels: jax.Array, shift: jax.Array, at_most: int) -> jax.Array:
     """
     if not at_most:
         return pixels
-    rows = jnp.arange(pixels.shape[1])[None] - shift[:, :1]
-    columns = jnp.arange(pixels.shape[2])[None] - shift[:, 1:]
-    rows, columns = (
-        jnp.clip(rows, 0, pixels.shape[1] - 1),
-        jnp.clip(columns, 0, pixels.shape[2] - 1),
-    )
+    height, width = pixels.shape[1:3]
+    rows = jnp.clip(jnp.arange(height)[None] - shift[:, :1], 0, height - 1)
+    columns = jnp.clip(jnp.arange(width)[None] - shift[:, 1:], 0, width - 1)
     return jax.vmap(lambda image, r, c: image[r][:, c])(pixels, rows, columns)
