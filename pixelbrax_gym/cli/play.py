@@ -24,6 +24,7 @@ ENV_OPTIONS = ("backend", "camera", "look", "shadows", "distractors", "clips", "
 """Options of an environment that the command takes; one that is not given stays as it is."""
 
 Act = Callable[[np.ndarray], np.ndarray]
+"""Gives an (A,) float32 action for an (H, W, 3 K) uint8 observation."""
 
 
 @dataclass(frozen=True)
@@ -91,17 +92,10 @@ def run(arguments: Sequence[str]) -> int:
 
 
 def images(env: GymnasiumEnv, act: Act, seed: int, observed: int | None) -> Iterator[np.ndarray]:
-    """Play for ever, episode after episode.
+    """Play for ever, and yield (H, W, 3) uint8 images.
 
-    Args:
-        env: with ``render_mode="rgb_array"``.
-        act: gives an (A,) float32 action for an (H, W, 3 K) uint8 observation.
-        seed: of the first episode.
-        observed: None yields what ``render`` draws; a number the newest frame of the observation,
-            enlarged by a whole factor to about so many pixels.
-
-    Yields:
-        (H, W, 3) uint8 images.
+    They are what ``render`` draws; or, ``observed``, the newest frame of the observation, enlarged
+    by a whole factor to about so many pixels.
     """
     obs, _ = env.reset(seed=seed)
     while True:

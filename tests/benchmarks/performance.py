@@ -123,7 +123,8 @@ def comparison(group: str, column: str, names: dict[str, str], counts: tuple[int
 
 def _lines(group: str, column: str, num_envs: int) -> dict[str, dict[str, Any]]:
     row = measured("cpu-avx512", group, f"{group}.compare", task="ant", num_envs=num_envs)
-    return {line[column]: line for line in row}
+    # The loop beside TorchRL has another autoreset mode; the first is meant.
+    return {line[column]: line for line in reversed(row)}
 
 
 def programs() -> str:
