@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from pixelbrax_jax.envs.making import named_rigs as named_rigs
     from pixelbrax_jax.envs.pixel_env import PixelEnv as PixelEnv
     from pixelbrax_jax.envs.sharded import ShardedVectorEnv as ShardedVectorEnv
-    from pixelbrax_jax.envs.vector import AUTORESET_MODES as AUTORESET_MODES
     from pixelbrax_jax.envs.vector import VectorPixelEnv as VectorPixelEnv
     from pixelbrax_jax.physics.base import Physics as Physics
     from pixelbrax_jax.physics.brax.engine import BraxPhysics as BraxPhysics
@@ -48,7 +47,7 @@ _PUBLIC = {
     "envs.making": "make named_rigs",
     "envs.pixel_env": "PixelEnv",
     "envs.sharded": "ShardedVectorEnv",
-    "envs.vector": "AUTORESET_MODES VectorPixelEnv",
+    "envs.vector": "VectorPixelEnv",
     "physics.base": "Physics",
     "physics.brax.engine": "BraxPhysics",
     "physics.brax.mjcf": "mjcf_physics",

@@ -62,7 +62,7 @@ ALLOWED: dict[str, set[str]] = {
     },
     "pixelbrax_gym": {
         "pixelbrax_jax",
-        *_below("config", "plain", "registry", "tasks", "policy", "renderer", "envs"),
+        *_below("config", "plain", "registry", "tasks", "policy", "renderer"),
     }
     - {"pixelbrax_jax._platform"},
     # The command line joins everything, and nothing imports it.
