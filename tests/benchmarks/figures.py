@@ -70,7 +70,7 @@ def public(package: str, *more: str) -> Figures:
         return "".join(
             f"\n::: {getattr(value, '__module__', package)}.{name}\n"
             for name, value in named.items()
-            if not inspect.ismodule(value)
+            if not inspect.ismodule(value) and (root is pb or getattr(pb, name, None) is not value)
         )
 
     return {package.replace(".", "-").replace("_", "-"): directives}
