@@ -8,7 +8,6 @@ from typing import Any
 import jax
 import numpy as np
 
-from pixelbrax_jax.flags import is_guarded
 from pixelbrax_jax.validation import check_choice
 
 OUTPUTS = ("jax", "numpy", "torch")
@@ -49,18 +48,6 @@ def to_numpy(tree: Any) -> Any:
         The same tree of NumPy arrays, of the same shapes and dtypes.
     """
     return jax.tree.map(_writable, tree)
-
-
-def read_under_guard(outputs: dict[str, Any]) -> None:
-    """Read all but observations explicitly where ``jax.transfer_guard`` watches what is read.
-
-    JAX keeps what it has read, so that ``float(x)`` and ``np.asarray(x)`` transfer nothing then.
-
-    Args:
-        outputs: of a ``StatefulEnv``.
-    """
-    if is_guarded("device_to_host"):
-        jax.device_get({name: x for name, x in outputs.items() if name != "obs"})
 
 
 class _Memory:

@@ -29,7 +29,7 @@ def test_nothing_is_compiled_twice(make_vector, mode):
     def play(num_steps):
         env.reset(seed=num_steps)
         for _ in range(num_steps):
-            done = np.asarray(env._stateful._snapshot.done)
+            done = np.asarray(env._stateful._snapshot.ended)
             if mode == "disabled" and done.any():
                 env.reset(options={"reset_mask": done})
             env.step(env.action_space.sample())
