@@ -162,12 +162,7 @@ class Programs:
         return images
 
     def check_state(self, state: Any, params: EnvParams) -> None:
-        """Reject what ``start`` cannot take.
-
-        Raises:
-            TypeError: it is no ``EnvState``.
-            ValueError: it has other parts, shapes or dtypes; the message names the first.
-        """
+        """Reject what ``start`` cannot take; the message names the first difference."""
         if not isinstance(state, EnvState):
             raise TypeError(
                 f"a state must be an EnvState, as get_state() returns, got {type(state).__name__}."
@@ -245,12 +240,7 @@ def pack(state: EnvState) -> Packed:
 
 
 def unpack(packed: Packed, like: EnvState) -> EnvState:
-    """Return the state that ``pack`` was given, to the bit.
-
-    Args:
-        packed: what it returned.
-        like: a state of the same shapes, also of ``jax.ShapeDtypeStruct``.
-    """
+    """Return the state that ``pack`` was given, to the bit; ``like`` has its shapes and types."""
     parts, tree = jax.tree.flatten(like.replace(frames=None))
     if like.frames.shape[0] > _FEW:
         restored = list(map(_from_data, packed.rest, parts))

@@ -15,14 +15,7 @@ SEEDS = 2**32
 
 
 def as_seed(seed: Any) -> int:
-    """Return a seed as Python's own integer.
-
-    Args:
-        seed: an integer of Python or NumPy, or an array or tensor of integers without axes.
-
-    Raises:
-        TypeError: it is none of these.
-    """
+    """Return a seed as Python's own integer; a TypeError if it is no integer of any library."""
     if not isinstance(seed, (bool, np.bool_)):
         try:
             return operator.index(seed)
@@ -32,12 +25,7 @@ def as_seed(seed: Any) -> int:
 
 
 def check_seed(seed: Any) -> int:
-    """Return a seed that is in range.
-
-    Raises:
-        TypeError: it is no integer.
-        ValueError: it is out of range, naming the value.
-    """
+    """Return a seed as Python's own integer; a ValueError if it is out of range."""
     seed = as_seed(seed)
     if not 0 <= seed < SEEDS:
         raise ValueError(f"seeds must lie in [0, 2**32), got {seed}.")
@@ -45,16 +33,10 @@ def check_seed(seed: Any) -> int:
 
 
 def seeds_of(seed: Any, num_envs: int) -> list[int | None]:
-    """Return a seed for each environment.
+    """Return a seed for each of N environments.
 
-    Args:
-        seed: s gives environment i the seed s + i; a list, array or tensor has one for each, or
-            None. None gives None to all.
-        num_envs: N.
-
-    Raises:
-        TypeError: a seed is no integer.
-        ValueError: a seed is out of range, or there are not N.
+    s gives environment i the seed s + i; a list, array or tensor has one for each, or None. None
+    gives None to all.
     """
     if seed is None:
         return [None] * num_envs
@@ -76,29 +58,18 @@ def spread_seeds(seed: Any, num_envs: int) -> list[int]:
     """Return ``seed + i`` for environment i, going on at 0 beyond 2**32 - 1.
 
     For frameworks that hand seeds of any size from one environment to the next.
-
-    Raises:
-        TypeError: it is no integer.
     """
     first = as_seed(seed)
     return [(first + i) % SEEDS for i in range(num_envs)]
 
 
 def read_options(options: Any, seed: Any, num_envs: int | None = None) -> dict[str, Any]:
-    """Return what Gymnasium's ``options`` of ``reset`` ask for, checked.
+    """Return ``state`` and ``mask``, as far as Gymnasium's ``options`` of ``reset`` have them.
 
     Args:
-        options: None, or a dict of ``state`` and ``reset_mask``; never changed.
+        options: what the caller gave; never changed.
         seed: the one that is given beside them.
         num_envs: N; None for a single environment, which takes no mask.
-
-    Returns:
-        ``state`` and ``mask``, (N,) bool, each if it is given.
-
-    Raises:
-        TypeError: the options are neither None nor a dict, or the mask is no array of bool.
-        ValueError: an option is unknown, a seed beside a state, or the mask has another shape or
-            no True.
     """
     if options is None:
         return {}
@@ -123,17 +94,7 @@ def read_options(options: Any, seed: Any, num_envs: int | None = None) -> dict[s
 
 
 def as_mask(what: str, given: Any, shape: tuple[int | None, ...]) -> np.ndarray:
-    """Return a mask in the host's memory.
-
-    Args:
-        what: what the mask stands for, as the message should call it.
-        given: a NumPy array, torch tensor or JAX array, on any device.
-        shape: that it must have.
-
-    Raises:
-        TypeError: it is no array or tensor of bool.
-        ValueError: it has another shape.
-    """
+    """Return an array or tensor of bool, on any device, as a NumPy array of that shape."""
     dtype = str(getattr(given, "dtype", "")).removeprefix("torch.")
     if dtype != "bool":
         kind = f"{dtype} array" if dtype else type(given).__name__

@@ -106,12 +106,6 @@ class StatefulEnv:
                 ``options["episode_length"]``, which counts control steps. Of two limits the one
                 that is reached first holds.
             render_size: ``render_height`` and ``render_width``, pixels of ``render()``.
-
-        Raises:
-            TypeError: an option is unknown; the message lists those there are.
-            ValueError: an option is out of range; the message lists what is allowed.
-            MemoryError: observations or an image would not fit into this machine's memory.
-            RuntimeError: this process is a fork that cannot run JAX.
         """
         # Without `self` and `task` in front, and `options` at the end.
         own = list(inspect.signature(vars(adapter)["__init__"]).parameters)[2:-1]
@@ -167,11 +161,6 @@ class StatefulEnv:
 
         Returns:
             Outputs with reward 0; unmasked environments repeat their observation and flags.
-
-        Raises:
-            ResetNeeded: the first reset leaves some environments out.
-            TypeError: a seed is no integer, or the state no ``EnvState``.
-            ValueError: a seed is out of range, or there are not N; the state is another one's.
         """
         self._check_usable()
         if state is not None:
@@ -217,12 +206,6 @@ class StatefulEnv:
         Returns:
             Outputs. Environments that were not stepped repeat their observation, with ``done``
             False; the rest of theirs means nothing.
-
-        Raises:
-            ResetNeeded: an episode has ended and autoreset is disabled.
-            TypeError: the action is not floating point.
-            ValueError: the action has another shape, is elsewhere or contains NaN; nothing
-                was stepped.
         """
         self._check_ready("step")
         if self._must_reset:
@@ -252,20 +235,12 @@ class StatefulEnv:
         return self._programs.state(self._latest.packed, self.params)
 
     def set_state(self, state: Any, mask: np.ndarray | None = None) -> dict[str, Any]:
-        """Go on from given states.
+        """Go on from given states; outputs are as of ``reset``.
 
         Args:
             state: what ``get_state`` returned here or of another environment of the same options,
                 or ``PixelEnv.reset`` and ``PixelEnv.step`` did; also of NumPy arrays.
             mask: (N,) bool, which environments; None means all. Not for a single environment.
-
-        Returns:
-            Outputs as of ``reset``.
-
-        Raises:
-            TypeError: it is no ``EnvState``.
-            ValueError: it has other parts, shapes or types; the message names the first.
-            ResetNeeded: before the first reset some environments are left out.
         """
         self._check_usable()
         self._programs.check_state(state, self.params)
@@ -292,11 +267,7 @@ class StatefulEnv:
         return -(-self.episode_length // self.env.action_repeat)
 
     def render(self) -> jax.Array:
-        """Draw the present states: (N, render_height, render_width, 3) uint8, row 0 at the top.
-
-        Raises:
-            MemoryError: the images would not fit into this machine's memory.
-        """
+        """Draw the present states: (N, render_height, render_width, 3) uint8, row 0 at the top."""
         self._check_ready("render")
         height, width = self._render_size
         what = f"images of num_envs={self.num_envs}, height={height}, width={width}"

@@ -212,25 +212,11 @@ class GymnasiumVectorEnv(StatefulAdapter, gymnasium.vector.VectorEnv):
         return tuple(to_numpy(self._stateful.render()))
 
     def get_images(self) -> list[np.ndarray | None]:
-        """Draw the present states.
-
-        Returns:
-            N arrays (render_height, render_width, 3) of uint8; None without a render mode.
-
-        Raises:
-            ResetNeeded: before the first reset.
-            ClosedEnvironmentError: after ``close``.
-        """
+        """Return what ``render`` does as a list, N times None without a render mode."""
         return list(self.render() or [None] * self.num_envs)
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """Return what a method of each environment returns, or the attribute of that name.
-
-        Args:
-            name: of the method or attribute, such as ``"render"``.
-            *args: of the method.
-            **kwargs: of the method.
-        """
+        """Return what a method of each environment returns, or the attribute of that name."""
         return tuple(call_sub_envs(self._sub_envs, name, *args, **kwargs))
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
@@ -296,14 +282,7 @@ def _with_masks(infos: dict[str, Any], mask: Any) -> dict[str, Any]:
 
 
 def as_autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:
-    """Return Gymnasium's name of an autoreset mode.
-
-    Args:
-        mode: ours, Gymnasium's, or the value of Gymnasium's.
-
-    Raises:
-        ValueError: there is no such mode; the message lists them.
-    """
+    """Return Gymnasium's name of an autoreset mode: ours, Gymnasium's, or the value of that."""
     if isinstance(mode, AutoresetMode):
         return mode
     by_value = {known.value: known for known in AutoresetMode}

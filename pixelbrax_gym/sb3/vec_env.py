@@ -31,9 +31,6 @@ def check_channels(env: PixelEnv, channels_first: bool) -> None:
     """Reject images of which Stable-Baselines3 would read another axis as channels.
 
     It takes the shortest axis for them, the first of several.
-
-    Raises:
-        ValueError: it would; the message names the options.
     """
     channels = 3 * env.frame_stack
     shortest = min(env.height, env.width)
@@ -161,17 +158,9 @@ class SB3VecEnv(VecEnv):
         return self._observations(outputs["obs"])
 
     def seed(self, seed: int | None = None) -> Sequence[int]:
-        """Let environment i draw from ``seed + i`` from the next reset on.
+        """Let environment i draw from ``seed + i`` from the next reset on; returns the N seeds.
 
-        Args:
-            seed: an integer; beyond 2**32 - 1 they go on at 0. NumPy's global generator
-                draws one for None.
-
-        Returns:
-            The N seeds.
-
-        Raises:
-            TypeError: it is not an integer.
+        Beyond 2**32 - 1 they go on at 0. NumPy's global generator draws one for None.
         """
         if seed is None:
             seed = int(np.random.randint(SEEDS, dtype=np.uint64))  # noqa: NPY002  # as SB3 does
@@ -216,15 +205,7 @@ class SB3VecEnv(VecEnv):
             }
 
     def get_images(self) -> list[np.ndarray | None]:
-        """Draw the present states.
-
-        Returns:
-            N arrays (render_height, render_width, 3) of uint8; None without a render mode.
-
-        Raises:
-            ResetNeeded: before the first reset.
-            ClosedEnvironmentError: after ``close``.
-        """
+        """Return N images (render_height, render_width, 3) uint8; None without a render mode."""
         if self.render_mode is None:
             return [None] * self.num_envs
         return list(to_numpy(self._stateful.render()))
