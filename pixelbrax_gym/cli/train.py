@@ -63,7 +63,7 @@ def run(arguments: Sequence[str]) -> int:
     with needs_extra("train"):
         from pixelbrax_jax.agents.on_policy.presets import PRESETS
         from pixelbrax_jax.agents.registry import ALGORITHMS
-        from pixelbrax_jax.agents.runner import train
+        from pixelbrax_jax.agents.runner.train import train
     algorithms, presets = ",".join(ALGORITHMS), ",".join(PRESETS)
     if not arguments or arguments[0] in ("-h", "--help"):
         sys.stdout.write(
@@ -89,7 +89,7 @@ def run(arguments: Sequence[str]) -> int:
     first.start()
     config, options = settings(algorithm, first, rest)
     with _errors(options):
-        outcome = train.train(config, options, _report)
+        outcome = train(config, options, _report)
         return 128 + outcome.signal if outcome.interrupted else 0
 
 
