@@ -24,7 +24,7 @@ from pixelbrax_jax.agents.runner.metrics import AppendedFile, open_metrics, read
 from pixelbrax_jax.agents.runner.progress import Bar, Messages
 from pixelbrax_jax.agents.runner.saving import Saver
 from pixelbrax_jax.agents.runner.train import RunConfig, run
-from tests.agents.small import PARAMS, SMALL, ball_envs, same
+from tests.agents.small import ABOUT, PARAMS, SMALL, ball_envs, same
 
 PER_ITERATION = SMALL["num_envs"] * SMALL["num_steps"]
 
@@ -200,7 +200,7 @@ def test_a_policy_that_cannot_be_written_costs_no_checkpoint(tmp_path, monkeypat
     algorithm = PPO(PPOConfig(**SMALL), ball_envs())
     with pytest.raises(OSError, match=r"policy.jax: No space left on device.*160 steps is whole"):
         run(algorithm, PARAMS, RunConfig(str(tmp_path), progress=False))
-    checkpoints = Checkpoints(tmp_path / "checkpoints", {}, "ppo")
+    checkpoints = Checkpoints(tmp_path / "checkpoints", ABOUT)
     assert checkpoints.steps() == [5 * PER_ITERATION]
     checkpoints.close()
 
@@ -209,7 +209,7 @@ def test_a_checkpoint_is_tried_again(tmp_path, monkeypatch):
     free, now, told = [1 << 40], [0.0], []
     monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=free[0]))
     monkeypatch.setattr(saving, "time", SimpleNamespace(monotonic=lambda: now[0]))
-    checkpoints = Checkpoints(tmp_path, {}, "ppo")
+    checkpoints = Checkpoints(tmp_path, ABOUT)
     state = {"x": jnp.arange(3)}
     saver = Saver(checkpoints, 0, told.append, every=0, minutes=10)
     assert not saver.is_due_by_clock()
@@ -238,7 +238,7 @@ def test_a_checkpoint_is_tried_again(tmp_path, monkeypatch):
 
 def test_a_checkpoint_that_fails_while_it_is_written_leaves_the_others(tmp_path, caplog):
     told = []
-    checkpoints = Checkpoints(tmp_path, {}, "ppo", keep=1)
+    checkpoints = Checkpoints(tmp_path, ABOUT, keep=1)
     saver = Saver(checkpoints, 0, told.append, every=10, minutes=0)
     state = {"x": jnp.arange(300_000.0) % 7919 * 1.37}
     saver.save(state, 10, None, last=True)

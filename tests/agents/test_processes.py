@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from pixelbrax_jax.agents.runner.checkpoint import Checkpoints
+from tests.agents.small import ABOUT
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
@@ -178,7 +179,7 @@ def test_all_checkpoints_of_a_killed_run_are_whole(tmp_path):
         time.sleep(0.05)
     process.send_signal(signal.SIGKILL)
     process.wait()
-    checkpoints = Checkpoints(tmp_path / "checkpoints", {}, "ppo")
+    checkpoints = Checkpoints(tmp_path / "checkpoints", ABOUT)
     known = checkpoints.steps()
     checkpoints.close()
     assert known

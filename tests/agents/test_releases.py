@@ -47,12 +47,9 @@ def change(folder: Path, *, without: tuple[str, ...] = (), **changes) -> None:
 
 
 def restore(folder: Path, algorithm: PPO, name: str = "ppo"):
-    checkpoints = Checkpoints(
-        folder / "checkpoints",
-        settings.settings_of(algorithm, RunConfig()),
-        name,
-        former=settings.former_settings(type(algorithm.config)),
-    )
+    about = settings.describe_run(algorithm, RunConfig()) | {"algorithm": name}
+    former = settings.former_settings(type(algorithm.config))
+    checkpoints = Checkpoints(folder / "checkpoints", about, former=former)
     try:
         return checkpoints.restore(Runs(algorithm).template(PARAMS))
     finally:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
@@ -51,35 +51,24 @@ class Checkpoints:
     def __init__(
         self,
         folder: str | Path,
-        settings: dict[str, Any],
-        algorithm: str,
+        about: Mapping[str, Any],
         *,
         keep: int = 3,
         former: Mapping[str, Any] | None = None,
-        clips: Sequence[str] | None = None,
     ) -> None:
         """Open the folder, which is made if need be.
 
         Args:
             folder: where the checkpoints are.
-            settings: by name, stored with every checkpoint.
-            algorithm: name of the algorithm, stored likewise.
+            about: what of the run is stored with every checkpoint, as of ``describe_run``.
             keep: how many of the latest are kept, besides the best one.
             former: by name, what a stored run had that lacks a setting.
-            clips: digests of the clips that are played, which decide in place of their folder
-                whether they are the same; None of clips that their name tells.
 
         Raises:
             CheckpointError: the folder cannot be written to.
         """
         self.folder = Path(folder).absolute()
-        self._about: dict[str, Any] = {
-            "format": FORMAT,
-            "algorithm": algorithm,
-            "config": settings,
-            "clips": None if clips is None else list(clips),
-            "versions": versions(),
-        }
+        self._about = {"format": FORMAT, **about, "versions": versions()}
         self._former = dict(former or {})
         _check_writable(self.folder)
         policy = ocp.checkpoint_managers
@@ -138,21 +127,13 @@ class Checkpoints:
         self._writing = True
 
     def is_written(self) -> bool:
-        """Return whether nothing is being written any more.
-
-        Raises:
-            CheckpointError: the checkpoint that was being written could not be.
-        """
+        """Return whether nothing is being written any more; raises as `wait`."""
         if self._writing and not self._manager.is_saving_in_progress():
             self.wait()
         return not self._writing
 
     def wait(self) -> None:
-        """Return when everything is written.
-
-        Raises:
-            CheckpointError: it could not be.
-        """
+        """Return when everything is written, or raise a CheckpointError."""
         self._writing = False
         try:
             self._manager.wait_until_finished()
@@ -262,10 +243,7 @@ def latest_steps(folder: str | Path) -> int | None:
 
 
 def best_steps(folder: str | Path) -> int | None:
-    """Return the control steps of the checkpoint with the highest score, of equal ones the later.
-
-    None if no checkpoint has a score.
-    """
+    """Return the steps of the checkpoint with the highest score; None if none has a score."""
     scores = {steps: read_about(folder, steps)["score"] for steps in _all_steps(Path(folder))}
     scores = {steps: score for steps, score in scores.items() if score is not None}
     return max(scores, key=lambda steps: (scores[steps], steps), default=None)
@@ -306,7 +284,7 @@ def read_networks(folder: str | Path, template: Tree, steps: int | None = None) 
     Args:
         folder: of the checkpoints.
         template: networks of the same shapes, or their ``jax.eval_shape``.
-        steps: of which checkpoint; None takes the latest.
+        steps: as for `read_about`.
 
     Raises:
         CheckpointError: there is none, or its networks have other shapes.

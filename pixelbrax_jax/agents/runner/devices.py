@@ -29,15 +29,12 @@ def mesh_of(algorithm: Algorithm) -> Mesh | None:
 
 
 def state_shardings(mesh: Mesh, template: Any, num_seeds: int = 1) -> Any:
-    """Return a sharding for each leaf of a ``TrainState``.
+    """Return a sharding for each leaf of a ``TrainState``, or of its ``jax.eval_shape``.
 
     Args:
         mesh: devices along an axis ``"envs"``.
-        template: the state, or its ``jax.eval_shape``.
+        template: the state.
         num_seeds: if more than 1, leaves have a leading axis of that size.
-
-    Raises:
-        TypeError: a field does not say where its environments are.
     """
 
     def sharding(axis: int) -> NamedSharding:
@@ -73,15 +70,12 @@ def highest(*here: int) -> tuple[int, ...]:
 
 
 def check_memory(algorithm: Algorithm, template: TrainState, report: Report) -> None:
-    """Report what will be stored, and reject what would not fit.
+    """Report what will be stored, or raise a MemoryError if it would not fit.
 
     Args:
         algorithm: with its settings.
         template: ``jax.eval_shape`` of its state.
         report: gets the figures.
-
-    Raises:
-        MemoryError: it is more than ``memory_budget_gb``, or than the device has.
     """
     config = algorithm.config
     frames = config.bytes_per_iteration * template.iteration.size

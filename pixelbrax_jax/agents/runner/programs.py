@@ -38,12 +38,7 @@ class Runs:
 
     @jit(_env, static_argnums=0)
     def init(self, seed: jax.Array, env_params: EnvParams) -> TrainState:
-        """Return the state before the first iteration.
-
-        Args:
-            seed: () uint32, of the first run; the next one has the next seed.
-            env_params: of the environments.
-        """
+        """Return the state before the first iteration; each run has the seed after the last."""
         if self.num_seeds == 1:
             keys = jax.random.key(seed)
         else:

@@ -49,13 +49,7 @@ class Bar:
     """
 
     def __init__(self, shown: bool, total: int, report: Report) -> None:
-        """Draw the bar.
-
-        Args:
-            shown: whether there is one.
-            total: number of iterations.
-            report: gets a line if the bar fails.
-        """
+        """Draw the bar of ``total`` iterations; ``report`` gets a line if that fails."""
         self._report = report
         self.failure = ""
         self._bar = tqdm(disable=True)

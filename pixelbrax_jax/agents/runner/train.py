@@ -30,9 +30,8 @@ from pixelbrax_jax.agents.runner.saving import Saver
 from pixelbrax_jax.agents.runner.settings import (
     RunConfig,
     clip_digests,
+    describe_run,
     former_settings,
-    settings_of,
-    stored_clips,
 )
 from pixelbrax_jax.agents.runner.splits import make_splits
 from pixelbrax_jax.agents.runner.trained import save_policy
@@ -132,11 +131,9 @@ def run(
         check_memory(algorithm, template, messages)
         checkpoints = Checkpoints(
             Path(options.output_dir) / "checkpoints",
-            settings_of(algorithm, options),
-            algorithm.name,
+            describe_run(algorithm, options, shown),
             keep=options.keep_checkpoints,
             former=former_settings(type(algorithm.config)),
-            clips=stored_clips(algorithm.config, shown),
         )
         with closing(checkpoints):
             seed = jax.device_put(np.uint32(options.seed))
@@ -161,12 +158,7 @@ def run(
 
 
 def _goes_on(checkpoints: Checkpoints, options: RunConfig, report: Report) -> bool:
-    """Return whether the run goes on from a checkpoint.
-
-    Raises:
-        FileExistsError: there is one of an earlier run.
-        CheckpointError: only some processes see it.
-    """
+    """Return whether the run goes on from a checkpoint, or raise if it may not."""
     found = bool(checkpoints.steps())
     if any_process(found) and any_process(not found):
         raise CheckpointError(
@@ -186,11 +178,7 @@ def _goes_on(checkpoints: Checkpoints, options: RunConfig, report: Report) -> bo
 def _restored(
     checkpoints: Checkpoints, template: TrainState, algorithm: Algorithm, report: Report
 ) -> TrainState:
-    """Return the state of the latest checkpoint.
-
-    Raises:
-        CheckpointError: it is of another run, or behind the end of this one.
-    """
+    """Return the state of the latest checkpoint, or raise if it is not of this run."""
     state = checkpoints.restore(kept(template))
     steps, config = _steps(algorithm, state), algorithm.config
     if steps > config.num_iterations * config.steps_per_iteration:
@@ -261,7 +249,7 @@ class _Run:
         """Open the files of records in the first process, or raise in all of them."""
         writer, failure = MetricsWriter(self.report), None
         if self.is_first:
-            settings = settings_of(self.algorithm, self.options)
+            settings = describe_run(self.algorithm, self.options)["config"]
             try:
                 writer = open_metrics(
                     self.folder,
@@ -395,11 +383,7 @@ class _Run:
         return record
 
     def score(self, steps: int) -> float | None:
-        """Return by what the best checkpoint is chosen: one measure for all those of a run.
-
-        It is the return in clean episodes of this moment, and without evaluations that of the
-        latest training episodes.
-        """
+        """Return by what the best checkpoint is chosen: one measure for all those of a run."""
         if self.options.num_evals:
             return self.results["clean"].mean if self.evaluated_steps == steps else None
         return self.record.get("episode/return")
