@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import sys
-from dataclasses import make_dataclass
+from dataclasses import dataclass, make_dataclass
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -18,6 +17,7 @@ from tyro.constructors import (
     PrimitiveTypeInfo,
 )
 
+from pixelbrax_gym.cli import UsageError
 from pixelbrax_jax.agents.config import TrainConfig
 from pixelbrax_jax.agents.on_policy.presets import PRESETS, preset
 from pixelbrax_jax.agents.registry import ALGORITHMS
@@ -25,7 +25,7 @@ from pixelbrax_jax.agents.runner import train as training
 from pixelbrax_jax.agents.runner.checkpoint import CheckpointError, latest_steps
 from pixelbrax_jax.agents.runner.settings import RunConfig
 from pixelbrax_jax.config import EnvConfig
-from pixelbrax_jax.validation import check_positive_int
+from pixelbrax_jax.validation import check_choice, check_positive_int
 
 INTERRUPTED = 130
 """Exit status of a run that was stopped by Ctrl-C, as shells have it."""
@@ -61,6 +61,38 @@ def _names(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
     )
 
 
+@dataclass(frozen=True)
+class Launch:
+    """How a run is started."""
+
+    preset: str = "default"
+    """Named settings, as cpu; they change the defaults of all others."""
+    cpu_devices: int | None = None
+    """Emulated devices that the environments are spread over, one a core, on a machine without an
+    accelerator."""
+    coordinator: str | None = None
+    """HOST:PORT of process 0, of several processes."""
+    num_processes: int | None = None
+    """How many there are."""
+    process_id: int | None = None
+    """Which of them this is, from 0."""
+
+    def start(self) -> None:
+        """Make devices and processes known to JAX.
+
+        Raises:
+            UsageError: options do not go together.
+            ValueError: devices cannot be emulated.
+        """
+        if self.cpu_devices is not None:
+            _emulate(self.cpu_devices)
+        spread = (self.coordinator, self.num_processes, self.process_id)
+        if None not in spread:
+            jax.distributed.initialize(*spread)
+        elif any(given is not None for given in spread):
+            raise UsageError("--coordinator, --num-processes and --process-id belong together")
+
+
 def train(arguments: list[str]) -> int:
     """Run the command.
 
@@ -71,41 +103,28 @@ def train(arguments: list[str]) -> int:
         The exit status: 0 when all is well, 1 for an error, which stderr names, and for a run
         that was stopped 128 plus the signal's number, as shells have it: 130 for Ctrl-C, 143 for
         SIGTERM, 138 for SIGUSR1 on most systems.
+
+    Raises:
+        UsageError: no algorithm is named, or options do not go together.
+        ValueError: a setting is out of range.
     """
-    first = argparse.ArgumentParser(
-        prog="pixelbrax train", add_help=False, usage="pixelbrax train ALGORITHM [options]"
-    )
-    first.add_argument("algorithm", choices=sorted(ALGORITHMS))
-    first.add_argument("--preset", choices=sorted(PRESETS), default="default")
-    first.add_argument("--coordinator", help="host:port of process 0, of several processes")
-    first.add_argument("--num-processes", type=int)
-    first.add_argument("--process-id", type=int)
-    first.add_argument("--cpu-devices", type=int)
+    names = ",".join(ALGORITHMS)
     if not arguments or arguments[0] in ("-h", "--help"):
         sys.stdout.write(
-            "usage: pixelbrax train {"
-            + ",".join(ALGORITHMS)
-            + "} [--preset {"
-            + ",".join(PRESETS)
-            + "}] [options]\n\nAll options: pixelbrax train ppo --help\n"
+            f"usage: pixelbrax train {{{names}}} [--preset {{{','.join(PRESETS)}}}] [options]\n\n"
+            "All options: pixelbrax train ppo --help\n"
         )
         return 0
-    if arguments[0].startswith("-"):
-        first.error(
-            f"name an algorithm first, as in 'pixelbrax train ppo {arguments[0]} ...'; there are "
+    algorithm, *rest = arguments
+    if algorithm.startswith("-"):
+        raise UsageError(
+            f"name an algorithm first, as in 'pixelbrax train ppo {algorithm} ...'; there are "
             f"{', '.join(ALGORITHMS)}"
         )
-    chosen, rest = first.parse_known_args(arguments)
-    spread = (chosen.coordinator, chosen.num_processes, chosen.process_id)
-    if None in spread and any(given is not None for given in spread):
-        first.error("--coordinator, --num-processes and --process-id belong together")
-    options = None
+    check_choice("algorithm", algorithm, ALGORITHMS)
+    launch, config, options = parse(algorithm, rest)
+    launch.start()
     try:
-        if chosen.cpu_devices is not None:
-            _emulate(chosen.cpu_devices)
-        if chosen.coordinator is not None:
-            jax.distributed.initialize(*spread)
-        config, options = parse(chosen.algorithm, chosen.preset, rest)
         outcome = training.train(config, options, _report)
         return 128 + outcome.signal if outcome.interrupted else 0
     except (
@@ -120,8 +139,7 @@ def train(arguments: list[str]) -> int:
         _write(f"pixelbrax train: {error}")
         return 1
     except KeyboardInterrupt:
-        folder = Path(options.output_dir) / "checkpoints" if options else None
-        latest = None if folder is None else latest_steps(folder)
+        latest = latest_steps(Path(options.output_dir) / "checkpoints")
         kept = "there is no checkpoint"
         if latest is not None:
             kept = f"go on from the checkpoint of {latest} steps with --resume latest"
@@ -156,40 +174,39 @@ def _emulate(cpu_devices: int) -> None:
         ) from error
 
 
-def parse(algorithm: str, name: str, arguments: list[str]) -> tuple[TrainConfig, RunConfig]:
-    """Return settings of an algorithm and of the run, from options over a preset.
+def parse(algorithm: str, arguments: list[str]) -> tuple[Launch, TrainConfig, RunConfig]:
+    """Return how to start, settings of an algorithm and of the run.
 
     Args:
         algorithm: its name.
-        name: of the preset.
-        arguments: options, as ``--num-envs 64``.
+        arguments: options, as ``--preset cpu --num-envs 64``.
 
     Raises:
         ValueError: a setting is out of range.
         SystemExit: an option is unknown.
     """
-    # A preset's settings may be those of a task.
-    task = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    task.add_argument("--task")
-    defaults = preset(algorithm, name, task.parse_known_args(arguments)[0].task)
-    options = RunConfig(output_dir=f"runs/{algorithm}")
-    # One flat list of options for both.
-    parts: dict[str, Any] = {"config": defaults, "options": options}
+    # Defaults are those of a preset, which may be those of a task.
+    first, _ = tyro.cli(_First, args=arguments, return_unknown_args=True, add_help=False)
+    parts: dict[str, Any] = {
+        "launch": Launch(first.preset),
+        "config": preset(algorithm, first.preset, first.task),
+        "options": RunConfig(output_dir=f"runs/{algorithm}"),
+    }
+    # One flat list of options for all.
     flat: Any = tyro.conf.OmitArgPrefixes
-    kinds = [(part, flat[type(value)]) for part, value in parts.items()]
-    command = make_dataclass("Train", kinds)
-    description = (
-        f"Trains {algorithm.upper()} from pixels. --preset {{{','.join(PRESETS)}}} changes the "
-        "defaults; --cpu-devices D spreads the environments over D emulated devices, one a core, "
-        "on a machine without an accelerator; --coordinator HOST:PORT --num-processes P "
-        "--process-id I spreads a run over P processes."
-    )
+    command = make_dataclass("Train", [(part, flat[type(value)]) for part, value in parts.items()])
     with names_for_objects:
         parsed = tyro.cli(
             command,
             prog=f"pixelbrax train {algorithm}",
-            description=description,
+            description=f"Trains {algorithm.upper()} from pixels; presets: {', '.join(PRESETS)}.",
             default=command(**parts),
             args=arguments,
         )
-    return parsed.config, parsed.options
+    return parsed.launch, parsed.config, parsed.options
+
+
+@dataclass(frozen=True)
+class _First:
+    preset: str = "default"
+    task: str | None = None

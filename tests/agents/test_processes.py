@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pixelbrax_jax.agents.runner.checkpoint import Checkpoints
+from pixelbrax_jax.agents.runner.saving import Checkpoints
 from tests.agents.small import ABOUT
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]

@@ -201,10 +201,7 @@ def run(arguments: list[str], folder: Path, until: float) -> int:
 def config_of(arguments: list[str]) -> TrainConfig:
     """The settings that a command gives."""
     _, algorithm, *line = arguments
-    chosen = "default"
-    if line[0] == "--preset":
-        _, chosen, *line = line
-    return parse(algorithm, chosen, line)[0]
+    return parse(algorithm, line)[1]
 
 
 def is_made(path: Path, arguments: list[str]) -> bool:

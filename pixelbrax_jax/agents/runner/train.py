@@ -14,7 +14,7 @@ import numpy as np
 from pixelbrax_jax.agents.algorithm import Algorithm
 from pixelbrax_jax.agents.config import TrainConfig, make_env
 from pixelbrax_jax.agents.registry import make_algorithm
-from pixelbrax_jax.agents.runner.checkpoint import CheckpointError, Checkpoints
+from pixelbrax_jax.agents.runner.checkpoint import CheckpointError
 from pixelbrax_jax.agents.runner.devices import (
     any_process,
     check_memory,
@@ -26,7 +26,7 @@ from pixelbrax_jax.agents.runner.evaluate import Evaluator, Result, together
 from pixelbrax_jax.agents.runner.metrics import MetricsWriter, open_metrics, summarize
 from pixelbrax_jax.agents.runner.programs import Runs
 from pixelbrax_jax.agents.runner.progress import Bar, Messages, Report, reason, silent
-from pixelbrax_jax.agents.runner.saving import Saver
+from pixelbrax_jax.agents.runner.saving import Checkpoints
 from pixelbrax_jax.agents.runner.settings import (
     RunConfig,
     clip_digests,
@@ -134,6 +134,9 @@ def run(
             describe_run(algorithm, options, shown),
             keep=options.keep_checkpoints,
             former=former_settings(type(algorithm.config)),
+            every=options.checkpoint_every,
+            minutes=options.checkpoint_minutes,
+            report=messages,
         )
         with closing(checkpoints):
             seed = jax.device_put(np.uint32(options.seed))
@@ -279,33 +282,26 @@ class _Run:
             self.report(f"stopped by {signal_name(stopped_by)} before the first iteration; {left}")
             return state, steps, stopped_by
         self.report("compiling")
-        saver = Saver(
-            self.checkpoints,
-            steps,
-            self.report,
-            every=self.options.checkpoint_every,
-            minutes=self.options.checkpoint_minutes,
-        )
         self.restart_timer(steps)
         for number in range(done + 1, total + 1):
             state, steps = self.iterate(state, number), number * per_iteration
             bar.update(1)
             # The clock is that of the first process.
-            by_clock = self.is_first and saver.is_due_by_clock()
+            by_clock = self.is_first and self.checkpoints.is_due_by_clock()
             stopped_by, due = highest(self.stop.signal, int(by_clock))
             stopped_by = 0 if number == total else stopped_by
             last = number == total or bool(stopped_by)
             evaluates = is_due(number, self.options.num_evals, total)
-            saves = last or evaluates or bool(due) or saver.is_due_after(steps)
+            saves = last or evaluates or bool(due) or self.checkpoints.is_due_after(steps)
             logs = saves or number % self.options.log_every == 0
             if logs:
-                self.log(steps, writer, bar, saver)
+                self.log(steps, writer, bar)
             if evaluates and not stopped_by:
                 writer.write(steps, self.evaluate(state, steps))
             if saves:
-                saver.save(kept(state), steps, self.score(steps), last=last)
+                self.checkpoints.save(kept(state), steps, self.score(steps), last=last)
             else:
-                saver.look_after()
+                self.checkpoints.look_after()
             if stopped_by:
                 self.report(
                     f"stopped by {signal_name(stopped_by)} after {steps} steps; go on with "
@@ -335,13 +331,13 @@ class _Run:
     def restart_timer(self, steps: int) -> None:
         self.timed_since, self.timed_steps = time.perf_counter(), steps
 
-    def log(self, steps: int, writer: MetricsWriter, bar: Bar, saver: Saver) -> None:
+    def log(self, steps: int, writer: MetricsWriter, bar: Bar) -> None:
         """Write the metrics of the latest iterations, or raise a TrainingDivergedError."""
         if self.pending:
             records = jax.device_get(self.pending)
             self.pending = []
             for record in records:
-                self.check_finite(record, steps, saver)
+                self.check_finite(record, steps)
             self.record = summarize(records)
         if self.options.log_training_metrics:
             seconds = time.perf_counter() - self.timed_since
@@ -349,7 +345,7 @@ class _Run:
             writer.write(steps, self.record)
         bar.update(0, self.record)
 
-    def check_finite(self, record: dict[str, Any], steps: int, saver: Saver) -> None:
+    def check_finite(self, record: dict[str, Any], steps: int) -> None:
         wrong = {name: ~np.isfinite(value) for name, value in record.items()}
         wrong = {name: where for name, where in wrong.items() if where.any()}
         if not wrong:
@@ -358,8 +354,8 @@ class _Run:
         if self.options.seeds > 1:
             those = np.flatnonzero(np.any(list(wrong.values()), axis=0))
             seeds = f" of seed {', '.join(str(self.options.seed + int(i)) for i in those)}"
-        saver.look_after(wait=True)
-        latest = saver.latest()
+        self.checkpoints.look_after(wait=True)
+        latest = self.checkpoints.latest()
         kept = "there is none" if latest is None else f"that of {latest} steps is good"
         raise TrainingDivergedError(
             f"not finite within the iterations before step {steps}{seeds}: {', '.join(wrong)}. Of "
