@@ -253,11 +253,11 @@ def inspect() -> Machine:
             raise RuntimeError(broken["XLA_FLAGS"])
         import jax
 
-        import pixelbrax_jax
+        from pixelbrax_jax.renderer.choice import auto_renderer
 
         first = jax.devices()[0]
         device, jax_platform = str(first), first.platform
-        renderer = pixelbrax_jax.auto_renderer()
+        renderer = auto_renderer()
     except Exception as error:  # whatever it is, it shall be reported and not raised
         jax_error = f"{type(error).__name__}: {error}"
     torch_cuda: bool | str | None = None

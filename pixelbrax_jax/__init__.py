@@ -10,7 +10,6 @@ if TYPE_CHECKING:
     from pixelbrax_jax.compilation import compiler_options as compiler_options
     from pixelbrax_jax.config import EnvConfig as EnvConfig
     from pixelbrax_jax.distractors import load_clips as load_clips
-    from pixelbrax_jax.envs.autoreset import AUTORESET_MODES as AUTORESET_MODES
     from pixelbrax_jax.envs.brax_env import BraxEnv as BraxEnv
     from pixelbrax_jax.envs.brax_env import wrap_fresh_episodes as wrap_fresh_episodes
     from pixelbrax_jax.envs.check import check_env as check_env
@@ -18,6 +17,7 @@ if TYPE_CHECKING:
     from pixelbrax_jax.envs.making import named_rigs as named_rigs
     from pixelbrax_jax.envs.pixel_env import PixelEnv as PixelEnv
     from pixelbrax_jax.envs.sharded import ShardedVectorEnv as ShardedVectorEnv
+    from pixelbrax_jax.envs.vector import AUTORESET_MODES as AUTORESET_MODES
     from pixelbrax_jax.envs.vector import VectorPixelEnv as VectorPixelEnv
     from pixelbrax_jax.physics.base import Physics as Physics
     from pixelbrax_jax.physics.brax.engine import BraxPhysics as BraxPhysics
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from pixelbrax_jax.registry import list_envs as list_envs
     from pixelbrax_jax.registry import register as register
     from pixelbrax_jax.renderer.base import render as render
-    from pixelbrax_jax.renderer.kernel import auto_renderer as auto_renderer
     from pixelbrax_jax.scene.cameras import make_rig as make_rig
     from pixelbrax_jax.scene.look import make_look as make_look
     from pixelbrax_jax.scene.place import place as place
@@ -50,20 +49,18 @@ _PUBLIC = {
     "compilation": "compiler_options",
     "config": "EnvConfig",
     "distractors": "load_clips",
-    "envs.autoreset": "AUTORESET_MODES",
     "envs.brax_env": "BraxEnv wrap_fresh_episodes",
     "envs.check": "check_env",
     "envs.making": "make named_rigs",
     "envs.pixel_env": "PixelEnv",
     "envs.sharded": "ShardedVectorEnv",
-    "envs.vector": "VectorPixelEnv",
+    "envs.vector": "AUTORESET_MODES VectorPixelEnv",
     "physics.base": "Physics",
     "physics.brax.engine": "BraxPhysics",
     "physics.brax.mjcf": "mjcf_physics",
     "policy": "list_pretrained load_policy",
     "registry": "list_envs register",
     "renderer.base": "render",
-    "renderer.kernel": "auto_renderer",
     "scene.cameras": "make_rig",
     "scene.look": "make_look",
     "scene.place": "place",

@@ -20,7 +20,6 @@ from pixelbrax_jax.types import Camera, CameraRig, Look
 from pixelbrax_jax.validation import check_bool, check_choice, check_options, check_positive_int
 
 OBS_MODES = ("pixels", "state", "both")
-PHYSICS_BATCHING = ("auto", "vmap")
 
 Distractors = str | Distractor | Iterable[str | Distractor] | None
 
@@ -46,23 +45,17 @@ class ProgramConfig:
     """Control steps per step; one frame is drawn at their end."""
     renderer: str = "auto"
     """``auto``, the fastest for the device; ``fused``, for all devices; ``pallas``, the kernel for
-    NVIDIA GPUs that ``auto`` takes there; ``pallas-interpret``, that kernel on any device, slowly;
-    or ``reference``, the slow one that the others are tested against."""
+    NVIDIA GPUs that ``auto`` takes there if it passes a check; or ``reference``, the slow one that
+    the others are tested against."""
     distractors: Distractors = ()
     """What changes the image: a distractor, the name of a preset, or several of them; as
     everywhere, a dictionary of ``plain.to_plain`` in place of an object."""
-    physics_batching: str = "auto"
-    """``auto``, the fastest for the device; or ``vmap``, also to compile for another device."""
 
     def __post_init__(self) -> None:
         """Check the options, and store them as Python's own types."""
         for name in ("height", "width", "frame_stack", "action_repeat"):
             self._store(name, check_positive_int(name, self._static(name)))
-        for name, allowed in (
-            ("obs_mode", OBS_MODES),
-            ("physics_batching", PHYSICS_BATCHING),
-        ):
-            check_choice(name, self._static(name), allowed)
+        check_choice("obs_mode", self._static("obs_mode"), OBS_MODES)
         check_renderer(self._static("renderer"))
         self._store("distractors", as_tuple(from_plain(self.distractors)))
 

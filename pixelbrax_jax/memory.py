@@ -9,14 +9,10 @@ import jax
 
 
 def check_fits(what: str, num_bytes: float) -> None:
-    """Reject what takes more bytes than the machine has.
+    """Reject ``what``, options and their values, if it takes more bytes than the machine has.
 
     This finds mistyped numbers early. What the machine could hold but a device or other programs
     leave no room for is found when it is allocated.
-
-    Args:
-        what: the options and their values, as the message should name them.
-        num_bytes: that they take at least.
 
     Raises:
         MemoryError: it is more than this machine's main memory, naming both.

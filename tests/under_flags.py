@@ -45,6 +45,10 @@ def make(name: str) -> tuple[Any, Any]:
     import pixelbrax_jax as pb
 
     name, _, renderer = name.partition("/")
+    if renderer == "pallas":
+        from tests.renderer.interpreted import interpreted_kernel
+
+        interpreted_kernel().__enter__()  # until the process ends
     task, *distractors = name.split(",")
     options = SIZE | {"distractors": tuple(distractors), "renderer": renderer or "auto"}
     if any("video" in link or "dcs" in link for link in distractors):

@@ -1,7 +1,7 @@
 """What an agent must learn to ignore: changes of color, background and viewpoint."""
 
 from pixelbrax_jax.distractors.base import Distractor as Distractor
-from pixelbrax_jax.distractors.camera import Camera as Camera
+from pixelbrax_jax.distractors.camera import MovingCamera as MovingCamera
 from pixelbrax_jax.distractors.clips import ClipBank as ClipBank
 from pixelbrax_jax.distractors.clips import OnlySplitWarning as OnlySplitWarning
 from pixelbrax_jax.distractors.clips import ProceduralClipsWarning as ProceduralClipsWarning

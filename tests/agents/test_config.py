@@ -96,7 +96,7 @@ def test_every_number_and_choice_is_checked():
     unchecked = {
         # Options of the environment, checked with those of every other one.
         "task", "backend", "reward_preset", "distractors", "clips", "camera", "look", "shadows",
-        "split", "obs_mode", "renderer", "physics_batching",
+        "split", "obs_mode", "renderer",
         # Truth values.
         "state_critic", "anneal", "normalize_reward", "clip_value", "decoupled",
     }  # fmt: skip

@@ -11,6 +11,7 @@ from jax.sharding import PartitionSpec as P
 
 from pixelbrax_jax._platform import interpreter as module
 from pixelbrax_jax._platform.interpreter import batch_last
+from pixelbrax_jax._platform.lowering import by_platform
 from tests.platform.equations import equations
 
 TABLE = jnp.arange(12.0).reshape(4, 3)
@@ -126,6 +127,11 @@ FUNCTIONS = {
     "three branches": lambda x: jax.lax.switch(
         jnp.argmax(x) * 2 - 1, [jnp.sin, lambda y: TABLE[0], jnp.outer(x, x).__matmul__], x
     ),
+    "a form for CPUs": lambda x: by_platform(x[0], x, cpu=jnp.multiply, default=jnp.subtract),
+    "a form for CPUs in a loop": lambda x: jax.lax.scan(
+        lambda c, y: (c + 1.0, by_platform(c, cpu=jnp.sin, default=jnp.cos)), jnp.float32(0), x
+    ),
+    "a form for CPUs of nothing": lambda x: x + by_platform(cpu=lambda: 1.0, default=lambda: 2.0),
     "the same branch": lambda x: jax.lax.switch(jnp.int32(1), [jnp.sin, jnp.cos], x),
     "draws": lambda x: jax.random.normal(jax.random.fold_in(jax.random.key(0), x[0] > 0), 2),
     "no use of it": lambda x: (TABLE, jnp.float32(3)),

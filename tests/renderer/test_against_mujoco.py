@@ -21,7 +21,9 @@ from tests.renderer.mujoco_rays import cast
 
 SIZE = 32
 NUM_POSES = 20
-RENDERERS = ("fused", pytest.param("pallas-interpret", marks=pytest.mark.slow))
+RENDERERS = ("fused", pytest.param("pallas", marks=pytest.mark.slow))
+
+pytestmark = pytest.mark.usefixtures("interpreted")
 
 
 def compare(model: mujoco.MjModel, batch, shown: list[int], renderer: str) -> None:

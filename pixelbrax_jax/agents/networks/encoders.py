@@ -10,6 +10,8 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
+from pixelbrax_jax._platform.lowering import by_platform
+
 _GREY = 0.5
 """Taken from pixels in [0, 1] by the encoders that are not published ones. A gradient has the same
 sign for all weights of a filter that sees positive numbers only, and large steps then leave most
@@ -33,7 +35,7 @@ def convolve(x: jax.Array, kernel: jax.Array, stride: int, pads: Pads) -> jax.Ar
             x, kernel, (stride, stride), pads, dimension_numbers=("NHWC", "HWIO", "NHWC")
         )
 
-    result: jax.Array = jax.lax.platform_dependent(x, kernel, cpu=products, default=native)
+    result: jax.Array = by_platform(x, kernel, cpu=products, default=native)
     return result
 
 

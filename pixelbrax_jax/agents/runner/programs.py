@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from pixelbrax_jax._platform.batches import map_runs
 from pixelbrax_jax.agents.algorithm import Algorithm
 from pixelbrax_jax.agents.runner.devices import mesh_of, replicated, state_shardings
 from pixelbrax_jax.agents.train_state import Metrics, TrainState
@@ -83,7 +84,7 @@ class Runs:
         def one(first: Any) -> Any:
             return function(first, *others)
 
-        return jax.lax.map(one, first) if jax.default_backend() == "cpu" else jax.vmap(one)(first)
+        return map_runs(one, first)
 
     def _spread(self, state: TrainState, metrics: Metrics) -> tuple[TrainState, Metrics]:
         """Spread the state over the devices, and give all of them the metrics."""

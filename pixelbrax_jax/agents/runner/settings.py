@@ -32,6 +32,9 @@ OF_RUNS = ("seed", "seeds")
 _PACKAGES = ("pixelbrax", "jax", "jaxlib", "brax", "mujoco", "flax", "optax")
 """Packages whose versions a run's last bits depend on."""
 
+_GONE = {"physics_batching"}
+"""Settings of former releases that changed no result."""
+
 _FREE = ("total_steps", "memory_budget_gb")
 """Settings that a run may go on with although they differ."""
 
@@ -152,7 +155,7 @@ def differences(about: Mapping[str, Any], own: Mapping[str, Any]) -> list[str]:
     old, new = about["config"], own["config"]
     free = {name for name in _FREE if name != "total_steps" or not new.get("anneal")}
     found = []
-    for name in sorted((old.keys() | new.keys()) - free - {"clips"}):
+    for name in sorted((old.keys() | new.keys()) - free - _GONE - {"clips"}):
         if name not in new:
             found.append(f"{name}: {old[name]!r} there, unknown here")
         elif old.get(name) != new[name]:

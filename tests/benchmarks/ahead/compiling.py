@@ -143,8 +143,7 @@ def make_program(
     obs_mode = "state" if name == "state step" else "pixels"
     if name == "plain renderer":
         options = {"renderer": "fused", **options}
-    # The batch as for any device: "auto" is for the one that JAX computes on.
-    env, params = pb.make(task, obs_mode=obs_mode, physics_batching="vmap", **options)
+    env, params = pb.make(task, obs_mode=obs_mode, **options)
     envs = pb.VectorPixelEnv(env, num_envs)
     state, _ = jax.eval_shape(envs.reset, jax.eval_shape(lambda: jax.random.key(0)), params)
     params = jax.tree.map(

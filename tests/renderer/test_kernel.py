@@ -1,10 +1,8 @@
-"""The kernel for NVIDIA GPUs, computed by XLA, against the plain ray-caster; and its choice."""
+"""The kernel for NVIDIA GPUs, computed by XLA, against the plain ray-caster."""
 
 from __future__ import annotations
 
-import re
 from functools import partial
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -14,13 +12,14 @@ import pytest
 import pixelbrax_jax as pb
 from pixelbrax_jax import GeomKind, make_look, render
 from pixelbrax_jax.distractors import Color, Distractor
-from pixelbrax_jax.renderer import base, kernel
-from pixelbrax_jax.renderer.culling import may_see, window_of
-from pixelbrax_jax.renderer.pixels import view_of
+from pixelbrax_jax.renderer.fused import view_of
+from pixelbrax_jax.renderer.kernel import may_see, window_of
 from pixelbrax_jax.tasks import BRAX_TASKS
 from tests.renderer import scenes
 from tests.renderer.test_lamps import LAMP
 from tests.renderer.test_planes import random_strip
+
+pytestmark = pytest.mark.usefixtures("interpreted")
 
 HEIGHT, WIDTH = 22, 29
 """638 pixels: two blocks of the kernel, and a part of a third. The height is even: of an odd one
@@ -65,7 +64,7 @@ def images(env, states, params):
 def assert_same_pictures(task, options):
     size = {"height": HEIGHT, "width": WIDTH}
     plain, params = pb.make(task, **size, renderer="fused", **options)
-    by_kernel, _ = pb.make(task, **size, renderer="pallas-interpret", **options)
+    by_kernel, _ = pb.make(task, **size, renderer="pallas", **options)
     states = poses(plain, params)
     one, other = (images(env, states, params) for env in (plain, by_kernel))
     assert one.std() > 5, "there is something to see"
@@ -96,7 +95,7 @@ def test_depth_and_geoms_are_those_of_the_plain_one(size, lamps):
     batch = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(leaf) for leaf in x]), *batch)
     plain, other = (
         jax.jit(jax.vmap(lambda scene, name=name: render(scene, *size, name)))(batch)
-        for name in ("fused", "pallas-interpret")
+        for name in ("fused", "pallas")
     )
     np.testing.assert_array_equal(other.seg, plain.seg)
     np.testing.assert_array_equal(other.ground, plain.ground)
@@ -109,7 +108,7 @@ def test_every_primitive():
     scene = scenes.random_scene(2)
     plain, other = (
         jax.jit(render, static_argnums=(1, 2, 3))(scene, HEIGHT, WIDTH, name)
-        for name in ("fused", "pallas-interpret")
+        for name in ("fused", "pallas")
     )
     assert len(np.unique(plain.seg)) >= 5
     np.testing.assert_array_equal(other.seg, plain.seg)
@@ -128,7 +127,7 @@ def test_many_geoms():
     )
     pos = jnp.asarray(rng.uniform(-1, 1, (count, 3)), jnp.float32)
     scene = one.replace(geoms=geoms, pos=pos, xmat=jnp.tile(jnp.eye(3), (count, 1, 1)))
-    plain, other = (render(scene, 40, 40, name) for name in ("fused", "pallas-interpret"))
+    plain, other = (render(scene, 40, 40, name) for name in ("fused", "pallas"))
     assert len(np.unique(plain.seg)) > 40
     np.testing.assert_array_equal(other.seg, plain.seg)
 
@@ -182,9 +181,9 @@ def test_no_geom_is_left_out_that_is_seen():
 
 def test_a_band_is_a_part_of_the_picture():
     scene = scenes.random_scene(3)
-    draw = jax.jit(partial(render, renderer="pallas-interpret"), static_argnums=(1, 2))
+    draw = jax.jit(partial(render, renderer="pallas"), static_argnums=(1, 2))
     whole = draw(scene, HEIGHT, WIDTH)
-    band = render(scene, HEIGHT, WIDTH, "pallas-interpret", first_row=jnp.int32(4), num_rows=7)
+    band = render(scene, HEIGHT, WIDTH, "pallas", first_row=jnp.int32(4), num_rows=7)
     np.testing.assert_array_equal(band.seg, whole.seg[4:11])
     np.testing.assert_allclose(band.r, whole.r[4:11], atol=1e-4)
 
@@ -196,14 +195,14 @@ def test_it_has_the_derivative_of_the_plain_one():
         look = scene.look.replace(light=light)
         return render(scene.replace(look=look), HEIGHT, WIDTH, renderer).r.mean()
 
-    one, other = (jax.grad(brightness)(scene.look.light, r) for r in ("fused", "pallas-interpret"))
+    one, other = (jax.grad(brightness)(scene.look.light, r) for r in ("fused", "pallas"))
     assert np.abs(one).max() > 1e-4
     np.testing.assert_allclose(other, one, rtol=1e-5)
 
 
 def test_rewards_may_be_differentiated_beside_an_image():
     size = {"height": HEIGHT, "width": WIDTH}
-    env, params = pb.make("inverted_pendulum", renderer="pallas-interpret", **size)
+    env, params = pb.make("inverted_pendulum", renderer="pallas", **size)
     state, _ = env.reset(jax.random.key(0), params)
 
     def position(action):
@@ -213,7 +212,7 @@ def test_rewards_may_be_differentiated_beside_an_image():
 
 
 class Mirrored(Distractor):
-    """Not by pixel: what it does needs the rows."""
+    """Not pixel by pixel: a kernel cannot do it."""
 
     kind, stream = "mirrored", 7
 
@@ -230,84 +229,5 @@ class Mirrored(Distractor):
         return jax.tree.map(lambda plane: plane[:, ::-1], frame)
 
 
-def test_a_distractor_that_is_not_by_pixel_changes_the_whole_image():
+def test_a_distractor_of_whole_images_changes_what_the_kernel_has_drawn():
     assert_same_pictures("hopper", {"distractors": (Mirrored(), Color(dynamics="static"))})
-
-
-class TestTheChoice:
-    def test_pallas_needs_an_nvidia_gpu(self):
-        if jax.default_backend() == "gpu":
-            pytest.skip("there is one")
-        for make in (
-            lambda: pb.make("ant", renderer="pallas"),
-            lambda: render(scenes.random_scene(0), 4, 4, "pallas"),
-        ):
-            with pytest.raises(ValueError, match="is a kernel for NVIDIA GPUs") as error:
-                make()
-            for alternative in ("'auto'", "'fused'", "'pallas-interpret'"):
-                assert alternative in str(error.value)
-
-    def test_a_nearly_right_name(self):
-        with pytest.raises(ValueError, match="Did you mean 'pallas-interpret'"):
-            pb.make("ant", renderer="pallas_interpret")
-
-    def test_a_card_that_is_too_old(self, monkeypatch):
-        from jax.experimental.pallas import triton
-
-        class Card:
-            device_kind, compute_capability = "Tesla V100", "7.0"
-            client = SimpleNamespace(platform_version="cuda 12.9")
-
-        monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-        monkeypatch.setattr(jax, "devices", lambda: [Card])
-        monkeypatch.delattr(triton, "get_gpu_info", raising=False)
-        assert "Tesla V100 has compute capability 7.0" in kernel.obstacle()
-        assert kernel.auto_renderer()[0] == "fused"
-        with pytest.raises(ValueError, match=r"compute capability 7\.0"):
-            base.check_renderer("pallas")
-        Card.compute_capability = "9.0"
-        assert kernel.obstacle() is None
-        assert kernel.auto_renderer() == ("pallas", "by one kernel, on Tesla V100")
-        Card.client.platform_version = "rocm 7"
-        assert "ROCm" in kernel.obstacle()
-        # Newer releases of JAX describe such a card too.
-        info = SimpleNamespace(compute_capability=0)
-        monkeypatch.setattr(triton, "get_gpu_info", lambda: info, raising=False)
-        assert "ROCm" in kernel.obstacle()
-        Card.client.platform_version = "cuda 12.9"
-        info.compute_capability = 75
-        assert kernel.obstacle() == "the card has compute capability 7.5, and the kernel needs 8.0"
-
-    @pytest.mark.parametrize("renderer", ["auto", "fused"])
-    def test_a_batch_is_one_kernel_in_a_program_for_cuda(self, monkeypatch, renderer):
-        monkeypatch.setattr(kernel, "obstacle", lambda: None)
-        env, params = pb.make("hopper", height=HEIGHT, width=WIDTH, renderer=renderer)
-        states = poses(env, params)
-        draw = jax.jit(jax.vmap(env.draw, in_axes=(0, None)))
-        with on_h100():
-            text = draw.trace(states, params).lower(lowering_platforms=("cuda",)).as_text()
-        kernels = re.findall(r"xla\.gpu\.triton.*?grid_x = (\d+).*?grid_y = (\d+)", text, re.S)
-        assert kernels == ([("3", str(NUM_POSES))] if renderer == "auto" else [])
-        # No loop over environments, nor over bands.
-        assert ("stablehlo.while" in text) == (renderer == "fused")
-
-    def test_a_program_for_a_cpu_is_that_of_the_plain_one(self, monkeypatch):
-        size = {"height": HEIGHT, "width": WIDTH}
-        texts = []
-        for renderer, why in (("auto", None), ("auto", "no card"), ("fused", None)):
-            monkeypatch.setattr(kernel, "obstacle", lambda why=why: why)
-            env, params = pb.make("hopper", renderer=renderer, **size)
-            jax.clear_caches()
-            states = poses(env, params)
-            texts.append(jax.jit(env.draw).lower(jax.tree.map(lambda x: x[0], states), params))
-        texts = [text.compile().as_text() for text in texts]
-        assert "triton" not in texts[0]
-        one, *others = (re.sub(r", metadata=\{[^}]*\}", "", text) for text in texts)
-        assert all(other.count(" fusion(") == one.count(" fusion(") for other in others)
-
-
-def on_h100():
-    """The context in which programs are lowered for an H100."""
-    device = jax.sharding.AbstractDevice("NVIDIA H100", 132, "gpu")
-    mesh = jax.sharding.AbstractMesh((), (), abstract_device=device)
-    return jax.sharding.use_abstract_mesh(mesh)

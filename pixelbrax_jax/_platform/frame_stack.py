@@ -1,4 +1,4 @@
-"""Frames -> what the agent sees. The only place where colors are rounded."""
+"""Stacks of frames, which each device writes fastest in another way."""
 
 from __future__ import annotations
 
@@ -6,20 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pixelbrax_jax.types import Frame
-
-
-def pack(frame: Frame) -> jax.Array:
-    """Pack a frame into 32 bits a pixel: red in the low byte, then green, then blue.
-
-    Returns:
-        (H, W) uint32; each channel is ``floor(255 x + 1/2)``.
-    """
-
-    def level(plane: jax.Array) -> jax.Array:
-        return (plane * 255.0 + 0.5).astype(jnp.uint32)
-
-    return level(frame.r) | level(frame.g) << 8 | level(frame.b) << 16
+from pixelbrax_jax._platform.lowering import by_platform
 
 
 def unpack(packed: jax.Array) -> jax.Array:
@@ -38,9 +25,7 @@ def push(frames: jax.Array, newest: jax.Array, is_first: jax.Array) -> jax.Array
     Returns:
         (H, W, 3 K) uint8.
     """
-    pushed: jax.Array = jax.lax.platform_dependent(
-        frames, newest, is_first, cpu=_concatenate, default=_shift
-    )
+    pushed: jax.Array = by_platform(frames, newest, is_first, cpu=_concatenate, default=_shift)
     return pushed
 
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import pixelbrax_jax as pb
-from pixelbrax_jax._platform import chunks
-from pixelbrax_jax._platform.chunks import chunk_size, step_rows
+from pixelbrax_jax._platform import batches
+from pixelbrax_jax._platform.batches import chunk_size, map_runs, step_rows
 from tests.envs.toy import PARAMS, Ball
 
 
@@ -37,23 +37,11 @@ def test_chunks_give_what_the_whole_gives(num_rows, last, monkeypatch):
     row, shared = jax.random.normal(keys[1], (num_rows, 3)), jax.random.normal(keys[2], (3, 3))
     expected = jax.jit(jax.vmap(step, in_axes=(0, 0, None)))(state, row, shared)
     for largest in (128, 4, 3, 1):
-        monkeypatch.setattr(chunks, "_CHUNK", largest)
+        monkeypatch.setattr(batches, "_CHUNK", largest)
         actual = jax.jit(partial(step_rows, step, last=last))(state, row, shared)
         for a, b in zip(jax.tree.leaves(actual), jax.tree.leaves(expected), strict=True):
             assert a.shape == b.shape
             np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)
-
-
-def test_physics_may_be_batched_by_vmap():
-    """The switch decides how physics are computed, and not what they are."""
-    results = {}
-    for batching in ("auto", "vmap"):
-        env = pb.PixelEnv(Ball(), height=4, width=4, physics_batching=batching)
-        envs = pb.VectorPixelEnv(env, 5)
-        state, _ = envs.reset(jax.random.key(0), PARAMS)
-        _, results[batching] = envs.step(state, jnp.full((5, 1), 0.3), PARAMS)
-    close = partial(np.testing.assert_allclose, rtol=1e-6, atol=1e-6)
-    jax.tree.map(close, results["auto"], results["vmap"])
 
 
 def test_physics_say_which_axis_a_batch_is(monkeypatch):
@@ -65,7 +53,7 @@ def test_physics_say_which_axis_a_batch_is(monkeypatch):
     class BallByFirstAxis(Ball):
         batch_last = False
 
-    monkeypatch.setattr(chunks, "batch_last", fail)
+    monkeypatch.setattr(batches, "batch_last", fail)
     for physics in (BallByFirstAxis(), Ball()):
         envs = pb.VectorPixelEnv(pb.PixelEnv(physics, obs_mode="state", frame_stack=9), 3)
         state, _ = jax.eval_shape(envs.reset, jax.random.key(0), PARAMS)
@@ -76,20 +64,18 @@ def test_physics_say_which_axis_a_batch_is(monkeypatch):
                 jax.eval_shape(envs.step, state, jnp.zeros((3, 1)), PARAMS)
 
 
-@pytest.mark.parametrize(
-    ("backend", "batching"), [("cpu", "vmap"), ("gpu", "auto"), ("tpu", "auto")]
-)
-def test_a_program_for_an_accelerator_never_traces_what_is_for_cpus(backend, batching, monkeypatch):
-    def fail(*args, **kwargs):
-        raise AssertionError("this is for CPUs")
+@pytest.mark.parametrize(("platform", "loops"), [("cpu", 1), ("cuda", 0)])
+def test_only_a_cpu_has_a_loop_over_chunks(platform, loops):
+    states, rows = jnp.zeros((256, 3)), jnp.zeros((256, 3))
 
-    env = pb.PixelEnv(Ball(), obs_mode="state", physics_batching=batching, frame_stack=7)
-    envs = pb.VectorPixelEnv(env, 3)
-    state, _ = jax.eval_shape(envs.reset, jax.random.key(0), PARAMS)
-    monkeypatch.setattr("pixelbrax_jax.envs.vector.step_rows", fail)
-    monkeypatch.setattr(jax, "default_backend", lambda: backend)
-    jax.eval_shape(envs.step, state, jnp.zeros((3, 1)), PARAMS)
-    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
-    other = pb.VectorPixelEnv(pb.PixelEnv(Ball(), obs_mode="state", frame_stack=8), 3)
-    with pytest.raises(AssertionError, match="for CPUs"):
-        jax.eval_shape(other.step, state, jnp.zeros((3, 1)), PARAMS)
+    def put(states, rows):
+        moved, sums = step_rows(step, {"x": states, "empty": states[:, :0]}, rows, jnp.eye(3))
+        return moved["x"], sums
+
+    text = jax.jit(put).trace(states, rows).lower(lowering_platforms=(platform,)).as_text()
+    assert text.count("stablehlo.while") == loops
+
+
+def test_runs_are_mapped_one_after_the_other_on_a_cpu():
+    runs = jnp.arange(6.0).reshape(3, 2)
+    np.testing.assert_array_equal(map_runs(lambda run: run * 2.0, runs), runs * 2.0)

@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-AUTORESET_MODES = ("next_step", "same_step", "disabled")
+from pixelbrax_jax._platform.lowering import by_platform, trace_once
 
 _BLOCK = 32
 """Environments that are reset together; their number is rounded up to a multiple."""
@@ -18,29 +18,19 @@ _BLOCK = 32
 def reset_rows(
     fn: Callable[..., Any], arguments: tuple[Any, ...], mask: jax.Array, rows: Any
 ) -> Any:
-    """Return ``rows`` with those where ``mask`` reset, as fits the device that it is lowered for.
+    """Return ``rows`` with those where ``mask`` reset.
 
-    A CPU resets the masked rows alone, in a loop whose turns depend on the mask. An accelerator
-    would wait for the host to read in every step whether the loop goes on: it resets all rows and
-    selects, which is less than one turn of the loop. A reset that itself tries until it succeeds
-    waits in any case, and is done for masked rows alone.
-
-    Args:
-        fn: the reset of one row, otherwise as in ``replace_rows``.
-        arguments: as there.
-        mask: as there.
-        rows: as there.
+    A CPU resets the masked rows alone, in a loop whose length depends on the mask. An accelerator
+    would wait for the host in every turn of such a loop: it resets all rows and selects. A reset
+    that tries until it succeeds waits in any case, and is done for masked rows alone. Arguments
+    are those of ``replace_rows``.
     """
+    fn = trace_once(fn)
     row = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), arguments)
-    if _ends_by_itself(jax.make_jaxpr(fn)(*row).jaxpr):
-        return replace_rows(fn, arguments, mask, rows)
-    return jax.lax.platform_dependent(
-        arguments,
-        mask,
-        rows,
-        cpu=partial(replace_rows, fn),
-        default=partial(_select_rows, fn),
-    )
+    replace = partial(replace_rows, fn)
+    if _has_open_loop(jax.make_jaxpr(fn)(*row).jaxpr):
+        return replace(arguments, mask, rows)
+    return by_platform(arguments, mask, rows, cpu=replace, default=partial(_select_rows, fn))
 
 
 def replace_rows(
@@ -86,13 +76,13 @@ def _select_rows(
     return jax.tree.map(select, jax.vmap(fn)(*arguments), rows)
 
 
-def _ends_by_itself(jaxpr: Any) -> bool:
-    """Return whether a program has a loop whose number of turns is not known beforehand."""
+def _has_open_loop(jaxpr: Any) -> bool:
+    """Return whether a program has a loop that goes on until its data says otherwise."""
     for eqn in jaxpr.eqns:
         parts = [
             getattr(part, "jaxpr", part) for part in jax.tree.leaves(list(eqn.params.values()))
         ]
         inner = (part for part in parts if hasattr(part, "eqns"))
-        if eqn.primitive.name == "while" or any(map(_ends_by_itself, inner)):
+        if eqn.primitive.name == "while" or any(map(_has_open_loop, inner)):
             return True
     return False
