@@ -224,30 +224,25 @@ class _Run:
     def train(self, state: TrainState) -> Outcome:
         """Train from ``state`` to the end, or until a signal."""
         began = steps = _steps(self.algorithm, state)
-        writer = self.open_writer(steps)
+        self.writer = self.open_writer(steps)
         try:
             shown = self.options.progress and self.is_first
-            bar = Bar(shown, self.config.num_iterations, self.report)
-            with closing(bar):
-                state, steps, stopped_by = self.iterations(state, steps, writer, bar)
+            self.bar = Bar(shown, self.config.num_iterations, self.report)
+            with closing(self.bar):
+                state, steps, stopped_by = self.iterations(state, steps)
             if self.is_first and (not stopped_by or steps > began):
                 self.export(state, steps)
         finally:
-            writer.close()
-            for line in (missing := writer.missing()):
+            self.writer.close()
+            for line in (missing := self.writer.missing()):
                 self.report(line)
         if not stopped_by:
             self.report(f"done after {steps} steps; checkpoints and policy in {self.folder}")
-        failed = {"the progress bar": bar.failure, "messages": self.report.failure}
-        incomplete = [f"{name} could not be shown: {why}" for name, why in failed.items() if why]
-        return Outcome(
-            state,
-            self.record,
-            self.results,
-            bool(stopped_by),
-            stopped_by,
-            (*missing, *incomplete),
-        )
+        failed = {"the progress bar": self.bar.failure, "messages": self.report.failure}
+        hidden = [f"{name} could not be shown: {why}" for name, why in failed.items() if why]
+        incomplete = (*missing, *hidden)
+        interrupted = bool(stopped_by)
+        return Outcome(state, self.record, self.results, interrupted, stopped_by, incomplete)
 
     def open_writer(self, steps: int) -> MetricsWriter:
         """Open the files of records in the first process, or raise in all of them."""
@@ -268,13 +263,11 @@ class _Run:
             raise failure or RuntimeError("process 0 cannot write metrics; it says why.")
         return writer
 
-    def iterations(
-        self, state: TrainState, steps: int, writer: MetricsWriter, bar: Bar
-    ) -> tuple[TrainState, int, int]:
+    def iterations(self, state: TrainState, steps: int) -> tuple[TrainState, int, int]:
         """Return the state at the end or behind a signal, its steps, the signal's number or 0."""
         per_iteration, total = self.config.steps_per_iteration, self.config.num_iterations
         done = steps // per_iteration
-        bar.update(done)
+        self.bar.update(done)
         if done >= total:
             self.report(f"the run has had its {steps} steps")
             return state, steps, 0
@@ -286,7 +279,7 @@ class _Run:
         self.restart_timer(steps)
         for number in range(done + 1, total + 1):
             state, steps = self.iterate(state, number), number * per_iteration
-            bar.update(1)
+            self.bar.update(1)
             # The clock is that of the first process.
             by_clock = self.is_first and self.checkpoints.is_due_by_clock()
             stopped_by, due = highest(self.stop.signal, int(by_clock))
@@ -296,9 +289,9 @@ class _Run:
             saves = last or evaluates or bool(due) or self.checkpoints.is_due_after(steps)
             logs = saves or number % self.options.log_every == 0
             if logs:
-                self.log(steps, writer, bar)
+                self.log(steps)
             if evaluates and not stopped_by:
-                writer.write(steps, self.evaluate(state, steps))
+                self.evaluate(state, steps)
             if saves:
                 self.checkpoints.save(kept(state), steps, self.score(steps), last=last)
             else:
@@ -310,7 +303,7 @@ class _Run:
                 )
                 # Behind the checkpoint: whoever is asked to stop may soon be killed.
                 if evaluates:
-                    writer.write(steps, self.evaluate(state, steps))
+                    self.evaluate(state, steps)
                 break
             if logs:
                 self.restart_timer(steps)
@@ -332,7 +325,7 @@ class _Run:
     def restart_timer(self, steps: int) -> None:
         self.timed_since, self.timed_steps = time.perf_counter(), steps
 
-    def log(self, steps: int, writer: MetricsWriter, bar: Bar) -> None:
+    def log(self, steps: int) -> None:
         """Write the metrics of the latest iterations, or raise a TrainingDivergedError."""
         if self.pending:
             records = jax.device_get(self.pending)
@@ -343,8 +336,8 @@ class _Run:
         if self.options.log_training_metrics:
             seconds = time.perf_counter() - self.timed_since
             self.record["speed/steps_per_second"] = (steps - self.timed_steps) / seconds
-            writer.write(steps, self.record)
-        bar.update(0, self.record)
+            self.writer.write(steps, self.record)
+        self.bar.update(0, self.record)
 
     def check_finite(self, record: dict[str, Any], steps: int) -> None:
         wrong = {name: ~np.isfinite(value) for name, value in record.items()}
@@ -364,8 +357,8 @@ class _Run:
             "max_grad_norm may help."
         )
 
-    def evaluate(self, state: TrainState, steps: int) -> dict[str, float]:
-        """Evaluate each run in each split, and return what is logged of it."""
+    def evaluate(self, state: TrainState, steps: int) -> None:
+        """Evaluate each run in each split, and log it."""
         record: dict[str, float] = {}
         policies = self.runs.split(jax.device_get(state.networks))
         for split, evaluator in self.evaluators.items():
@@ -377,7 +370,7 @@ class _Run:
                 line += f" +- {result.standard_error:.1f} (standard error)"
             self.report(line)
         self.evaluated_steps = steps
-        return record
+        self.writer.write(steps, record)
 
     def score(self, steps: int) -> float | None:
         """Return by what the best checkpoint is chosen: one measure for all those of a run."""
