@@ -158,6 +158,14 @@ class BrokenPipe:
         raise BrokenPipeError(32, "Broken pipe")
 
 
+def test_a_bar_is_shown_on_terminals_unless_asked_for(monkeypatch):
+    yes, no = (SimpleNamespace(isatty=lambda told=told: told) for told in (True, False))
+    for terminal in (yes, no, None):
+        monkeypatch.setattr(sys, "stderr", terminal)
+        assert RunConfig().progress == bool(terminal and terminal.isatty())
+        assert RunConfig(progress=True).progress
+
+
 def test_a_bar_that_cannot_be_drawn_is_told_once(monkeypatch):
     monkeypatch.setattr(sys, "stderr", BrokenPipe())
     told = []

@@ -62,10 +62,9 @@ class AppendedFile:
         self._ended = False
 
     def append(self, block: bytes = b"") -> None:
-        """Write what waits, then a block.
+        """Write what waits, then a block; an OSError if some of it waits still.
 
-        Raises:
-            OSError: some of it waits still, or more than 64 MiB did, behind which the file ends.
+        The file ends where more than 64 MiB would have to wait.
         """
         self._ended = self._ended or len(self._waiting) + len(block) > _MAX_WAITING
         if not self._ended:
@@ -77,11 +76,7 @@ class AppendedFile:
             raise OSError("more waited for room on the disk than is kept in memory")
 
     def close(self) -> None:
-        """Write what waits and close the file.
-
-        Raises:
-            OSError: some of it could not be written.
-        """
+        """Write what waits and close the file, or raise an OSError."""
         try:
             self.append()
         finally:
@@ -174,7 +169,7 @@ class MetricsWriter:
         outputs: Sequence[_Output] = (),
         seconds: float = 0.0,
     ) -> None:
-        """Start the clock at ``seconds``; ``report`` gets a line about what cannot be written."""
+        """Start the clock at ``seconds``."""
         self._report = report
         self._outputs = outputs
         self._began = time.monotonic() - seconds
@@ -232,19 +227,10 @@ def open_metrics(
     first_step: int = 0,
     wandb_project: str | None = None,
 ) -> MetricsWriter:
-    """Open ``metrics.jsonl``, TensorBoard's file and, if asked, Weights & Biases.
+    """Open ``metrics.jsonl``, TensorBoard's file and, if asked, Weights & Biases; or raise.
 
-    Args:
-        folder: where the files are.
-        config: settings, written to ``config.json`` for people and scripts; nothing reads it back.
-        report: gets a line about what cannot be written.
-        first_step: control steps at which the run goes on; later records of an earlier attempt are
-            dropped, for they will be written again.
-        wandb_project: of Weights & Biases; None writes nothing there.
-
-    Raises:
-        ImportError: a project is given, but wandb is not installed.
-        OSError: a file cannot be opened.
+    ``config`` is written to ``config.json`` for people and scripts; nothing reads it back. Records
+    of an earlier attempt beyond ``first_step`` are dropped, for they will be written again.
     """
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "config.json").write_text(json.dumps(config, indent=2) + "\n", "utf-8")

@@ -42,9 +42,6 @@ class Checkpoints:
     Each is a folder named by the number of control steps. It appears under that name only when
     it is complete, so that a run that is killed while writing leaves the one before. One that
     cannot be written is reported and tried again; but for the last one, which is an error.
-
-    Attributes:
-        folder: where they are.
     """
 
     def __init__(
@@ -58,19 +55,16 @@ class Checkpoints:
         minutes: float = 0.0,
         report: Report = silent,
     ) -> None:
-        """Open the folder, which is made if need be.
+        """Open the folder, or raise a CheckpointError if it cannot be written to.
 
         Args:
-            folder: where the checkpoints are.
-            about: what of the run is stored with every checkpoint, as of ``describe_run``.
-            keep: how many of the latest are kept, besides the best one.
+            folder: of the checkpoints, which is made if need be.
+            about: of ``describe_run``, stored with every checkpoint.
+            keep: as ``RunConfig.keep_checkpoints``.
             former: by name, what a stored run had that lacks a setting.
-            every: control steps between checkpoints; 0 does not count them.
-            minutes: between checkpoints; 0 goes by no clock.
+            every: as ``RunConfig.checkpoint_every``.
+            minutes: as ``RunConfig.checkpoint_minutes``.
             report: gets a line about checkpoints that cannot be written.
-
-        Raises:
-            CheckpointError: the folder cannot be written to.
         """
         self.folder = Path(folder).absolute()
         self._about = {"format": FORMAT, **about, "versions": versions()}
@@ -116,10 +110,10 @@ class Checkpoints:
             state: any pytree of arrays.
             steps: control steps so far.
             score: the higher, the better; None if it is not known.
-            last: whether the run stops behind it, so that it is waited for.
+            last: whether the run stops behind it: it is waited for, and must be written.
 
         Raises:
-            CheckpointError: the last one cannot be written, or of several processes only some can.
+            CheckpointError: it must be written and cannot be, or only some processes can.
         """
         self.look_after(wait=True)
         self._last_steps, self._due = steps, self._in_minutes(self._minutes)
@@ -158,11 +152,8 @@ class Checkpoints:
     def restore(self, template: Tree) -> Tree:
         """Return the state of the latest checkpoint, equal to the bit to what was saved.
 
-        Args:
-            template: a state of the same shapes, or its ``jax.eval_shape``.
-
-        Raises:
-            CheckpointError: there is none, or it is of another configuration or format.
+        ``template`` is a state of the same shapes, or its ``jax.eval_shape``. A checkpoint of other
+        settings or of another format is a CheckpointError.
         """
         about = read_about(self.folder)
         self._check(about)

@@ -98,11 +98,8 @@ def describe_run(
 ) -> dict[str, Any]:
     """Return what decides the result of a run, as JSON has it: algorithm, settings, clips.
 
-    Args:
-        algorithm: with its settings.
-        options: of the run, whose seeds are among the settings.
-        clips: digests of the clips that are played. Those of made clips are not stored: their
-            name tells them, and they may differ in a pixel from one processor to the next.
+    ``clips`` are digests of what is played. Those of made clips are not stored: their name tells
+    them, and they may differ in a pixel from one processor to the next.
     """
     settings = describe(algorithm.config) | {name: getattr(options, name) for name in OF_RUNS}
     settings["clips"] = place_of(settings["clips"])
@@ -148,9 +145,7 @@ def unknown_settings(about: Mapping[str, Any], known: Mapping[str, Any]) -> str:
 def differences(about: Mapping[str, Any], own: Mapping[str, Any]) -> list[str]:
     """Return the settings with which a stored run may not go on, one line each.
 
-    Args:
-        about: of ``describe_run``, as stored, with all settings.
-        own: the same of the run that shall go on.
+    Both are of ``describe_run``: ``about`` as stored, ``own`` of the run that shall go on.
     """
     old, new = about["config"], own["config"]
     free = {name for name in _FREE if name != "total_steps" or not new.get("anneal")}
