@@ -350,10 +350,10 @@ class _Run:
             seeds = f" of seed {', '.join(str(self.options.seed + int(i)) for i in those)}"
         self.checkpoints.look_after(wait=True)
         latest = self.checkpoints.latest()
-        kept = "there is none" if latest is None else f"that of {latest} steps is good"
+        good = "there is none" if latest is None else f"that of {latest} steps is good"
         raise TrainingDivergedError(
             f"not finite within the iterations before step {steps}{seeds}: {', '.join(wrong)}. Of "
-            f"the checkpoints {kept}. Begin anew in another --output-dir; a lower learning_rate or "
+            f"the checkpoints {good}. Begin anew in another --output-dir; a lower learning_rate or "
             "max_grad_norm may help."
         )
 
