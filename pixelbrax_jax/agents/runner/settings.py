@@ -131,7 +131,7 @@ def versions() -> dict[str, str]:
 
 def unknown_settings(about: Mapping[str, Any], known: Mapping[str, Any]) -> str:
     """Return a sentence on what is stored in ``about`` and not ``known`` here; empty if nothing."""
-    names = [name for name in about["config"] if name not in known]
+    names = [name for name in about["config"] if name not in known and name not in _GONE]
     if not names:
         return ""
     written = about.get("versions", {}).get("pixelbrax", "another release")

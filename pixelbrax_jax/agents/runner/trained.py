@@ -200,7 +200,7 @@ def load_config(about: Mapping[str, Any]) -> TrainConfig:
     if unknown := unknown_settings(about, former):
         raise CheckpointError(unknown.strip())
     stored = former | about["config"]
-    return kind().replace(**{n: value for n, value in stored.items() if n not in OF_RUNS})
+    return kind().replace(**{name: stored[name] for name in former if name not in OF_RUNS})
 
 
 def save_policy(algorithm: Algorithm, networks: Networks, path: str | Path) -> Path:
