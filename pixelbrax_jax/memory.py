@@ -1,9 +1,11 @@
-"""Sizes that no memory of this machine could hold, refused before anything is allocated."""
+"""How much memory there is, and sizes that do not fit, refused before anything is allocated."""
 
 from __future__ import annotations
 
 import math
 import os
+
+import jax
 
 
 def check_fits(what: str, num_bytes: float) -> None:
@@ -21,6 +23,18 @@ def check_fits(what: str, num_bytes: float) -> None:
             f"{what} would take at least {num_bytes / 1e9:,.1f} GB, and this machine has "
             f"{limit / 1e9:,.1f} GB of memory; lower one of them."
         )
+
+
+def device_memory() -> float:
+    """Return the bytes that JAX may use on its first device; infinite where nobody tells."""
+    statistics = jax.local_devices()[0].memory_stats() or {}
+    if "bytes_limit" in statistics:
+        return float(statistics["bytes_limit"])
+    try:
+        import psutil
+    except ImportError:
+        return math.inf
+    return float(psutil.virtual_memory().available)
 
 
 def _main_memory() -> float:

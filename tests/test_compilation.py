@@ -121,7 +121,7 @@ import sys
 import gymnasium, numpy as np, torch
 import pixelbrax_gym
 import pixelbrax_jax as pb
-from pixelbrax_jax.cli import main
+from pixelbrax_gym.cli import main
 
 assert pb.compiler_options()
 small = {"height": 24, "width": 24}

@@ -156,7 +156,7 @@ def play_torchrl() -> dict[str, Any]:
 
 def train(name: str) -> dict[str, Any]:
     """``pixelbrax train``, and the policy that it leaves."""
-    from pixelbrax_jax.cli import main as pixelbrax
+    from pixelbrax_gym.cli import main as pixelbrax
     from pixelbrax_jax.policy import load_policy
 
     with tempfile.TemporaryDirectory() as folder:

@@ -16,7 +16,7 @@ Row = dict[str, Any]
 
 
 class AbsentError(Exception):
-    """What is to be measured is not here, with the reason."""
+    """What is to be measured is not here; the message says why."""
 
 
 @dataclass(frozen=True)
@@ -37,12 +37,12 @@ class Case:
 
     @property
     def key(self) -> str:
-        """Names the case in the results."""
+        """Its name in the results."""
         arguments = json.dumps(dict(self.arguments), sort_keys=True)
         return f"{self.group} {self.measure} {arguments}"
 
     def command(self) -> list[str]:
-        """The process that measures it; its last line is the result, as JSON.
+        """Return the command that measures it, whose last line is the result, as JSON.
 
         Raises:
             AbsentError: it cannot run here.
@@ -52,7 +52,7 @@ class Case:
         return [sys.executable, "-m", "pixelbrax_gym.bench.worker", function, arguments]
 
     def environ(self) -> dict[str, str]:
-        """Variables that its process needs besides those of this one."""
+        """Return variables that its process needs besides those of this one."""
         return {}
 
 
@@ -64,10 +64,8 @@ class Group:
         cases: what is measured.
         table: the outcomes in Markdown.
         note: what it shows and what it does not.
-        measured: whether its programs run; else they are compiled alone.
     """
 
     cases: Callable[[], Iterator[Case]]
     table: Callable[[list[Row]], str]
-    note: str = ""
-    measured: bool = True
+    note: str

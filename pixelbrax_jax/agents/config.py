@@ -1,4 +1,4 @@
-"""Settings that all algorithms have: the environment, the rollout, the networks."""
+"""Settings that all algorithms have: the environment, the networks, the optimiser."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass, fields, replace
 from numbers import Integral, Real
 from types import NoneType
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
-from pixelbrax_jax.agents.networks.actor import ENCODERS, LOG_STD_RANGE, POLICIES, SMALLEST
+from pixelbrax_jax.agents.networks.encoders import ENCODERS, SMALLEST
 from pixelbrax_jax.config import ENV_OPTIONS, EnvConfig
 from pixelbrax_jax.distractors.presets import as_tuple
 from pixelbrax_jax.envs.making import make
@@ -21,8 +21,6 @@ from pixelbrax_jax.validation import (
     check_positive_int,
 )
 
-ADVANTAGE_NORMS = ("batch", "minibatch", "none")
-
 
 @dataclass(frozen=True)
 class TrainConfig:
@@ -31,28 +29,21 @@ class TrainConfig:
     env: EnvConfig = EnvConfig()  # noqa: RUF009 (it is frozen)
     """Options of the environment; camera, look, clips and distractors as names."""
 
+    memory_settings: ClassVar[tuple[str, ...]] = ("num_envs",)
+    """Names of settings that a run takes less memory with when they are lower."""
+
     total_steps: int = 25_000_000
-    """Control steps of the whole run, over all environments; rounded up to whole rollouts."""
+    """Control steps of the whole run, over all environments; rounded up to whole iterations."""
     num_envs: int = 256
     """Environments N."""
-    num_steps: int = 64
-    """Steps T of each environment in one rollout."""
 
     encoder: str = "impala"
     """``impala``, ``nature``, ``drq``, ``small`` or ``patch``."""
-    policy: str = "gaussian"
-    """``gaussian``, ``tanh_gaussian`` or ``deacrep``."""
-    initial_std: float = 1.0
-    """Standard deviation of a new policy, unless it is ``deacrep``."""
     state_critic: bool = False
     """Whether a separate critic sees the simulator's state in place of pixels."""
-    random_shift: int = 0
-    """Pixels by which images are shifted at most, one random shift for each rollout."""
 
     gamma: float = 0.99
     """Discount of rewards, for each action."""
-    gae_lambda: float = 0.95
-    """Lambda of generalised advantage estimation."""
     learning_rate: float = 3e-4
     """Adam's step size."""
     anneal: bool = False
@@ -61,16 +52,6 @@ class TrainConfig:
     """Adam's epsilon."""
     max_grad_norm: float = 0.5
     """Global norm to which each network's gradient is clipped; 0 clips nothing."""
-    num_minibatches: int = 8
-    """Minibatches of an epoch; each has T / num_minibatches steps of every environment."""
-    clip_coef: float = 0.2
-    """Epsilon of PPO's clipped ratio."""
-    ent_coef: float = 0.001
-    """Weight of the entropy bonus."""
-    normalize_advantage: str = "batch"
-    """Over what advantages get mean 0 and deviation 1: ``batch``, ``minibatch`` or ``none``."""
-    normalize_reward: bool = True
-    """Whether rewards are divided by the deviation of discounted returns."""
     memory_budget_gb: float | None = None
     """Bytes, in 10^9, that stored frames may take; none asks the device."""
 
@@ -81,24 +62,13 @@ class TrainConfig:
             ValueError: a setting is out of range; the message says what is allowed.
         """
         _check_env(self.env)
-        for name in ("total_steps", "num_envs", "num_steps", "num_minibatches"):
+        for name in ("total_steps", "num_envs"):
             check_positive_int(name, getattr(self, name))
         check_choice("encoder", self.encoder, ENCODERS)
-        check_choice("policy", self.policy, POLICIES)
-        check_choice("normalize_advantage", self.normalize_advantage, ADVANTAGE_NORMS)
-        for name in ("gamma", "gae_lambda", "clip_coef"):
-            check_fraction(name, getattr(self, name))
-        for name in ("learning_rate", "initial_std", "adam_eps"):
+        check_fraction("gamma", self.gamma)
+        for name in ("learning_rate", "adam_eps"):
             check_positive(name, getattr(self, name))
-        for name in ("max_grad_norm", "ent_coef"):
-            check_positive(name, getattr(self, name), or_zero=True)
-        low, high = (math.exp(x) for x in LOG_STD_RANGE)
-        if not low < self.initial_std < high:
-            raise ValueError(
-                f"initial_std must be between {low:.4f} and {high:.2f}, where standard deviations "
-                f"are kept, got {self.initial_std}."
-            )
-        check_count("random_shift", self.random_shift)
+        check_positive("max_grad_norm", self.max_grad_norm, or_zero=True)
         if self.memory_budget_gb is not None:
             check_positive("memory_budget_gb", self.memory_budget_gb)
         smallest = SMALLEST[self.encoder]
@@ -108,17 +78,21 @@ class TrainConfig:
                 f"pixels, got {self.env.height} x {self.env.width}; another encoder takes smaller "
                 "ones."
             )
-        check_divides("num_steps", self.num_steps, "num_minibatches", self.num_minibatches)
 
     @property
     def steps_per_iteration(self) -> int:
-        """Control steps that one rollout counts."""
-        return self.num_envs * self.num_steps * self.env.action_repeat
+        """Control steps of one iteration, over all environments."""
+        raise NotImplementedError(f"{type(self).__name__} lacks steps_per_iteration.")
 
     @property
     def num_iterations(self) -> int:
-        """Rollouts of the whole run."""
+        """Iterations of the whole run."""
         return -(-self.total_steps // self.steps_per_iteration)
+
+    @property
+    def bytes_per_iteration(self) -> int:
+        """Bytes of the frames that an iteration stores beside the state."""
+        return 0
 
     def replace(self, **settings: Any) -> Self:
         """Return these settings with others, those of the environment among them by their names.
@@ -174,11 +148,7 @@ def describe(config: TrainConfig) -> dict[str, Any]:
 
 
 def check_positive(name: str, value: object, or_zero: bool = False) -> None:
-    """Reject what is not a positive, finite number.
-
-    Raises:
-        ValueError: otherwise, naming the setting.
-    """
+    """Raise a ValueError that names the setting unless it is a positive, finite number."""
     known = isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
     if not (known and (value > 0 or (or_zero and value == 0))):  # type: ignore[operator]
         wanted = "a number of at least 0" if or_zero else "a positive number"
@@ -186,23 +156,13 @@ def check_positive(name: str, value: object, or_zero: bool = False) -> None:
 
 
 def check_count(name: str, value: object) -> None:
-    """Reject what is not a whole number of at least 0.
-
-    Raises:
-        ValueError: otherwise, naming the setting.
-    """
+    """Raise a ValueError that names the setting unless it is a whole number of at least 0."""
     if not isinstance(value, Integral) or isinstance(value, bool) or value < 0:
         raise ValueError(f"{name} must be a whole number of at least 0, got {value!r}.")
 
 
 def check_divides(whole: str, size: int, part: str, count: int) -> None:
-    """Reject a number of parts into which a whole cannot be cut.
-
-    Raises:
-        ValueError: with the next counts that would do.
-    """
+    """Raise a ValueError that tells the next counts unless ``size`` has ``count`` equal parts."""
     if size % count:
-        allowed = [str(n) for n in range(1, size + 1) if size % n == 0]
-        raise ValueError(
-            f"{part}={count} must divide {whole}={size}; it may be {', '.join(allowed)}."
-        )
+        allowed = ", ".join(str(n) for n in range(1, size + 1) if size % n == 0)
+        raise ValueError(f"{part}={count} must divide {whole}={size}; it may be {allowed}.")

@@ -9,11 +9,10 @@ import jax
 from pixelbrax_jax.agents.algorithm import Algorithm, environments, train_function
 from pixelbrax_jax.agents.config import TrainConfig
 from pixelbrax_jax.agents.on_policy.dcpg import DCPG
-from pixelbrax_jax.agents.on_policy.losses import Metrics
 from pixelbrax_jax.agents.on_policy.ppg import PPG
 from pixelbrax_jax.agents.on_policy.ppo import PPO
-from pixelbrax_jax.agents.on_policy.rollout import Environments
-from pixelbrax_jax.agents.train_state import TrainState
+from pixelbrax_jax.agents.rollout import Environments
+from pixelbrax_jax.agents.train_state import Metrics, TrainState
 from pixelbrax_jax.types import EnvParams
 
 ALGORITHMS: dict[str, type[Algorithm]] = {kind.name: kind for kind in (PPO, PPG, DCPG)}

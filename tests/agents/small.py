@@ -67,7 +67,7 @@ class Agent:
 
     def run(self, state: TrainState, iterations: int) -> tuple[TrainState, dict[str, Any]]:
         """As ``train_function`` does; the metrics are the last ones of either phase."""
-        phases, metrics = self.algorithm.num_phases, {}
+        phases, metrics = self.algorithm.auxiliary_every, {}
         for number in range(iterations):
             state, facts = self.iterate(state)
             metrics |= facts

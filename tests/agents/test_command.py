@@ -9,13 +9,13 @@ import imageio.v3 as imageio
 import jax
 import pytest
 
+from pixelbrax_gym.cli import _train as command
+from pixelbrax_gym.cli import main
+from pixelbrax_gym.cli._train import parse
 from pixelbrax_jax.agents.config import describe
 from pixelbrax_jax.agents.on_policy.presets import PRESETS, TASK_SETTINGS, preset
 from pixelbrax_jax.agents.registry import ALGORITHMS
-from pixelbrax_jax.agents.runner import train_command as command
-from pixelbrax_jax.agents.runner.train_command import parse
 from pixelbrax_jax.agents.runner.trained import load_config
-from pixelbrax_jax.cli import main
 from pixelbrax_jax.tasks import TASKS
 from tests.benchmarks.experiments import (
     config_of,
@@ -117,7 +117,7 @@ def test_tasks_are_listed(capsys):
 
 
 def test_tasks_tell_what_is_missing(capsys, monkeypatch):
-    monkeypatch.setattr("pixelbrax_jax.cli.find_spec", lambda name: None)
+    monkeypatch.setattr("pixelbrax_gym.cli.tasks.find_spec", lambda name: None)
     assert main(["tasks"]) == 0
     told = capsys.readouterr()
     assert [line.split()[0] for line in told.out.splitlines()] == list(TASKS)
@@ -150,7 +150,7 @@ def test_stopped_at_once_it_says_what_is_left(monkeypatch, capsys, tmp_path):
     def stopped(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(command, "run", stopped)
+    monkeypatch.setattr(command.training, "train", stopped)
     line = ["train", "ppo", *TINY, "--output-dir", str(tmp_path)]
     assert main(line) == 130
     assert "stopped at once; there is no checkpoint" in capsys.readouterr().err

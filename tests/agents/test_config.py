@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from pixelbrax_jax.agents.config import TrainConfig, describe, make_env
+from pixelbrax_jax.agents.on_policy.config import OnPolicyConfig
 from pixelbrax_jax.agents.on_policy.dcpg import DCPGConfig
 from pixelbrax_jax.agents.on_policy.ppg import PPGConfig
 from pixelbrax_jax.agents.on_policy.ppo import PPO, PPOConfig
@@ -202,7 +203,7 @@ def test_a_run_too_short_for_an_auxiliary_phase_may_do_without_one():
 
 
 def test_iterations_are_rounded_up_and_count_control_steps():
-    config = TrainConfig(
+    config = OnPolicyConfig(
         env=EnvConfig(action_repeat=4), num_envs=3, num_steps=16, total_steps=3 * 16 * 4 + 1
     )
     assert config.steps_per_iteration == 192

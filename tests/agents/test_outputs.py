@@ -16,10 +16,11 @@ import pytest
 from tensorboardX.proto.event_pb2 import Event
 from tensorboardX.record_writer import masked_crc32c
 
+from pixelbrax_jax import stop_signals
 from pixelbrax_jax.agents.on_policy.ppo import PPO, PPOConfig
-from pixelbrax_jax.agents.runner import interruption, metrics, saving, train
+from pixelbrax_jax.agents.runner import metrics, saving, train
 from pixelbrax_jax.agents.runner.checkpoint import CheckpointError, Checkpoints
-from pixelbrax_jax.agents.runner.metrics import AppendedFile, MetricsWriter, read_metrics
+from pixelbrax_jax.agents.runner.metrics import AppendedFile, open_metrics, read_metrics
 from pixelbrax_jax.agents.runner.progress import Bar, Messages
 from pixelbrax_jax.agents.runner.saving import Saver
 from pixelbrax_jax.agents.runner.train import RunConfig, run
@@ -84,7 +85,7 @@ def test_no_more_than_so_much_waits(tmp_path, monkeypatch):
 
 def test_records_are_complete_when_there_is_room_again(tmp_path):
     told = []
-    writer = MetricsWriter(tmp_path, {}, first_step=7, report=told.append)
+    writer = open_metrics(tmp_path, {}, told.append, first_step=7)
     with files_of_at_most(100):
         for steps in (10, 20, 2**33):
             writer.write(steps, {"loss/value": 0.5, "learning_rate": 0.25})
@@ -108,7 +109,7 @@ def test_records_are_complete_when_there_is_room_again(tmp_path):
 
 def test_a_disk_that_stays_full_is_told_at_the_end(tmp_path):
     told = []
-    writer = MetricsWriter(tmp_path, {}, report=told.append)
+    writer = open_metrics(tmp_path, {}, told.append)
     writer.write(10, {"x": 1.0})
     with files_of_at_most(60):
         writer.write(20, {"x": 1.0})
@@ -133,7 +134,7 @@ def test_weights_and_biases_may_fail(tmp_path, monkeypatch):
 
     monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(init=lambda **_: Run()))
     told = []
-    writer = MetricsWriter(tmp_path, {}, wandb_project="p", report=told.append)
+    writer = open_metrics(tmp_path, {}, told.append, wandb_project="p")
     for steps in (1, 2, 3):
         writer.write(steps, {"x": 0.0})
     writer.close()
@@ -177,7 +178,9 @@ def test_a_run_without_a_reader_is_the_same(tmp_path, monkeypatch):
     quiet = run(ppo(), PARAMS, RunConfig(str(tmp_path / "a"), progress=False))
     monkeypatch.setattr(sys, "stderr", BrokenPipe())
     # A clock that asks for a checkpoint after every iteration, as far as it can.
-    options = RunConfig(str(tmp_path / "b"), checkpoint_minutes=1e-9, keep_checkpoints=9)
+    options = RunConfig(
+        str(tmp_path / "b"), checkpoint_minutes=1e-9, keep_checkpoints=9, progress=True
+    )
     outcome = run(ppo(), PARAMS, options, report=report)
     assert same(outcome.state, quiet.state)
     assert quiet.incomplete == ()
@@ -258,8 +261,8 @@ def test_a_checkpoint_that_fails_while_it_is_written_leaves_the_others(tmp_path,
 def test_only_a_second_ctrl_c_stops_at_once(monkeypatch):
     now, lines = [100.0], []
     before = signal.getsignal(signal.SIGINT)
-    monkeypatch.setattr(interruption, "time", SimpleNamespace(monotonic=lambda: now[0]))
-    with interruption.stop_requests(lines.append) as request:
+    monkeypatch.setattr(stop_signals, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    with stop_signals.stop_requests(lines.append) as request:
         assert not request.signal
         for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGTERM, signal.SIGINT):
             signal.raise_signal(number)
@@ -268,7 +271,7 @@ def test_only_a_second_ctrl_c_stops_at_once(monkeypatch):
         assert len(lines) == 1
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
-    with interruption.stop_requests(lines.append):
+    with stop_signals.stop_requests(lines.append):
         # One key press that a wrapper passes on again.
         for _ in range(2):
             signal.raise_signal(signal.SIGINT)
@@ -286,7 +289,7 @@ NUMBERS = [
 @pytest.mark.parametrize("number", NUMBERS)
 def test_what_schedulers_send_is_a_request_to_stop(number):
     lines, before = [], signal.getsignal(number)
-    with interruption.stop_requests(lines.append) as request:
+    with stop_signals.stop_requests(lines.append) as request:
         os.kill(os.getpid(), number)
         assert request.signal == number
     assert lines[0].startswith(f"{number.name}: stopping within two iterations, with a checkpoint")
@@ -299,11 +302,11 @@ def test_signals_that_the_program_uses_stay_its_own(number):
     got = []
     before = signal.signal(number, lambda number, _: got.append(number))
     try:
-        with interruption.stop_requests(got.append) as request:
+        with stop_signals.stop_requests(got.append) as request:
             os.kill(os.getpid(), number)
             assert (request.signal, got) == (0, [number])
         signal.signal(number, signal.SIG_IGN)
-        with interruption.stop_requests(got.append) as request:
+        with stop_signals.stop_requests(got.append) as request:
             os.kill(os.getpid(), number)
             assert (request.signal, got) == (0, [number])
     finally:

@@ -9,13 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pixelbrax_jax.agents.networks.actor import Dynamics
-from pixelbrax_jax.agents.on_policy import phasic
-from pixelbrax_jax.agents.on_policy.actor_critic import ActorCritic
-from pixelbrax_jax.agents.on_policy.dcpg import DCPG, DCPGConfig, dynamics_loss
+from pixelbrax_jax.agents.on_policy.dcpg import DCPG, DCPGConfig, Dynamics, dynamics_loss
 from pixelbrax_jax.agents.on_policy.losses import mean
+from pixelbrax_jax.agents.on_policy.phasic import Chunk
 from pixelbrax_jax.agents.on_policy.ppg import PPG, PPGConfig
-from pixelbrax_jax.agents.on_policy.rollout import observations
+from pixelbrax_jax.agents.rollout import observations
 from tests.agents.small import PHASIC, SMALL, Agent, assert_close, ball_envs, same
 
 NUM_AUX_STEPS = PHASIC["aux_epochs"] * PHASIC["aux_minibatches"]
@@ -124,19 +122,16 @@ def test_steps_that_teach_nothing_change_no_auxiliary_phase(agent):
 
 def test_the_policy_that_is_kept_has_no_gradient_at_first(ppg, envs):
     """The divergence from the policy before the phase is 0 there, and at its minimum."""
-    agent = ActorCritic(ppg.config, envs, shared=False, has_value=True)
 
-    def policy_of(networks, pixels):
-        return agent.actor(networks["actor"], pixels).policy
-
-    def loss(networks, chunk, key):
-        divergence = chunk.policy.kl_to(policy_of(networks, chunk.pixels))
-        return mean(divergence, chunk.weight), {"kl": divergence.max()}
+    class KeepsPolicy(PPG):
+        def auxiliary_loss(self, networks, chunk, key):
+            policy = self.agent.actor(networks["actor"], chunk.pixels).policy
+            divergence = chunk.policy.kl_to(policy)
+            return mean(divergence, chunk.weight), {"kl": divergence.max()}
 
     # Without steps every minibatch is a first one; a critic that is in no term has no gradient.
     state = full(ppg).replace(iteration=jnp.uint32(ppg.config.num_iterations + 1))
-    run = jax.jit(lambda state: phasic.auxiliary_phase(ppg.config, state, policy_of, loss, 1, 4))
-    after, facts = run(state)
+    after, facts = Agent(KeepsPolicy(ppg.config, envs)).auxiliary(state)
     assert same(after.networks, state.networks)
     assert abs(float(facts["kl"])) < 1e-6
     assert float(facts["auxiliary/grad_norm/actor"]) < 1e-6
@@ -151,12 +146,11 @@ def test_dcpg_s_value_stays_where_it_was_while_the_policy_learns(envs):
     agent = Agent(algorithm)
     before = agent.init(2)
     after, _ = agent.iterate(before)
-    critic = ActorCritic(config, envs, shared=True)
     times = jnp.broadcast_to(jnp.arange(8)[:, None], (8, 4))
     frames = jax.tree.map(lambda x: x[0], after.buffer.frames)
     pixels = observations(frames, times, config.random_shift)
     (old_policy, old), (policy, new) = (
-        critic(state.networks, pixels, None) for state in (before, after)
+        algorithm.agent(state.networks, pixels, None) for state in (before, after)
     )
 
     def size(x):
@@ -223,36 +217,36 @@ def test_the_averaged_actor_moves_in_the_auxiliary_phase_alone(decoupled):
     assert_close(after.networks["target"], expected, atol=1e-5)
 
 
-def chunk_of(weight, key=0) -> phasic.Chunk:
+def chunk_of(weight, key=0) -> Chunk:
     """Three steps of two environments; only what the dynamics loss reads."""
     raw = jax.random.normal(jax.random.key(key), (6, 1))
     weight = jnp.asarray(weight, jnp.float32)
-    return phasic.Chunk(None, None, raw, None, weight, None, None, 3)
+    return Chunk(None, None, raw, None, weight, None, 3)
 
 
 @pytest.fixture(scope="module")
 def dynamics():
     features = jax.random.normal(jax.random.key(1), (6, 4))
-    head = Dynamics()
-    return head, head.init(jax.random.key(2), features, jnp.zeros((6, 1)), features), features
+    params = Dynamics().init(jax.random.key(2), features, jnp.zeros((6, 1)), features)
+    return params, features
 
 
 def test_the_dynamics_loss_of_a_guess_is_that_of_three_coins(dynamics):
-    head, params, features = dynamics
+    params, features = dynamics
     blank = jax.tree.map(jnp.zeros_like, params)
-    loss = dynamics_loss(head, blank, features, chunk_of(np.ones(6)), jax.random.key(0))
+    loss = dynamics_loss(blank, features, chunk_of(np.ones(6)), jax.random.key(0))
     # Weights 1, 1/2 and 1.
     assert float(loss) == pytest.approx(2.5 * math.log(2))
 
 
 def test_pairs_that_an_episode_s_end_parts_are_left_out(dynamics):
-    head, params, features = dynamics
+    params, features = dynamics
     # Columns are environments: of the first environment the second step only begins an episode.
     weight = np.array([[1, 1], [0, 1], [1, 1]]).T.reshape(-1)
 
     @jax.grad
     def gradient(features, weight):
-        return dynamics_loss(head, params, features, chunk_of(weight), jax.random.key(0))
+        return dynamics_loss(params, features, chunk_of(weight), jax.random.key(0))
 
     slopes = np.asarray(gradient(features, weight)).reshape(2, 3, 4).swapaxes(0, 1)
     assert (slopes != 0).any(-1).all()

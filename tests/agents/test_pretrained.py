@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from pixelbrax_gym.cli import main
 from pixelbrax_jax import list_pretrained, load_policy, make, policy
 from pixelbrax_jax.agents.registry import ALGORITHMS
 from pixelbrax_jax.agents.runner.trained import load_pretrained
-from pixelbrax_jax.cli import main
 
 
 @pytest.mark.parametrize("name", list_pretrained())

@@ -32,7 +32,7 @@ FOUR_DEVICES = {"XLA_FLAGS": "--xla_force_host_platform_device_count=4"}
 
 def command(algorithm: str, folder: Path, options: str) -> list[str]:
     return [
-        *(sys.executable, "-m", "pixelbrax_jax.cli", "train", algorithm),
+        *(sys.executable, "-m", "pixelbrax_gym.cli", "train", algorithm),
         *f"{TINY} {EXTRA[algorithm]} {options}".split(),
         *("--output-dir", str(folder)),
     ]
@@ -119,7 +119,7 @@ def test_frames_stay_on_their_devices(tmp_path):
 import jax, re
 from pixelbrax_jax.agents.config import make_env
 from pixelbrax_jax.agents.on_policy.ppg import PPG, PPGConfig
-from pixelbrax_jax.agents.runner.sharding import replicate, state_shardings
+from pixelbrax_jax.agents.runner.devices import replicate, state_shardings
 from pixelbrax_jax.config import EnvConfig
 from pixelbrax_jax.envs.sharded import ShardedVectorEnv, make_env_mesh
 

@@ -6,14 +6,13 @@ import json
 import zipfile
 from pathlib import Path
 
-import jax
 import pytest
 
 from pixelbrax_jax.agents.on_policy.ppg import PPGConfig
 from pixelbrax_jax.agents.on_policy.ppo import PPO, PPOConfig
 from pixelbrax_jax.agents.runner import settings
 from pixelbrax_jax.agents.runner.checkpoint import CheckpointError, Checkpoints, read_about
-from pixelbrax_jax.agents.runner.seeds import Runs
+from pixelbrax_jax.agents.runner.programs import Runs
 from pixelbrax_jax.agents.runner.train import RunConfig, run
 from pixelbrax_jax.agents.runner.trained import load_config
 from tests.agents.small import OPTIONS, PARAMS, SMALL, ball_envs, same
@@ -55,7 +54,7 @@ def restore(folder: Path, algorithm: PPO, name: str = "ppo"):
         former=settings.former_settings(type(algorithm.config)),
     )
     try:
-        return checkpoints.restore(jax.eval_shape(Runs(algorithm, 1).init, 0, PARAMS))
+        return checkpoints.restore(Runs(algorithm).template(PARAMS))
     finally:
         checkpoints.close()
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pixelbrax_jax.agents.on_policy.returns import RewardScaler, gae
+from pixelbrax_jax.agents.on_policy.losses import RewardScaler, gae
 
 T, N = 40, 16
 GAMMA, LAMBDA = 0.97, 0.9

@@ -10,13 +10,8 @@ import numpy as np
 import pytest
 
 from pixelbrax_jax.agents.on_policy.ppo import PPOConfig
-from pixelbrax_jax.agents.runner.evaluate import (
-    NoSplitError,
-    make_split,
-    make_splits,
-    splits_of,
-)
 from pixelbrax_jax.agents.runner.settings import clip_digests
+from pixelbrax_jax.agents.runner.splits import NoSplitError, make_split, make_splits, splits_of
 from pixelbrax_jax.distractors import folders
 from pixelbrax_jax.distractors.clips import load_clips
 
@@ -65,7 +60,7 @@ def test_a_run_is_evaluated_on_its_own_split_and_on_the_held_out_one(split, held
         for letter, name in zip("abcdefgh", names, strict=True):
             write_clips(images, letter).joinpath(letter).rename(images / name)
         clips = tmp_path
-    made = make_splits(config(clips, split))
+    made = dict(make_splits(config(clips, split)))
     assert list(made) == ["clean", "train", "test"]
     assert shown(made["train"]) == digests(clips, split)
     assert shown(made["test"]) == digests(clips, held_out)
@@ -78,18 +73,18 @@ def test_clips_of_training_are_no_test(split, tmp_path):
     folder = write_clips(tmp_path / "clips" / ("" if split == "all" else split), "ab").parents[0]
     folder = tmp_path / "clips" if split == "all" else folder
     lines = []
-    made = make_splits(config(folder, split), report=lines.append)
+    made = dict(make_splits(config(folder, split), report=lines.append))
     assert list(made) == ["clean", "train"]
     (line,) = lines
     assert f"no split 'test': of the 2 clips of split {split!r} of {folder}, training" in line
     with pytest.raises(NoSplitError, match="training plays 2; --clips takes others"):
-        make_split(config(folder, split), "test")
+        dict(make_splits(config(folder, split), ["test"]))
 
 
 def test_the_test_split_of_a_folder_must_have_other_clips(tmp_path):
     write_clips(tmp_path / "train", "abc")
     lines = []
-    assert "test" not in make_splits(config(tmp_path), report=lines.append)
+    assert "test" not in dict(make_splits(config(tmp_path), report=lines.append))
     assert lines[0].startswith("no split 'test': ")
     write_clips(tmp_path / "test", "cd")
     with pytest.raises(NoSplitError, match=r"of the 2 clips of split 'test'.*training plays 1;"):

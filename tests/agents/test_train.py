@@ -26,15 +26,17 @@ from pixelbrax_jax.agents.runner.checkpoint import (
     read_about,
     read_networks,
 )
-from pixelbrax_jax.agents.runner.export import save_policy
 from pixelbrax_jax.agents.runner.metrics import read_metrics, summarize
+from pixelbrax_jax.agents.runner.saving import Saver
 from pixelbrax_jax.agents.runner.train import RunConfig, TrainingDivergedError, run
+from pixelbrax_jax.agents.runner.trained import save_policy
 from pixelbrax_jax.policy import load_policy
 from tests.agents.small import OPTIONS, PARAMS, SMALL, ball_envs, same, with_iterate
 from tests.envs.toy import Ball
 
 PHASES = {"num_policy_phases": 3, "aux_minibatches": 3, "aux_epochs": 1}
 PER_ITERATION = SMALL["num_envs"] * SMALL["num_steps"]
+SPLITS = {"clean": (PixelEnv(Ball(), **OPTIONS), PARAMS)}
 
 
 def ppg(iterations: int, **changes):
@@ -89,42 +91,30 @@ def test_nothing_around_the_training_changes_it(whole, tmp_path):
     )
 
 
-def test_without_evaluations_no_such_environment_is_made(whole, tmp_path, monkeypatch):
-    def refuse(*arguments):
-        raise AssertionError("an evaluation environment was made")
-
-    monkeypatch.setattr(train, "make_splits", refuse)
-    outcome = run(ppg(3), PARAMS, options(tmp_path, num_evals=0, log_training_metrics=True))
-    assert len(read_metrics(tmp_path / "metrics.jsonl")) == 3
+def test_without_metrics_and_evaluations_nothing_is_logged(tmp_path, monkeypatch):
+    monkeypatch.setattr(train, "make_splits", None)
+    outcome = run(ppg(3), PARAMS, options(tmp_path, log_training_metrics=False))
+    assert read_metrics(tmp_path / "metrics.jsonl") == []
     assert outcome.metrics
     assert not outcome.evaluations
 
 
-def test_settings_lie_beside_the_metrics(whole):
-    settings = json.loads((whole[1] / "config.json").read_text())
-    config = ppg(8).config
-    assert settings["algorithm"] == "ppg"
-    assert settings["seed"] == 0
-    assert settings["total_steps"] == config.total_steps
-    assert settings["learning_rate"] == config.learning_rate
-
-
-def test_without_metrics_nothing_is_logged(tmp_path):
-    run(ppg(3), PARAMS, options(tmp_path, log_training_metrics=False))
-    assert read_metrics(tmp_path / "metrics.jsonl") == []
-
-
-def test_every_metric_is_a_finite_number(whole):
+def test_metrics_are_finite_numbers_and_settings_lie_beside_them(whole):
     for record in read_metrics(whole[1] / "metrics.jsonl"):
         assert all(np.isfinite(value) for value in record.values()), record
-    names = set(record)
-    assert {"loss/policy", "loss/value", "learning_rate", "speed/steps_per_second"} <= names
+    assert {"loss/policy", "loss/value", "learning_rate", "speed/steps_per_second"} <= set(record)
     assert (whole[1] / "tensorboard").is_dir()
+    settings = json.loads((whole[1] / "config.json").read_text())
+    assert settings == describe(ppg(8).config) | {"algorithm": "ppg", "seed": 0, "seeds": 1}
 
 
 def test_an_earlier_run_is_not_overwritten(whole):
+    before = (whole[1] / "config.json").read_bytes()
     with pytest.raises(FileExistsError, match="--resume latest"):
         run(ppg(8), PARAMS, options(whole[1]))
+    with pytest.raises(CheckpointError, match="total_steps=160 are fewer than the 256 that the"):
+        run(ppg(5), PARAMS, options(whole[1], resume="latest"))
+    assert (whole[1] / "config.json").read_bytes() == before
 
 
 def test_another_configuration_is_refused_by_name(whole):
@@ -180,10 +170,10 @@ def test_the_best_and_the_latest_are_kept(tmp_path):
         )
     checkpoints.wait()
     assert checkpoints.steps() == [2, 2**33, 2**33 + 5]
-    assert checkpoints.best() == 2
-    assert same(checkpoints.restore(state), state)
+    assert best_steps(tmp_path) == 2
     with pytest.raises(CheckpointError, match="there are those of 2, 8589934592, 8589934597"):
-        checkpoints.restore(state, 3)
+        read_about(tmp_path, 3)
+    assert same(checkpoints.restore(state), state)
     checkpoints.close()
 
 
@@ -201,17 +191,43 @@ def test_the_best_outlives_a_resumed_run(tmp_path):
     again.close()
 
 
-def test_only_evaluations_score_where_there_are_any(tmp_path, monkeypatch):
-    splits = {"clean": (PixelEnv(Ball(), **OPTIONS), PARAMS)}
-    monkeypatch.setattr(train, "make_splits", lambda *_: splits)
+def test_only_evaluations_score_where_there_are_any(tmp_path):
     each = options(tmp_path, num_evals=2, eval_episodes=1, checkpoint_every=PER_ITERATION)
-    run(ppg(4), PARAMS, replace(each, keep_checkpoints=9))
+    run(ppg(4), PARAMS, replace(each, keep_checkpoints=9), splits=SPLITS)
     scores = [read_about(tmp_path / "checkpoints", PER_ITERATION * i)["score"] for i in range(1, 5)]
     assert [score is not None for score in scores] == [False, True, False, True]
     evaluations = [r for r in read_metrics(tmp_path / "metrics.jsonl") if "eval/clean/return" in r]
     assert [r["eval/clean/return"] for r in evaluations] == [scores[1], scores[3]]
     # Of one episode there is no standard error, and NaN is not JSON.
     assert "NaN" not in (tmp_path / "metrics.jsonl").read_text()
+
+
+@pytest.mark.parametrize("stopped", [False, True])
+def test_what_follows_an_iteration(tmp_path, monkeypatch, stopped):
+    done = []
+
+    def watch(kind, name, place):
+        method = getattr(kind, name)
+
+        def call(self, *arguments, **others):
+            done.append((name, arguments[place] // PER_ITERATION))
+            return method(self, *arguments, **others)
+
+        monkeypatch.setattr(kind, name, call)
+
+    watch(train._Run, "log", 0)
+    watch(train._Run, "evaluate", 1)
+    watch(Saver, "save", 1)
+    if stopped:
+        signals = iter((0, 0, signal.SIGTERM))
+        monkeypatch.setattr(train, "highest", lambda *_: (next(signals), 0))
+    run(ppg(4), PARAMS, options(tmp_path, log_every=3, num_evals=2, eval_episodes=1), splits=SPLITS)
+    if stopped:
+        # Whoever is asked to stop may soon be killed: first what must not be lost.
+        assert done == [("log", 2), ("save", 2), ("evaluate", 2)]
+    else:
+        every = ("log", "evaluate", "save")
+        assert done == [*((name, 2) for name in every), ("log", 3), *((name, 4) for name in every)]
 
 
 def test_a_run_under_other_versions_is_told(tmp_path):
@@ -275,14 +291,14 @@ def test_training_stays_one_iteration_ahead_of_the_device(tmp_path, monkeypatch)
         heavy = jax.lax.fori_loop(0, 10, lambda _, x: x @ x / 800.0, jnp.ones((800, 800)))
         return state, metrics | {"heavy": heavy[0, 0]}
 
-    one, ahead = train._Run._iterate, []
+    one, ahead = train._Run.iterate, []
 
     def watched(self, state, number):
         state = one(self, state, number)
-        ahead.append(sum(not record["heavy"].is_ready() for record in self._pending))
+        ahead.append(sum(not record["heavy"].is_ready() for record in self.pending))
         return state
 
-    monkeypatch.setattr(train._Run, "_iterate", watched)
+    monkeypatch.setattr(train._Run, "iterate", watched)
     run(with_iterate(algorithm, iterate), PARAMS, options(tmp_path, log_every=12))
     assert len(ahead) == 12
     assert max(ahead) == 1
@@ -328,7 +344,7 @@ def test_a_buffer_that_would_not_fit_is_told_with_figures(tmp_path):
     lines = []
     with pytest.raises(MemoryError, match=r"Lower num_envs, num_steps, num_policy_phases"):
         run(ppg(8, memory_budget_gb=1e-6), PARAMS, options(tmp_path), report=lines.append)
-    assert "auxiliary buffer" in lines[0]
+    assert ", buffer " in lines[0]
 
 
 def test_an_exported_policy_acts_without_the_package(whole, tmp_path):

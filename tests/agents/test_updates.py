@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from pixelbrax_jax.agents.algorithm import train_function
-from pixelbrax_jax.agents.on_policy.actor_critic import ActorCritic
 from pixelbrax_jax.agents.on_policy.dcpg import DCPG, DCPGConfig
 from pixelbrax_jax.agents.on_policy.losses import value_loss
 from pixelbrax_jax.agents.on_policy.ppg import PPG, PPGConfig
@@ -87,7 +86,7 @@ def test_the_step_size_of_a_run_falls_along_a_line(agent):
 
 def test_ppg_without_auxiliary_phases_is_ppo(ppo, ppg, envs):
     config = PPGConfig(**SMALL | PHASIC | {"aux_epochs": 0}, vf_coef=1.0)
-    assert PPG(config, envs).num_phases == 0
+    assert PPG(config, envs).auxiliary_every == 0
 
     def shared(networks):
         """All but the value head, which PPO's actor does not have."""
@@ -154,11 +153,10 @@ def pixels():
     return jax.random.randint(jax.random.key(0), (6, 18, 18, 6), 0, 256).astype(jnp.uint8)
 
 
-def value_gradient(envs, pixels, **layout):
-    """Gradient of a value loss, by network and layer."""
-    config = PPOConfig(**SMALL)
-    agent = ActorCritic(config, envs, **layout)
-    networks = agent.init(jax.random.key(0))
+def value_gradient(envs, pixels, layout):
+    """Which layers of which networks a value loss moves, with a layout of PPG."""
+    algorithm = PPG(PPGConfig(**SMALL, **PHASIC, layout=layout), envs)
+    agent, networks = algorithm.agent, algorithm.init_networks(jax.random.key(0))
 
     @jax.jit
     @jax.grad
@@ -174,17 +172,17 @@ def value_gradient(envs, pixels, **layout):
 
 
 def test_a_separate_value_leaves_the_actor_alone(envs, pixels):
-    moves = value_gradient(envs, pixels, shared=False, has_value=True)
+    moves = value_gradient(envs, pixels, "dual")
     assert {name for (name, _), moved in moves.items() if moved} == {"critic"}
 
 
 def test_a_detached_value_moves_its_head_alone(envs, pixels):
-    moves = value_gradient(envs, pixels, shared=True, detach_value=True)
+    moves = value_gradient(envs, pixels, "detach")
     assert {layer for (_, layer), moved in moves.items() if moved} == {"value"}
 
 
 def test_a_shared_value_moves_the_encoder_and_no_policy_head(envs, pixels):
-    moves = value_gradient(envs, pixels, shared=True)
+    moves = value_gradient(envs, pixels, "shared")
     assert {layer for (_, layer), moved in moves.items() if moved} == {"Small_0", "value"}
     assert {layer for (_, layer), moved in moves.items() if not moved} == {"mean", "log_std"}
 

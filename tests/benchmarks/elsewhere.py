@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import json
 
-from pixelbrax_jax.agents.runner.evaluate import Evaluator, make_split
+from pixelbrax_jax.agents.runner.evaluate import Evaluator
+from pixelbrax_jax.agents.runner.splits import make_split
 from pixelbrax_jax.agents.runner.trained import load_pretrained
 from pixelbrax_jax.policy import read_pretrained
 from tests.benchmarks.experiments import EPISODES

@@ -28,12 +28,12 @@ from pathlib import Path
 
 import pixelbrax_jax
 from pixelbrax_gym.bench.machine import describe_cpu
+from pixelbrax_gym.cli._train import parse
 from pixelbrax_jax.agents.config import TrainConfig
 from pixelbrax_jax.agents.on_policy.presets import TASK_SETTINGS, preset
 from pixelbrax_jax.agents.registry import ALGORITHMS
 from pixelbrax_jax.agents.runner.checkpoint import read_about
 from pixelbrax_jax.agents.runner.metrics import read_metrics
-from pixelbrax_jax.agents.runner.train_command import parse
 from pixelbrax_jax.agents.runner.trained import load_config
 from pixelbrax_jax.stop_signals import stop_signals
 from pixelbrax_jax.tasks import DMC_TASKS
@@ -182,7 +182,7 @@ def offer(task: str, folder: Path, kept: dict) -> None:
 
 def run(arguments: list[str], folder: Path, until: float) -> int:
     """Make a run, or go on with it; its exit status, above 128 if it was stopped."""
-    command = [sys.executable, "-m", "pixelbrax_jax.cli", *arguments]
+    command = [sys.executable, "-m", "pixelbrax_gym.cli", *arguments]
     command += ["--resume", "latest", "--output-dir", str(folder)]
     with subprocess.Popen(["nice", "-n", "19", *command], start_new_session=True) as process:
         stop = lambda *_: process.terminate()  # noqa: E731

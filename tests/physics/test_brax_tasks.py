@@ -262,8 +262,14 @@ def test_brax_still_refuses_the_swimmer_elsewhere(backend):
         load_brax_env("swimmer", backend)
 
 
-@pytest.mark.slow
-@each_backend
+@pytest.mark.parametrize(
+    ("task", "backend"),
+    [
+        pytest.param(row.name, name, marks=() if name == row.default_backend else pytest.mark.slow)
+        for row in BRAX_TASKS.values()
+        for name in row.backends
+    ],
+)
 def test_step_is_traced_once(task, backend):
     """Python numbers and weak types in Brax's state do not leak into ours."""
     physics = make_physics(task, backend=backend)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import logging
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
+from pixelbrax_jax.agents.runner.devices import any_process
 from pixelbrax_jax.agents.runner.settings import differences, unknown_settings, versions
-from pixelbrax_jax.agents.runner.sharding import any_process
 
 FORMAT = 4
 """Number of the format; raised when what is stored changes its meaning."""
@@ -81,7 +81,7 @@ class Checkpoints:
             "versions": versions(),
         }
         self._former = dict(former or {})
-        check_writable(self.folder)
+        _check_writable(self.folder)
         policy = ocp.checkpoint_managers
         best = policy.BestN(
             get_metric_fn=lambda m: m["score"], n=1, keep_checkpoints_without_metrics=False
@@ -99,10 +99,6 @@ class Checkpoints:
     def steps(self) -> list[int]:
         """Return control steps of all checkpoints, ascending."""
         return sorted(self._manager.all_steps())
-
-    def best(self) -> int | None:
-        """Return the steps of the checkpoint with the highest score; None if none has one."""
-        return best_steps(self.folder)
 
     def save(self, state: Any, steps: int, score: float | None) -> None:
         """Begin to write a checkpoint; training may go on meanwhile.
@@ -163,53 +159,31 @@ class Checkpoints:
         except (OSError, ValueError) as error:  # TensorStore has a ValueError for a full disk.
             raise self._failed(error) from error
 
-    def _failed(self, error: Exception) -> CheckpointError:
-        """Return what to raise for a checkpoint that cannot be written; removes what there is."""
-        if jax.process_index() == 0:
-            for path in self.folder.glob("*.orbax-checkpoint-tmp*"):
-                shutil.rmtree(path, ignore_errors=True)
-        # The manager has left out those that the new one would have replaced.
-        with contextlib.suppress(OSError):
-            self._manager.reload()
-        # TensorStore's messages end with the system's own words.
-        reason = str(error).partition("\n")[0].rsplit(": ", 1)[-1]
-        reason = getattr(error, "strerror", None) or reason or type(error).__name__
-        return CheckpointError(f"cannot write a checkpoint to {self.folder}: {reason}.")
-
-    def restore(self, template: Tree, steps: int | None = None) -> Tree:
-        """Return the state of a checkpoint.
+    def restore(self, template: Tree) -> Tree:
+        """Return the state of the latest checkpoint, equal to the bit to what was saved.
 
         Args:
             template: a state of the same shapes, or its ``jax.eval_shape``.
-            steps: of which checkpoint; None takes the latest.
-
-        Returns:
-            The state, equal to the bit to what was saved.
 
         Raises:
             CheckpointError: there is none, or it is of another configuration or format.
         """
-        steps = self._which(steps)
-        self._check(steps)
+        about = read_about(self.folder)
+        self._check(about)
         wanted = _plain(template)
-        self._check_arrays(steps, wanted)
+        self._check_arrays(about, wanted)
         targets = {
             name: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=_sharding(leaf))
             for name, leaf in wanted.items()
         }
-        leaves = self._manager.restore(
-            steps, args=ocp.args.Composite(state=ocp.args.StandardRestore(targets))
-        )["state"]
-        return _typed(template, leaves)
+        restored = self._manager.restore(
+            about["steps"], args=ocp.args.Composite(state=ocp.args.StandardRestore(targets))
+        )
+        return _typed(template, restored["state"])
 
-    def other_versions(self, steps: int | None = None) -> list[str]:
-        """Return packages whose versions, and devices whose kind or number, were others then.
-
-        Args:
-            steps: of which checkpoint; None takes the latest.
-        """
-        old = read_about(self.folder, self._which(steps))["versions"]
-        new = self._about["versions"]
+    def other_versions(self) -> list[str]:
+        """Return packages whose versions, and devices whose kind or number, were others then."""
+        old, new = read_about(self.folder)["versions"], self._about["versions"]
         return [
             f"{name} {old.get(name)} there, {new.get(name)} here"
             for name in sorted(old.keys() | new.keys())
@@ -222,37 +196,40 @@ class Checkpoints:
             self.wait()
         finally:
             # `wait` has raised what it may raise of a full disk.
-            with contextlib.suppress(OSError, ValueError):
+            with suppress(OSError, ValueError):
                 self._manager.close()
             logging.getLogger("absl").removeFilter(_not_a_traceback)
 
-    def _which(self, steps: int | None) -> int:
-        known = self.steps()
-        if not known:
-            raise CheckpointError(f"there is no checkpoint in {self.folder}.")
-        if steps is not None and steps not in known:
-            raise CheckpointError(
-                f"there is no checkpoint of {steps} steps in {self.folder}; there are those of "
-                f"{', '.join(map(str, known))}."
-            )
-        return known[-1] if steps is None else steps
+    def _failed(self, error: Exception) -> CheckpointError:
+        """Return what to raise for a checkpoint that cannot be written; removes what there is."""
+        if jax.process_index() == 0:
+            for path in self.folder.glob("*.orbax-checkpoint-tmp*"):
+                shutil.rmtree(path, ignore_errors=True)
+        # The manager has left out those that the new one would have replaced.
+        with suppress(OSError):
+            self._manager.reload()
+        # TensorStore's messages end with the system's own words.
+        reason = str(error).partition("\n")[0].rsplit(": ", 1)[-1]
+        reason = getattr(error, "strerror", None) or reason or type(error).__name__
+        return CheckpointError(f"cannot write a checkpoint to {self.folder}: {reason}.")
 
-    def _check(self, steps: int) -> None:
-        about = read_about(self.folder, steps)
+    def _check(self, about: dict[str, Any]) -> None:
+        """Reject a checkpoint of another format, algorithm or settings."""
+        own = self._about
         if about["format"] != FORMAT:
             raise CheckpointError(
                 f"{self.folder} has format {about['format']!r}, of which this version reads the "
                 "networks alone: evaluate or record the run, and train anew in another "
                 "--output-dir."
             )
-        if about["algorithm"] != self._about["algorithm"]:
+        if about["algorithm"] != own["algorithm"]:
             raise CheckpointError(
-                f"{self.folder} is a run of {about['algorithm']}, not of "
-                f"{self._about['algorithm']}; give another --output-dir."
+                f"{self.folder} is a run of {about['algorithm']}, not of {own['algorithm']}; give "
+                "another --output-dir."
             )
         about = about | {"config": self._former | about["config"]}
-        if other := differences(about, self._about):
-            old, new = about["config"], self._about["config"]
+        old, new = about["config"], own["config"]
+        if other := differences(about, own):
             why = unknown_settings(about, new)
             if old.get("total_steps") != new.get("total_steps") and new.get("anneal"):
                 why += "A step size that falls over all of total_steps leaves them fixed. "
@@ -261,8 +238,9 @@ class Checkpoints:
                 f"{why}Use the same ones, or another --output-dir."
             )
 
-    def _check_arrays(self, steps: int, wanted: dict[str, Any]) -> None:
-        stored = _shapes(self.folder / str(steps) / "state")
+    def _check_arrays(self, about: dict[str, Any], wanted: dict[str, Any]) -> None:
+        """Reject a checkpoint whose arrays are others."""
+        stored = _shapes(self.folder / str(about["steps"]) / "state")
         shapes = {name: tuple(leaf.shape) for name, leaf in wanted.items()}
         other = [
             f"{name}: {stored.get(name, 'none')} there, {shapes.get(name, 'none')} here"
@@ -271,29 +249,26 @@ class Checkpoints:
         ]
         if other:
             more = f" and {len(other) - 3} more" if len(other) > 3 else ""
-            others = "; ".join(self.other_versions(steps)) or "the versions are the same"
+            others = "; ".join(self.other_versions()) or "the versions are the same"
             raise CheckpointError(
                 f"the checkpoint in {self.folder} has other arrays: {'; '.join(other[:3])}{more} "
                 f"({others}). Go on with what wrote it, or train anew in another --output-dir."
             )
 
 
-def best_steps(folder: str | Path) -> int | None:
-    """Return control steps of the checkpoint with the highest score; None if none has a score.
-
-    Of equal scores the later one is taken.
-
-    Args:
-        folder: of the checkpoints.
-    """
-    scores = {steps: read_about(folder, steps)["score"] for steps in _all_steps(Path(folder))}
-    scores = {steps: score for steps, score in scores.items() if score is not None}
-    return max(scores, key=lambda steps: (scores[steps], steps)) if scores else None
-
-
 def latest_steps(folder: str | Path) -> int | None:
     """Return the control steps of the latest checkpoint in a folder; None if there is none."""
     return max(_all_steps(Path(folder)), default=None)
+
+
+def best_steps(folder: str | Path) -> int | None:
+    """Return the control steps of the checkpoint with the highest score, of equal ones the later.
+
+    None if no checkpoint has a score.
+    """
+    scores = {steps: read_about(folder, steps)["score"] for steps in _all_steps(Path(folder))}
+    scores = {steps: score for steps, score in scores.items() if score is not None}
+    return max(scores, key=lambda steps: (scores[steps], steps), default=None)
 
 
 def read_about(folder: str | Path, steps: int | None = None) -> dict[str, Any]:
@@ -338,16 +313,14 @@ def read_networks(folder: str | Path, template: Tree, steps: int | None = None) 
     """
     about = read_about(folder, steps)
     path = Path(folder).absolute() / str(about["steps"]) / "state"
-    wanted = _plain({"networks": template})
-    reader = ocp.Checkpointer(ocp.PyTreeCheckpointHandler())
-    stored = _shapes(path)
+    wanted, stored = _plain({"networks": template}), _shapes(path)
     for name, leaf in wanted.items():
         if stored.get(name) != leaf.shape:
             found = stored.get(name, "missing")
             raise CheckpointError(f"{path.parent}: {name} is {found}, not {leaf.shape}.")
     as_numpy = {name: ocp.RestoreArgs(restore_type=np.ndarray) for name in wanted}
     with _without_warnings():
-        restored = reader.restore(
+        restored = ocp.Checkpointer(ocp.PyTreeCheckpointHandler()).restore(
             path, args=ocp.args.PyTreeRestore(wanted, restore_args=as_numpy, partial_restore=True)
         )
     leaves = {name: jax.device_put(restored[name]) for name in wanted}
@@ -356,18 +329,19 @@ def read_networks(folder: str | Path, template: Tree, steps: int | None = None) 
 
 def _shapes(path: Path) -> dict[str, tuple[int, ...]]:
     """Return the shapes of stored arrays, by their place."""
-    reader = ocp.Checkpointer(ocp.PyTreeCheckpointHandler())
     with _without_warnings():
-        stored = reader.metadata(path).item_metadata.tree
-    return {name: tuple(leaf.shape) for name, leaf in stored.items()}
+        found = ocp.Checkpointer(ocp.PyTreeCheckpointHandler()).metadata(path)
+    return {name: tuple(leaf.shape) for name, leaf in found.item_metadata.tree.items()}
 
 
-def check_writable(folder: Path) -> None:
-    """Reject a folder that cannot be made or written to.
+def _all_steps(folder: Path) -> list[int]:
+    # Without the file, a folder is one that is being deleted.
+    found = (path for path in folder.glob("*") if path.name.isdigit())
+    return sorted(int(path.name) for path in found if (path / "about" / "metadata").exists())
 
-    Raises:
-        CheckpointError: naming the folder and the reason.
-    """
+
+def _check_writable(folder: Path) -> None:
+    """Reject a folder that cannot be made or written to."""
     probe = folder / ".writable"
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -390,7 +364,7 @@ def _plain(tree: Any) -> dict[str, Any]:
             else:
                 leaf = jax.random.key_data(leaf)
         if leaf.size:
-            leaves[jax.tree_util.keystr(path, simple=True, separator=".")] = leaf
+            leaves[_place(path)] = leaf
     return leaves
 
 
@@ -399,11 +373,12 @@ def _typed(template: Tree, leaves: dict[str, Any]) -> Tree:
 
     def leaf(path: Any, like: Any) -> Any:
         if not like.size:
+            # Made by a program, as those of other processes' devices must be.
             empty = jax.jit(
                 lambda: jnp.zeros(like.shape, like.dtype), out_shardings=_sharding(like)
             )
             return empty()
-        value = leaves[jax.tree_util.keystr(path, simple=True, separator=".")]
+        value = leaves[_place(path)]
         if jnp.issubdtype(like.dtype, jax.dtypes.prng_key):
             return jax.random.wrap_key_data(value)
         return value
@@ -411,27 +386,8 @@ def _typed(template: Tree, leaves: dict[str, Any]) -> Tree:
     return jax.tree_util.tree_map_with_path(leaf, template)
 
 
-def _all_steps(folder: Path) -> list[int]:
-    # Without the file, a folder is one that is being deleted.
-    found = (path for path in folder.glob("*") if path.name.isdigit())
-    return sorted(int(path.name) for path in found if (path / "about" / "metadata").exists())
-
-
-def _not_a_traceback(record: logging.LogRecord) -> bool:
-    """Return whether a record is no traceback of Orbax, whose errors `Checkpoints` raises."""
-    return not (record.exc_info and "orbax" in record.pathname)
-
-
-@contextlib.contextmanager
-def _without_warnings() -> Iterator[None]:
-    """Silence Orbax's warnings."""
-    logger = logging.getLogger("absl")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        yield
-    finally:
-        logger.setLevel(level)
+def _place(path: Any) -> str:
+    return jax.tree_util.keystr(path, simple=True, separator=".")
 
 
 def _sharding(leaf: Any) -> Any:
@@ -445,6 +401,18 @@ def _bytes(number: float) -> str:
     return f"{number / 1e9:.2f} GB" if number >= 1e8 else f"{number / 1e6:.2f} MB"
 
 
-def nbytes(tree: Any) -> int:
-    """Return bytes of all arrays of a tree, or of its ``jax.eval_shape``."""
-    return sum(int(np.prod(leaf.shape)) * leaf.dtype.itemsize for leaf in _plain(tree).values())
+def _not_a_traceback(record: logging.LogRecord) -> bool:
+    """Return whether a record is no traceback of Orbax, whose errors `Checkpoints` raises."""
+    return not (record.exc_info and "orbax" in record.pathname)
+
+
+@contextmanager
+def _without_warnings() -> Iterator[None]:
+    """Silence Orbax's warnings."""
+    logger = logging.getLogger("absl")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
 from typing import Any
 
 import jax
 
 from pixelbrax_jax.agents.runner.checkpoint import CheckpointError, Checkpoints, DiskFullError
+from pixelbrax_jax.agents.runner.progress import Report
 
 _RETRY_MINUTES = 1.0
 
@@ -25,20 +25,12 @@ class Saver:
         self,
         checkpoints: Checkpoints,
         steps: int,
-        report: Callable[[str], None],
+        report: Report,
         *,
         every: int,
         minutes: float,
     ) -> None:
-        """Start the clock.
-
-        Args:
-            checkpoints: of the run.
-            steps: control steps at which it goes on.
-            report: gets a line about checkpoints that cannot be written.
-            every: control steps between checkpoints; 0 does not count them.
-            minutes: between checkpoints; 0 goes by no clock.
-        """
+        """Start the clock at ``steps``; ``every`` and ``minutes`` are those of ``RunConfig``."""
         self._checkpoints = checkpoints
         self._report = report
         self._every = every
@@ -56,13 +48,7 @@ class Saver:
         return bool(self._every) and steps // self._every > self._last_steps // self._every
 
     def save(self, state: Any, steps: int, score: float | None, *, last: bool) -> None:
-        """Write a checkpoint; training may go on meanwhile, and the last one is waited for.
-
-        Args:
-            state: any pytree of arrays.
-            steps: control steps so far.
-            score: the higher, the better; None if it is not known.
-            last: whether the run stops behind it.
+        """As ``Checkpoints.save``; the last one is waited for.
 
         Raises:
             CheckpointError: the last one cannot be written, or of several processes only some can.
@@ -74,24 +60,18 @@ class Saver:
             if last:
                 self._checkpoints.wait()
         except CheckpointError as error:
-            if last:
-                latest = self.latest()
-                kept = "there is no other" if latest is None else f"that of {latest} steps stays"
-                raise CheckpointError(
-                    f"the checkpoint of {steps} steps, the last one, is lost; {kept}. {error} "
-                    "Make room or mend the folder, and go on with --resume latest."
-                ) from error
-            self._fail(error)
+            if not last:
+                self._fail(error)
+                return
+            latest = self.latest()
+            kept = "there is no other" if latest is None else f"that of {latest} steps stays"
+            raise CheckpointError(
+                f"the checkpoint of {steps} steps, the last one, is lost; {kept}. {error} "
+                "Make room or mend the folder, and go on with --resume latest."
+            ) from error
 
     def look_after(self, *, wait: bool = False) -> None:
-        """Tell what has become of the checkpoint that is being written.
-
-        Args:
-            wait: whether to wait until it is written.
-
-        Raises:
-            CheckpointError: of several processes only some can write it.
-        """
+        """Tell what has become of the checkpoint that is being written; raises as `save`."""
         try:
             if wait:
                 self._checkpoints.wait()
@@ -101,7 +81,7 @@ class Saver:
         except CheckpointError as error:
             self._fail(error)
             return
-        if self._failing and self._checkpoints.steps()[-1:] == [self._last_steps]:
+        if self._failing and self.latest() == self._last_steps:
             self._failing = False
             self._report(f"the checkpoint of {self._last_steps} steps is written")
 

@@ -1,18 +1,18 @@
-"""A trained agent, from the folder of its run."""
+"""A trained agent: read from the folder of its run, or from the package; its policy in a file."""
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Protocol
 
 import jax
+import jax.numpy as jnp
 
+from pixelbrax_jax.agents.algorithm import Algorithm
 from pixelbrax_jax.agents.config import TrainConfig, make_env
-from pixelbrax_jax.agents.optimizer import Networks
 from pixelbrax_jax.agents.registry import ALGORITHMS
 from pixelbrax_jax.agents.runner.checkpoint import (
     CheckpointError,
@@ -20,18 +20,37 @@ from pixelbrax_jax.agents.runner.checkpoint import (
     read_about,
     read_networks,
 )
-from pixelbrax_jax.agents.runner.evaluate import WITHOUT_DISTRACTORS, Player, splits_of
-from pixelbrax_jax.agents.runner.seeds import Runs
+from pixelbrax_jax.agents.runner.programs import Runs
 from pixelbrax_jax.agents.runner.settings import (
     OF_RUNS,
     clip_digests,
     former_settings,
     unknown_settings,
 )
+from pixelbrax_jax.agents.runner.splits import WITHOUT_DISTRACTORS, splits_of
+from pixelbrax_jax.agents.train_state import Networks
 from pixelbrax_jax.distractors.presets import as_tuple
 from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.policy import Policy, load_policy, read_pretrained
+
+PLATFORMS = ("cpu", "cuda", "tpu")
+"""Devices that an exported policy runs on."""
+
+
+class Player(Protocol):
+    """What chooses actions; hashable. Every ``Algorithm`` does."""
+
+    @property
+    def acting(self) -> tuple[str, ...]:
+        """As ``Algorithm.acting``."""
+
+    @property
+    def config(self) -> TrainConfig:
+        """Settings of its training."""
+
+    def act(self, networks: Networks, pixels: jax.Array, key: jax.Array | None = None) -> jax.Array:
+        """As ``Algorithm.act``."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +59,7 @@ class Pretrained:
 
     config: TrainConfig
     policy: Policy
+    acting: ClassVar[tuple[str, ...]] = ()
 
     @under_default_flags
     def act(self, networks: Networks, pixels: jax.Array, key: jax.Array | None = None) -> jax.Array:
@@ -85,25 +105,30 @@ def load_pretrained(name: str) -> Trained:
     """
     about = read_pretrained(name)
     player = Pretrained(load_config(about), load_policy(name))
-    return Trained(player, {"actor": {}}, about["steps"], about["config"].get("seed", 0))
+    return Trained(player, {}, about["steps"], about["config"].get("seed", 0))
 
 
-def load_chosen(options: argparse.Namespace) -> Trained:
-    """Return what the options of a command choose: a run's checkpoint, or a pretrained policy.
+def load_agent(
+    folder: str | Path | None,
+    pretrained: str | None,
+    *,
+    steps: int | None = None,
+    best: bool = False,
+    run: int = 0,
+) -> Trained:
+    """Return an agent by `load_trained` from a folder, or by `load_pretrained` by its name.
 
     Raises:
         CheckpointError: there is no such checkpoint.
         ValueError: options do not go together, or are out of range.
     """
-    if (options.folder is None) == (options.pretrained is None):
+    if folder is not None and pretrained is None:
+        return load_trained(folder, steps=steps, best=best, run=run)
+    if folder is not None or pretrained is None:
         raise ValueError("give the folder of a run, or --pretrained and a name: one of the two.")
-    if options.pretrained is None:
-        return load_trained(
-            options.folder, steps=options.steps, best=options.best, run=options.run_index
-        )
-    if options.steps is not None or options.best or options.run_index:
+    if steps is not None or best or run:
         raise ValueError("--steps, --best and --run choose of a run's folder, not of --pretrained.")
-    return load_pretrained(options.pretrained)
+    return load_pretrained(pretrained)
 
 
 def load_trained(
@@ -141,7 +166,7 @@ def load_trained(
     env, params = make_env(config, **WITHOUT_DISTRACTORS)
     algorithm = ALGORITHMS[about["algorithm"]](config, VectorPixelEnv(env, config.num_envs))
     runs = Runs(algorithm, num_seeds)
-    template = jax.eval_shape(runs.init, 0, params).networks
+    template = runs.template(params).networks
     networks = runs.split(read_networks(checkpoints, template, about["steps"]))[run]
     clips = about.get("clips")
     return Trained(
@@ -199,3 +224,37 @@ def load_config(about: Mapping[str, Any]) -> TrainConfig:
         raise CheckpointError(unknown.strip())
     stored = former | about["config"]
     return kind().replace(**{n: value for n, value in stored.items() if n not in OF_RUNS})
+
+
+def save_policy(algorithm: Algorithm, networks: Networks, path: str | Path) -> Path:
+    """Write a policy's mean action as a compiled function of JAX's export format.
+
+    The file holds program and parameters, runs on CPU, CUDA and TPU for any number of
+    observations, and needs nothing but JAX: ``jax.export.deserialize(bytes).call(pixels)``.
+
+    Args:
+        algorithm: whose ``act`` is stored.
+        networks: parameters.
+        path: of the file.
+
+    Returns:
+        The path.
+    """
+    spec = algorithm.envs.env.obs_spec
+    spec = spec["pixels"] if isinstance(spec, dict) else spec
+    acting = {name: networks[name] for name in algorithm.acting}
+    (batch,) = jax.export.symbolic_shape("batch")
+    exported = jax.export.export(
+        jax.jit(lambda pixels: algorithm.act(acting, pixels)), platforms=PLATFORMS
+    )(jax.ShapeDtypeStruct((batch, *spec.shape), jnp.uint8))
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # Written aside and renamed: a file of this name is always whole.
+    part = path.with_name(path.name + ".part")
+    try:
+        part.write_bytes(exported.serialize())
+        part.replace(path)
+    except OSError:
+        part.unlink(missing_ok=True)
+        raise
+    return path

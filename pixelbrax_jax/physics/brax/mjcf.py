@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -231,7 +231,7 @@ def _load(model: mujoco.MjModel, backend: str) -> mjcf.System:
 
 
 def _check_functions(task: _Task, model: mujoco.MjModel) -> None:
-    def zeros(*shape: int) -> jax.ShapeDtypeStruct:
+    def zeros(*shape: int) -> Any:
         return jax.ShapeDtypeStruct(shape, jnp.float32)
 
     links, action = model.nbody - 1, zeros(model.nu)

@@ -110,7 +110,7 @@ class MjxPhysics(GuardedPhysics):
         )
 
     def first(self, key: jax.Array) -> tuple[MjxState, jax.Array]:
-        """Draw an initial state; return it and the sensors as ``observe`` takes them."""
+        """Sample an initial state; return it and the sensors as ``observe`` takes them."""
         return self._settle(self._formulas.start(self.dynamics, key))
 
     @under_default_flags

@@ -193,7 +193,7 @@ class Formulas:
     """How a task's episodes begin, what is observed and rewarded, and what is special about it.
 
     Attributes:
-        start: draws an initial state from a key.
+        start: samples an initial state from a key.
         observe: returns the observation, in DM Control's order.
         reward: returns the reward, in [0, 1].
         substeps: physics steps per control step.

@@ -12,7 +12,7 @@ from pixelbrax_jax.physics.mjx.formulas import Formulas, Snapshot, Start, joined
 
 
 def _start(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Draw both angles uniformly."""
+    """Sample both angles uniformly."""
     return Start(jax.random.uniform(key, (dynamics.model.nq,), minval=-jnp.pi, maxval=jnp.pi))
 
 

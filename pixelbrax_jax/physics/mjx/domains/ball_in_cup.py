@@ -11,18 +11,18 @@ from pixelbrax_jax.physics.mjx.resets import free_of_contact
 
 
 def _start(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Draw a place of the ball where it touches nothing; the cup is at rest in its middle."""
+    """Sample a place of the ball where it touches nothing; the cup is at rest in its middle."""
     model = dynamics.model
     x, z = (int(model.joint(name).qposadr[0]) for name in ("ball_x", "ball_z"))
 
-    def draw(key: jax.Array, before: Start) -> Start:
+    def sample(key: jax.Array, before: Start) -> Start:
         del before
         place = jax.random.uniform(
             key, (2,), minval=jnp.array([-0.2, 0.2]), maxval=jnp.array([0.2, 0.5])
         )
         return Start(jnp.asarray(model.qpos0, jnp.float32).at[jnp.array([x, z])].set(place))
 
-    return free_of_contact(dynamics, key, draw)
+    return free_of_contact(dynamics, key, sample)
 
 
 def _observe(seen: Snapshot) -> jax.Array:

@@ -10,13 +10,13 @@ from pixelbrax_jax.physics.mjx.formulas import Formulas, Snapshot, Start, joined
 
 
 def _start_hanging(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Draw a cart near the middle with its pole down."""
+    """Sample a cart near the middle with its pole down."""
     noise = 0.01 * jax.random.normal(key, (2, dynamics.model.nq))
     return Start(jnp.array([0.0, jnp.pi]) + noise[0], noise[1])
 
 
 def _start_upright(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Draw a cart near the middle with its pole almost upright."""
+    """Sample a cart near the middle with its pole almost upright."""
     pose, speed = jax.random.split(key)
     reach = jnp.array([0.1, 0.034])
     qpos = jax.random.uniform(pose, (2,), minval=-reach, maxval=reach)

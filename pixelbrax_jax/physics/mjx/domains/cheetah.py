@@ -16,9 +16,9 @@ _SETTLING_STEPS = 200
 
 
 def _start(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Draw limited joints uniformly, then let the body fall for 200 physics steps.
+    """Sample limited joints uniformly, then let the body fall for 200 physics steps.
 
-    DM Control draws joint positions after the forces of the model's own pose are known. The first
+    DM Control samples joint positions after the forces of the model's own pose are known. The first
     of these steps moves by them, and so by the same velocity in every episode.
     """
     model = dynamics.model

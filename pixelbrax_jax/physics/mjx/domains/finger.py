@@ -20,12 +20,12 @@ meets is the fingertip and the spinner's caps."""
 
 
 def _start_spin(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Draw joints that let nothing touch."""
+    """Sample joints that let nothing touch."""
     return free_of_contact(dynamics, key, lambda key, _: Start(random_joints(dynamics.model, key)))
 
 
 def _start_turn(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Draw joints, and a target on the circle that the body's tip can reach."""
+    """Sample joints, and a target on the circle that the body's tip can reach."""
     model = dynamics.model
     angle_key, pose_key = jax.random.split(key)
     angle = jax.random.uniform(angle_key, (), minval=-jnp.pi, maxval=jnp.pi)

@@ -22,7 +22,7 @@ _JOINTS = (
 
 
 def _start_upright(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Draw any rotation, and joints within 0.2 rad."""
+    """Sample any rotation, and joints within 0.2 rad."""
     rotation, joints = jax.random.split(key)
     model = dynamics.model
     bend = jax.random.uniform(joints, (model.nq - 7,), minval=-0.2, maxval=0.2)
@@ -31,7 +31,7 @@ def _start_upright(dynamics: Dynamics, key: jax.Array) -> Start:
 
 
 def _start_swim(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Draw what uprighting draws, and a target in a box."""
+    """Sample what uprighting samples, and a target in a box."""
     fish, target = jax.random.split(key)
     low, high = jnp.array([-0.4, -0.4, 0.1]), jnp.array([0.4, 0.4, 0.3])
     place = jax.random.uniform(target, (3,), minval=low, maxval=high)

@@ -16,7 +16,7 @@ _HOP_SPEED = 2.0
 
 
 def _start(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Draw joints and the root's angle; contacts are not looked for."""
+    """Sample joints and the root's angle; contacts are not looked for."""
     return Start(random_joints(dynamics.model, key))
 
 

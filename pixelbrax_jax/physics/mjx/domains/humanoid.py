@@ -15,7 +15,7 @@ _STAND_HEIGHT = 1.4
 
 
 def _start(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Draw joints and the root's rotation that let nothing touch."""
+    """Sample joints and the root's rotation that let nothing touch."""
     return free_of_contact(dynamics, key, lambda key, _: Start(random_joints(dynamics.model, key)))
 
 

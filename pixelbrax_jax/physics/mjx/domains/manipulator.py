@@ -28,7 +28,7 @@ _TOUCH = ("palm_touch", "finger_touch", "thumb_touch", "fingertip_touch", "thumb
 _TARGET = "target_ball"
 
 _IN_HAND, _AT_TARGET = 0.1, 0.1
-"""Probabilities of where the ball is in a draw; else it is anywhere."""
+"""Probabilities of where the ball is in a sample; else it is anywhere."""
 
 _MAX_CONTACTS = 24
 """Of 148 that there can be: random actions make 10 at most, and all take three times as long."""
@@ -38,14 +38,14 @@ _NEAR = 0.01
 
 
 def _start(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Draw joints, target and ball until nothing touches."""
-    return free_of_contact(dynamics, key, partial(_draw, dynamics))
+    """Sample joints, target and ball until nothing touches."""
+    return free_of_contact(dynamics, key, partial(_sample, dynamics))
 
 
-def _draw(dynamics: Dynamics, key: jax.Array, before: Start) -> Start:
-    """Draw the arm, a target, and a ball in the hand, at the target or anywhere, and then moving.
+def _sample(dynamics: Dynamics, key: jax.Array, before: Start) -> Start:
+    """Sample the arm, a target, and a ball in the hand, at the target or anywhere, and then moving.
 
-    A ball in the hand or at the target is as fast as the one of the draw ``before``: DM Control
+    A ball in the hand or at the target is as fast as the one of the sample ``before``: DM Control
     starts again without stopping it.
     """
     model = dynamics.model
@@ -78,7 +78,7 @@ def _positions(model: mujoco.MjModel, *joints: str) -> np.ndarray:
 
 
 def _arm(model: mujoco.MjModel, key: jax.Array) -> jax.Array:
-    """Draw the arm's joints, uniformly in their range or all round, radians."""
+    """Sample the arm's joints, uniformly in their range or all round, radians."""
     rows = [model.joint(name).id for name in _ARM]
     limited = model.jnt_limited[rows].astype(bool)[:, None]
     low, high = np.where(limited, model.jnt_range[rows], [-np.pi, np.pi]).T.astype(np.float32)

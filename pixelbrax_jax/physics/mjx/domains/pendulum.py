@@ -14,7 +14,7 @@ _COSINE_BOUND = math.cos(math.radians(8))
 
 
 def _start(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Draw any angle."""
+    """Sample any angle."""
     return Start(jax.random.uniform(key, (dynamics.model.nq,), minval=-jnp.pi, maxval=jnp.pi))
 
 

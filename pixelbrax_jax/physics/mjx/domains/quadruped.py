@@ -21,7 +21,7 @@ _EPISODE = 20.0
 
 
 def _start(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Draw any rotation, at the lowest height, in whole centimetres, where nothing touches.
+    """Sample any rotation, at the lowest height, in whole centimetres, where nothing touches.
 
     DM Control begins at height 0 and lifts until there is no contact. All distances from the floor
     grow by what the body is lifted, so that the height is known from those at height 0.

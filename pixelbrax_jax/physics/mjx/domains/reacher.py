@@ -14,7 +14,7 @@ from pixelbrax_jax.physics.opengl import mujoco
 
 
 def _start(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Draw joints, and a target from 5 to 20 cm away from the shoulder."""
+    """Sample joints, and a target from 5 to 20 cm away from the shoulder."""
     joints, angle, radius = jax.random.split(key, 3)
     model = dynamics.model
     angle = jax.random.uniform(angle, (), minval=0.0, maxval=2 * jnp.pi)

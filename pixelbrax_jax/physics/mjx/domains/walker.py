@@ -15,7 +15,7 @@ _STAND_HEIGHT = 1.2
 
 
 def _start(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Draw joints and the root's angle; contacts are not looked for."""
+    """Sample joints and the root's angle; contacts are not looked for."""
     return Start(random_joints(dynamics.model, key))
 
 
