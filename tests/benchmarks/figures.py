@@ -42,10 +42,10 @@ def brax_tasks() -> str:
 def options() -> str:
     """Every option of an environment, with its default and its documentation."""
     about = {}
-    for declaring in pb.EnvConfig.__mro__[:-1]:
-        (kind,) = ast.parse(inspect.getsource(declaring)).body
-        assert isinstance(kind, ast.ClassDef)
-        for field, text in zip(kind.body, kind.body[1:], strict=False):
+    for kind in pb.EnvConfig.__mro__[:-1]:
+        (body,) = ast.parse(inspect.getsource(kind)).body
+        assert isinstance(body, ast.ClassDef)
+        for field, text in zip(body.body, body.body[1:], strict=False):
             if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
                 about[field.target.id] = ast.literal_eval(text.value)  # type: ignore[union-attr]
     lines = [
