@@ -22,8 +22,8 @@ def chains() -> dict[str, tuple[Any, ...]]:
         "color, each material": (kinds.Color("geom", "walk", 0.2, "uniform"),),
         "video overlay": (kinds.Video(mode="overlay"),),
         "video background": (background,),
-        "camera": (kinds.Camera(scale=0.2),),
-        "all three": (kinds.Color(), background, kinds.Camera(scale=0.2)),
+        "camera": (kinds.MovingCamera(scale=0.2),),
+        "all three": (kinds.Color(), background, kinds.MovingCamera(scale=0.2)),
     }
 
 

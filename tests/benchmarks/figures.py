@@ -16,7 +16,6 @@ from pathlib import Path
 import pixelbrax_jax as pb
 from pixelbrax_gym.bench import report
 from pixelbrax_gym.bench.tables import table
-from pixelbrax_jax import config
 from pixelbrax_jax.tasks import BRAX_TASKS
 from tests.benchmarks import dmc_page, performance, results
 from tests.benchmarks.cases import GROUPS
@@ -43,11 +42,12 @@ def brax_tasks() -> str:
 def options() -> str:
     """Every option of an environment, with its default and its documentation."""
     about = {}
-    for kind in ast.parse(inspect.getsource(config)).body:
-        if isinstance(kind, ast.ClassDef):
-            for field, text in zip(kind.body, kind.body[1:], strict=False):
-                if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
-                    about[field.target.id] = ast.literal_eval(text.value)  # type: ignore[union-attr]
+    for kind in pb.EnvConfig.__mro__[:-1]:
+        (body,) = ast.parse(inspect.getsource(kind)).body
+        assert isinstance(body, ast.ClassDef)
+        for field, text in zip(body.body, body.body[1:], strict=False):
+            if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
+                about[field.target.id] = ast.literal_eval(text.value)  # type: ignore[union-attr]
     lines = [
         [
             f"`{field.name}`",
