@@ -68,6 +68,11 @@ class _First:
     task: str | None = None
 
 
+def _first(arguments: Sequence[str]) -> _First:
+    first, _ = tyro.cli(_First, args=arguments, return_unknown_args=True, add_help=False)
+    return first
+
+
 def run(arguments: Sequence[str]) -> int:
     """Run the command."""
     with needs_extra("train"):
@@ -90,7 +95,11 @@ def run(arguments: Sequence[str]) -> int:
             f"name an algorithm first, as in 'pixelbrax train ppo {algorithm} ...'; there are "
             f"{', '.join(ALGORITHMS)}"
         )
-    check_choice("algorithm", algorithm, ALGORITHMS)
+    try:
+        check_choice("algorithm", algorithm, ALGORITHMS)
+        check_choice("preset", _first(rest).preset, PRESETS)
+    except ValueError as error:
+        raise UsageError(str(error)) from error
     launch, config, options = parse(algorithm, rest)
     launch.start()
     try:
@@ -130,7 +139,7 @@ def parse(algorithm: str, arguments: Sequence[str]) -> tuple[Launch, TrainConfig
     from pixelbrax_jax.agents.runner.settings import RunConfig
 
     # Defaults are those of a preset, which may be those of a task.
-    first, _ = tyro.cli(_First, args=arguments, return_unknown_args=True, add_help=False)
+    first = _first(arguments)
     parts: dict[str, Any] = {
         "launch": Launch(first.preset),
         "config": preset(algorithm, first.preset, first.task),
