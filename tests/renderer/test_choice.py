@@ -81,17 +81,13 @@ def test_one_wrong_pixel_is_refused(plane, value, told):
     assert told in check.text
 
 
-class FakeCard:
-    device_kind, compute_capability = "NVIDIA H100", "9.0"
-    client = SimpleNamespace(platform_version="cuda 12.9")
-
-
 @pytest.fixture
 def card(monkeypatch):
     """JAX says that it computes on an NVIDIA GPU."""
     from jax.experimental.pallas import triton
 
-    card = type("Card", (FakeCard,), {"client": SimpleNamespace(platform_version="cuda 12.9")})
+    client = SimpleNamespace(platform_version="cuda 12.9")
+    card = SimpleNamespace(device_kind="NVIDIA H100", compute_capability="9.0", client=client)
     monkeypatch.setattr(choice, "default_platform", lambda: "gpu")
     monkeypatch.setattr(jax, "devices", lambda: [card])
     monkeypatch.delattr(triton, "get_gpu_info", raising=False)
