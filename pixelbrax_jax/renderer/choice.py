@@ -28,6 +28,9 @@ _CAPABILITY = 8.0
 
 _HEIGHT, _WIDTH = 24, 40
 
+_EYES = ((-2.0, -4.25, 2.25), (0.5, -4.25, 1.75))
+"""Metres, where the check looks from: no edge in its images goes through the middle of a pixel."""
+
 Draw = Callable[[Scene, int, int], Frame]
 
 _COLOR = 1.0 / 255.0
@@ -158,7 +161,7 @@ def _compare(draw: Draw) -> KernelCheck:
         return jax.tree.map(np.asarray, frames)
 
     with default_flags(), jax.disable_jit(False):
-        scenes = jax.jit(jax.vmap(_scene))(np.array([[0.5, -4.0, 2.0], [-2.0, -3.5, 1.5]]))
+        scenes = jax.jit(jax.vmap(_scene))(np.array(_EYES))
         wanted = images(plain)
         try:
             found = images(draw)
