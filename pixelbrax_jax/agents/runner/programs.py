@@ -14,6 +14,7 @@ from pixelbrax_jax.agents.algorithm import Algorithm
 from pixelbrax_jax.agents.runner.devices import mesh_of, replicated, state_shardings
 from pixelbrax_jax.agents.train_state import Metrics, TrainState
 from pixelbrax_jax.compilation import jit
+from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.types import EnvParams
 
 
@@ -39,17 +40,16 @@ class Runs:
 
     @jit(_env, static_argnums=0)
     def init(self, seed: jax.Array, env_params: EnvParams) -> TrainState:
-        """Return the state before the first iteration.
+        """Return the state before the first iteration; each run has the seed after the last."""
+        return self._spread(self._init(seed, env_params), {})[0]
 
-        Args:
-            seed: () uint32, of the first run; the next one has the next seed.
-            env_params: of the environments.
-        """
+    @under_default_flags
+    def _init(self, seed: jax.Array, env_params: EnvParams) -> TrainState:
         if self.num_seeds == 1:
             keys = jax.random.key(seed)
         else:
             keys = jnp.stack([jax.random.key(seed + i) for i in range(self.num_seeds)])
-        return self._spread(self._each(self.algorithm.init, keys, env_params), {})[0]
+        return self._each(self.algorithm.init, keys, env_params)
 
     # The state before an iteration is not needed after it: its memory is used again.
 
@@ -65,7 +65,7 @@ class Runs:
 
     def template(self, env_params: EnvParams) -> TrainState:
         """Return shapes, dtypes and, of several devices, shardings of the state."""
-        template = jax.eval_shape(self.init, jnp.uint32(0), env_params)
+        template: TrainState = jax.eval_shape(self._init, jnp.uint32(0), env_params)
         mesh = mesh_of(self.algorithm)
         if mesh is None:
             return template
