@@ -33,7 +33,7 @@ ROWS: dict[str, tuple] = {
         f"color, geom, {scale}": (distractors.Color("geom", "walk", scale, "uniform"),)
         for scale in (0.1, 0.2, 0.3)
     },
-    **{f"camera, {scale}": (distractors.Camera(scale=scale),) for scale in (0.1, 0.2, 0.3)},
+    **{f"camera, {scale}": (distractors.MovingCamera(scale=scale),) for scale in (0.1, 0.2, 0.3)},
     **{name: (name,) for name in ("dcs-easy", "dcs-medium", "dcs-hard")},
 }
 MOVING = ("paper-color", "paper-video", "video-hard", "dcs-easy", "dcs-medium", "dcs-hard")

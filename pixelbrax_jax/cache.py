@@ -7,10 +7,7 @@ from pathlib import Path
 
 
 def cache_folder(given: str | Path | None = None) -> Path:
-    """Return the folder, which need not exist.
-
-    Args:
-        given: by the caller; None means ``$PIXELBRAX_CACHE``, else ``~/.cache/pixelbrax``.
+    """Return the given folder, else ``$PIXELBRAX_CACHE``, else ``~/.cache/pixelbrax``.
 
     Raises:
         FileNotFoundError: the user has no home folder, and it would be in it; with the fix.
@@ -36,11 +33,7 @@ def whole_path(path: str | os.PathLike[str]) -> Path:
 
 
 def in_home(path: Path) -> Path:
-    """Return a path with the home folder in place of ``~``.
-
-    Raises:
-        FileNotFoundError: there is no such home folder; with the fix.
-    """
+    """Return a path with the home folder in place of ``~``, or raise as ``whole_path`` does."""
     try:
         return path.expanduser()
     except RuntimeError as error:

@@ -10,6 +10,7 @@ from typing import Any, ParamSpec, TypeVar
 import jax
 import numpy as np
 
+from pixelbrax_jax._platform.lowering import default_platform
 from pixelbrax_jax.flags import is_guarded, under_default_flags
 from pixelbrax_jax.validation import check_choice
 
@@ -26,7 +27,7 @@ cut into parts that the host launches one after the other. XLA leaves out what a
 _PLATFORMS = {"cpu": "cpu", "gpu": "gpu", "cuda": "gpu", "rocm": "gpu", "tpu": "tpu"}
 """JAX's names of platforms, and those of its default backends."""
 
-_MOST_CROSSINGS = 50
+_MOST_INTERSECTIONS = 50
 """Geoms times rays of a pixel, one to the camera and one to each of the model's lamps, which XLA's
 newer emitters still make one fast loop of."""
 
@@ -72,12 +73,8 @@ def jit(
 ) -> Callable[[Callable[_P, _T]], Callable[_P, _T]]:
     """Decorate as ``jax.jit`` does, with ``compiler_options``.
 
-    They are asked for at the first call for a physics: importing a package must not start a device,
-    and the step of an environment not ask again.
-
-    Args:
-        env_of: gives the environment of the function's first argument, which is static.
-        **options: of ``jax.jit``.
+    ``env_of`` gives the environment of the function's first argument, which is static. The options
+    are asked for at the first call for a physics: importing a package must not start a device.
     """
 
     def decorate(function: Callable[_P, _T]) -> Callable[_P, _T]:
@@ -112,15 +109,15 @@ def _physics(env: Any) -> Any:
 
 def _options(physics: Any, platform: str | None = None) -> dict[str, Any]:
     if platform is None:
-        platform = jax.default_backend()
+        platform = default_platform()
     else:
         platform = _PLATFORMS[check_choice("platform", platform, _PLATFORMS)]
     flags = os.environ.get("XLA_FLAGS", "")
     if platform == "gpu" and _COMMANDS not in flags:
         chosen: dict[str, Any] = {_COMMANDS: _CAPTURED}
     elif platform == "cpu" and _WIDTH not in flags:
-        chosen = {_WIDTH: 512, **getattr(physics, "compiler_options", {})}
-        if _crossings(physics) > _MOST_CROSSINGS:
+        chosen = {_WIDTH: 512, **(physics.compiler_options if physics else {})}
+        if physics is not None and _intersections(physics) > _MOST_INTERSECTIONS:
             # The newer ones cut long loops up, and compute what the parts share again in each of
             # them: drawing DM Control's swimmer15 takes 250 times as long.
             chosen.setdefault(_EMITTERS, False)
@@ -129,11 +126,8 @@ def _options(physics: Any, platform: str | None = None) -> dict[str, Any]:
     return {name: value for name, value in chosen.items() if _is_known(name, value)}
 
 
-def _crossings(physics: Any) -> int:
-    geoms, look = getattr(physics, "geoms", None), getattr(physics, "look", None)
-    if geoms is None:
-        return 0
-    return len(geoms.kind) * (1 + len(look.lamps if look else ()))
+def _intersections(physics: Any) -> int:
+    return len(physics.geoms.kind) * (1 + len(physics.look.lamps if physics.look else ()))
 
 
 @cache

@@ -12,15 +12,14 @@ import jax
 from pixelbrax_jax.distractors.base import Distractor
 from pixelbrax_jax.distractors.clips import ClipBank
 from pixelbrax_jax.distractors.presets import as_tuple
+from pixelbrax_jax.physics.brax.tasks import BraxOptions
 from pixelbrax_jax.plain import from_plain
 from pixelbrax_jax.renderer.base import check_renderer
 from pixelbrax_jax.scene.look import make_look
-from pixelbrax_jax.tasks import REWARD_PRESETS
 from pixelbrax_jax.types import Camera, CameraRig, Look
 from pixelbrax_jax.validation import check_bool, check_choice, check_options, check_positive_int
 
 OBS_MODES = ("pixels", "state", "both")
-PHYSICS_BATCHING = ("auto", "vmap")
 
 Distractors = str | Distractor | Iterable[str | Distractor] | None
 
@@ -46,23 +45,17 @@ class ProgramConfig:
     """Control steps per step; one frame is drawn at their end."""
     renderer: str = "auto"
     """``auto``, the fastest for the device; ``fused``, for all devices; ``pallas``, the kernel for
-    NVIDIA GPUs that ``auto`` takes there; ``pallas-interpret``, that kernel on any device, slowly;
-    or ``reference``, the slow one that the others are tested against."""
+    NVIDIA GPUs that ``auto`` takes there if it passes a check; or ``reference``, the slow one that
+    the others are tested against."""
     distractors: Distractors = ()
     """What changes the image: a distractor, the name of a preset, or several of them; as
     everywhere, a dictionary of ``plain.to_plain`` in place of an object."""
-    physics_batching: str = "auto"
-    """``auto``, the fastest for the device; or ``vmap``, also to compile for another device."""
 
     def __post_init__(self) -> None:
         """Check the options, and store them as Python's own types."""
         for name in ("height", "width", "frame_stack", "action_repeat"):
             self._store(name, check_positive_int(name, self._static(name)))
-        for name, allowed in (
-            ("obs_mode", OBS_MODES),
-            ("physics_batching", PHYSICS_BATCHING),
-        ):
-            check_choice(name, self._static(name), allowed)
+        check_choice("obs_mode", self._static("obs_mode"), OBS_MODES)
         check_renderer(self._static("renderer"))
         self._store("distractors", as_tuple(from_plain(self.distractors)))
 
@@ -90,8 +83,11 @@ class ProgramConfig:
         object.__setattr__(self, name, value)
 
 
+_SUITE_OPTIONS = fields(BraxOptions)
+
+
 @dataclass(frozen=True)
-class EnvConfig(ProgramConfig):
+class EnvConfig(BraxOptions, ProgramConfig):
     """All options of an environment; ``pixelbrax_jax.make(task, **options)`` takes them.
 
     Raises:
@@ -102,11 +98,6 @@ class EnvConfig(ProgramConfig):
     task: str = "ant"
     """Task, one of ``pixelbrax_jax.list_envs()``; or ``module:name``, which imports the module that
     registers it."""
-    backend: str | None = None
-    """Physics backend: ``spring``, ``positional``, ``generalized`` or ``mjx``; None means the
-    task's own, which is all that tasks of the DM Control Suite have."""
-    reward_preset: str = "brax"
-    """``brax``, or ``paper`` for the rewards of arXiv 2502.00021; for Brax's tasks alone."""
     camera: str | CameraRig | Camera = "default"
     """Viewpoint: a name of ``named_rigs``, a ``CameraRig`` or a ``Camera``."""
     look: str | Look = "default"
@@ -124,10 +115,10 @@ class EnvConfig(ProgramConfig):
 
     def __post_init__(self) -> None:
         """Check the options, and store them as Python's own types."""
-        super().__post_init__()
-        for name in ("task", "backend", "split"):
+        ProgramConfig.__post_init__(self)
+        for name in ("task", "split", *(option.name for option in _SUITE_OPTIONS)):
             self._static(name)
-        check_choice("reward_preset", self._static("reward_preset"), REWARD_PRESETS)
+        BraxOptions.__post_init__(self)
         episode_length = check_positive_int("episode_length", self._static("episode_length"))
         self._store("episode_length", episode_length)
         if self.shadows is not None:
@@ -139,6 +130,11 @@ class EnvConfig(ProgramConfig):
             raise TypeError(
                 f"clips must be a folder, 'procedural' or a bank of load_clips, got {self.clips!r}."
             )
+
+    def suite_options(self) -> dict[str, Any]:
+        """Return those options of single suites that are not at their defaults."""
+        values = {option.name: getattr(self, option.name) for option in _SUITE_OPTIONS}
+        return {o.name: values[o.name] for o in _SUITE_OPTIONS if values[o.name] != o.default}
 
 
 PROGRAM_OPTIONS = tuple(field.name for field in fields(ProgramConfig))

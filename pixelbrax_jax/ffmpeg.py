@@ -64,16 +64,7 @@ class Encoder:
     """Writes frames into an MP4 that every player plays: H.264, 4:2:0, as they come."""
 
     def __init__(self, path: Path, fps: float) -> None:
-        """Start nothing yet.
-
-        Args:
-            path: of the file.
-            fps: frames per second.
-
-        Raises:
-            ImportError: imageio-ffmpeg is not installed.
-            OSError: there is no FFmpeg; the message has the fix.
-        """
+        """Start nothing yet; raise as ``find_ffmpeg`` does."""
         self._program, self._path, self._fps = find_ffmpeg(), path, fps
         self._process: subprocess.Popen[bytes] | None = None
         self._log: IO[bytes] | None = None
@@ -82,9 +73,6 @@ class Encoder:
         """Write a frame.
 
         4:2:0 has one color for two by two pixels, so an odd side is repeated once at its end.
-
-        Args:
-            frame: (H, W, 3) uint8, of the size of the first one.
 
         Raises:
             OSError: FFmpeg could not write it; with its reason.
@@ -152,12 +140,7 @@ class Decoder:
     """
 
     def __init__(self, path: Path) -> None:
-        """Start nothing yet.
-
-        Raises:
-            ImportError: imageio-ffmpeg is not installed.
-            OSError: there is no FFmpeg; the message has the fix.
-        """
+        """Start nothing yet; raise as ``find_ffmpeg`` does."""
         self._program, self._path = find_ffmpeg(), path
         self.declared: int | None = None
         self.of_file = False
@@ -200,11 +183,7 @@ class Decoder:
 
 
 def reason(log: str) -> str:
-    """Return what FFmpeg says first of what is wrong, without its marks; empty if it says nothing.
-
-    Args:
-        log: all that it wrote, at whatever level.
-    """
+    """Return what FFmpeg's log says first of what is wrong, without its marks; empty if nothing."""
     lines = [line for line in log.splitlines() if line.strip()]
     wrong = [line for line in lines if "[error]" in line or "[fatal]" in line] or lines
     # "[mov,mp4 @ 0x55] [error] moov atom not found"

@@ -15,7 +15,7 @@ _P = ParamSpec("_P")
 _T = TypeVar("_T")
 
 PRNG = "threefry2x32"
-"""What all random numbers are drawn by: of JAX's own implementations the one whose numbers do not
+"""The implementation of all random numbers: the one of JAX's own in which a key's numbers do not
 depend on the other keys of a batch."""
 
 _FLAGS = (
@@ -64,9 +64,6 @@ def under_default_flags(function: Callable[_P, _T]) -> Callable[_P, _T]:
     Within ``jax.jit``, so that a compiled program's call costs nothing. Arguments of 64 bits are
     rounded to 32, and keys of another implementation than threefry become keys of it: those of
     JAX's ``rbg`` and ``unsafe_rbg`` that equal seeds make become equal ones.
-
-    Args:
-        function: of trees of arrays, and of whatever else it takes.
     """
 
     @wraps(function)

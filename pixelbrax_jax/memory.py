@@ -1,20 +1,18 @@
-"""Sizes that no memory of this machine could hold, refused before anything is allocated."""
+"""How much memory there is, and sizes that do not fit, refused before anything is allocated."""
 
 from __future__ import annotations
 
 import math
 import os
 
+import jax
+
 
 def check_fits(what: str, num_bytes: float) -> None:
-    """Reject what takes more bytes than the machine has.
+    """Reject ``what``, options and their values, if it takes more bytes than the machine has.
 
     This finds mistyped numbers early. What the machine could hold but a device or other programs
     leave no room for is found when it is allocated.
-
-    Args:
-        what: the options and their values, as the message should name them.
-        num_bytes: that they take at least.
 
     Raises:
         MemoryError: it is more than this machine's main memory, naming both.
@@ -25,6 +23,18 @@ def check_fits(what: str, num_bytes: float) -> None:
             f"{what} would take at least {num_bytes / 1e9:,.1f} GB, and this machine has "
             f"{limit / 1e9:,.1f} GB of memory; lower one of them."
         )
+
+
+def device_memory() -> float:
+    """Return the bytes that JAX may use on its first device; infinite where nobody tells."""
+    statistics = jax.local_devices()[0].memory_stats() or {}
+    if "bytes_limit" in statistics:
+        return float(statistics["bytes_limit"])
+    try:
+        import psutil
+    except ImportError:
+        return math.inf
+    return float(psutil.virtual_memory().available)
 
 
 def _main_memory() -> float:

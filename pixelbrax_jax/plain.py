@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from pixelbrax_jax.distractors.base import Distractor
-from pixelbrax_jax.distractors.camera import Camera as CameraDistractor
+from pixelbrax_jax.distractors.camera import MovingCamera
 from pixelbrax_jax.distractors.color import Color
 from pixelbrax_jax.distractors.video import Video
 from pixelbrax_jax.types import Camera, CameraRig, Lamp, Look
@@ -23,7 +23,7 @@ TYPE = "type"
 """The entry of a dictionary that names what it describes."""
 
 _TYPES: dict[str, type] = {cls.__name__: cls for cls in (Camera, CameraRig, Lamp, Look)} | {
-    cls.kind: cls for cls in (CameraDistractor, Color, Video)
+    cls.kind: cls for cls in (MovingCamera, Color, Video)
 }
 _NAMES = {cls: name for name, cls in _TYPES.items()}
 

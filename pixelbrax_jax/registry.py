@@ -1,34 +1,19 @@
-"""Task name -> pixel environment and its parameters."""
+"""Tasks by name: those that are built in, and those that users register."""
 
 from __future__ import annotations
 
 import importlib
-import inspect
-import os
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from types import ModuleType
 from typing import Any
-from weakref import WeakValueDictionary
 
-import jax
-import numpy as np
-
-from pixelbrax_jax import spatial
-from pixelbrax_jax.config import PROGRAM_OPTIONS, EnvConfig, env_config
-from pixelbrax_jax.distractors.clips import ClipBank, load_clips, warn_procedural
-from pixelbrax_jax.distractors.presets import resolve
-from pixelbrax_jax.distractors.video import Video
-from pixelbrax_jax.envs.pixel_env import PixelEnv
-from pixelbrax_jax.extras import install_extra
 from pixelbrax_jax.flags import default_flags
-from pixelbrax_jax.physics import make_physics
-from pixelbrax_jax.physics.base import Physics
-from pixelbrax_jax.scene.cameras import make_rig, rig_around, rigs_of, seen_from
-from pixelbrax_jax.scene.look import make_look
-from pixelbrax_jax.tasks import DMC_TASKS, SUITES, TASKS
-from pixelbrax_jax.types import Camera, CameraRig, Clips, EnvParams, GeomKind, Look
+from pixelbrax_jax.physics.base import Physics, check_physics
+from pixelbrax_jax.tasks import SUITES, TASKS
+from pixelbrax_jax.types import Camera, CameraRig
 from pixelbrax_jax.validation import check_choice, suggest
 
 
@@ -37,16 +22,11 @@ class _OwnTask:
     """A task of the user's."""
 
     make_physics: Callable[[], Physics]
-    camera: CameraRig | None
+    camera: CameraRig | Camera | None
 
     @cached_property
     def physics(self) -> Physics:
-        return self.make_physics()
-
-    @cached_property
-    def default_rig(self) -> CameraRig:
-        own = getattr(self.physics, "rigs", {})
-        return self.camera or own.get("default") or _corner_rig(self.physics)
+        return check_physics(self.make_physics())
 
 
 _OWN_TASKS: dict[str, _OwnTask] = {}
@@ -64,7 +44,7 @@ def list_envs(suite: str | None = None) -> tuple[str, ...]:
     """
     if suite is None:
         return tuple(sorted([*TASKS, *_OWN_TASKS]))
-    return tuple(sorted(SUITES[check_choice("suite", suite, SUITES)]))
+    return tuple(sorted(SUITES[check_choice("suite", suite, SUITES)].tasks))
 
 
 def register(
@@ -80,8 +60,8 @@ def register(
         make_physics: builds the physics, e.g. ``lambda: BraxPhysics(MyEnv())`` or
             ``lambda: mjcf_physics("arm.xml", reward=my_reward)``. Called once, by the first
             ``make``.
-        camera: default viewpoint; None is the model's camera ``default``, or without it a look from
-            a corner at everything but the ground, following the first body of what actuators move.
+        camera: default viewpoint; None is the physics' camera ``default``, or without it a look
+            from a corner at everything but the ground, following ``Physics.followed_link``.
 
     Raises:
         ValueError: the name is taken or empty.
@@ -95,129 +75,77 @@ def register(
         raise TypeError("make_physics must be a function that returns a Physics.")
     if not isinstance(camera, CameraRig | Camera | None):
         raise TypeError(f"camera must be a CameraRig, a Camera or None, got {camera!r}.")
-    _OWN_TASKS[name] = _OwnTask(make_physics, None if camera is None else make_rig(name, camera))
+    _OWN_TASKS[name] = _OwnTask(make_physics, camera)
 
 
 @default_flags()
-def make(task: str | EnvConfig, **options: Any) -> tuple[PixelEnv, EnvParams]:
-    """Make a pixel environment and its parameters.
-
-    Environments made of equal options are equal, and share compiled programs. Those that differ
-    in nothing but camera, look, time limit or clips are equal too: these are parameters.
+def make_physics(task: str, **options: Any) -> Physics:
+    """Make the physics of a task.
 
     Args:
-        task: one of ``list_envs()``; or ``"module:name"``, a task that importing the module
-            registers; or an ``EnvConfig``, of which ``options`` are changed.
-        **options: the fields of ``EnvConfig``, which says what they are.
+        task: one of ``list_envs()``.
+        **options: those of its suite, such as ``backend`` of Brax's tasks.
 
     Returns:
-        The environment and its parameters.
+        The physics; equal arguments give equal objects.
 
     Raises:
-        ValueError: a name is unknown or a number out of range; the message lists what is allowed.
-        TypeError: there is no such option; the message lists them and names the nearest one.
-        ImportError: the task is of the DM Control Suite, and dm_control is not installed; the
-            message has the line that installs it. Or the module of a task cannot be imported.
-        FileNotFoundError: clips are missing.
-        MemoryError: the clips would take too much memory.
-        RuntimeError: JAX has no device to compute on.
+        ValueError: the task is unknown, or takes no such option.
+        ImportError: the task's models come from a package that is not installed; the message has
+            the line that installs it.
+        TypeError: what was registered returns no ``Physics``.
     """
-    config = _registered(env_config(task, options))
-    _check_device()
-    physics = _physics(config)
-    program = {name: getattr(config, name) for name in PROGRAM_OPTIONS}
-    program["distractors"] = resolve(config.distractors, config.task)
-    env = PixelEnv(physics, **program)
-    rig = _rig(config, physics)
-    if not rig.link < len(physics.link_names):
-        raise ValueError(
-            f"the camera follows link {rig.link}, but task {config.task!r} has only "
-            f"{len(physics.link_names)} links: {', '.join(physics.link_names)}."
-        )
-    params = EnvParams(
-        geoms=seen_from(physics.geoms, rig),
-        rig=rig,
-        look=_look(config, physics),
-        episode_length=np.int32(config.episode_length),
-    )
-    # Here, so that no program has to: JAX may be told to refuse that (`jax.transfer_guard`).
-    return env, jax.device_put(params).replace(clips=_clips(config, env))
+    check_choice("task", task, list_envs(), meant=_meant(task))
+    own = _OWN_TASKS.get(task)
+    suite = next((suite for suite in SUITES.values() if task in suite.tasks), None)
+    for name, value in options.items():
+        if suite is None or name not in suite.options:
+            takers = [other.title for other in SUITES.values() if name in other.options]
+            fix = "leave it out" if own is None else "choose it where it was registered"
+            raise ValueError(
+                f"{name}={value!r} is for {' and '.join(takers) or 'no task'} alone, and task "
+                f"{task!r} is none of these: {fix}."
+            )
+    if own is not None:
+        return own.physics
+    assert suite is not None
+    physics: Physics = importlib.import_module(suite.loader).make_physics(task, **options)
+    return physics
 
 
-def _check_device() -> None:
-    """Start JAX, whose own error may be without a word.
-
-    Raises:
-        RuntimeError: it finds no device; the message names what was asked for, and has the fix.
-    """
-    try:
-        jax.devices()
-    except (RuntimeError, AssertionError) as error:
-        asked = os.environ.get("JAX_PLATFORMS")
-        raise RuntimeError(
-            "JAX finds no device to compute on"
-            + (f" with JAX_PLATFORMS={asked}; unset it" if asked else "; run pixelbrax doctor")
-            + f", or {install_extra('cuda12', 'cuda13')}"
-            + (f" ({error})." if str(error) else ".")
-        ) from error
+def registered_camera(task: str) -> CameraRig | Camera | None:
+    """Return the viewpoint that a task was registered with."""
+    return _OWN_TASKS[task].camera if task in _OWN_TASKS else None
 
 
-@default_flags()
-def named_rigs(task: str) -> dict[str, CameraRig]:
-    """Return the viewpoints of a task by name, which ``camera=`` takes.
-
-    Args:
-        task: as ``make`` takes it.
-
-    Returns:
-        ``default``, ``side`` (seen along +y), ``front`` (along -x), ``top`` (from above, +y up in
-        the image); ``original`` where the paper has the task; of the DM Control Suite and of tasks
-        of your own the model's cameras that keep their orientation, also in place of others of
-        that name.
-
-    Raises:
-        ValueError: the task is unknown.
-        ImportError: as in ``make``.
-    """
-    config = _registered(env_config(task, {}))
-    return rigs_of(config.task, _own_rigs(config.task, _physics(config)))
-
-
-_parameters = [
-    inspect.Parameter(
-        field.name,
-        inspect.Parameter.POSITIONAL_OR_KEYWORD
-        if field.name == "task"
-        else inspect.Parameter.KEYWORD_ONLY,
-        default=inspect.Parameter.empty if field.name == "task" else field.default,
-        annotation=field.type,
-    )
-    for field in fields(EnvConfig)
-]
-# What help() and editors show.
-make.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
-    sorted(_parameters, key=lambda parameter: parameter.kind)
-)
-
-
-def _registered(config: EnvConfig) -> EnvConfig:
-    """Return the options with the bare name of the task, the module of which is imported.
+def find_task(task: str) -> str:
+    """Return the name of a task, of which ``module:name`` imports the module that registers it.
 
     Raises:
         ValueError: the module's name is none, or it registers no task of that name.
         ImportError: the module cannot be imported.
     """
-    task = config.task
     if not isinstance(task, str) or ":" not in task or task in list_envs():
-        return config
+        return task
     module, _, name = task.partition(":")
     if not all(part.isidentifier() for part in module.split(".")):
         raise ValueError(
             f"task {task!r} must be NAME or MODULE:NAME, with the module as 'import' has it, such "
             "as my_tasks:my_swing for a file my_tasks.py."
         )
+    found = _import(module, task)
+    if name not in _OWN_TASKS:
+        own = ", ".join(sorted(_OWN_TASKS)) or "none"
+        raise ValueError(
+            f"module {module!r} ({found.__spec__ and found.__spec__.origin}) registers no task "
+            f"{name!r}; registered are: {own}.{suggest(name, _OWN_TASKS)}"
+        )
+    return name
+
+
+def _import(module: str, task: str) -> ModuleType:
     try:
-        found = importlib.import_module(module)
+        return importlib.import_module(module)
     except ImportError as error:
         missing = isinstance(error, ModuleNotFoundError)
         if not (missing and f"{module}.".startswith(f"{error.name}.")):
@@ -230,117 +158,14 @@ def _registered(config: EnvConfig) -> EnvConfig:
             f"current one, {Path.cwd()}, or in PYTHONPATH.{suggest(module, here)}",
             name=error.name,
         ) from error
-    if name not in _OWN_TASKS:
-        own = ", ".join(sorted(_OWN_TASKS)) or "none"
-        raise ValueError(
-            f"module {module!r} ({getattr(found, '__file__', None)}) registers no task {name!r}; "
-            f"registered are: {own}.{suggest(name, _OWN_TASKS)}"
-        )
-    return replace(config, task=name)
-
-
-def _physics(config: EnvConfig) -> Physics:
-    check_choice("task", config.task, list_envs(), meant=_meant(config.task))
-    if config.task in TASKS:
-        return make_physics(config.task, backend=config.backend, reward_preset=config.reward_preset)
-    if config.backend is not None or config.reward_preset != "brax":
-        raise ValueError(
-            f"task {config.task!r} was registered with its own physics: choose its backend and "
-            "reward there, not in make()."
-        )
-    return _OWN_TASKS[config.task].physics
 
 
 def _meant(task: object) -> str | None:
-    """Return the task that is meant by Gymnasium's name, or by DM Control's in other libraries."""
-    for full, row in TASKS.items():
-        if task == row.gymnasium_id:
-            return full
-    name = str(task).lower().replace("-", "_").removeprefix("dmc_")
-    found = [full for full, row in DMC_TASKS.items() if name in (full, full[4:], row.task)]
+    """Return the one task that another library calls so."""
+    names = {own: map(_plain, row.other_names()) for own, row in TASKS.items()}
+    found = [own for own, others in names.items() if _plain(task) in others]
     return found[0] if len(found) == 1 else None
 
 
-def _own_rigs(task: str, physics: Physics) -> Mapping[str, CameraRig]:
-    """Return the viewpoints of a task that its row has not."""
-    rigs: Mapping[str, CameraRig] = getattr(physics, "rigs", {})
-    return {**rigs, "default": _OWN_TASKS[task].default_rig} if task in _OWN_TASKS else rigs
-
-
-def _rig(config: EnvConfig, physics: Physics) -> CameraRig:
-    rigs = _own_rigs(config.task, physics)
-    unfit: Mapping[str, str] = getattr(physics, "unfit_cameras", {})
-    if isinstance(config.camera, str) and config.camera in set(unfit) - set(
-        rigs_of(config.task, rigs)
-    ):
-        raise ValueError(
-            f"camera {config.camera!r} of task {config.task!r} cannot be a viewpoint: "
-            f"{unfit[config.camera]}, and a viewpoint is a perspective that keeps its direction. "
-            f"Allowed: {', '.join(sorted(rigs_of(config.task, rigs)))}, a CameraRig or a Camera."
-        )
-    return make_rig(config.task, config.camera, rigs)
-
-
-def _look(config: EnvConfig, physics: Physics) -> Look:
-    """Return the look; the default one of a task of the DM Control Suite is its model's own."""
-    own = config.task in DMC_TASKS and config.look == "default"
-    return make_look(
-        "dmc" if own else config.look,
-        shadows=config.shadows,
-        own=getattr(physics, "look", None),
-    )
-
-
-def _clips(config: EnvConfig, env: PixelEnv) -> Clips | None:
-    """Return the clips on the device, None where nothing plays any."""
-    clips, split = config.clips, config.split
-    videos = [link for link in env.chain.links if isinstance(link, Video)]
-    if clips is not None and not videos and env.obs_mode != "state":
-        raise ValueError("clips are given, but no video is: add 'video' to the distractors.")
-    if split != "train" and not config.distractors:
-        raise ValueError(
-            f"split={split!r} is given, but no distractor is: add one that has splits, such as "
-            "'video', to the distractors."
-        )
-    if not videos:
-        return None
-    if isinstance(clips, ClipBank):
-        if split not in ("train", clips.split):
-            raise ValueError(f"split={split!r}, but the clips are of split {clips.split!r}.")
-        return _on_device(clips)
-    if clips is None:
-        warn_procedural()
-        clips = "procedural"
-    bank = load_clips(
-        clips, split, height=env.height, width=env.width, num_clips=videos[0].num_clips
-    )
-    return _on_device(bank)
-
-
-# Weakly, so that clips leave the device with the last environment that shows them.
-_resident: WeakValueDictionary[str, Clips] = WeakValueDictionary()
-
-
-def _on_device(bank: ClipBank) -> Clips:
-    """Return the clips on the device, where equal ones are once."""
-    clips = _resident.get(bank.digest)
-    if clips is None:
-        clips = _resident[bank.digest] = bank.to_device()
-    return clips
-
-
-def _corner_rig(physics: Physics) -> CameraRig:
-    state = physics.reset(jax.random.key(0))
-    geoms, xpos, xquat = physics.geoms, np.asarray(state.xpos), np.asarray(state.xquat)
-    points = [
-        geoms.pos[g] if link < 0 else xpos[link] + spatial.rotate(xquat[link], geoms.pos[g])
-        for g, link in enumerate(geoms.link)
-        if geoms.kind[g] != GeomKind.PLANE
-    ]
-    link = int(getattr(physics, "followed_link", 0))
-    around = rig_around(
-        np.stack([np.asarray(p) for p in points] + list(xpos[link : link + 1])), link
-    )
-    # `rig_around` wants the target relative to the link it follows.
-    shift = np.array([xpos[link, 0], xpos[link, 1], 0.0], np.float32)
-    return around.replace(eye=around.eye - shift, target=around.target - shift)
+def _plain(name: object) -> str:
+    return str(name).lower().replace("-", "_")

@@ -1,4 +1,4 @@
-"""Rotations and frames. Quaternions are ``(w, x, y, z)``, as in MuJoCo and Brax."""
+"""Rotations and frames, float32. Quaternions are ``(w, x, y, z)``, as in MuJoCo and Brax."""
 
 from __future__ import annotations
 
@@ -7,15 +7,7 @@ import jax.numpy as jnp
 
 
 def quat_multiply(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Return the Hamilton product: the rotation that applies ``b`` first, then ``a``.
-
-    Args:
-        a: (..., 4) float32.
-        b: (..., 4) float32.
-
-    Returns:
-        (..., 4) float32.
-    """
+    """Return the product (..., 4): the rotation that applies ``b`` first, then ``a``."""
     aw, ax, ay, az = (a[..., i] for i in range(4))
     bw, bx, by, bz = (b[..., i] for i in range(4))
     return jnp.stack(
@@ -30,14 +22,7 @@ def quat_multiply(a: jax.Array, b: jax.Array) -> jax.Array:
 
 
 def quat_normalize(quat: jax.Array) -> jax.Array:
-    """Return the unit quaternion of the same rotation; the zero quaternion becomes the identity.
-
-    Args:
-        quat: (..., 4) float32.
-
-    Returns:
-        (..., 4) float32 of norm 1.
-    """
+    """Return the unit quaternion (..., 4) of the same rotation; of zero, the identity."""
     square = jnp.sum(quat * quat, axis=-1, keepdims=True)
     identity = jnp.array([1.0, 0.0, 0.0, 0.0], quat.dtype)
     # The inner `where` keeps the gradient finite at the zero quaternion.
@@ -46,14 +31,7 @@ def quat_normalize(quat: jax.Array) -> jax.Array:
 
 
 def quat_to_mat(quat: jax.Array) -> jax.Array:
-    """Return the rotation matrix of a unit quaternion; its columns are the rotated axes.
-
-    Args:
-        quat: (..., 4) float32, unit.
-
-    Returns:
-        (..., 3, 3) float32.
-    """
+    """Return the matrix (..., 3, 3) of a unit quaternion; its columns are the rotated axes."""
     w, x, y, z = (quat[..., i] for i in range(4))
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -64,29 +42,14 @@ def quat_to_mat(quat: jax.Array) -> jax.Array:
 
 
 def rotate(quat: jax.Array, vector: jax.Array) -> jax.Array:
-    """Return ``vector`` turned by the unit quaternion ``quat``.
-
-    Args:
-        quat: (..., 4) float32, unit.
-        vector: (..., 3) float32.
-
-    Returns:
-        (..., 3) float32.
-    """
+    """Return ``vector`` (..., 3) turned by the unit quaternion ``quat`` (..., 4)."""
     w, axis = quat[..., :1], quat[..., 1:]
     twice = 2 * jnp.cross(axis, vector)
     return vector + w * twice + jnp.cross(axis, twice)
 
 
 def unit(vector: jax.Array) -> jax.Array:
-    """Return ``vector`` scaled to length 1; the zero vector stays zero, with a zero gradient.
-
-    Args:
-        vector: (..., 3) float32.
-
-    Returns:
-        (..., 3) float32.
-    """
+    """Return ``vector`` (..., 3) scaled to length 1; zero stays zero, with a zero gradient."""
     square = jnp.sum(vector * vector, axis=-1, keepdims=True)
     return jnp.where(square > 0, vector * jax.lax.rsqrt(jnp.where(square > 0, square, 1.0)), 0.0)
 
@@ -95,9 +58,9 @@ def look_at(eye: jax.Array, target: jax.Array, up: jax.Array) -> jax.Array:
     """Return the orientation of a camera at ``eye`` that looks at ``target``.
 
     Args:
-        eye: (3,) float32, metres.
-        target: (3,) float32, metres, different from ``eye``.
-        up: (3,) float32, not parallel to the viewing direction.
+        eye: (3,) metres.
+        target: (3,) metres, different from ``eye``.
+        up: (3,) not parallel to the viewing direction.
 
     Returns:
         (3, 3) float32; columns are the camera's right, up and back directions.

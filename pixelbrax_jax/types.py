@@ -1,20 +1,21 @@
 """Every value that crosses from one module of the package to the next.
 
-Shapes are those of ONE environment; a batch has the same fields with a leading axis.
-Letters: G geoms, M materials, L links, S state features, A actions, H and W pixels,
-K stacked frames. Lengths are metres, angles degrees, quaternions ``(w, x, y, z)``, colors
-linear in [0, 1]. The world is right-handed with z up. Row 0 of an image is its top.
+Shapes are those of ONE environment; a batch has the same fields with a leading axis. Letters: G
+geoms, M materials, L links, S state features, A actions, H and W pixels, K stacked frames. Arrays
+are float32 where nothing else is said. Lengths are metres, angles degrees, quaternions ``(w, x, y,
+z)`` of length 1, colors linear in [0, 1]. The world is right-handed with z up. Row 0 of an image is
+its top.
 
-Fields marked *static* are Python values: they decide which program is compiled, hence they
-are hashable and cannot be traced. All other fields are arrays and may be differentiated,
-batched or randomised.
+Fields marked *static* are Python values: they decide which program is compiled, hence they are
+hashable and cannot be traced. All other fields are arrays and may be differentiated, batched or
+randomised.
 """
 
 from __future__ import annotations
 
-import warnings
+from collections.abc import Iterable, Mapping
 from enum import IntEnum
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -26,14 +27,75 @@ FAR = float(np.finfo(np.float32).max)
 
 
 class GeomKind(IntEnum):
-    """Shapes the renderer draws, numbered as MuJoCo's ``mjtGeom``."""
+    """Shapes the renderer draws: one row each, beginning with MuJoCo's number (``mjtGeom``).
 
-    PLANE = 0
-    SPHERE = 2
-    CAPSULE = 3
-    ELLIPSOID = 4
-    CYLINDER = 5
-    BOX = 6
+    All but the plane are convex. Their formulas are in ``renderer.intersect`` and, for the renderer
+    that others are tested against, in ``renderer.reference``.
+
+    Attributes:
+        num_sizes: how many of a geom's three size numbers mean something.
+        reach: which sphere around its center a geom is inside of: its radius is ``first``, the
+            first size number; ``largest``, that of the three; ``diagonal``, their norm; or ``all``,
+            for what has no end.
+        is_long: whether that sphere is around both ends of the z axis, at the second size number.
+        has_far_form: whether float32 needs a longer formula where the camera is far away.
+    """
+
+    num_sizes: int
+    reach: str
+    is_long: bool
+    has_far_form: bool
+
+    def __new__(
+        cls,
+        number: int,
+        num_sizes: int = 0,
+        reach: str = "",
+        is_long: bool = False,
+        has_far_form: bool = False,
+    ) -> GeomKind:
+        """Make a row, which is MuJoCo's number.
+
+        Raises:
+            TypeError: the number of sizes or the reach is missing or unknown.
+        """
+        if not 1 <= num_sizes <= 3 or reach not in ("first", "largest", "diagonal", "all"):
+            raise TypeError(f"GeomKind {number} needs a number of sizes and a reach.")
+        kind = int.__new__(cls, number)
+        kind._value_ = number
+        kind.num_sizes, kind.reach = num_sizes, reach
+        kind.is_long, kind.has_far_form = is_long, has_far_form
+        return kind
+
+    PLANE = 0, 3, "all"
+    SPHERE = 2, 1, "first", False, True
+    CAPSULE = 3, 2, "first", True, True
+    ELLIPSOID = 4, 3, "largest"
+    CYLINDER = 5, 2, "first", True
+    BOX = 6, 3, "diagonal"
+
+
+_Formula = TypeVar("_Formula")
+
+
+def for_each_kind(
+    what: str, formulas: Mapping[GeomKind, _Formula], kinds: Iterable[GeomKind] = GeomKind
+) -> Mapping[GeomKind, _Formula]:
+    """Return a table with one entry for each kind of geom.
+
+    Args:
+        what: what the table has, for the message.
+        formulas: the table.
+        kinds: those that it must have.
+
+    Raises:
+        TypeError: it lacks a kind, or has one that it must not.
+    """
+    wrong = set(kinds) ^ set(formulas)
+    if wrong:
+        names = ", ".join(sorted(kind.name for kind in wrong))
+        raise TypeError(f"{what} must have one entry for each kind of geom; wrong for {names}.")
+    return formulas
 
 
 class String(struct.PyTreeNode):
@@ -42,8 +104,8 @@ class String(struct.PyTreeNode):
     Attributes:
         geoms: static, rows of ``Geoms`` that are its pieces, in order; all capsules on no link.
         link: (2,) static, indices of the links that carry its ends, -1 for the world.
-        ends: (2, 3) float32, metres, its ends in the frames of these links.
-        length: () float32, metres; a distance of the ends that is greater stretches it.
+        ends: (2, 3), its ends in the frames of these links.
+        length: (); a distance of the ends that is greater stretches it.
     """
 
     geoms: tuple[int, ...] = struct.field(pytree_node=False)
@@ -60,11 +122,10 @@ class Geoms(struct.PyTreeNode):
         link: (G,) static, index of the carrying link, -1 for the world.
         material: (G,) static, row of ``rgb`` that colors the geom.
         name: (G,) static, the model's geom name, or ``kind/index`` where it has none.
-        size: (G, 3) float32, metres, with MuJoCo's meaning per kind: radius, half length,
-            half extents.
-        pos: (G, 3) float32, metres, in the link's frame.
-        quat: (G, 4) float32, unit, in the link's frame.
-        rgb: (M, 3) float32, one color per material.
+        size: (G, 3), with MuJoCo's meaning per kind: radius, half length, half extents.
+        pos: (G, 3), in the link's frame.
+        quat: (G, 4), in the link's frame.
+        rgb: (M, 3), one color per material.
         bounded: (G,) static, planes that end at their size along their x and y, where a size of
             0 is no end. Empty where no plane ends, whatever its size.
         patterned: (G,) static, planes that are ground: drawn with the look's pattern, others in
@@ -105,10 +166,10 @@ class PhysicsState(struct.PyTreeNode):
 
     Attributes:
         engine: the engine's own state, opaque to everyone else.
-        xpos: (L, 3) float32, metres, link origins in the world frame.
-        xquat: (L, 4) float32, unit, link orientations in the world frame.
-        obs: (S,) float32, the task's state observation.
-        reward: () float32, reward of the step that led here, 0 after a reset.
+        xpos: (L, 3), link origins in the world frame.
+        xquat: (L, 4), link orientations in the world frame.
+        obs: (S,), the task's state observation.
+        reward: (), of the step that led here, 0 after a reset.
         terminated: () bool, the task ended (never a time limit).
         non_finite: () bool, the step diverged; the pose shown is then the last finite one.
     """
@@ -126,10 +187,10 @@ class Camera(struct.PyTreeNode):
     """A pinhole camera in the world frame.
 
     Attributes:
-        pos: (3,) float32, metres.
-        xmat: (3, 3) float32, columns are the camera's right, up and back directions; it looks
-            along minus its third column, as MuJoCo's and OpenGL's cameras do.
-        fovy: () float32, vertical field of view, degrees.
+        pos: (3,).
+        xmat: (3, 3), columns are the camera's right, up and back directions; it looks along
+            minus its third column, as MuJoCo's and OpenGL's cameras do.
+        fovy: (), vertical field of view.
     """
 
     pos: jax.Array
@@ -144,11 +205,11 @@ class CameraRig(struct.PyTreeNode):
 
     Attributes:
         link: static, index of the followed link, -1 to follow nothing.
-        track: (3,) float32, fraction of the link's position that is followed, per world axis.
-        eye: (3,) float32, metres.
-        target: (3,) float32, metres, the point looked at.
-        up: (3,) float32, the world direction that is up in the image.
-        fovy: () float32, vertical field of view, degrees.
+        track: (3,), fraction of the link's position that is followed, per world axis.
+        eye: (3,).
+        target: (3,), the point looked at.
+        up: (3,), the world direction that is up in the image.
+        fovy: (), vertical field of view.
     """
 
     link: int = struct.field(pytree_node=False)
@@ -169,10 +230,10 @@ class Lamp(struct.PyTreeNode):
     Attributes:
         link: static, index of the followed link, -1 for a lamp at rest.
         exponent: static int, at least 0.
-        pos: (3,) float32, metres, the offset; in a scene the place in the world.
-        axis: (3,) float32, unit, world direction in which it shines.
-        cos_cutoff: () float32, cosine of the angle at which its light ends; -1 for none.
-        diffuse, highlight: () float32 coefficients, as in ``Look``.
+        pos: (3,), the offset; in a scene the place in the world.
+        axis: (3,), unit, world direction in which it shines.
+        cos_cutoff: (), cosine of the angle at which its light ends; -1 for none.
+        diffuse, highlight: () coefficients, as in ``Look``.
     """
 
     link: int = struct.field(pytree_node=False)
@@ -235,8 +296,8 @@ class Scene(struct.PyTreeNode):
 
     Attributes:
         geoms: shapes, sizes and colors.
-        pos: (G, 3) float32, metres, geom centers.
-        xmat: (G, 3, 3) float32, geom orientations; columns are the geom's axes.
+        pos: (G, 3), geom centers.
+        xmat: (G, 3, 3), geom orientations; columns are the geom's axes.
         camera: the viewpoint.
         look: light, sky and ground.
     """
@@ -252,9 +313,9 @@ class Frame(struct.PyTreeNode):
     """One image. Color channels stay apart: stacking them early costs a CPU dearly.
 
     Attributes:
-        r, g, b: (H, W) float32 in [0, 1].
-        depth: (H, W) float32, metres along the camera's viewing axis (not along the ray),
-            ``FAR`` where nothing is hit.
+        r, g, b: (H, W) in [0, 1].
+        depth: (H, W), along the camera's viewing axis (not along the ray), ``FAR`` where nothing is
+            hit.
         seg: (H, W) int32, index of the geom seen, -1 for the sky.
         ground: (H, W) bool, a plane that is ground is seen; cheaper to ask than ``seg``.
     """
@@ -279,12 +340,6 @@ class Clips(struct.PyTreeNode):
     packed: jax.Array
     first: jax.Array
     length: jax.Array
-
-    @property
-    def words(self) -> jax.Array:
-        """The former name of ``packed``, which goes with the next release."""
-        warnings.warn("Clips.words is Clips.packed now.", DeprecationWarning, stacklevel=2)
-        return self.packed
 
 
 class EnvParams(struct.PyTreeNode):
@@ -346,26 +401,14 @@ class EnvState(struct.PyTreeNode):
         """() bool, the episode has ended and the next call must reset."""
         return self.sim.done
 
-    def __getattr__(self, name: str) -> Any:
-        """Look up a field of ``sim`` under the place and name that it had."""
-        new = {"head_start": "time_limit_offset", "distraction": "distractor_state"}.get(name, name)
-        if new not in SimState.__dataclass_fields__:
-            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-        warnings.warn(
-            f"EnvState.{name} is EnvState.sim.{new}; the short form goes with the next release.",
-            DeprecationWarning,
-            stacklevel=2,
-        )
-        return getattr(self.sim, new)
-
 
 class Timestep(struct.PyTreeNode):
     """What an agent sees after a reset or a step.
 
     Attributes:
-        obs: uint8 (H, W, 3K) pixels, oldest frame first; or (S,) float32 state; or a dict of
-            both under ``"pixels"`` and ``"state"``, as ``obs_mode`` says.
-        reward: () float32, 0 after a reset.
+        obs: uint8 (H, W, 3K) pixels, oldest frame first; or (S,) state; or a dict of both under
+            ``"pixels"`` and ``"state"``, as ``obs_mode`` says.
+        reward: (), 0 after a reset.
         terminated: () bool, the task ended.
         truncated: () bool, the time limit was reached; never together with ``terminated``.
         info: dict with a fixed set of keys, see ``PixelEnv.step``.

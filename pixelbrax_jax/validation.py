@@ -47,9 +47,6 @@ def check_choice(
         allowed: every accepted name.
         meant: the one that a wrong value surely stands for; None suggests the nearest one.
 
-    Returns:
-        ``value``.
-
     Raises:
         ValueError: otherwise, naming the value, all allowed names and the nearest one.
     """
@@ -62,10 +59,6 @@ def check_choice(
 
 def check_options(given: Iterable[str], allowed: Iterable[str]) -> None:
     """Check that keyword arguments are known.
-
-    Args:
-        given: their names.
-        allowed: every accepted name.
 
     Raises:
         TypeError: one is not, naming it, all allowed names and the nearest one. It is phrased as
@@ -81,16 +74,7 @@ def check_options(given: Iterable[str], allowed: Iterable[str]) -> None:
 
 
 def suggest(value: object, names: Iterable[str], likeness: float = _SIMILAR) -> str:
-    """Ask whether a similar name was meant.
-
-    Args:
-        value: what the user gave.
-        names: what there is.
-        likeness: of at most 1, from which a name is similar.
-
-    Returns:
-        A question with a space before it; empty if no name is similar.
-    """
+    """Return a question after a space: whether a similar name was meant. Empty if none is."""
     by_lower = {name.lower(): name for name in names}
     given = str(value).lower()
     nearest = difflib.get_close_matches(given, by_lower, n=1, cutoff=likeness)
@@ -101,17 +85,10 @@ def suggest(value: object, names: Iterable[str], likeness: float = _SIMILAR) -> 
 
 
 def check_bool(what: str, value: object) -> bool:
-    """Return ``value`` if it is a truth value.
-
-    Args:
-        what: what the value stands for, as the message should call it.
-        value: what the user gave; Python's or NumPy's.
-
-    Returns:
-        ``value`` as Python's own.
+    """Return ``value``, Python's or NumPy's truth value, as Python's.
 
     Raises:
-        TypeError: otherwise, naming the value.
+        TypeError: it is something else.
     """
     if isinstance(value, (bool, np.bool_)):
         return bool(value)
@@ -119,17 +96,10 @@ def check_bool(what: str, value: object) -> bool:
 
 
 def check_positive_int(what: str, value: object) -> int:
-    """Return ``value`` if it is a positive integer.
-
-    Args:
-        what: what the value stands for, as the message should call it.
-        value: what the user gave; Python's or NumPy's integers, but no truth values.
-
-    Returns:
-        ``value`` as Python's own.
+    """Return ``value``, Python's or NumPy's integer of at least 1, as Python's.
 
     Raises:
-        ValueError: otherwise, naming the value.
+        ValueError: it is something else, or a truth value.
     """
     if isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= 1:
         return int(value)
@@ -139,15 +109,8 @@ def check_positive_int(what: str, value: object) -> int:
 def check_fraction(what: str, value: object) -> float:
     """Return ``value`` if it is a number in [0, 1].
 
-    Args:
-        what: what the value stands for, as the message should call it.
-        value: what the user gave.
-
-    Returns:
-        ``value`` as Python's own.
-
     Raises:
-        ValueError: otherwise, naming the value.
+        ValueError: it is something else.
     """
     if isinstance(value, Real) and not isinstance(value, bool) and 0.0 <= float(value) <= 1.0:
         return float(value)

@@ -53,7 +53,7 @@ def write_frames(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> 
     except ImportError as error:
         raise ImportError(NO_WRITER) from error
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.open("ab").close()  # whether it can be written, before anything is drawn
+    path.open("ab").close()  # whether it can be written, before anything is rendered
     count, shape = 0, None
     try:
         with contextlib.closing(writer):

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import subprocess
-import sys
 from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import pytest
 
-from pixelbrax_gym.bench import cases, command
-from pixelbrax_gym.bench.ahead import compiling, environment, kernels, registers, tables
-from pixelbrax_gym.bench.ahead.case import DUMP, PROGRAMS
-from pixelbrax_gym.bench.ahead.hlo import parse
-from pixelbrax_gym.bench.ahead.programs import make_program
 from pixelbrax_gym.bench.case import AbsentError
+from tests.benchmarks.ahead import case, compiling, tables
+from tests.benchmarks.ahead.case import DUMP, PROGRAMS
+from tests.benchmarks.ahead.compiling import make_program
+from tests.benchmarks.ahead.hlo import kernels, longest_chain, loops, parse
 
 PROGRAM = """HloModule jit_ahead, is_scheduled=true
 
@@ -56,30 +54,30 @@ COUNTED = ', backend_config={"known_trip_count":{"n":"5"}}'
 
 def test_a_counted_loop_multiplies_its_kernels():
     program = parse(PROGRAM.replace(" COUNTED", COUNTED))
-    found = {kernel.name: kernel for kernel in kernels.kernels(program)}
+    found = {kernel.name: kernel for kernel in kernels(program)}
     assert {name: kernel.launches for name, kernel in found.items()} == {
         "first": 1,
         "side": 1,
         "one": 5,
         "copied": 5,
     }
-    assert [loop.trips for loop in kernels.loops(program)] == [5]
+    assert loops(program) == [5]
     # A copy, then five turns in which the two kernels may run side by side.
-    assert kernels.longest_chain(program) == 6
+    assert longest_chain(program) == 6
 
 
 def test_a_slice_reads_what_it_takes():
-    found = {kernel.name: kernel for kernel in kernels.kernels(parse(PROGRAM))}
+    found = {kernel.name: kernel for kernel in kernels(parse(PROGRAM))}
     assert (found["one"].read, found["one"].written) == (32 + 4, 32)
     assert (found["copied"].read, found["copied"].written) == (2048, 2048)
 
 
 def test_a_loop_of_unknown_length_counts_once_with_its_condition():
     program = parse(PROGRAM.replace(" COUNTED", ""))
-    assert [loop.trips for loop in kernels.loops(program)] == [None]
-    assert sum(kernel.launches for kernel in kernels.kernels(program)) == 5
+    assert loops(program) == [None]
+    assert sum(kernel.launches for kernel in kernels(program)) == 5
     # A copy, two kernels side by side, and the condition.
-    assert kernels.longest_chain(program) == 3
+    assert longest_chain(program) == 3
 
 
 def test_a_program_of_this_machine_is_read():
@@ -87,7 +85,7 @@ def test_a_program_of_this_machine_is_read():
         jnp.ones((8, 8))
     )
     program = parse(compiled.compile().as_text())
-    assert sum(kernel.launches for kernel in kernels.kernels(program)) >= 3
+    assert sum(kernel.launches for kernel in kernels(program)) >= 3
 
 
 def test_another_text_is_refused():
@@ -117,65 +115,38 @@ def test_a_dump_that_the_user_asked_for_is_kept(monkeypatch, tmp_path):
     assert not ours.exists()
 
 
-def test_registers_are_not_known_without_an_assembler(monkeypatch, tmp_path):
-    monkeypatch.setattr(registers, "find_assembler", lambda: None)
-    assert registers.assemble([tmp_path / "kernel.ptx"], "sm_90a") is None
-
-
-def test_the_most_of_several_kernels_is_told(monkeypatch, tmp_path):
+def test_registers_are_those_of_the_largest_kernels(monkeypatch, tmp_path):
+    sources = [tmp_path / "a.ptx", tmp_path / "b.ptx"]
+    for source in sources:
+        source.touch()
     told = iter(
         (
             "0 bytes stack frame, 8 bytes spill stores, 4 bytes spill loads\nUsed 40 registers",
             "0 bytes stack frame, 0 bytes spill stores, 0 bytes spill loads\nUsed 90 registers",
         )
     )
-    monkeypatch.setattr(registers, "find_assembler", lambda: "ptxas")
+    monkeypatch.setattr(compiling, "find_assembler", lambda: "ptxas")
     monkeypatch.setattr(
         subprocess, "run", lambda *_, **__: SimpleNamespace(stderr=next(told), returncode=0)
     )
-    found = registers.assemble([tmp_path / "a.ptx", tmp_path / "b.ptx"], "sm_90a")
-    assert found == {"registers": 90, "spilled": 12}
+    assert compiling.assemble(sources, "sm_90a") == {"registers": 90, "spilled": 12}
+    monkeypatch.setattr(compiling, "find_assembler", lambda: None)
+    assert compiling.assemble(sources, "sm_90a") == {"registers": None, "spilled": None}
 
 
-def test_a_compiler_that_cannot_be_installed_is_absent(monkeypatch, tmp_path):
+def test_the_compiler_is_that_of_the_running_jax_or_absent(monkeypatch, tmp_path):
+    assert all(name.endswith(f"=={jax.__version__}") for name in case.packages("cuda")[:2])
     monkeypatch.setenv("PIXELBRAX_CACHE", str(tmp_path))
-    monkeypatch.setattr(environment, "packages", lambda _: ("no package of this name",))
+    monkeypatch.setattr(case, "packages", lambda _: ("no package of this name",))
     with pytest.raises(AbsentError, match="cannot be installed"):
-        environment.install("cuda")
-
-
-def test_the_compiler_is_that_of_the_running_jax():
-    release = f"=={jax.__version__}"
-    assert all(name.endswith(release) for name in environment.packages("cuda")[:2])
-    assert release[2:] in environment.folder("cuda").name
+        case.install("cuda")
 
 
 def test_what_is_not_known_is_told_so():
-    values = dict.fromkeys(
-        (
-            *("kernels", "launches", "longest_chain", "host_steps", "unknown_loops"),
-            *("temporary_bytes", "output_bytes", "read_bytes", "written_bytes"),
-        ),
-        1,
-    )
+    names = ("kernels", "launches", "longest_chain", "host_steps", "unknown_loops")
+    names += ("temporary_bytes", "output_bytes", "read_bytes", "written_bytes")
+    values = dict.fromkeys(names, 1)
     values |= {"registers": None, "spilled": None, "model_seconds": {"graph": 2e-5}}
     about = {"task": "ant", "num_envs": 1024, "program": "renderer"}
     row = {"status": "ok", "arguments": about, "values": values}
     assert "| not known |" in tables.gpu([row])
-
-
-def test_what_runs_is_not_mixed_with_what_does_not(capsys):
-    with pytest.raises(SystemExit):
-        command.main(["--only", "gpu-program", "renderer"])
-    assert "gpu-program runs nothing: leave out renderer" in capsys.readouterr().err
-    assert command.main(["--only", "gpu-program", "--task", "ant", "--list"]) == 0
-    assert len(capsys.readouterr().out.splitlines()) == 20
-    assert not set(cases.COMPILED) & {*cases.QUICK, *cases.FULL}
-
-
-def test_importing_the_cases_imports_no_compiler():
-    code = (
-        "import sys, pixelbrax_gym.bench.cases; print('jax.experimental.topologies' in sys.modules)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "False"

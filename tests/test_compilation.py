@@ -102,7 +102,7 @@ def test_on_a_gpu_loops_are_captured_unless_the_user_says_otherwise(monkeypatch)
     assert "WHILE" in ours[commands].split(",")
     assert compiler_options(platform="cuda") == ours
     with monkeypatch.context() as patch:
-        patch.setattr("jax.default_backend", lambda: "gpu")
+        patch.setattr("pixelbrax_jax.compilation.default_platform", lambda: "gpu")
         assert compiler_options() == ours
     monkeypatch.setenv("XLA_FLAGS", f"--{commands}=-WHILE")
     assert compiler_options(platform="gpu") == {}
@@ -121,7 +121,7 @@ import sys
 import gymnasium, numpy as np, torch
 import pixelbrax_gym
 import pixelbrax_jax as pb
-from pixelbrax_jax.cli import main
+from pixelbrax_gym.cli import main
 
 assert pb.compiler_options()
 small = {"height": 24, "width": 24}

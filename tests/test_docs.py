@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import inspect
 import re
 import shlex
 import textwrap
@@ -13,8 +14,9 @@ from pathlib import Path
 import gymnasium
 import pytest
 
-import pixelbrax_gym  # noqa: F401  # a page that registers its ids first would take them away
+import pixelbrax_gym  # a page that registers its ids first would take them away
 from pixelbrax_jax import registry
+from pixelbrax_jax.tasks import BRAX_TASKS
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
@@ -24,6 +26,15 @@ FENCE = re.compile(r"^(?P<indent>\s*)```(?P<language>\w*)")
 NOT_RUN = re.compile(r"^\s*<!-- not run: \S.*-->\s*$")
 LINK = re.compile(r"\]\(([^)\s]+)(?:\s+\"[^\"]*\")?\)|<img[^>]*\ssrc=\"([^\"]+)\"")
 SNIPPET = re.compile(r"^\s*--8<-- \"([^:\"]+)(?::([\w-]+))?\"", re.MULTILINE)
+
+
+ADAPTERS = (
+    pixelbrax_gym.GymnasiumEnv,
+    pixelbrax_gym.GymnasiumVectorEnv,
+    pixelbrax_gym.TorchRLEnv,
+    pixelbrax_gym.SB3VecEnv,
+)
+"""In the order of the columns in docs/options.md."""
 
 
 @dataclass(frozen=True)
@@ -124,18 +135,33 @@ def test_links_resolve(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_included_sections_exist(name):
-    for file, section in SNIPPET.findall((ROOT / name).read_text("utf-8")):
+    page = (ROOT / name).read_text("utf-8")
+    for file, section in SNIPPET.findall(page):
         text = (ROOT / file).read_text("utf-8")
         if section:
             for end in ("start", "end"):
                 assert text.count(f"--8<-- [{end}:{section}]") == 1, f"{name}: {file}:{section}"
+    # A formatter may take the scissors of an inclusion for Python and spread them out.
+    assert len(re.findall(r"^\s*-+ ?8 ?<", page, re.MULTILINE)) == len(SNIPPET.findall(page))
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_every_inclusion_is_understood(name):
-    """A formatter may take the scissors of an inclusion for Python and spread them out."""
-    text = (ROOT / name).read_text("utf-8")
-    assert len(re.findall(r"^\s*-+ ?8 ?<", text, re.MULTILINE)) == len(SNIPPET.findall(text))
+def test_every_brax_task_has_its_animation():
+    page = (ROOT / "docs/tasks.md").read_text("utf-8")
+    shown = re.findall(r"!\[(\w+)\]\((images/tasks/\w+\.gif)\)", page)
+    assert shown == [(name, f"images/tasks/{name}.gif") for name in BRAX_TASKS]
+
+
+def test_the_options_of_adapters_are_listed():
+    page = (ROOT / "docs/options.md").read_text("utf-8")
+    heading = "| option | Gymnasium `make` |"
+    listed: list[set[str]] = [set() for _ in ADAPTERS]
+    for line in page[page.index(heading) :].split("\n\n")[0].splitlines()[2:]:
+        names, *cells, _ = line.strip("|").split("|")
+        for options, cell in zip(listed, cells, strict=True):
+            options |= set(re.findall(r"`([^`]*)`", names)) if cell.strip() == "yes" else set()
+    for adapter, options in zip(ADAPTERS, listed, strict=True):
+        taken = set(inspect.signature(adapter.__init__).parameters)
+        assert options == taken - {"self", "task", "options"}, adapter
 
 
 def test_blocks_are_found():

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from pixelbrax_gym import doctor
+from pixelbrax_gym import cli, doctor
 from pixelbrax_gym.gymnasium import window
-from pixelbrax_jax import cli, load_clips
+from pixelbrax_jax import load_clips
 from pixelbrax_jax.distractors import media
 from pixelbrax_jax.extras import install_extra
 from pixelbrax_jax.video import write_frames
@@ -37,7 +37,7 @@ def test_extras_that_are_named_exist():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     calls = re.findall(r"install_extra\(([^)]*)\)", "".join(p.read_text("utf-8") for p in SOURCES))
     named = {name for call in calls for name in re.findall(r"""["'](\w+)["']""", call)}
-    named |= set(doctor._OPTIONAL.values())
+    named |= set(doctor.EXTRAS.values())
     assert {"torch", "clips", "cuda13"} <= named
     assert named <= set(project["optional-dependencies"])
 
@@ -81,8 +81,9 @@ def test_a_video_needs_an_extra(monkeypatch, tmp_path):
             write_frames(tmp_path / name, [], 20)
 
 
-@pytest.mark.parametrize("command", ["record", "evaluate_command"])
+@pytest.mark.parametrize("command", ["train", "evaluate", "record"])
 def test_trained_agents_need_an_extra(monkeypatch, capsys, command):
-    monkeypatch.setitem(sys.modules, f"pixelbrax_jax.agents.runner.{command}", None)
-    assert cli.main([command.partition("_")[0], "nowhere"]) == 1
+    for module in ("train", "trained"):
+        monkeypatch.setitem(sys.modules, f"pixelbrax_jax.agents.runner.{module}", None)
+    assert cli.main([command, "ppo"]) == 1
     assert '"pixelbrax[train]"' in capsys.readouterr().err

@@ -15,7 +15,7 @@ import jax
 import pytest
 
 from pixelbrax_gym.bench import runner
-from pixelbrax_gym.bench.ahead.case import AheadCase
+from tests.benchmarks.ahead.case import AheadCase
 
 pytestmark = [pytest.mark.gpu_program, pytest.mark.timeout(900)]
 

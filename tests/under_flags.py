@@ -45,6 +45,10 @@ def make(name: str) -> tuple[Any, Any]:
     import pixelbrax_jax as pb
 
     name, _, renderer = name.partition("/")
+    if renderer == "pallas":
+        from tests.renderer.interpreted import interpreted_kernel
+
+        interpreted_kernel().__enter__()  # until the process ends
     task, *distractors = name.split(",")
     options = SIZE | {"distractors": tuple(distractors), "renderer": renderer or "auto"}
     if any("video" in link or "dcs" in link for link in distractors):
@@ -152,7 +156,7 @@ def play_torchrl() -> dict[str, Any]:
 
 def train(name: str) -> dict[str, Any]:
     """``pixelbrax train``, and the policy that it leaves."""
-    from pixelbrax_jax.cli import main as pixelbrax
+    from pixelbrax_gym.cli import main as pixelbrax
     from pixelbrax_jax.policy import load_policy
 
     with tempfile.TemporaryDirectory() as folder:

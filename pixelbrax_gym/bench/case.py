@@ -16,33 +16,28 @@ Row = dict[str, Any]
 
 
 class AbsentError(Exception):
-    """What is to be measured is not here, with the reason."""
+    """What is to be measured is not here; the message says why."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """One measurement, made in a process of its own.
-
-    Attributes:
-        group: the part of the benchmark that it belongs to.
-        measure: ``module.function`` of a package.
-        arguments: of that function.
-        package: the package.
-    """
+    """One measurement, made in a process of its own."""
 
     group: str
+    """The part of the benchmark that it belongs to."""
     measure: str
+    """``module.function`` of the package."""
     arguments: Mapping[str, Any] = field(default_factory=dict)
     package: str = "pixelbrax_gym.bench"
 
     @property
     def key(self) -> str:
-        """Names the case in the results."""
+        """Its name in the results."""
         arguments = json.dumps(dict(self.arguments), sort_keys=True)
         return f"{self.group} {self.measure} {arguments}"
 
     def command(self) -> list[str]:
-        """The process that measures it; its last line is the result, as JSON.
+        """Return the command that measures it, whose last line is the result, as JSON.
 
         Raises:
             AbsentError: it cannot run here.
@@ -52,22 +47,14 @@ class Case:
         return [sys.executable, "-m", "pixelbrax_gym.bench.worker", function, arguments]
 
     def environ(self) -> dict[str, str]:
-        """Variables that its process needs besides those of this one."""
+        """Return variables that its process needs besides those of this one."""
         return {}
 
 
 @dataclass(frozen=True)
 class Group:
-    """A part of the benchmark.
-
-    Attributes:
-        cases: what is measured.
-        table: the outcomes in Markdown.
-        note: what it shows and what it does not.
-        measured: whether its programs run; else they are compiled alone.
-    """
+    """A part of the benchmark: its cases, their outcomes in Markdown, and what these show."""
 
     cases: Callable[[], Iterator[Case]]
     table: Callable[[list[Row]], str]
-    note: str = ""
-    measured: bool = True
+    note: str

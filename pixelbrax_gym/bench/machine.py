@@ -29,23 +29,38 @@ def num_cores() -> int:
     return os.cpu_count() or 1
 
 
-def describe_cpu() -> dict[str, Any]:
-    """The processor, without a device of JAX being made.
+def installed_version(package: str) -> str | None:
+    """Return the release of a package; None where it is not installed."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
 
-    Virtual machines name several generations alike; family and model tell them apart.
+
+def describe_cpu() -> dict[str, Any]:
+    """Return what is known of the processor; starts no device of JAX.
+
+    Virtual machines name several generations alike; family, model and vectors tell them apart.
     """
+    entries: dict[str, str] = {}
+    if (cpuinfo := Path("/proc/cpuinfo")).exists():
+        for line in reversed(cpuinfo.read_text().splitlines()):
+            name, _, entry = line.partition(":")
+            entries[name.strip()] = entry.strip()
+    flags = entries.get("flags", "").split()
+    widest = {"avx512f": "AVX-512", "avx2": "AVX2"}
     return {
-        "processor": _from_cpuinfo("model name") or platform.processor() or platform.machine(),
-        "family": _from_cpuinfo("cpu family"),
-        "model": _from_cpuinfo("model"),
-        "vectors": _vectors(),
+        "processor": entries.get("model name") or platform.processor() or platform.machine(),
+        "family": entries.get("cpu family", ""),
+        "model": entries.get("model", ""),
+        "vectors": next((name for flag, name in widest.items() if flag in flags), ""),
         "cores": num_cores(),
         "system": f"{platform.system()} {platform.machine()}",
     }
 
 
 def describe() -> dict[str, Any]:
-    """Device, processor and versions."""
+    """Return device, processor and versions."""
     import jax
 
     device = jax.devices()[0]
@@ -56,38 +71,12 @@ def describe() -> dict[str, Any]:
         "runtime": device.client.platform_version,
         **describe_cpu(),
         "python": platform.python_version(),
-        "versions": {name: _version(name) for name in PACKAGES},
+        "versions": {name: installed_version(name) for name in PACKAGES},
         "xla_flags": os.environ.get("XLA_FLAGS", ""),
     }
 
 
 def file_stem(machine: dict[str, Any]) -> str:
-    """Name of the files of results: CPUs with other vectors write into other files."""
+    """Return the name of the files of results: CPUs with other vectors write into other files."""
     vectors: str = machine["vectors"] if machine["platform"] == "cpu" else ""
     return "-".join(filter(None, (machine["platform"], vectors.lower().replace("-", ""))))
-
-
-def _version(name: str) -> str | None:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return None
-
-
-def _vectors() -> str:
-    """The widest vectors that the processor computes with, where the system tells.
-
-    Virtual machines name processors of several generations alike, and images depend on it.
-    """
-    flags = _from_cpuinfo("flags").split()
-    known = {"avx512f": "AVX-512", "avx2": "AVX2"}
-    return next((name for flag, name in known.items() if flag in flags), "")
-
-
-def _from_cpuinfo(entry: str) -> str:
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        for line in cpuinfo.read_text().splitlines():
-            if line.partition(":")[0].strip() == entry:
-                return line.partition(":")[2].strip()
-    return ""

@@ -1,56 +1,46 @@
-"""Results -> a page of tables, and a plot."""
+"""Results -> a page of tables, and a plot of steps per second."""
 
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
 
 from pixelbrax_gym.bench.case import Group, Row
-from pixelbrax_gym.bench.plot import plot
-from pixelbrax_gym.bench.tables import table
+from pixelbrax_gym.bench.tables import succeeded, table, title
 
-_MEASURED = (
+_HEADING = (
     "# Measurements",
     "Medians of at least five repetitions of half a second or more, unless a part says "
-    "otherwise; compilation is apart, every call is waited for, actions are drawn, and "
+    "otherwise; compilation is apart, every call is waited for, actions are random, and "
     "episodes begin anew. Each case has a process of its own.",
-)
-_COMPILED = (
-    "# Compiled, not run",
-    "Programs compiled ahead of time for accelerators that need not be here, and what the compiler "
-    "made of them. Compiled on:",
 )
 
 
 def write(file: Path, groups: Mapping[str, Group]) -> None:
     """Write the page, and with matplotlib the plot, that belong to the results in ``file``."""
     kept = json.loads(file.read_text("utf-8"))
-    known = {case.key for group in groups.values() for case in group.cases()}
-    rows = [row for key, row in kept["cases"].items() if key in known]
     picture = file.with_suffix(".png")
-    plotted = find_spec("matplotlib") is not None and plot(rows, picture)
+    plotted = find_spec("matplotlib") is not None and plot(_rows(kept, groups), picture)
     if not plotted:
         picture.unlink(missing_ok=True)
     part = file.with_suffix(".md.part")
-    text = page(kept["machines"], rows, groups, picture.name if plotted else None)
-    part.write_text(text, "utf-8")
+    part.write_text(page(kept, groups, picture.name if plotted else None), "utf-8")
     part.replace(file.with_suffix(".md"))
 
 
-def page(
-    machines: Mapping[str, Row], rows: list[Row], groups: Mapping[str, Group], plot: str | None
-) -> str:
-    """The page, in Markdown."""
+def page(kept: Mapping[str, Row], groups: Mapping[str, Group], picture: str | None) -> str:
+    """Return the page of a file's results, in Markdown, with the plot of that name."""
+    rows = _rows(kept, groups)
     used = {row["machine"] for row in rows}
-    measured = any(group.measured for group in groups.values())
     parts = [
-        *(_MEASURED if measured else _COMPILED),
-        *(_machine(machine) for name, machine in machines.items() if name in used),
+        *_HEADING,
+        *(_machine(machine) for name, machine in kept["machines"].items() if name in used),
     ]
-    if plot:
-        parts.append(f"![Steps per second over the number of environments]({plot})")
+    if picture:
+        parts.append(f"![Steps per second over the number of environments]({picture})")
     for name, group in groups.items():
         of_group = [row for row in rows if row["group"] == name]
         if of_group:
@@ -63,10 +53,53 @@ def page(
     return "\n\n".join(part.strip() for part in parts) + "\n"
 
 
+def plot(rows: list[Row], path: Path) -> bool:
+    """Draw steps per second over the number of environments, and return if there are any."""
+    chosen = [row for row in succeeded(rows) if row["group"] == "environments"]
+    tasks = list(dict.fromkeys(row["arguments"]["task"] for row in chosen))
+    if not tasks:
+        return False
+    # A value that other tools leave there keeps matplotlib from being imported.
+    os.environ["MPLBACKEND"] = "Agg"
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, panels = plt.subplots(
+        1,
+        len(tasks),
+        figsize=(1 + 3 * len(tasks), 3.6),
+        sharey=True,
+        layout="constrained",
+        squeeze=False,
+    )
+    for panel, task in zip(panels[0], tasks, strict=True):
+        for obs_mode, label in (("state", "state only"), ("pixels", "84 x 84 pixels")):
+            points = sorted(
+                (row["arguments"]["num_envs"], row["values"]["steps_per_second"])
+                for row in chosen
+                if row["arguments"]["task"] == task and row["arguments"].get("obs_mode") == obs_mode
+            )
+            panel.loglog([x for x, _ in points], [y for _, y in points], "o-", label=label)
+        panel.set(title=title(task), xlabel="environments")
+        panel.grid(alpha=0.3, which="both")
+        panel.legend(fontsize=7)
+    panels[0, 0].set_ylabel("steps / s")
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+    return True
+
+
+def _rows(kept: Mapping[str, Row], groups: Mapping[str, Group]) -> list[Row]:
+    """Outcomes of the cases that the groups have today."""
+    known = {case.key for group in groups.values() for case in group.cases()}
+    return [row for key, row in kept["cases"].items() if key in known]
+
+
 def _machine(machine: Row) -> str:
     versions = ", ".join(f"{name} {v}" for name, v in machine["versions"].items() if v)
-    # Results from before vectors were noted have none.
-    vectors = f" with {machine['vectors']}" if machine.get("vectors") else ""
+    vectors = f" with {machine['vectors']}" if machine["vectors"] else ""
     return (
         f"{machine['device']} ({machine['processor']}{vectors}, {machine['cores']} cores), "
         f"{machine['system']}, Python {machine['python']}; {versions}. "

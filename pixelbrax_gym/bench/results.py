@@ -14,10 +14,6 @@ from pixelbrax_gym.bench.case import Case
 class Results:
     """What has been measured, in a JSON file that is written after every case.
 
-    Args:
-        file: where it is kept; what is there stays.
-        machine: of this process, as ``machine.describe`` has it.
-
     Raises:
         ValueError: the file is of another kind.
     """
@@ -37,14 +33,15 @@ class Results:
         self.kept["machines"][self.machine] = machine
 
     def has(self, case: Case) -> bool:
-        """Whether there is nothing more to learn of the case on this machine."""
+        """Whether a case need not be measured again on this machine."""
         known = self.kept["cases"].get(case.key, {})
         learned = known.get("status") in ("ok", "out of memory")
         return learned and known["machine"] == self.machine
 
     def add(self, case: Case, outcome: dict[str, Any]) -> None:
         """Keep an outcome. The file is never half written."""
-        self.kept["cases"][case.key] = {
+        cases = self.kept["cases"]
+        cases[case.key] = {
             "group": case.group,
             "measure": case.measure,
             "arguments": dict(case.arguments),
@@ -52,9 +49,8 @@ class Results:
             "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M"),
             **outcome,
         }
-        used = {known["machine"] for known in self.kept["cases"].values()}
+        used = {known["machine"] for known in cases.values()}
         self.kept["machines"] = {k: v for k, v in self.kept["machines"].items() if k in used}
-        self.file.parent.mkdir(parents=True, exist_ok=True)
         part = self.file.with_suffix(".part")
         part.write_text(json.dumps(self.kept, indent=1) + "\n", "utf-8")
         part.replace(self.file)

@@ -11,7 +11,7 @@ from pixelbrax_jax.tasks import TASKS
 
 
 def table(heads: Iterable[str], lines: Iterable[Iterable[Any]]) -> str:
-    """Heads and lines, in columns that are as wide as what is in them."""
+    """Return heads and lines, in columns that are as wide as what is in them."""
     rows = [[str(cell) for cell in row] for row in (list(heads), *lines)]
     widths = [max(3, *map(len, column)) for column in zip(*rows, strict=True)]
     rows.insert(1, ["-" * width for width in widths])
@@ -20,48 +20,47 @@ def table(heads: Iterable[str], lines: Iterable[Iterable[Any]]) -> str:
 
 
 def number(value: float | None) -> str:
-    """Three significant digits, thousands apart; a hyphen for what is not known."""
+    """Return three significant digits, thousands apart; a hyphen for what is not known."""
     if value is None or not math.isfinite(value):
         return "-"
     if value == 0:
         return "0"
     digits = 2 - math.floor(math.log10(abs(value)))
-    rounded = round(value, digits)
-    return f"{rounded:,.{max(0, digits)}f}"
+    return f"{round(value, digits):,.{max(0, digits)}f}"
 
 
 def title(task: str) -> str:
-    """A task's name as in its Gymnasium id."""
+    """Return a task's name as in its Gymnasium id."""
     return TASKS[task].gymnasium_id.removeprefix("PixelBrax/").removesuffix("-v0")
 
 
 def succeeded(rows: list[Row]) -> list[Row]:
-    """Those that have values."""
+    """Return those that have values."""
     return [row for row in rows if row["status"] == "ok"]
 
 
 def find(rows: list[Row], measure: str, **arguments: Any) -> Row | None:
-    """The first outcome of a measure with these arguments, and maybe others."""
+    """Return the first outcome of a measure with these arguments, and maybe others."""
     for row in rows:
         if row["measure"] == measure and arguments.items() <= row["arguments"].items():
             return row
     return None
 
 
-def value(row: Row | None, name: str) -> float | None:
-    """A value of an outcome; None if there is none."""
+def value(row: Row | None, name: str) -> Any:
+    """Return a value of an outcome; None if there is none."""
     return row["values"][name] if row is not None and row["status"] == "ok" else None
 
 
 def cell(row: Row | None, name: str) -> str:
-    """A value of an outcome, or why there is none."""
+    """Return a value of an outcome as text, or why there is none."""
     if row is None:
         return "not yet"
     return number(row["values"][name]) if row["status"] == "ok" else str(row["status"])
 
 
 def ratio(above: float | None, below: float | None) -> str:
-    """A quotient; a hyphen if one of both is not known."""
+    """Return a quotient as text; a hyphen if one of both is not known."""
     return number(above / below) if above and below else "-"
 
 
@@ -69,52 +68,41 @@ def renderer(rows: list[Row]) -> str:
     """Frames per second of the ray-caster."""
 
     def line(row: Row) -> list[str]:
-        values, options = row["values"], dict(row["arguments"])
-        num_envs = options.pop("num_envs")
-        options.pop("task")
+        options = {k: v for k, v in row["arguments"].items() if k not in ("task", "num_envs")}
         return [
             ", ".join(f"{k}={v}" for k, v in options.items()) or "default",
-            str(num_envs),
-            number(values["frames_per_second"]),
-            number(values["compile_seconds"]),
-            number(values["temporary_bytes"] / values["output_bytes"]),
-            number(values["operations_per_frame"] / 1e6),
+            str(row["arguments"]["num_envs"]),
+            number(row["values"]["frames_per_second"]),
+            number(row["values"]["compile_seconds"]),
         ]
 
-    heads = (
-        "Ant",
-        "environments",
-        "frames/s",
-        "compilation, s",
-        "temporaries / output",
-        "million operations / frame",
-    )
+    heads = ("Ant", "environments", "frames/s", "compilation, s")
     return table(heads, map(line, succeeded(rows)))
 
 
 def environments(rows: list[Row]) -> str:
     """Steps per second with pixels and without, over the number of environments."""
     lines = []
-    names = {row["arguments"]["task"]: None for row in rows}
-    for task in names:
+    for task in dict.fromkeys(row["arguments"]["task"] for row in rows):
         of_task = [row for row in rows if row["arguments"]["task"] == task]
         for num_envs in sorted({row["arguments"]["num_envs"] for row in of_task}):
             where = {"num_envs": num_envs}
             state = find(of_task, "throughput.scan", **where, obs_mode="state")
             pixels = find(of_task, "throughput.scan", **where, obs_mode="pixels")
             frames = find(of_task, "throughput.renderer", **where)
-            speed, held = value(pixels, "steps_per_second"), value(pixels, "bytes_per_env")
+            both = (value(row, "steps_per_second") for row in (pixels, state))
+            held, peak = value(pixels, "bytes_per_env"), _peak_bytes(pixels)
             lines.append(
                 [
                     title(task),
                     num_envs,
                     cell(pixels, "steps_per_second"),
                     cell(state, "steps_per_second"),
-                    ratio(speed, value(state, "steps_per_second")),
+                    ratio(*both),
                     cell(frames, "frames_per_second") if frames else "-",
                     cell(pixels, "compile_seconds"),
-                    number(held / 1e3 if held else None),
-                    _gigabytes(pixels),
+                    number(held and held / 1e3),
+                    number(peak and peak / 1e9),
                 ]
             )
     heads = (
@@ -131,12 +119,15 @@ def environments(rows: list[Row]) -> str:
     return table(heads, lines)
 
 
-def interleaved(*columns: str) -> Callable[[list[Row]], str]:
-    """A table of a comparison of interleaved runs.
+def _peak_bytes(row: Row | None) -> float | None:
+    if row is None or row["status"] != "ok":
+        return None
+    peak = row["peak_bytes"]
+    return peak["device"] or peak["host"]
 
-    Args:
-        columns: what tells its lines apart, by their names in the case's arguments or values.
-    """
+
+def interleaved(*columns: str) -> Callable[[list[Row]], str]:
+    """Return what draws a comparison, whose lines differ in these arguments or values."""
 
     def draw(rows: list[Row]) -> str:
         lines = [
@@ -156,10 +147,3 @@ def interleaved(*columns: str) -> Callable[[list[Row]], str]:
         return table((*heads, "steps/s", "ratio", "interval", "rounds"), lines)
 
     return draw
-
-
-def _gigabytes(row: Row | None) -> str:
-    if row is None or row["status"] != "ok":
-        return "-"
-    held = row["peak_bytes"]["device"] or row["peak_bytes"]["host"]
-    return number(held / 1e9 if held else None)

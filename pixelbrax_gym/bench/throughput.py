@@ -6,11 +6,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 import pixelbrax_jax as pb
 from pixelbrax_gym.bench.timing import compiled, rate
-from pixelbrax_jax.tasks import TASKS
 
 
 def renderer(
@@ -21,7 +19,7 @@ def renderer(
     shadows: bool = False,
     renderer: str = "fused",
 ) -> dict[str, Any]:
-    """The ray-caster alone: packed words from link poses."""
+    """Measure the ray-caster alone: packed words from link poses."""
     env, params = pb.make(
         task, look=look, shadows=shadows, height=size, width=size, renderer=renderer
     )
@@ -34,29 +32,15 @@ def renderer(
         return words
 
     speed = rate(run)
-    memory = program.memory_analysis()
     return {
         "frames_per_second": num_envs * speed["median"],
         "speed": speed,
         "compile_seconds": compile_seconds,
-        "temporary_bytes": memory.temp_size_in_bytes,
-        "output_bytes": memory.output_size_in_bytes,
-        "operations_per_frame": operations(env, states, params) / num_envs,
     }
 
 
-def operations(env: pb.PixelEnv, states: Any, params: Any) -> float:
-    """Count the floating-point operations of all images, as the program is written.
-
-    XLA counts the body of a loop once, however often it runs; here is no loop.
-    """
-    draw = jax.vmap(env.draw, in_axes=(0, None))
-    cost = jax.jit(draw).lower(states, params).cost_analysis() or {}
-    return float(cost.get("flops", 0.0))
-
-
 def first_states(env: pb.PixelEnv, params: Any, num_envs: int) -> Any:
-    """States at the start of an episode, without key and frames, which drawing does not read."""
+    """Return states at the start of an episode, without what drawing does not read."""
     keys = jax.random.split(jax.random.key(0), num_envs)
     reset = jax.jit(jax.vmap(lambda key: env.reset_sim(key, jnp.uint32(0), params)))
     return reset(keys)
@@ -68,7 +52,7 @@ def scan(
     obs_mode: str = "pixels",
     size: int = 84,
 ) -> dict[str, Any]:
-    """Environment steps in one compiled loop, with drawn actions and autoreset.
+    """Measure environment steps in one compiled loop, with random actions and autoreset.
 
     Every frame enters the frame stack, which is the loop's state: none can be left out.
     """
@@ -103,35 +87,9 @@ def scan(
 
     # Fresh memory for a call is a tenth of the time of four steps with 1000 environments.
     speed = rate(run, least_calls=16)
-    memory = program.memory_analysis()
     return {
         "steps_per_second": num_envs * speed["median"],
         "speed": speed,
         "compile_seconds": compile_seconds,
-        "backend": env.physics.backend,
-        "control_dt": env.dt,
         "bytes_per_env": held / num_envs,
-        "temporary_bytes_per_env": memory.temp_size_in_bytes / num_envs,
-    }
-
-
-def gymnasium(task: str, num_envs: int) -> dict[str, Any]:
-    """Steps per second of Gymnasium's vector environment with NumPy output, as peers have it."""
-    from gymnasium import make_vec
-
-    envs = make_vec(TASKS[task].gymnasium_id, num_envs=num_envs, output="numpy")
-    envs.reset(seed=0)
-    draw = np.random.default_rng(0)
-    shape = envs.action_space.shape
-
-    def run(calls: int) -> Any:
-        for _ in range(calls):
-            obs = envs.step(draw.uniform(-1.0, 1.0, shape).astype(np.float32))[0]
-        return obs
-
-    speed = rate(run)
-    return {
-        "steps_per_second": num_envs * speed["median"],
-        "speed": speed,
-        "control_dt": pb.make(task)[0].dt,
     }

@@ -23,7 +23,7 @@ Name = TypeVar("Name")
 def compiled(
     env: Any, function: Callable, *arguments: Any, **jit_options: Any
 ) -> tuple[Any, float]:
-    """An environment's compiled program and the seconds it took to trace and compile."""
+    """Return an environment's compiled program and the seconds to trace and compile it."""
     started = time.perf_counter()
     jitted = jax.jit(function, compiler_options=compiler_options(env), **jit_options)
     program = jitted.lower(*arguments).compile()
@@ -31,30 +31,13 @@ def compiled(
 
 
 def rate(run: Callable[[int], Any], least_calls: int = 1) -> dict[str, float]:
-    """Calls per second.
-
-    Args:
-        run: does so many calls and returns something to wait for.
-        least_calls: of a repetition.
-
-    Returns:
-        Median, slowest and fastest repetition, and the calls of each.
-    """
+    """Measure calls per second of what does so many calls and returns something to wait for."""
     calls = least_calls
-    jax.block_until_ready(run(calls))
-    while True:
-        started = time.perf_counter()
-        jax.block_until_ready(run(calls))
-        seconds = time.perf_counter() - started
-        if seconds >= REPETITION_SECONDS:
-            break
+    _seconds(run, calls)
+    while (seconds := _seconds(run, calls)) < REPETITION_SECONDS:
         wanted = 1.1 * REPETITION_SECONDS / max(seconds, 1e-6)
         calls = max(calls + 1, int(calls * min(10.0, wanted)))
-    rates = []
-    for _ in range(REPETITIONS):
-        started = time.perf_counter()
-        jax.block_until_ready(run(calls))
-        rates.append(calls / (time.perf_counter() - started))
+    rates = [calls / _seconds(run, calls) for _ in range(REPETITIONS)]
     return {
         "median": float(np.median(rates)),
         "slowest": min(rates),
@@ -63,43 +46,44 @@ def rate(run: Callable[[int], Any], least_calls: int = 1) -> dict[str, float]:
     }
 
 
+def _seconds(run: Callable[..., Any], *arguments: Any) -> float:
+    started = time.perf_counter()
+    jax.block_until_ready(run(*arguments))
+    return time.perf_counter() - started
+
+
 def take_interleaved(
     runners: Mapping[Name, Callable[[], Any]], seconds: float = SECONDS
 ) -> dict[Name, list[float]]:
-    """Seconds of each runner's runs, one in each round: at least five rounds, at most 300.
+    """Measure the seconds of each runner's runs, one in each of 5 to 300 rounds.
 
-    A change of the machine's mood then strikes everyone alike, so that ratios hold where speeds
-    do not. Turns are short and their order is drawn anew in each round.
-
-    Args:
-        runners: each runs, and waits for what it has done.
-        seconds: about how long all runs take altogether.
+    When the machine slows down it does so for all, so that ratios hold where speeds do not. Each
+    round has an order of its own. All runs take about ``seconds`` altogether.
     """
     for run in runners.values():
         run()
-    order = list(runners)
-    draw = np.random.default_rng(0)
-    started = time.perf_counter()
-    times: dict[Name, list[float]] = {key: [] for key in runners}
-    rounds = 0
+    order, random = list(runners), np.random.default_rng(0)
+    times: dict[Name, list[float]] = {name: [] for name in order}
+    started, rounds = time.perf_counter(), 0
     while rounds < 5 or (rounds < 300 and time.perf_counter() - started < seconds):
         rounds += 1
-        for place in draw.permutation(len(order)):
-            key = order[place]
-            began = time.perf_counter()
-            runners[key]()
-            times[key].append(time.perf_counter() - began)
+        for place in random.permutation(len(order)):
+            times[order[place]].append(_seconds(runners[order[place]]))
     return times
 
 
 def speed_ratio(seconds: list[float], standard: list[float]) -> dict[str, Any]:
-    """How fast a runner is beside a standard, round by round.
+    """Compare a runner with a standard, round by round.
 
     Returns:
-        ``ratio``, the median over the rounds, more than 1 for the faster, and ``interval``, the
-        bounds of its bootstrap interval of 95 %.
+        ``ratio``, the median over the rounds, more than 1 for the faster; ``interval``, the
+        bounds of its bootstrap interval of 95 %; and ``runs``.
     """
     ratios = np.divide(standard, seconds)
     drawn = np.random.default_rng(0).choice(ratios, (2000, len(ratios)))
     low, high = np.quantile(np.median(drawn, axis=1), [0.025, 0.975])
-    return {"ratio": float(np.median(ratios)), "interval": [float(low), float(high)]}
+    return {
+        "ratio": float(np.median(ratios)),
+        "interval": [float(low), float(high)],
+        "runs": len(seconds),
+    }

@@ -17,7 +17,6 @@ from pixelbrax_gym.interop.export import exporter, to_numpy
 from pixelbrax_gym.resets import check_seed, read_options
 from pixelbrax_gym.stateful import StatefulEnv
 from pixelbrax_gym.sub_env import SubEnv, call_sub_envs
-from pixelbrax_jax import AUTORESET_MODES
 from pixelbrax_jax.validation import check_choice
 
 
@@ -288,4 +287,5 @@ def as_autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:
     by_value = {known.value: known for known in AutoresetMode}
     if isinstance(mode, str) and mode in by_value:
         return by_value[mode]
-    return AutoresetMode[check_choice("autoreset_mode", mode, AUTORESET_MODES).upper()]
+    modes = [known.name.lower() for known in AutoresetMode]
+    return AutoresetMode[check_choice("autoreset_mode", mode, modes).upper()]

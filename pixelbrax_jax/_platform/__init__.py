@@ -1,1 +1,1 @@
-"""How a CPU runs the physics of a batch fast; nothing else knows of it."""
+"""What differs by device: decided when a program is lowered, and known to nothing else."""

@@ -35,14 +35,8 @@ def batch_last(fn: Callable[..., Any], in_axes: Sequence[int | None]) -> Callabl
     parameters are others, all of ``fn`` is computed by ``jax.vmap``, with a RuntimeWarning once in
     a process. Side effects, such as those of ``jax.debug.print``, may happen twice then.
 
-    Args:
-        fn: a function of trees of arrays, of one row.
-        in_axes: for each argument 0, a row in each entry of its arrays' first axis, or None, the
-            same for all rows. At least one is 0.
-
-    Returns:
-        The function of all rows; its results have rows along their first axis. It raises a
-        ValueError if arguments have different numbers of rows.
+    An argument's axis is 0 or None; at least one is 0. If arguments have different numbers of rows,
+    the function raises a ValueError.
     """
 
     def rows_of(*args: Any) -> Any:
@@ -128,8 +122,8 @@ def _apply(eqn: core.JaxprEqn, inputs: list[Operand], size: int) -> list[Operand
     name = eqn.primitive.name
     if not any(x.batched for x in inputs):
         return [Operand(x, False) for x in bind(eqn, *(x.value for x in inputs))]
-    if name in _CALLS:
-        return _evaluate(eqn.params[_CALLS[name]], inputs, size)
+    if (program := _program(eqn)) is not None:
+        return _evaluate(program, inputs[len(inputs) - len(program.jaxpr.invars) :], size)
     if name == "scan":
         return _scan(eqn, inputs, size)
     if name == "while":
@@ -151,7 +145,22 @@ def _by_vmap(eqn: core.JaxprEqn, inputs: list[Operand]) -> list[Any]:
 
 
 _CALLS = {"jit": "jaxpr", "closed_call": "call_jaxpr"}
-"""Primitives that are programs, which are written out in place, and the parameter that has it."""
+"""Primitives that are programs, and the parameter that has it."""
+
+
+def _program(eqn: core.JaxprEqn) -> core.ClosedJaxpr | None:
+    """Return the program that an equation stands for, to be written out in its place.
+
+    It takes the equation's last operands. Of ``by_platform`` it is the form of a CPU.
+    """
+    if eqn.primitive.name in _CALLS:
+        return eqn.params[_CALLS[eqn.primitive.name]]
+    for platforms, branch in zip(
+        eqn.params.get("branches_platforms") or (), eqn.params.get("branches", ()), strict=False
+    ):
+        if platforms is None or "cpu" in platforms:
+            return branch
+    return None
 
 
 @rule("cond")
@@ -166,6 +175,14 @@ def _cond(eqn: core.JaxprEqn, inputs: Sequence[Operand], size: int) -> list[Any]
 
     branches = [partial(branch, closed) for closed in eqn.params["branches"]]
     values = [x.value for x in operands]
+    platforms = eqn.params.get("branches_platforms")
+    if platforms is not None:
+        # Of `by_platform`: batches have this form on a CPU alone.
+        return next(
+            take(*values)
+            for take, names in zip(branches, platforms, strict=True)
+            if names is None or "cpu" in names
+        )
     if not index.batched:
         return list(lax.switch(index.value, branches, *values))
     # Rows differ in their branch: all are computed, as under `jax.vmap`.
@@ -276,8 +293,8 @@ def _reach(closed: core.ClosedJaxpr, flags: Sequence[bool]) -> list[bool]:
 
     for eqn in closed.jaxpr.eqns:
         inputs = [read(atom) for atom in eqn.invars]
-        if eqn.primitive.name in _CALLS:
-            outputs = _reach(eqn.params[_CALLS[eqn.primitive.name]], inputs)
+        if (program := _program(eqn)) is not None:
+            outputs = _reach(program, inputs[len(inputs) - len(program.jaxpr.invars) :])
         elif eqn.primitive.name == "scan":
             outputs = _reach_scan(eqn, inputs)
         elif eqn.primitive.name == "while":

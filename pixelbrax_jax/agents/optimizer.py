@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import optax
 
 from pixelbrax_jax.agents.config import TrainConfig
-
-Networks = dict[str, Any]
-"""Parameters by name of the network."""
+from pixelbrax_jax.agents.train_state import Metrics, Networks
 
 
 class Optimizer:
-    """Steps along the gradients of several networks."""
+    """Steps along the gradients of several networks, by the settings of ``config``."""
 
     def __init__(self, config: TrainConfig) -> None:
-        """Take its settings from ``config``."""
         self._config = config
         self._adam = optax.scale_by_adam(eps=config.adam_eps)
 
@@ -30,19 +25,14 @@ class Optimizer:
         """Return () float32, the step size in an iteration, a () uint32."""
         rate = jnp.float32(self._config.learning_rate)
         if self._config.anneal:
+            # Rounding may make the fraction negative, which optax.linear_schedule lets pass.
             rate *= jnp.maximum(0.0, 1.0 - iteration / self._config.num_iterations)
         return rate
 
     def step(
         self, networks: Networks, opt_state: Networks, gradients: Networks, iteration: jax.Array
-    ) -> tuple[Networks, Networks, dict[str, jax.Array]]:
+    ) -> tuple[Networks, Networks, Metrics]:
         """Step those networks that have gradients; the others stay.
-
-        Args:
-            networks: parameters.
-            opt_state: of ``init``.
-            gradients: of some of the networks.
-            iteration: () uint32, of the step size.
 
         Returns:
             Parameters, the optimiser's state, and the gradients' global norms before clipping.
@@ -52,6 +42,7 @@ class Optimizer:
         for name, gradient in gradients.items():
             norm = norms[name] = optax.tree.norm(gradient)
             if self._config.max_grad_norm:
+                # As PyTorch clips; optax.clip_by_global_norm has no 1e-6.
                 scale = jnp.minimum(1.0, self._config.max_grad_norm / (norm + 1e-6))
                 gradient = jax.tree.map(lambda g, scale=scale: g * scale, gradient)
             updates, opt_state[name] = self._adam.update(gradient, opt_state[name])

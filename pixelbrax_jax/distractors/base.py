@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable
 from typing import Any, ClassVar
 
@@ -18,53 +17,25 @@ class Distractor:
     for it decides which program is compiled. Whatever varies is in its *state*, a pytree that
     ``reset`` samples at an episode's reset and ``advance`` carries from frame to frame.
 
-    ``change_params`` acts before the image is drawn, ``change_frame`` after. Each is a no-op
+    ``change_params`` acts before the image is rendered, ``change_frame`` after. Each is a no-op
     unless it is overridden.
 
     Attributes:
         kind: name of the distractor; an environment has at most one of a kind.
         stream: name of its random stream, folded into an episode's key; its own for each kind.
-        by_pixel: whether ``change_frame`` works element by element, in any shape of the planes, and
-            of the arrays in its state reads single numbers, as ``state.shift[0]``. A GPU then
-            computes it within the kernel that draws; else in passes of its own over the image.
     """
 
     kind: ClassVar[str]
     stream: ClassVar[int]
-    by_pixel: ClassVar[bool] = False
 
     def reset(self, key: jax.Array, params: EnvParams) -> Any:
-        """Sample the state at the first frame of an episode.
-
-        Args:
-            key: a key of this episode and this distractor alone.
-            params: of the environment.
-        """
+        """Sample the state at the first frame of an episode, by a key of its own."""
         raise NotImplementedError
 
-    def begin(self, key: jax.Array, params: EnvParams) -> Any:
-        """Sample a state; the former name of ``reset``, which goes with the next release."""
-        warnings.warn("Distractor.begin is Distractor.reset now.", DeprecationWarning, stacklevel=2)
-        return self.reset(key, params)
-
-    def __init_subclass__(cls) -> None:
-        super().__init_subclass__()
-        if "begin" in vars(cls) and "reset" not in vars(cls):
-            warnings.warn(
-                f"{cls.__name__}.begin is called reset now; rename it.",
-                DeprecationWarning,
-                stacklevel=2,
-            )
-            cls.reset = vars(cls)["begin"]  # type: ignore[method-assign]
-
     def advance(self, state: Any, key: jax.Array, frame: jax.Array, params: EnvParams) -> Any:
-        """Return the state at the next frame.
+        """Return the state at the next frame, () int32 ``frame`` of its episode, 0 first.
 
-        Args:
-            state: at the frame before.
-            key: a key of this frame and this distractor alone.
-            frame: () int32, index of the frame in its episode, 0 first.
-            params: of the environment.
+        The key is that of this frame and this distractor alone.
         """
         del key, frame, params
         return state
@@ -77,29 +48,18 @@ class Distractor:
     def backdrop(
         self, state: Any, params: EnvParams, rows: jax.Array, height: int, width: int
     ) -> jax.Array | None:
-        """Return rows of an image that ``change_frame`` mixes in.
+        """Return ``rows``, (R,) int32, of an image that ``change_frame`` mixes in.
 
-        Args:
-            state: at this frame.
-            params: of the environment.
-            rows: (R,) int32, which rows, in [0, height).
-            height: pixels of the whole image.
-            width: pixels.
-
-        Returns:
-            (R, width) uint32 packed pixels, or None.
+        They are numbered in [0, height), and are (R, width) uint32 packed pixels; None for none.
         """
         del state, params, rows, height, width
         return None
 
     def change_frame(self, state: Any, frame: Frame, backdrop: jax.Array | None) -> Frame:
-        """Return the image with other colors, all in [0, 1].
+        """Return some rows of the image, or all, with other colors, all in [0, 1].
 
-        Args:
-            state: at this frame.
-            frame: some rows of the image, or all.
-            backdrop: the same rows of the backdrop, if there is one. What differs from pixel to
-                pixel, such as noise, belongs there.
+        ``backdrop`` are the same rows of the backdrop, if there is one. What differs from pixel to
+        pixel, such as noise, belongs there.
         """
         del state, backdrop
         return frame
@@ -122,11 +82,8 @@ class Chain:
     def __init__(self, distractors: Iterable[object] = ()) -> None:
         """Sort and check.
 
-        Args:
-            distractors: any of them.
-
         Raises:
-            ValueError: two are of one kind or draw from one stream.
+            ValueError: two are of one kind, or have one stream.
             TypeError: one is no distractor, or cannot be hashed.
         """
         links = [_checked(distractor) for distractor in distractors]
@@ -158,39 +115,20 @@ class Chain:
             params = link.change_params(state, params)
         return params
 
-    def backdrops(
+    def change_frame(
         self,
         states: tuple[Any, ...],
         params: EnvParams,
+        frame: Frame,
         rows: jax.Array,
         height: int,
         width: int,
-    ) -> tuple[jax.Array | None, ...]:
-        """Return the images to mix in, (R, width) each."""
-        return tuple(
-            link.backdrop(state, params, rows, height, width)
-            for link, state in zip(self.links, states, strict=True)
-        )
-
-    def change_frame(
-        self, states: tuple[Any, ...], frame: Frame, backdrops: tuple[jax.Array | None, ...]
     ) -> Frame:
-        """Return the changed image."""
-        for link, state, backdrop in zip(self.links, states, backdrops, strict=True):
+        """Return rows of the image with other colors, given (R,) int32, which rows they are."""
+        for link, state in zip(self.links, states, strict=True):
+            backdrop = link.backdrop(state, params, rows, height, width)
             frame = link.change_frame(state, frame, backdrop)
         return frame
-
-    @property
-    def by_pixel(self) -> bool:
-        """Whether all that change the frame do so by pixel; see ``Distractor``."""
-        return all(link.by_pixel or not _changes_frame(link) for link in self.links)
-
-    def frame_states(self, states: tuple[Any, ...]) -> tuple[Any, ...]:
-        """Return the states, with None in place of those that ``change_frame`` does not read."""
-        return tuple(
-            state if _changes_frame(link) else None
-            for link, state in zip(self.links, states, strict=True)
-        )
 
     def info(self, states: tuple[Any, ...]) -> dict[str, jax.Array]:
         """Return what all of them add to ``Timestep.info``."""
@@ -202,10 +140,6 @@ class Chain:
     @staticmethod
     def _key(key: jax.Array, link: Distractor, frame: jax.Array | int) -> jax.Array:
         return jax.random.fold_in(jax.random.fold_in(key, link.stream), frame)
-
-
-def _changes_frame(link: Distractor) -> bool:
-    return type(link).change_frame is not Distractor.change_frame
 
 
 def _checked(distractor: object) -> Distractor:

@@ -15,8 +15,7 @@ from pixelbrax_jax.types import CameraRig, EnvParams
 from pixelbrax_jax.validation import check_fraction
 
 _RADIUS = 4.0
-"""Distance of a camera at which speeds are what they are called; they grow in proportion."""
-
+"""Metres from its target at which a camera has the suite's speeds; they grow in proportion."""
 
 _POLE = 0.02
 """Radians from straight above that a camera keeps, for there it would not know what is up."""
@@ -43,7 +42,7 @@ class CameraState(struct.PyTreeNode):
 
 
 @dataclass(frozen=True)
-class Camera(Distractor):
+class MovingCamera(Distractor):
     """Moves the camera about the point that it looks at.
 
     It stays in a box of spherical coordinates about that point. With b the ``scale`` and r0 the
@@ -66,6 +65,9 @@ class Camera(Distractor):
     Attributes:
         scale: b in [0, 1]; 0.1 is easy, 0.2 medium, 0.3 hard.
         dynamic: whether the camera wanders within an episode.
+
+    Raises:
+        ValueError: the scale is out of range.
     """
 
     scale: float = 0.1
@@ -75,15 +77,11 @@ class Camera(Distractor):
     stream: ClassVar[int] = 3
 
     def __post_init__(self) -> None:
-        """Check the options.
-
-        Raises:
-            ValueError: the scale is out of range.
-        """
-        check_fraction("scale of Camera", self.scale)
+        """Check the options."""
+        check_fraction("scale of MovingCamera", self.scale)
 
     def reset(self, key: jax.Array, params: EnvParams) -> CameraState:
-        """Return a place drawn from the box, and a velocity."""
+        """Return a place sampled from the box, and a velocity."""
         low, high = self._box(params.rig)
         place_key, direction_key, speed_key, roll_key = jax.random.split(key, 4)
         place = jax.random.uniform(place_key, (4,), minval=low, maxval=high)

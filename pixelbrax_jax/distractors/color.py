@@ -30,7 +30,7 @@ class Color(Distractor):
     more: straight above it shifts by all of the amount, at the horizon by all or, of a sky that
     has a color below too, by half, and below not at all.
 
-    An amount x is drawn from a normal distribution of standard deviation ``scale``, or from a
+    An amount x is sampled from a normal distribution of standard deviation ``scale``, or from a
     uniform one on [-scale, scale], cut to where colors stay in [0, 1] for materials. When, is
     decided by ``dynamics``:
 
@@ -44,7 +44,7 @@ class Color(Distractor):
     Control Suite, arXiv 2101.02722, at scales 0.1, 0.2, 0.3. Robot, ground and sky in another
     color each episode are color-easy and color-hard of the DMControl Generalization Benchmark,
     arXiv 2011.13389; it picks one of 100 recorded palettes, which are normal samples of standard
-    deviation 0.1 and 0.2 about the true colors, cut to [0, 1]. We draw new ones.
+    deviation 0.1 and 0.2 about the true colors, cut to [0, 1]. We sample new ones.
 
     Attributes:
         mode: ``"frame"`` or ``"geom"``.
@@ -54,6 +54,9 @@ class Color(Distractor):
         sky: whether the sky shifts too; of ``mode="geom"`` only.
         materials: the model's names of the materials that shift, of ``mode="geom"`` only; None
             for all. Where materials have no names, all shift.
+
+    Raises:
+        ValueError: an option is unknown or out of range; the message says what is allowed.
     """
 
     mode: str = "frame"
@@ -65,14 +68,9 @@ class Color(Distractor):
 
     kind: ClassVar[str] = "color"
     stream: ClassVar[int] = 1
-    by_pixel: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        """Check the options.
-
-        Raises:
-            ValueError: an option is unknown or out of range; the message says what is allowed.
-        """
+        """Check the options."""
         check_choice("mode of Color", self.mode, MODES)
         check_choice("dynamics of Color", self.dynamics, DYNAMICS)
         check_choice("distribution of Color", self.distribution, DISTRIBUTIONS)
@@ -155,7 +153,7 @@ class Color(Distractor):
         low, high = -rgb, 1.0 - rgb
         plane = _plane_material(params)
         if plane is not None:
-            # Planes are drawn in the ground's colors, not in their own.
+            # Planes show the ground's colors, not in their own.
             ground = jnp.asarray(params.look.ground_rgb)
             low, high = low.at[plane].set(-ground.min(0)), high.at[plane].set(1 - ground.max(0))
         names = params.geoms.material_name

@@ -32,17 +32,7 @@ def check_image(path: str) -> None:
 
 
 def contact_sheet(bank: ClipBank) -> Any:
-    """Return a row for each clip, with a few of its frames.
-
-    Args:
-        bank: the clips.
-
-    Returns:
-        A Pillow image.
-
-    Raises:
-        ImportError: Pillow is missing, with the fix.
-    """
+    """Return a Pillow image with a row for each clip: a few of its frames."""
     height = bank.frames.shape[1]
     rows = []
     for first, length in zip(bank.first, bank.length, strict=True):

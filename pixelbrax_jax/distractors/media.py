@@ -33,11 +33,7 @@ def read_clip(
     Images are turned as their EXIF orientation says, videos as their display matrix does. 16 bits
     become 8, floats in [0, 1] become 0 to 255, and what is transparent lies on black.
 
-    Args:
-        source: the clip.
-        height: pixels.
-        width: pixels.
-        check_count: called with the number of a video's frames so far; may raise.
+    ``check_count`` is called with the number of frames so far, and may raise.
 
     Returns:
         (H, W, 3) uint8 each, and what the file lacks, to be said after its name; empty if it lacks
@@ -50,6 +46,7 @@ def read_clip(
         ImportError: Pillow or imageio-ffmpeg is missing, with the fix.
     """
     if not source.is_video:
+        check_count(len(source.files))
         with ThreadPoolExecutor() as pool:  # Pillow decodes and scales without Python's lock
             return list(pool.map(lambda file: _picture(file, height, width), source.files)), ""
     frames: list[np.ndarray] = []
@@ -186,11 +183,7 @@ def _to_rgb(image: Any) -> Any:
 
 
 def pillow() -> Any:
-    """Return Pillow's module of images.
-
-    Raises:
-        ImportError: it is missing, with the fix.
-    """
+    """Return Pillow's module of images, or raise an ImportError that has the fix."""
     try:
         from PIL import Image
     except ImportError as error:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from pixelbrax_jax.distractors.base import Distractor
-from pixelbrax_jax.distractors.camera import Camera
+from pixelbrax_jax.distractors.camera import MovingCamera
 from pixelbrax_jax.distractors.color import Color
 from pixelbrax_jax.distractors.video import Video
 from pixelbrax_jax.validation import check_choice
@@ -30,25 +30,17 @@ _OTHER_GROUND_ALPHA = 0.3
 _FIXED: dict[str, tuple[Distractor, ...]] = {
     "color": (Color(),),
     "video": (Video(),),
-    "camera": (Camera(),),
+    "camera": (MovingCamera(),),
     "paper-color": (Color(mode="frame", dynamics="iid", scale=0.3, distribution="normal"),),
     "paper-video": (Video(mode="overlay", alpha=0.5, dynamics="loop"),),
     "video-easy": (Video(ground_alpha=1.0, dynamics="loop", num_clips=10, random_start=False),),
     "video-hard": (Video(ground_alpha=0.0, dynamics="loop", num_clips=100, random_start=False),),
 }
 
+# DM Control's materials of robot and ground.
+_DMC = ("self", "grid")
 _FIXED |= {
-    f"color-{level}": (
-        Color(
-            mode="geom",
-            dynamics="static",
-            scale=scale,
-            distribution="normal",
-            sky=True,
-            # DM Control's materials of robot and ground.
-            materials=("self", "grid"),
-        ),
-    )
+    f"color-{level}": (Color("geom", "static", scale, "normal", sky=True, materials=_DMC),)
     for level, scale in (("easy", 0.1), ("hard", 0.2))
 }
 
@@ -66,7 +58,7 @@ def preset(name: str, task: str) -> tuple[Distractor, ...]:
     * ``"dcs-easy"``, ``"dcs-medium"``, ``"dcs-hard"``, and each with ``"-static"``: color, video
       and camera of the Distracting Control Suite, arXiv 2101.02722.
     * ``"color-easy"``, ``"color-hard"``, ``"video-easy"``, ``"video-hard"``: of the DMControl
-      Generalization Benchmark, arXiv 2011.13389; colors are drawn, see ``Color``.
+      Generalization Benchmark, arXiv 2011.13389; colors are sampled, see ``Color``.
 
     Args:
         name: one of ``PRESETS``.
@@ -85,7 +77,7 @@ def preset(name: str, task: str) -> tuple[Distractor, ...]:
     dynamic = not rest
     scale = _SCALES[level]
     return (
-        Camera(scale=scale, dynamic=dynamic),
+        MovingCamera(scale=scale, dynamic=dynamic),
         Video(
             ground_alpha=_ground_alpha(task),
             dynamics="pingpong" if dynamic else "static",
@@ -136,11 +128,7 @@ def as_tuple(
 def resolve(
     distractors: str | Distractor | Iterable[str | Distractor] | None, task: str
 ) -> tuple[Distractor, ...]:
-    """Return distractors, those of a preset in place of its name.
-
-    Args:
-        distractors: one or several, or their names.
-        task: the task, which decides details of some presets.
+    """Return distractors, those of a preset for the task in place of its name.
 
     Raises:
         ValueError: a name is unknown.

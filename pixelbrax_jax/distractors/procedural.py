@@ -29,16 +29,7 @@ def names(split: str) -> list[str]:
 
 
 def clip(name: str, height: int, width: int) -> np.ndarray:
-    """Return one clip.
-
-    Args:
-        name: of ``names``.
-        height: pixels.
-        width: pixels.
-
-    Rephase:
-        (FRAMES, height, width, 3) uint8.
-    """
+    """Return the clip of one of ``names``, (FRAMES, height, width, 3) uint8."""
     family, seed = name.split("-")
     draw = _Draws(int(seed))
     # Units of an image's smaller side, whatever its size.

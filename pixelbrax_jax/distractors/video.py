@@ -63,7 +63,10 @@ class Video(Distractor):
         ground_alpha: fraction of the ground that is kept, in [0, 1]; of a background only.
         dynamics: ``"pingpong"``, ``"loop"`` or ``"static"``.
         num_clips: how many clips of the split are used, the first ones; None means all.
-        random_start: whether the first frame is drawn; else it is the clip's first.
+        random_start: whether the first frame is sampled; else it is the clip's first.
+
+    Raises:
+        ValueError: an option is unknown or out of range; the message says what is allowed.
     """
 
     mode: str = "background"
@@ -75,14 +78,9 @@ class Video(Distractor):
 
     kind: ClassVar[str] = "video"
     stream: ClassVar[int] = 2
-    by_pixel: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        """Check the options.
-
-        Raises:
-            ValueError: an option is unknown or out of range; the message says what is allowed.
-        """
+        """Check the options."""
         check_choice("mode of Video", self.mode, MODES)
         check_choice("dynamics of Video", self.dynamics, DYNAMICS)
         check_fraction("alpha of Video", self.fraction)
@@ -170,18 +168,7 @@ def frame_index(
     direction: jax.Array | int,
     frame: jax.Array | int,
 ) -> jax.Array:
-    """Return the clip's frame at frame ``frame`` of the episode; see ``Video``.
-
-    Args:
-        dynamics: ``"pingpong"``, ``"loop"`` or ``"static"``.
-        length: () int32, frames of the clip, at least 1.
-        start: () int32, in [0, length).
-        direction: () int32, +1 or -1.
-        frame: () int32, at least 0.
-
-    Returns:
-        () int32 in [0, length).
-    """
+    """Return the clip's frame at frame ``frame`` of the episode, () int32; see ``Video``."""
     first = jnp.asarray(start, jnp.int32)
     if dynamics == "static":
         return first

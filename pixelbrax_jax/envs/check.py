@@ -74,12 +74,10 @@ def _describe(tree: Any) -> list[tuple[str, tuple[int, ...], str]]:
 
 
 def _same_structure(expected: Any, actual: Any, what: str) -> None:
+    rule = f"{what} must keep its structure"
     for before, after in zip(_describe(expected), _describe(actual), strict=False):
-        _require(before == after, f"{what} must keep its structure: {before} became {after}")
-    _require(
-        str(jax.tree.structure(expected)) == str(jax.tree.structure(actual)),
-        f"{what} must keep its structure",
-    )
+        _require(before == after, f"{rule}: {before} became {after}")
+    _require(str(jax.tree.structure(expected)) == str(jax.tree.structure(actual)), rule)
 
 
 def _check_timestep(env: PixelEnv, timestep: Timestep, origin: str) -> None:
@@ -155,10 +153,7 @@ def _check_single_trace(
 
 
 def _equal(a: Any, b: Any) -> bool:
-    return all(
-        bool(jnp.array_equal(x, y))
-        for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
-    )
+    return all(map(jnp.array_equal, jax.tree.leaves(a), jax.tree.leaves(b)))
 
 
 def _close(a: Any, b: Any) -> bool:

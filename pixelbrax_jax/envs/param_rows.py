@@ -49,14 +49,7 @@ _SHAPES: dict[str, tuple[int | str, ...]] = {
 
 @dataclass(frozen=True)
 class ParamRows:
-    """Parameters taken apart.
-
-    Attributes:
-        own: arrays with a row for each environment.
-        shared: arrays that are the same for all.
-        is_own: which of the two each array of the parameters is in.
-        tree: structure of the parameters.
-    """
+    """Parameters taken apart: arrays with a row for each environment, and those alike for all."""
 
     own: tuple[Any, ...]
     shared: tuple[Any, ...]
@@ -64,12 +57,7 @@ class ParamRows:
     tree: Any
 
     def join(self, own: Sequence[Any], shared: Sequence[Any] | None = None) -> EnvParams:
-        """Return the parameters of one environment.
-
-        Args:
-            own: its rows.
-            shared: what is the same for all, if it is passed as an argument.
-        """
+        """Return the parameters of one environment, of its own rows and what is shared."""
         rest = iter(self.shared if shared is None else shared)
         rows = iter(own)
         leaves = [next(rows) if is_own else next(rest) for is_own in self.is_own]
@@ -83,11 +71,7 @@ class ParamRows:
 
 
 def split_params(params: EnvParams, num_envs: int) -> ParamRows:
-    """Take parameters apart.
-
-    Args:
-        params: each array as ``EnvParams`` has it, or with a leading axis N.
-        num_envs: N.
+    """Take apart parameters that are as ``EnvParams`` has them, or have a leading axis N.
 
     Raises:
         ValueError: an array has neither shape; the message names it, and both.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any
@@ -10,16 +9,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from pixelbrax_jax._platform.frame_stack import push, unpack
 from pixelbrax_jax.config import ProgramConfig
 from pixelbrax_jax.distractors.base import Chain
 from pixelbrax_jax.distractors.presets import as_tuple
-from pixelbrax_jax.envs import observe
-from pixelbrax_jax.envs.fusion_barrier import fusion_barrier
 from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.memory import check_fits
-from pixelbrax_jax.physics.base import Physics
-from pixelbrax_jax.renderer import kernel
-from pixelbrax_jax.renderer.base import render
+from pixelbrax_jax.physics.base import Physics, check_physics
+from pixelbrax_jax.renderer.base import draw, render
+from pixelbrax_jax.renderer.choice import why_no_kernel
 from pixelbrax_jax.scene.place import place
 from pixelbrax_jax.types import EnvParams, EnvState, Frame, Scene, SimState, Timestep
 from pixelbrax_jax.validation import check_positive_int
@@ -60,6 +58,7 @@ class PixelEnv(ProgramConfig):
     def __post_init__(self) -> None:
         """Check the fields."""
         super().__post_init__()
+        check_physics(self.physics)
         try:
             hash(self.physics)
         except TypeError as error:
@@ -70,6 +69,8 @@ class PixelEnv(ProgramConfig):
         chain = Chain(as_tuple(self.distractors) if self.obs_mode != "state" else ())
         self._store("distractors", chain.links)
         self.check_memory(1)
+        if self.renderer == "auto" and self.obs_mode != "state":
+            why_no_kernel()  # on a GPU, checks the kernel before a program is traced
 
     @cached_property
     def chain(self) -> Chain:
@@ -95,10 +96,7 @@ class PixelEnv(ProgramConfig):
         return both if self.obs_mode == "both" else both[self.obs_mode]
 
     def check_memory(self, num_envs: int) -> None:
-        """Reject sizes that cannot fit into this machine's main memory.
-
-        Args:
-            num_envs: how many environments are stepped together.
+        """Reject a number of environments that cannot fit into this machine's main memory.
 
         Raises:
             MemoryError: observations and states of two steps, which are there at the same time,
@@ -160,6 +158,7 @@ class PixelEnv(ProgramConfig):
             ValueError: ``action`` has another shape.
             TypeError: ``action`` is not floating point.
         """
+        action = check_action(action, (self.action_size,))
         sim, reward = self.advance(state.sim, state.key, action, params)
         frames = self.push_frame(state.frames, sim, params, jnp.bool_(False))
         state = state.replace(sim=sim, frames=frames)
@@ -168,15 +167,7 @@ class PixelEnv(ProgramConfig):
     @partial(jax.jit, static_argnums=0)
     @under_default_flags
     def next_episode(self, state: EnvState, params: EnvParams) -> tuple[EnvState, Timestep]:
-        """Reset to the environment's next episode.
-
-        Args:
-            state: any state of the environment.
-            params: what may be randomised.
-
-        Returns:
-            The state and the first timestep, with reward 0.
-        """
+        """Reset to the environment's next episode, from any of its states."""
         return self._reset(state.key, state.sim.episode + 1, params)
 
     @partial(jax.jit, static_argnums=0)
@@ -201,11 +192,6 @@ class PixelEnv(ProgramConfig):
             TypeError: ``key`` is not a single typed key, or the physics has no ``from_qpos``.
         """
         check_key(key)
-        if not hasattr(self.physics, "from_qpos"):
-            raise TypeError(
-                f"{type(self.physics).__name__} cannot start in a chosen pose: give it a function "
-                "from_qpos(q, qd, *, key) that returns the first state of an episode."
-            )
         return self._reset(key, jnp.uint32(0), params, (qpos, qvel))
 
     def _reset(
@@ -231,16 +217,12 @@ class PixelEnv(ProgramConfig):
             state: the state to draw.
             params: what may be randomised.
             height: pixels, the observation's by default.
-            width: pixels, the observation's by default.
-
-        Returns:
-            Colors, depth and segmentation.
+            width: likewise.
         """
         height, width = self._size(height, width)
         frame = render(self._scene(state.sim, params), height, width, self.renderer)
         rows, distractor_state = jnp.arange(height), state.sim.distractor_state
-        backdrops = self.chain.backdrops(distractor_state, params, rows, height, width)
-        return self.chain.change_frame(distractor_state, frame, backdrops)
+        return self.chain.change_frame(distractor_state, params, frame, rows, height, width)
 
     @partial(jax.jit, static_argnums=(0, 3, 4))
     @under_default_flags
@@ -251,24 +233,13 @@ class PixelEnv(ProgramConfig):
         height: int | None = None,
         width: int | None = None,
     ) -> jax.Array:
-        """Draw a state as pixels, rounded like an observation, at any size.
-
-        Args:
-            state: the state to draw.
-            params: what may be randomised.
-            height: pixels, the observation's by default.
-            width: pixels, the observation's by default.
+        """Draw a state as ``render`` does, rounded like an observation.
 
         Returns:
             (height, width, 3) uint8, row 0 at the top.
         """
         height, width = self._size(height, width)
-        return observe.unpack(self.draw(state.sim, params, height, width))
-
-    def picture(self, *args: Any, **kwargs: Any) -> jax.Array:
-        """Draw a state; the former name of ``image``, which goes with the next release."""
-        warnings.warn("PixelEnv.picture is PixelEnv.image now.", DeprecationWarning, stacklevel=2)
-        return self.image(*args, **kwargs)
+        return unpack(self.draw(state.sim, params, height, width))
 
     # The pieces of a step, which `VectorPixelEnv` puts together in another order.
 
@@ -297,7 +268,7 @@ class PixelEnv(ProgramConfig):
         self, sim: SimState, key: jax.Array, action: jax.Array, params: EnvParams
     ) -> tuple[SimState, jax.Array]:
         """Return the state after the action, and the reward; ``key`` is the environment's."""
-        action = self._check_action(action)
+        action = jnp.clip(action.astype(jnp.float32), -1.0, 1.0)
 
         def control_step(carry: Any, _: None) -> tuple[Any, None]:
             physics, reward, count, over = carry
@@ -333,33 +304,11 @@ class PixelEnv(ProgramConfig):
     ) -> jax.Array:
         """Return the image of a state, (height, width) uint32 packed pixels."""
         height, width = self._size(height, width)
-        scene, states = self._scene(sim, params), sim.distractor_state
 
-        def finish(states: Any, frame: Frame, backdrops: Any) -> jax.Array:
-            return observe.pack(self.chain.change_frame(states, frame, backdrops))
+        def change(frame: Frame, rows: jax.Array) -> Frame:
+            return self.chain.change_frame(sim.distractor_state, params, frame, rows, height, width)
 
-        def draw_rows(first_row: jax.Array, num_rows: int) -> jax.Array:
-            frame = render(scene, height, width, plain, first_row=first_row, num_rows=num_rows)
-            rows = jnp.minimum(first_row + jnp.arange(num_rows), height - 1)
-            backdrops = self.chain.backdrops(states, params, rows, height, width)
-            return finish(states, frame, backdrops)
-
-        def by_kernel() -> jax.Array:
-            from pixelbrax_jax.renderer import pallas
-
-            backdrops = self.chain.backdrops(states, params, jnp.arange(height), height, width)
-            interpret = self.renderer == "pallas-interpret"
-            if not self.chain.by_pixel:
-                frame = pallas.render(scene, height, width, interpret=interpret)
-                return finish(states, frame, backdrops)
-            kept = self.chain.frame_states(states)
-            return pallas.draw(scene, height, width, finish, kept, backdrops, interpret=interpret)
-
-        if self.renderer.startswith("pallas"):
-            return by_kernel()
-        plain = "fused" if self.renderer == "auto" else self.renderer
-        has_kernel = self.renderer == "auto" and kernel.obstacle() is None
-        return fusion_barrier(draw_rows, height, width, by_kernel if has_kernel else None)
+        return draw(self._scene(sim, params), height, width, self.renderer, change)
 
     def blank_frames(self) -> jax.Array:
         """Return a black frame stack; an empty one without pixels."""
@@ -372,7 +321,7 @@ class PixelEnv(ProgramConfig):
         """Return the frame stack with the image of a state, K copies of it if it is the first."""
         if self.obs_mode == "state":
             return frames
-        return observe.push(frames, self.draw(sim, params), is_first)
+        return push(frames, self.draw(sim, params), is_first)
 
     def timestep(self, state: EnvState, reward: jax.Array, params: EnvParams) -> Timestep:
         """Return what the agent sees of a state."""
@@ -410,15 +359,20 @@ class PixelEnv(ProgramConfig):
         physics = sim.physics
         return place(params.geoms, params.rig, params.look, physics.xpos, physics.xquat)
 
-    def _check_action(self, action: jax.Array) -> jax.Array:
-        action = jnp.asarray(action)
-        if action.shape != (self.action_size,):
-            raise ValueError(
-                f"action must have shape ({self.action_size},), got {tuple(action.shape)}."
-            )
-        if not jnp.issubdtype(action.dtype, jnp.floating):
-            raise TypeError(f"action must be floating point in [-1, 1], got {action.dtype}.")
-        return jnp.clip(action.astype(jnp.float32), -1.0, 1.0)
+
+def check_action(action: Any, shape: tuple[int, ...]) -> jax.Array:
+    """Return actions as an array, if they are floats of the given shape.
+
+    Raises:
+        ValueError: they have another shape.
+        TypeError: they are not floating point.
+    """
+    action = jnp.asarray(action)
+    if action.shape != shape:
+        raise ValueError(f"action must have shape {shape}, got {action.shape}.")
+    if not jnp.issubdtype(action.dtype, jnp.floating):
+        raise TypeError(f"action must be floating point in [-1, 1], got {action.dtype}.")
+    return action
 
 
 def check_key(key: jax.Array, shape: tuple[int, ...] = ()) -> None:

@@ -23,7 +23,7 @@ AXIS = "envs"
 
 
 def make_env_mesh(num_devices: int | None = None) -> Mesh:
-    """Make a mesh of devices along the axis ``"envs"``, whose shardings the compiler propagates.
+    """Make a mesh of devices along the axis ``"envs"``; the compiler propagates its shardings.
 
     Args:
         num_devices: how many; None takes all, those of other processes too.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -10,14 +9,16 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from pixelbrax_jax._platform.chunks import step_rows
-from pixelbrax_jax.envs import observe
-from pixelbrax_jax.envs.autoreset import AUTORESET_MODES, replace_rows, reset_rows
+from pixelbrax_jax._platform.batches import step_rows
+from pixelbrax_jax._platform.frame_stack import push
+from pixelbrax_jax._platform.resets import replace_rows, reset_rows
 from pixelbrax_jax.envs.param_rows import ParamRows, split_params
-from pixelbrax_jax.envs.pixel_env import PixelEnv, check_key
+from pixelbrax_jax.envs.pixel_env import PixelEnv, check_action, check_key
 from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.types import EnvParams, EnvState, SimState, Timestep
 from pixelbrax_jax.validation import check_choice, check_positive_int
+
+AUTORESET_MODES = ("next_step", "same_step", "disabled")
 
 
 @dataclass(frozen=True)
@@ -155,10 +156,7 @@ class VectorPixelEnv:
             ValueError: ``action`` has another shape, or an array of ``params``.
             TypeError: ``action`` is not floating point.
         """
-        action = jnp.asarray(action)
-        expected = (self.num_envs, self.env.action_size)
-        if action.shape != expected:
-            raise ValueError(f"action must have shape {expected}, got {tuple(action.shape)}.")
+        action = check_action(action, (self.num_envs, self.env.action_size))
         ended, rows = state.done, self._rows(params)
         sim, reward = self._advance(state.sim, state.key, action, rows)
         state = state.replace(sim=sim)
@@ -191,12 +189,6 @@ class VectorPixelEnv:
         check_key(key)
         return jax.vmap(partial(jax.random.fold_in, key))(jnp.arange(num_envs))
 
-    @staticmethod
-    def keys_of(key: jax.Array, num_envs: int) -> jax.Array:
-        """Return keys; the former name of ``env_keys``, which goes with the next release."""
-        warnings.warn("VectorPixelEnv.keys_of is env_keys now.", DeprecationWarning, stacklevel=2)
-        return VectorPixelEnv.env_keys(key, num_envs)
-
     def _rows(self, params: EnvParams) -> ParamRows:
         return split_params(params, self.num_envs)
 
@@ -209,11 +201,8 @@ class VectorPixelEnv:
             key, action, own = rows
             return self.env.advance(sim, key, action, params.join(own, shared))
 
-        rows = keys, action, params.own
-        if self._is_for_a_cpu():
-            last = getattr(self.env.physics, "batch_last", True)
-            return step_rows(step, sim, rows, params.shared, last=last)
-        return jax.vmap(step, in_axes=(0, 0, None))(sim, rows, params.shared)
+        last = self.env.physics.batch_last
+        return step_rows(step, sim, (keys, action, params.own), params.shared, last=last)
 
     def _env_keys(self, key: jax.Array) -> jax.Array:
         if getattr(key, "shape", ()) == ():
@@ -243,21 +232,13 @@ class VectorPixelEnv:
         def reset(key: jax.Array, episode: jax.Array, own: Any) -> SimState:
             return self.env.reset_sim(key, episode, params.join(own))
 
-        replace = replace_rows if self._is_for_a_cpu() else reset_rows
-        sim: SimState = replace(reset, (state.key, episode, params.own), mask, state.sim)
+        sim: SimState = reset_rows(reset, (state.key, episode, params.own), mask, state.sim)
         return sim
-
-    def _is_for_a_cpu(self) -> bool:
-        """Return whether programs are for CPUs alone.
-
-        Not left to the lowering: neither traces what is for the other.
-        """
-        return self.env.physics_batching == "auto" and jax.default_backend() == "cpu"
 
     def _reset_and_draw(
         self, state: EnvState, mask: jax.Array, episode: jax.Array, params: ParamRows
     ) -> EnvState:
-        """Return the states, reset and drawn where ``mask``; the others keep their frames."""
+        """Return the states, reset and rendered where ``mask``; the others keep their frames."""
         sim = self._reset_rows(state, mask, episode, params)
         state = state.replace(sim=sim)
         if self.env.obs_mode == "state":
@@ -268,6 +249,6 @@ class VectorPixelEnv:
             return self.env.draw(sim, params.join(own))
 
         newest = replace_rows(draw, (sim, params.own), mask, blank)
-        first = jax.vmap(observe.push)(state.frames, newest, jnp.ones_like(mask))
-        # Environments that go on keep their stack as it is: nothing new was drawn for them.
+        first = jax.vmap(push)(state.frames, newest, jnp.ones_like(mask))
+        # Environments that go on keep their stack as it is: nothing new was rendered for them.
         return state.replace(frames=jnp.where(mask[:, None, None, None], first, state.frames))

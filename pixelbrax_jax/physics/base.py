@@ -1,14 +1,16 @@
-"""The interface between physics and the rest of the package."""
+"""What physics is to the rest of the package: the base class of every engine."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Protocol, runtime_checkable
+import abc
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any
 
 import jax
 from flax import struct
 
-from pixelbrax_jax.types import Geoms, PhysicsState
+from pixelbrax_jax.types import CameraRig, Geoms, Look, PhysicsState
 
 
 class Kinematics(struct.PyTreeNode):
@@ -35,8 +37,7 @@ ResetFn = Callable[[jax.Array], tuple[jax.Array, jax.Array]]
 """Of a PRNG key; returns joint positions (Q,) and velocities (V,), as in ``Kinematics``."""
 
 
-@runtime_checkable
-class Physics(Protocol):
+class Physics(abc.ABC):
     """A task's dynamics for ONE environment, as pure functions.
 
     ``reset`` and ``step`` may be jitted, vmapped and scanned; every state they return has the
@@ -45,13 +46,7 @@ class Physics(Protocol):
     to. Environments over equal physics share compiled programs; it must hence be hashable, and
     equal only to what computes the same.
 
-    An engine may have more attributes: ``rigs``, cameras by name, of which ``default`` is the
-    task's own if it is there; ``unfit_cameras``, by name why other cameras of the model cannot be
-    rigs; ``followed_link``, the link that a camera follows if nothing else is said, 0 by default;
-    ``look``, the lights, sky and ground of its model; ``from_qpos``, a function of joint positions,
-    velocities and a key that returns the first state of an episode; ``batch_last``, False where a
-    CPU computes a batch faster with the environments as first axis; and ``compiler_options``, which
-    XLA needs on a CPU to make its programs fast.
+    A subclass has the first six attributes, ``reset`` and ``step``; the rest have defaults.
 
     Attributes:
         geoms: the visible shapes, each fixed in a link's frame.
@@ -61,6 +56,13 @@ class Physics(Protocol):
         backend: name of the physics backend.
         link_names: L names; ``link/index`` where the model has none. Row i of ``xpos`` and
             ``xquat`` belongs to ``link_names[i]``.
+        rigs: cameras by name; ``default`` is the task's own. Without it a camera looks from a
+            corner at everything but the ground.
+        unfit_cameras: why other cameras of the model cannot be rigs, by name.
+        followed_link: the link that a camera follows if nothing else is said.
+        look: lights, sky and ground of the model, which are the looks ``default`` and ``dmc`` then.
+        batch_last: whether a CPU computes a batch faster with the environments as last axis.
+        compiler_options: what XLA needs on a CPU to make the programs fast.
     """
 
     geoms: Geoms
@@ -69,7 +71,14 @@ class Physics(Protocol):
     state_size: int
     backend: str
     link_names: tuple[str, ...]
+    rigs: Mapping[str, CameraRig] = MappingProxyType({})
+    unfit_cameras: Mapping[str, str] = MappingProxyType({})
+    followed_link: int = 0
+    look: Look | None = None
+    batch_last: bool = True
+    compiler_options: Mapping[str, Any] = MappingProxyType({})
 
+    @abc.abstractmethod
     def reset(self, key: jax.Array) -> PhysicsState:
         """Sample the task's initial state.
 
@@ -81,8 +90,8 @@ class Physics(Protocol):
             sample itself be non-finite, ``non_finite`` and ``terminated`` are true, the links
             are at the world's origin and the observation is 0.
         """
-        ...
 
+    @abc.abstractmethod
     def step(self, state: PhysicsState, action: jax.Array) -> PhysicsState:
         """Advance by one control step.
 
@@ -95,4 +104,41 @@ class Physics(Protocol):
             given state with reward 0 and ``terminated`` and ``non_finite`` true. Stepping on
             after a termination is allowed and continues the dynamics.
         """
-        ...
+
+    def from_qpos(
+        self, q: jax.Array, qd: jax.Array | None = None, *, key: jax.Array | None = None
+    ) -> PhysicsState:
+        """Return the first state of an episode, in a chosen pose.
+
+        Args:
+            q: (Q,) float32, joint positions in MuJoCo's order; quaternions of any length.
+            qd: (V,) float32, joint velocities, 0 if not given.
+            key: decides what the task samples besides, such as a target.
+
+        Returns:
+            A state that ``step`` accepts. ``terminated`` is false even if the task would end in
+            this pose; the next step says so.
+
+        Raises:
+            ValueError: for a wrong shape.
+            TypeError: this physics has no such function.
+        """
+        del q, qd, key
+        raise TypeError(
+            f"{type(self).__name__} cannot start in a chosen pose: give it a function "
+            "from_qpos(q, qd, *, key) that returns the first state of an episode."
+        )
+
+
+def check_physics(physics: object) -> Physics:
+    """Return ``physics`` if it is one.
+
+    Raises:
+        TypeError: it is not a subclass of ``Physics``.
+    """
+    if isinstance(physics, Physics):
+        return physics
+    raise TypeError(
+        f"physics must be a pixelbrax_jax.Physics, got a {type(physics).__name__}: make its class "
+        "a subclass, class MyPhysics(pixelbrax_jax.Physics)."
+    )

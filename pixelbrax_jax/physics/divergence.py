@@ -1,16 +1,17 @@
-"""The guard against diverging physics, which every engine gets."""
+"""The guard against diverging physics, and equality of physics, which every engine gets."""
 
 from __future__ import annotations
 
 import abc
+from collections.abc import Callable, Hashable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax.flags import under_default_flags
-from pixelbrax_jax.physics.recipe import Recipe
+from pixelbrax_jax.physics.base import Physics
 from pixelbrax_jax.spatial import quat_normalize
 from pixelbrax_jax.types import PhysicsState
 
@@ -19,12 +20,23 @@ from pixelbrax_jax.types import PhysicsState
 _LARGEST = 1e10
 
 
-class GuardedPhysics(abc.ABC):
+class Recipe(NamedTuple):
+    """A function of a module and its hashable arguments that give the physics."""
+
+    make: Callable[..., Any]
+    arguments: tuple[Any, ...]
+
+
+class GuardedPhysics(Physics):
     """Base of a ``Physics`` that ends an episode cleanly where its simulation diverges.
 
     A step counts as diverged if a watched number is not finite or larger than 1e10 in magnitude.
     It returns the state before it, with reward 0 and ``terminated`` and ``non_finite`` true.
     """
+
+    _identity: Hashable = None
+    """Objects of one class and identity are equal; with None, to themselves alone. A pickle keeps
+    nothing else of the physics if it is a ``Recipe``."""
 
     @abc.abstractmethod
     def _reset(self, key: jax.Array) -> PhysicsState:
@@ -38,11 +50,18 @@ class GuardedPhysics(abc.ABC):
     def _watched(self, state: PhysicsState) -> Any:
         """Return a tree of what must be finite besides observation and reward."""
 
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, GuardedPhysics) or self._identity is None:
+            return self is other
+        return type(self) is type(other) and self._identity == other._identity
+
+    def __hash__(self) -> int:
+        return object.__hash__(self) if self._identity is None else hash(self._identity)
+
     def __reduce_ex__(self, protocol: Any) -> Any:
         """Return what is pickled: of a task of the package, how it is made."""
-        identity = getattr(self, "_identity", None)
-        if isinstance(identity, Recipe):
-            return identity.make, identity.arguments
+        if isinstance(self._identity, Recipe):
+            return self._identity.make, self._identity.arguments
         return super().__reduce_ex__(protocol)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> GuardedPhysics:

@@ -2,68 +2,102 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
-from pixelbrax_jax.tasks import Color
+from pixelbrax_jax.physics.opengl import mujoco
+from pixelbrax_jax.physics.task import Color
 from pixelbrax_jax.types import GeomKind, Geoms
 from pixelbrax_jax.validation import check_choice
 
 # MuJoCo's viewer shows these groups by default.
 VISIBLE_GROUPS = (0, 1, 2)
 
-# How many of a geom's three size numbers mean something.
-SIZES: Mapping[GeomKind, int] = {
-    GeomKind.PLANE: 3,
-    GeomKind.SPHERE: 1,
-    GeomKind.CAPSULE: 2,
-    GeomKind.ELLIPSOID: 3,
-    GeomKind.CYLINDER: 2,
-    GeomKind.BOX: 3,
-}
 _DEFAULT_RGBA = np.array([0.5, 0.5, 0.5, 1.0], np.float32)
 
 
-def read_geoms(
+class Shape(NamedTuple):
+    """One visible shape; fields as in ``Geoms``, with its color and the name of its material."""
+
+    kind: GeomKind
+    link: int
+    name: str
+    size: np.ndarray
+    pos: np.ndarray
+    quat: np.ndarray
+    rgb: Color
+    material: str = ""
+    bounded: bool = False
+    patterned: bool = False
+
+
+def as_geoms(shapes: Sequence[Shape]) -> Geoms:
+    """Return shapes as ``Geoms``.
+
+    Those of equal color share a material, except that planes never share one with other kinds, so
+    that a ground can be recolored alone.
+    """
+    materials: dict[tuple[bool, tuple[float, ...]], str] = {}
+    keys = []
+    for shape in shapes:
+        rgb = tuple(np.asarray(shape.rgb, np.float32).tolist())
+        keys.append((shape.kind == GeomKind.PLANE, rgb))
+        materials.setdefault(keys[-1], shape.material)
+    rows = list(materials)
+
+    def stack(arrays: Iterable[object]) -> jnp.ndarray:
+        return jnp.asarray(np.stack([np.asarray(array, np.float32) for array in arrays]))
+
+    return Geoms(
+        kind=tuple(int(shape.kind) for shape in shapes),
+        link=tuple(shape.link for shape in shapes),
+        material=tuple(map(rows.index, keys)),
+        name=tuple(shape.name for shape in shapes),
+        size=stack(shape.size for shape in shapes),
+        pos=stack(shape.pos for shape in shapes),
+        quat=stack(shape.quat for shape in shapes),
+        rgb=stack(rgb for _, rgb in rows),
+        bounded=tuple(shape.bounded for shape in shapes),
+        patterned=tuple(shape.patterned for shape in shapes),
+        material_name=tuple(materials.values()) if any(materials.values()) else (),
+    )
+
+
+def geom_shapes(
     model: mujoco.MjModel,
     *,
     colors: Mapping[str, Color] | None = None,
     drawn_radius: Mapping[str, float] | None = None,
     geom_groups: Collection[int] = VISIBLE_GROUPS,
-) -> Geoms:
-    """Return the geoms MuJoCo's viewer would show, without textures.
+) -> list[Shape]:
+    """Return the geoms MuJoCo's viewer would show, without textures, in the model's order.
 
     A geom is left out if its group is not shown or its alpha is 0; any other alpha counts as
-    opaque. Geoms of equal color share a material, except that planes never share one with
-    other kinds, so that a ground can be recolored alone.
+    opaque. Planes are without end, and ground.
 
     Args:
         model: a compiled model; link i is its body i + 1.
         colors: replacements by geom name, red, green, blue in [0, 1].
-        drawn_radius: metres, replacements by name of a sphere that is drawn larger than it
-            is, because it would be lost in a small image. Physics does not see it.
+        drawn_radius: metres, by name of a sphere that is drawn larger than it is, because it
+            would be lost in a small image. Physics does not see it.
         geom_groups: the groups shown.
-
-    Returns:
-        The shapes in the model's order.
 
     Raises:
         ValueError: for an unknown name or a bad value in ``colors`` or ``drawn_radius``, for a
             visible geom, flex or skin that the renderer has no formula for, or if nothing is
             visible.
     """
-    colors = dict(colors or {})
     names = [_name(model, i) for i in range(model.ngeom)]
+    colors, drawn_radius = dict(colors or {}), dict(drawn_radius or {})
     for name, color in colors.items():
         check_choice("geom", name, names)
         if np.shape(color) != (3,) or not all(0 <= c <= 1 for c in color):
             raise ValueError(
                 f"color of geom {name!r} must be three numbers in [0, 1], got {color!r}"
             )
-    drawn_radius = dict(drawn_radius or {})
     for name, radius in drawn_radius.items():
         check_choice("geom", name, names)
         shape = _kind_name(model, names.index(name))
@@ -73,36 +107,60 @@ def read_geoms(
                 f"{name!r}, a {shape}."
             )
     _check_surfaces(model, geom_groups)
-
-    shown = shown_geoms(model, geom_groups)
-    if not shown:
+    shapes = []
+    for i in shown_geoms(model, geom_groups):
+        kind, name = _kind(model, i, names[i]), names[i]
+        size = sizes(kind, model.geom_size[i])
+        size[0] = drawn_radius.get(name, size[0])
+        shapes.append(
+            Shape(
+                kind=kind,
+                # Link 0 is MuJoCo's body 1, because the world is no link.
+                link=int(model.geom_bodyid[i]) - 1,
+                name=name,
+                size=size,
+                pos=model.geom_pos[i],
+                quat=model.geom_quat[i],
+                rgb=colors.get(name, tuple(geom_rgba(model, i)[:3])),
+                patterned=kind == GeomKind.PLANE,
+            )
+        )
+    if not shapes:
         raise ValueError(
             f"no geom is visible: all have alpha 0 or a group outside {tuple(geom_groups)}"
         )
-    kinds = [_kind(model, i, names[i]) for i in shown]
+    return shapes
 
-    materials: dict[tuple[bool, Color], int] = {}
-    rows = []
-    for i, kind in zip(shown, kinds, strict=True):
-        red, green, blue = (float(c) for c in colors.get(names[i], _rgba(model, i)[:3]))
-        key = (kind == GeomKind.PLANE, (red, green, blue))
-        rows.append(materials.setdefault(key, len(materials)))
 
-    size = np.array(model.geom_size[shown], np.float32)
-    for row, i, kind in zip(size, shown, kinds, strict=True):
-        row[SIZES[kind] :] = 0
-        row[0] = drawn_radius.get(names[i], row[0])
-    return Geoms(
-        kind=tuple(int(kind) for kind in kinds),
-        # Brax's link 0 is MuJoCo's body 1, because the world is no link.
-        link=tuple(int(model.geom_bodyid[i]) - 1 for i in shown),
-        material=tuple(rows),
-        name=tuple(names[i] for i in shown),
-        size=jnp.asarray(size),
-        pos=jnp.asarray(model.geom_pos[shown], jnp.float32),
-        quat=jnp.asarray(model.geom_quat[shown], jnp.float32),
-        rgb=jnp.asarray([color for _, color in materials], jnp.float32),
-    )
+def site_shapes(model: mujoco.MjModel, groups: Collection[int] = VISIBLE_GROUPS) -> Iterator[Shape]:
+    """Yield the sites that MuJoCo's viewer would show, as ``site/<name>``."""
+    for i in range(model.nsite):
+        rgba = resolve_rgba(model, model.site_rgba[i], model.site_matid[i])
+        if model.site_group[i] not in groups or not rgba[3] > 0:
+            continue
+        kind = GeomKind(int(model.site_type[i]))
+        yield Shape(
+            kind=kind,
+            link=int(model.site_bodyid[i]) - 1,
+            name=f"site/{model.site(i).name or i}",
+            size=sizes(kind, model.site_size[i]),
+            pos=model.site_pos[i],
+            quat=model.site_quat[i],
+            rgb=tuple(rgba[:3]),
+            material=material_name(model, model.site_matid[i]),
+        )
+
+
+def sizes(kind: GeomKind, numbers: np.ndarray) -> np.ndarray:
+    """Return (3,) float32 size numbers, 0 where they mean nothing."""
+    size = np.array(numbers, np.float32)
+    size[kind.num_sizes :] = 0
+    return size
+
+
+def material_name(model: mujoco.MjModel, index: int) -> str:
+    """Return a material's name, empty for none."""
+    return str(model.material(index).name) if index >= 0 else ""
 
 
 def _name(model: mujoco.MjModel, index: int) -> str:
@@ -141,18 +199,18 @@ def _check_surfaces(model: mujoco.MjModel, groups: Collection[int]) -> None:
 
 
 def shown_geoms(model: mujoco.MjModel, geom_groups: Collection[int] = VISIBLE_GROUPS) -> list[int]:
-    """Return indices of the geoms that ``read_geoms`` returns, in its order."""
+    """Return indices of the geoms that ``geom_shapes`` returns, in its order."""
+    groups = model.geom_group
     return [
-        i
-        for i in range(model.ngeom)
-        if model.geom_group[i] in geom_groups and _rgba(model, i)[3] > 0
+        i for i in range(model.ngeom) if groups[i] in geom_groups and geom_rgba(model, i)[3] > 0
     ]
+
+
+def geom_rgba(model: mujoco.MjModel, index: int) -> np.ndarray:
+    """Return (4,) float32, the color of a geom or of its material."""
+    return resolve_rgba(model, model.geom_rgba[index], int(model.geom_matid[index]))
 
 
 def resolve_rgba(model: mujoco.MjModel, own: np.ndarray, material: int) -> np.ndarray:
     """Return (4,) float32: a material colors what has MuJoCo's default rgba itself."""
     return model.mat_rgba[material] if material >= 0 and (own == _DEFAULT_RGBA).all() else own
-
-
-def _rgba(model: mujoco.MjModel, index: int) -> np.ndarray:
-    return resolve_rgba(model, model.geom_rgba[index], int(model.geom_matid[index]))

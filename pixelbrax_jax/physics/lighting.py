@@ -1,8 +1,7 @@
 """Lights, sky and ground of a MuJoCo model, as a look.
 
 MuJoCo's renderer is OpenGL's fixed pipeline: ambient and diffuse light times a material's color,
-and a white highlight. Its light types and modes, and its textures, are documented in the XML
-reference (mujoco.readthedocs.io, elements ``light``, ``headlight``, ``texture``, ``material``).
+and a white highlight.
 """
 
 from __future__ import annotations
@@ -11,10 +10,10 @@ import warnings
 from collections.abc import Collection
 from typing import Any
 
-import mujoco
 import numpy as np
 
-from pixelbrax_jax.physics.geometry import resolve_rgba
+from pixelbrax_jax.physics.geometry import geom_rgba
+from pixelbrax_jax.physics.opengl import mujoco
 from pixelbrax_jax.physics.viewpoints import follows_tracked
 from pixelbrax_jax.types import Lamp, Look
 
@@ -41,18 +40,16 @@ def read_look(
 ) -> Look:
     """Return the look of a model's own picture.
 
+    Colors of lights become shades of grey, a lamp on a body follows but does not turn, and the
+    sky's texture becomes its best fit by three colors. Lamps that follow another center of mass
+    than the camera does are left out; so are, with a warning, directional lights after the first.
+
     Args:
         model: the compiled model; link i is its body i + 1.
         com_link: index of the link at the tracked center of mass, -1 if there is none.
         movable: names of lamps that move along with the target.
         target_link: index of the target's link, -1 if there is none.
         anchor: (3,) metres, where the target is in the model.
-
-    Returns:
-        The look. Colors of lights become shades of grey, a lamp on a body follows but does not
-        turn, and the sky's texture becomes its best fit by three colors. Lamps that follow another
-        center of mass than the camera does are left out; so are, with a warning, directional lights
-        after the first.
     """
     active = [i for i in range(model.nlight) if model.light_active[i]]
     suns = [i for i in active if model.light_type[i] == _DIRECTIONAL]
@@ -125,7 +122,7 @@ def mean_color(model: mujoco.MjModel, geom: int) -> tuple[float, float, float] |
     texture = _texture(model, geom)
     if texture < 0:
         return None
-    rgba = resolve_rgba(model, model.geom_rgba[geom], int(model.geom_matid[geom]))
+    rgba = geom_rgba(model, geom)
     headlight = model.vis.headlight
     light = _ambient(model) + (float(headlight.diffuse.mean()) if headlight.active else 0.0)
     mean = _pixels(model, texture).mean((0, 1)) / 255.0 * rgba[:3]

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from itertools import pairwise
 from typing import NamedTuple
 
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from pixelbrax_jax.physics.geometry import (
-    SIZES,
     VISIBLE_GROUPS,
-    read_geoms,
+    Shape,
+    as_geoms,
+    geom_shapes,
+    material_name,
     resolve_rgba,
     shown_geoms,
+    site_shapes,
 )
 from pixelbrax_jax.physics.lighting import checker, mean_color, read_look
+from pixelbrax_jax.physics.opengl import mujoco
 from pixelbrax_jax.physics.viewpoints import read_rigs
 from pixelbrax_jax.physics.viewpoints import tracked_body as tracked_body
 from pixelbrax_jax.types import CameraRig, GeomKind, Geoms, Look, String
@@ -43,8 +46,8 @@ class ModelScene(NamedTuple):
         rigs: all cameras that can be rigs, by name.
         look: the model's own lights, sky and ground.
         links: names of links after those of the bodies: ``camera/com``, at the center of mass of
-            the subtree of ``tracked_body(model)``, if there is such a body; then ``target``, if
-            anything movable is visible. Neither turns.
+            the subtree of ``tracked_body(model)``, and ``target``, of what is movable and visible,
+            where there are such. Neither turns.
     """
 
     geoms: Geoms
@@ -65,16 +68,15 @@ def read_scene(
         movable: names of geoms, sites and lamps of the world that move together, with the link
             ``target``; the first visible geom or site is at that link's origin.
 
-    Returns:
-        The scene's parts.
-
     Raises:
         ValueError: there is no such camera, or its orientation follows a body; a name of
             ``movable`` is unknown or not of the world; something visible cannot be drawn.
     """
     _check_movable(model, movable)
     links = [COM_LINK] if tracked_body(model) >= 0 else []
-    geoms = _with_strings(model, with_sites(model, _with_planes(model)))
+    shapes = [*_textured_geoms(model), *site_shapes(model)]
+    pieces, strings = _strings(model, len(shapes))
+    geoms = as_geoms([*shapes, *pieces]).replace(strings=tuple(strings))
     target = model.nbody - 1 + len(links)
     moved = [g for g, name in enumerate(geoms.name) if name.removeprefix("site/") in movable]
     anchor = np.zeros(3)
@@ -119,64 +121,25 @@ def _check_movable(model: mujoco.MjModel, movable: Collection[str]) -> None:
             raise ValueError(f"{name!r} cannot be movable: it is fixed to a body that moves.")
 
 
-def _with_planes(model: mujoco.MjModel) -> Geoms:
-    """Return the geoms, with bounds of planes and whether they are checkered.
+def _textured_geoms(model: mujoco.MjModel) -> Iterator[Shape]:
+    """Yield the geoms, with ends of planes and whether they are checkered.
 
     Any other texture, and that of another shape, becomes its mean color.
     """
-    geoms = read_geoms(model)
-    rows = shown_geoms(model)
-    means = {name: mean_color(model, i) for name, i in zip(geoms.name, rows, strict=True)}
-    geoms = read_geoms(model, colors={name: mean for name, mean in means.items() if mean})
-    first = [geoms.material.index(m) for m in range(len(geoms.rgb))]
-    return geoms.replace(
-        material_name=tuple(_material(model, model.geom_matid[rows[g]]) for g in first),
-        bounded=tuple(
-            bool(model.geom_type[i] == GeomKind.PLANE and (model.geom_size[i, :2] > 0).any())
-            for i in rows
-        ),
-        patterned=tuple(
-            model.geom_type[i] == GeomKind.PLANE and checker(model, i) is not None for i in rows
-        ),
-    )
-
-
-def with_sites(
-    model: mujoco.MjModel, geoms: Geoms, groups: Collection[int] = VISIBLE_GROUPS
-) -> Geoms:
-    """Return the geoms with the sites that MuJoCo's viewer would show, as ``site/<name>``.
-
-    Args:
-        model: the compiled model.
-        geoms: its geoms.
-        groups: MuJoCo's groups of sites that are visible.
-    """
-    rows = []
-    for i in range(model.nsite):
-        rgba = resolve_rgba(model, model.site_rgba[i], model.site_matid[i])
-        if model.site_group[i] not in groups or not rgba[3] > 0:
-            continue
-        kind = GeomKind(int(model.site_type[i]))
-        size = np.array(model.site_size[i], np.float32)
-        size[SIZES[kind] :] = 0
-        rows.append(
-            _Row(
-                kind=int(kind),
-                link=int(model.site_bodyid[i]) - 1,
-                name=f"site/{model.site(i).name or i}",
-                size=size,
-                pos=model.site_pos[i],
-                quat=model.site_quat[i],
-                rgb=rgba[:3],
-                material=_material(model, model.site_matid[i]),
-            )
+    for i, shape in zip(shown_geoms(model), geom_shapes(model), strict=True):
+        is_plane = shape.kind == GeomKind.PLANE
+        yield shape._replace(
+            rgb=mean_color(model, i) or shape.rgb,
+            material=material_name(model, model.geom_matid[i]),
+            bounded=bool(is_plane and (model.geom_size[i, :2] > 0).any()),
+            patterned=is_plane and checker(model, i) is not None,
         )
-    return _append(geoms, rows)
 
 
-def _with_strings(model: mujoco.MjModel, geoms: Geoms) -> Geoms:
-    """Return the geoms with those of spatial tendons."""
-    strings = []
+def _strings(model: mujoco.MjModel, first_geom: int) -> tuple[list[Shape], list[String]]:
+    """Return spatial tendons and their pieces, which are geoms from ``first_geom`` on."""
+    shapes: list[Shape] = []
+    strings: list[String] = []
     for tendon in range(model.ntendon):
         rgba = resolve_rgba(model, model.tendon_rgba[tendon], model.tendon_matid[tendon])
         first, count = int(model.tendon_adr[tendon]), int(model.tendon_num[tendon])
@@ -194,19 +157,20 @@ def _with_strings(model: mujoco.MjModel, geoms: Geoms) -> Geoms:
         slack = float(model.tendon_range[tendon, 1]) if _hangs(model, tendon) else 0.0
         pieces = 1 if slack == 0.0 else _PIECES
         for k, pair in enumerate(pairwise(sites)):
-            start = len(geoms.kind)
-            row = _Row(
-                kind=int(GeomKind.CAPSULE),
-                link=-1,
-                name="",
-                size=np.array([model.tendon_width[tendon], 0.0, 0.0], np.float32),
-                pos=np.zeros(3),
-                quat=np.array([1.0, 0.0, 0.0, 0.0]),
-                rgb=rgba[:3],
-                material=_material(model, model.tendon_matid[tendon]),
-            )
-            names = [f"tendon/{name}/{k * pieces + piece}" for piece in range(pieces)]
-            geoms = _append(geoms, [row._replace(name=piece) for piece in names])
+            start = first_geom + len(shapes)
+            shapes += [
+                Shape(
+                    kind=GeomKind.CAPSULE,
+                    link=-1,
+                    name=f"tendon/{name}/{k * pieces + piece}",
+                    size=np.array([model.tendon_width[tendon], 0.0, 0.0], np.float32),
+                    pos=np.zeros(3),
+                    quat=np.array([1.0, 0.0, 0.0, 0.0]),
+                    rgb=tuple(rgba[:3]),
+                    material=material_name(model, model.tendon_matid[tendon]),
+                )
+                for piece in range(pieces)
+            ]
             a, b = (int(model.site_bodyid[site]) - 1 for site in pair)
             strings.append(
                 String(
@@ -216,7 +180,7 @@ def _with_strings(model: mujoco.MjModel, geoms: Geoms) -> Geoms:
                     length=jnp.float32(slack),
                 )
             )
-    return geoms.replace(strings=tuple(strings))
+    return shapes, strings
 
 
 def _hangs(model: mujoco.MjModel, tendon: int) -> bool:
@@ -232,59 +196,4 @@ def _hangs(model: mujoco.MjModel, tendon: int) -> bool:
         and model.tendon_damping[tendon] == 0.0
         and model.opt.gravity.any()
         and not acts.any()
-    )
-
-
-class _Row(NamedTuple):
-    """One more geom; fields as in ``Geoms``, and its material's name."""
-
-    kind: int
-    link: int
-    name: str
-    size: np.ndarray
-    pos: np.ndarray
-    quat: np.ndarray
-    rgb: np.ndarray
-    material: str
-
-
-def _material(model: mujoco.MjModel, index: int) -> str:
-    """Return a material's name, empty for none."""
-    return str(model.material(index).name) if index >= 0 else ""
-
-
-def _append(geoms: Geoms, rows: list[_Row]) -> Geoms:
-    """Return the geoms with more; those of a known color share its material."""
-    if not rows:
-        return geoms
-    rgb, names = [np.asarray(color) for color in geoms.rgb], list(geoms.material_name)
-    of_planes = {
-        m for m, kind in zip(geoms.material, geoms.kind, strict=True) if kind == GeomKind.PLANE
-    }
-    materials = []
-    for row in rows:
-        color = np.asarray(row.rgb, np.float32)
-        same = [m for m, c in enumerate(rgb) if m not in of_planes and (c == color).all()]
-        if not same:
-            rgb.append(color)
-            names.append(row.material)
-        materials.append(same[0] if same else len(rgb) - 1)
-
-    def stack(old: object, name: str) -> object:
-        new = np.stack([getattr(row, name) for row in rows]).astype(np.float32)
-        return jnp.concatenate([jnp.asarray(old), new])
-
-    none = (False,) * len(rows)
-    return geoms.replace(
-        kind=geoms.kind + tuple(row.kind for row in rows),
-        link=geoms.link + tuple(row.link for row in rows),
-        material=geoms.material + tuple(materials),
-        name=geoms.name + tuple(row.name for row in rows),
-        size=stack(geoms.size, "size"),
-        pos=stack(geoms.pos, "pos"),
-        quat=stack(geoms.quat, "quat"),
-        rgb=jnp.asarray(np.stack(rgb)),
-        material_name=tuple(names) if geoms.material_name else (),
-        bounded=geoms.bounded + none if geoms.bounded else (),
-        patterned=geoms.patterned + none if geoms.patterned else (),
     )

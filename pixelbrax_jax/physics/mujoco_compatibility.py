@@ -11,7 +11,8 @@ from types import ModuleType
 from typing import Any
 
 import jax
-import mujoco
+
+from pixelbrax_jax.physics.opengl import mujoco
 
 _KNOWN_WARNINGS: tuple[tuple[str, type[Warning]], ...] = (
     # Brax, at every load of a model.
@@ -82,13 +83,10 @@ class _JaxOfThisProcess:
 
 
 def load_onto_own_device(module: ModuleType) -> None:
-    """Let one module put arrays on a device of this process.
+    """Let a module that knows JAX as ``jax`` put arrays on a device of this process.
 
     MuJoCo XLA puts models on ``jax.devices()[0]``, which in a run of several processes is a device
     of the first one, where no other process can read it.
-
-    Args:
-        module: a module that knows JAX as ``jax``.
     """
     if jax.process_count() > 1 and vars(module)["jax"] is jax:
         vars(module)["jax"] = _JaxOfThisProcess()

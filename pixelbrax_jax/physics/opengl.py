@@ -2,7 +2,8 @@
 
 MuJoCo decides about OpenGL once, while it is imported; imported without, it would have no
 ``GLContext`` for the rest of the process, and a user's own ``mujoco.Renderer`` would fail. So its
-modules are given a ``__getattr__``, which loads the context when it is first asked for.
+modules are given a ``__getattr__``, which loads the context when it is first asked for. Physics
+takes MuJoCo from here: ``from pixelbrax_jax.physics.opengl import mujoco``.
 """
 
 from __future__ import annotations
@@ -69,3 +70,7 @@ def _load_of(module: ModuleType, home: ModuleType) -> Any:
         return context
 
     return load
+
+
+import_mujoco()
+import mujoco as mujoco  # noqa: E402

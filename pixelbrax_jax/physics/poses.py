@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-import mujoco
 
+from pixelbrax_jax.physics.opengl import mujoco
 from pixelbrax_jax.spatial import quat_normalize
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import mujoco
 import numpy as np
 
+from pixelbrax_jax.physics.opengl import mujoco
 from pixelbrax_jax.types import CameraRig
 
 _TRACK = int(mujoco.mjtCamLight.mjCAMLIGHT_TRACK)
@@ -18,9 +18,8 @@ _PERSPECTIVE = int(mujoco.mjtProjection.mjPROJ_PERSPECTIVE)
 def tracked_body(model: mujoco.MjModel) -> int:
     """Return the body whose subtree's center of mass cameras and lamps of mode trackcom follow.
 
-    Returns:
-        That of the first such camera or else lamp; -1 if there is none. Others follow it if their
-        subtrees have the same mass, which a model's one robot sees to.
+    That is the first such camera's or else lamp's; -1 if there is none. Others follow it if their
+    subtrees have the same mass, which a model's one robot sees to.
     """
     for modes, bodies in (
         (model.cam_mode, model.cam_bodyid),
@@ -41,10 +40,8 @@ def follows_tracked(model: mujoco.MjModel, body: int) -> bool:
 def followed_body(model: mujoco.MjModel) -> int:
     """Return the body that a view follows if nothing else is said.
 
-    Returns:
-        The first body that moves of the first kinematic tree on which an actuator acts, so that a
-        goal or an obstacle is not followed; without such a tree the first body that moves; 0 if
-        none does.
+    That is the first that moves of the first kinematic tree on which an actuator acts, not a goal;
+    without such a tree the first that moves; 0 if none does.
     """
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -55,19 +52,15 @@ def followed_body(model: mujoco.MjModel) -> int:
 
 
 def read_rigs(model: mujoco.MjModel, com_link: int) -> dict[str, CameraRig]:
-    """Return rigs of a model's cameras that keep their orientation.
+    """Return rigs of a model's cameras, but those of ``unfit_cameras``, by name in its order.
 
-    Cameras at rest and those of MuJoCo's modes track and trackcom are; those of
-    ``unfit_cameras`` are left out. A rig's target is on the camera's axis as deep as what it
-    shows, the tracked point or the model's center of mass, so that a camera distractor turns about
-    that.
+    A camera without a name is ``camera/<index>``. A rig's target is on the camera's axis as deep as
+    what it shows, the tracked point or the model's center of mass, so that a camera distractor
+    turns about that.
 
     Args:
         model: the compiled model; link i is its body i + 1.
         com_link: index of the link at the tracked center of mass, -1 if there is none.
-
-    Returns:
-        Rigs by the camera's name, ``camera/<index>`` where it has none, in the model's order.
     """
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)

@@ -1,20 +1,24 @@
-"""Scene -> frame, by the chosen ray-caster, with a derivative that can be trusted."""
+"""Scene -> image, by the chosen ray-caster, with a derivative that can be trusted."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 
+from pixelbrax_jax._platform.lowering import by_platform
 from pixelbrax_jax.flags import under_default_flags
-from pixelbrax_jax.renderer import fused, kernel, reference
+from pixelbrax_jax.renderer import choice, fused, reference
 from pixelbrax_jax.types import Frame, Scene
 from pixelbrax_jax.validation import check_choice
 
-RENDERERS = ("auto", "fused", "pallas", "pallas-interpret", "reference")
+RENDERERS = ("auto", "fused", "pallas", "reference")
+
+_BANDS = 2
+"""Parts in which an accelerator draws an image, one above the other: a loop of one is none."""
 
 
 def check_renderer(renderer: object) -> str:
@@ -24,16 +28,11 @@ def check_renderer(renderer: object) -> str:
         ValueError: it is unknown, or the default device cannot run it; the message says what can.
     """
     name = check_choice("renderer", renderer, RENDERERS)
-    if name == "pallas":
-        why = kernel.obstacle()
-        if why is None and jax.default_backend() != "gpu":
-            why = f"JAX computes on a {jax.default_backend()}"
-        if why is not None:
-            raise ValueError(
-                f"renderer='pallas' is a kernel for NVIDIA GPUs, and {why}. Use 'auto' (the "
-                "fastest on every device, this kernel in programs compiled for CUDA), 'fused', or "
-                "'pallas-interpret', which computes the kernel on any device, slowly."
-            )
+    if name == "pallas" and (why := choice.why_not_here()) is not None:
+        raise ValueError(
+            f"renderer='pallas' is a kernel for NVIDIA GPUs, and {why}. Use 'auto' (the fastest on "
+            "every device, this kernel in programs compiled for CUDA) or 'fused'."
+        )
     return name
 
 
@@ -79,6 +78,89 @@ def render(
     return _fast(scene, first_row, height, width, rows, renderer)
 
 
+def draw(
+    scene: Scene,
+    height: int,
+    width: int,
+    renderer: str,
+    change: Callable[[Frame, jax.Array], Frame],
+) -> jax.Array:
+    """Draw an image, change it and pack it, as a program computes it once, whoever reads it.
+
+    Without a barrier XLA fuses the renderer into every reader of its image and runs it again for
+    each. Nothing is fused into a kernel of its own. Where there is none, control flow is a barrier
+    that XLA keeps: on a CPU a conditional, for which a GPU would wait for the host; on a TPU an
+    optimization barrier is enough; elsewhere a loop over bands, which also halves what XLA keeps of
+    an image that it does not fuse.
+
+    Args:
+        scene: what to draw.
+        height: pixels.
+        width: pixels.
+        renderer: one of ``RENDERERS``.
+        change: ``change(frame, rows)``, some rows of the image with other colors, given the
+            numbers of these rows, (R,) int32. What it does pixel by pixel is part of the kernel.
+
+    Returns:
+        (height, width) uint32 packed pixels.
+    """
+    plain = "fused" if renderer == "auto" else renderer
+
+    def draw_rows(first_row: jax.Array, num_rows: int) -> jax.Array:
+        frame = render(scene, height, width, plain, first_row=first_row, num_rows=num_rows)
+        return pack(change(frame, jnp.minimum(first_row + jnp.arange(num_rows), height - 1)))
+
+    def in_bands() -> jax.Array:
+        num_rows = -(-height // _BANDS)
+        first_rows = jnp.arange(_BANDS) * num_rows
+        bands = jax.lax.map(lambda first_row: draw_rows(first_row, num_rows), first_rows)
+        return bands.reshape(-1, width)[:height]
+
+    def in_a_conditional() -> jax.Array:
+        # On a CPU, XLA clears the result of a loop beforehand, and runs in one thread whatever is
+        # fused into the writes to it. A conditional costs nothing; were it known to be always
+        # taken, the compiler would remove it, and the barrier with it.
+        zero = jax.lax.optimization_barrier(jnp.int32(0))
+        blank = jnp.zeros(height * width, jnp.uint32)
+        # In one axis, as the renderer computes it.
+        image = jax.lax.cond(zero == 0, lambda: draw_rows(zero, height).ravel(), lambda: blank)
+        return image.reshape(height, width)
+
+    def behind_a_barrier() -> jax.Array:
+        # A TPU's compiler keeps it, and keeps less of an image than of its bands in a loop.
+        return jax.lax.optimization_barrier(draw_rows(jnp.int32(0), height))
+
+    def by_kernel() -> jax.Array:
+        from pixelbrax_jax.renderer import kernel
+
+        return kernel.draw(
+            scene, height, width, lambda frame: pack(change(frame, jnp.arange(height)))
+        )
+
+    if renderer == "pallas":
+        return by_kernel()
+    forms = {"cpu": in_a_conditional, "tpu": behind_a_barrier}
+    if renderer == "auto" and choice.why_no_kernel() is None:
+        forms["cuda"] = by_kernel
+    image: jax.Array = by_platform(default=in_bands, **forms)
+    return image
+
+
+def pack(frame: Frame) -> jax.Array:
+    """Pack a frame into 32 bits a pixel: red in the low byte, then green, then blue.
+
+    The only place where colors are rounded: each channel is ``floor(255 x + 1/2)``.
+
+    Returns:
+        (H, W) uint32.
+    """
+
+    def level(plane: jax.Array) -> jax.Array:
+        return (plane * 255.0 + 0.5).astype(jnp.uint32)
+
+    return level(frame.r) | level(frame.g) << 8 | level(frame.b) << 16
+
+
 @partial(jax.custom_jvp, nondiff_argnums=(2, 3, 4, 5))
 def _fast(
     scene: Scene, first_row: jax.Array, height: int, width: int, num_rows: int, renderer: str
@@ -87,17 +169,16 @@ def _fast(
         return fused.render(scene, height, width, first_row, num_rows)
 
     def by_kernel() -> Frame:
-        from pixelbrax_jax.renderer import pallas
+        from pixelbrax_jax.renderer import kernel
 
-        interpret = renderer == "pallas-interpret"
-        return pallas.render(scene, height, width, first_row, num_rows, interpret=interpret)
+        return kernel.render(scene, height, width, first_row, num_rows)
 
-    if renderer == "fused" or (renderer == "auto" and kernel.obstacle() is not None):
+    if renderer == "pallas":
+        return by_kernel()
+    if renderer == "fused" or choice.why_no_kernel() is not None:
         return plain()
-    if renderer == "auto":
-        frame: Frame = lax.platform_dependent(cuda=by_kernel, default=plain)
-        return frame
-    return by_kernel()
+    frame: Frame = by_platform(cuda=by_kernel, default=plain)
+    return frame
 
 
 @_fast.defjvp

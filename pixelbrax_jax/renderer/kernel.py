@@ -1,73 +1,290 @@
-"""Whether programs for NVIDIA GPUs draw by the kernel of `pallas.py`, and why not."""
+"""The fast ray-caster as one kernel for NVIDIA GPUs, written in Pallas.
+
+On a GPU XLA splits the program of `fused.py`, as a fusion takes only so many operands, and keeps
+planes of pixels between the parts. Here the same code is traced into a kernel: a block of it
+computes some pixels from references to the scene's numbers, changes their colors if asked to, and
+writes each of them once.
+
+A block leaves out geoms that it cannot see, by spheres around them (`GeomKind.reach`). Along one
+axis of the image, a sphere at (c, d), d in front of the camera, covers the slopes s between its two
+tangents, ``|c - s d| = r sqrt(1 + s^2)``. A convex hull covers what is between.
+"""
 
 from __future__ import annotations
 
-from functools import cache
-from importlib.util import find_spec
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental import pallas as pl
+from jax.experimental.pallas import triton
 
-_CAPABILITY = 8.0
-"""Least compute capability for which XLA compiles such kernels: Ampere's."""
+from pixelbrax_jax.renderer.fused import Near, Seen, View, rays, see, view_of
+from pixelbrax_jax.renderer.intersect import at_least, at_most
+from pixelbrax_jax.renderer.per_pixel import per_pixel
+from pixelbrax_jax.types import Frame, GeomKind, Scene
+
+BLOCK = 256
+"""Pixels of a block, some rows of a small image: fewer share the work that is done once a block,
+more see more geoms."""
+
+_WARPS = 4
+
+INTERPRET = False
+"""Whether XLA computes the kernel, slowly and on any device; tests set it."""
+
+_GEOMS = 32
+"""Geoms of which a word has one bit each."""
+
+_CLOSE = 1.01
+"""Radii in front of the camera within which a sphere counts as seen everywhere."""
+
+Window = tuple[tuple[Any, Any] | None, tuple[Any, Any]]
+"""Least and greatest slope along the image's x axis, and along y; None for all, else () float32."""
 
 
-def obstacle() -> str | None:
-    """Return why programs for CUDA, as traced here, do without the kernel; None if they have it.
+def draw(scene: Scene, height: int, width: int, change: Callable[[Frame], jax.Array]) -> jax.Array:
+    """Draw an image and change it into (height, width) uint32; it has no derivative.
 
-    Starts a device. What JAX computes on need not be a GPU: where its plugin for CUDA is installed,
-    programs may be compiled for one ahead of time. jax 0.12.0.1 must then be told which, and
-    0.10.2 need not; see `docs/renderer.md`.
+    A change that is made pixel by pixel is part of the kernel.
     """
-    backend = jax.default_backend()
-    # Without a plugin nothing is imported or traced that only a GPU needs.
-    if backend != "gpu" and not _has_plugin():
-        return f"JAX computes on a {backend}"
-    if backend == "gpu" and _is_rocm(jax.devices()[0]):
-        return "JAX computes on ROCm, and the kernel is for NVIDIA GPUs"
-    try:
-        from jax.experimental.pallas import triton
+    plane = jax.ShapeDtypeStruct((height, width), jnp.float32)
+    seg, ground = plane.update(dtype=jnp.int32), plane.update(dtype=bool)
+    by_pixel = per_pixel(change, Frame(plane, plane, plane, plane, seg, ground))
+    if by_pixel is None:
+        return change(render(scene, height, width))
 
-        # jax 0.12.0.1 tells of an abstract or a real card; 0.10.2 has no such function.
-        info = triton.get_gpu_info() if hasattr(triton, "get_gpu_info") else None
-    except ImportError:
-        return f"jax {jax.__version__} has no Pallas for Triton"
-    except ValueError as error:
-        return f"Pallas does not know the card: {error}"
-    if info is not None:
-        return _too_old("the card", info.compute_capability / 10)
-    return _about(jax.devices()[0]) if backend == "gpu" else None
+    def changed(view: View, numbers: Any, images: Any, seen: Seen) -> list[jax.Array]:
+        return [by_pixel.apply(seen.frame(_geom(view, seen)), numbers, images)]
+
+    band, inputs = _Band(height, width, 0, height), (by_pixel.numbers, by_pixel.images)
+    (image,) = _call(changed, view_of(scene, height, _einsum), *inputs, band, [jnp.uint32])
+    return image
 
 
-def auto_renderer() -> tuple[str, str]:
-    """Return the renderer that ``"auto"`` stands for on JAX's default device, and why."""
-    backend = jax.default_backend()
-    if backend != "gpu":
-        return "fused", f"JAX computes on a {backend}, and the kernel is for NVIDIA GPUs"
-    why = obstacle()
-    if why is not None:
-        return "fused", f"not by one kernel: {why}"
-    return "pallas", f"by one kernel, on {jax.devices()[0].device_kind}"
+def render(
+    scene: Scene,
+    height: int,
+    width: int,
+    first_row: jax.Array | int = 0,
+    num_rows: int | None = None,
+) -> Frame:
+    """Return a band of rows of an image; see ``fused.render``. It has no derivative."""
+
+    def planes(view: View, numbers: Any, images: Any, seen: Seen) -> list[jax.Array]:
+        del numbers, images
+        return [seen.r, seen.g, seen.b, seen.depth, _geom(view, seen)]
+
+    band = _Band(height, width, first_row, height if num_rows is None else num_rows)
+    view = view_of(scene, height, _einsum)
+    dtypes = [*[jnp.float32] * 4, jnp.int32]
+    r, g, b, depth, seg = _call(planes, view, (), (), band, dtypes)
+    ground = jnp.zeros(seg.shape, bool)
+    for geom, is_ground in zip(view.geom, view.ground, strict=True):
+        if is_ground:
+            ground |= seg == geom
+    return Frame(r=r, g=g, b=b, depth=depth, seg=seg, ground=ground)
 
 
-def _is_rocm(device: jax.Device) -> bool:
-    return "rocm" in getattr(device.client, "platform_version", "").lower()
+class _Band(NamedTuple):
+    """Rows of an image: its size, the first row, which may be traced, and their number."""
+
+    height: int
+    width: int
+    first_row: jax.Array | int
+    num_rows: int
 
 
-def _about(device: jax.Device) -> str | None:
-    """Return what an NVIDIA GPU lacks."""
-    capability = str(getattr(device, "compute_capability", ""))
-    try:
-        return _too_old(device.device_kind, float(capability))
-    except ValueError:
-        return f"the compute capability of {device.device_kind} is unknown: {capability!r}"
+def _near(view: View, band: _Band, start: jax.Array, last: jax.Array) -> Near:
+    """Return the argument of ``see`` for the pixels from ``start`` to ``last`` of a band."""
+    width = np.int32(band.width)
+    top, bottom = (jax.lax.div(i, width) + band.first_row for i in (start, last))
+    columns = None
+    if band.width >= BLOCK:
+        # The block ends in the row in which it begins, or in the next one.
+        first, end = (jax.lax.rem(i, width) for i in (start, last))
+        one_row = top == bottom
+        columns = (jnp.where(one_row, first, 0), jnp.where(one_row, end, width - 1))
+    seen = may_see(view, window_of(view, (top, bottom), columns, band.height, band.width))
+
+    def near(rank: int, update: Callable[[Any], Any], value: Any) -> Any:
+        if view.kind[rank] == GeomKind.PLANE:
+            return update(value)
+        return jax.lax.cond(seen(rank), update, lambda value: value, value)
+
+    return near
 
 
-def _too_old(card: str, capability: float) -> str | None:
-    if capability >= _CAPABILITY:
-        return None
-    return f"{card} has compute capability {capability}, and the kernel needs {_CAPABILITY}"
+def _einsum(subscripts: str, a: Any, b: Any) -> jax.Array:
+    """Return ``jnp.einsum`` over one axis as a sum, which XLA fuses: products it launches apart."""
+    inputs, output = subscripts.split("->")
+    (over,) = set(inputs) - {",", *output}
+    terms = [
+        jnp.expand_dims(
+            jnp.einsum(f"{axes}->{''.join(axis for axis in output + over if axis in axes)}", x),
+            [place for place, axis in enumerate(output + over) if axis not in axes],
+        )
+        for axes, x in zip(inputs.split(","), (a, b), strict=True)
+    ]
+    return jnp.sum(terms[0] * terms[1], axis=-1)
 
 
-@cache
-def _has_plugin() -> bool:
-    return any(map(find_spec, ("jax_cuda12_plugin", "jax_cuda13_plugin")))
+def _geom(view: View, seen: Seen) -> jax.Array:
+    """Return the geom of each pixel: a kernel has no table to look it up in."""
+    geom = jnp.full(seen.rank.shape, -1, jnp.int32)
+    for rank, of_rank in enumerate(view.geom):
+        geom = jnp.where(seen.rank == rank, of_rank, geom)
+    return geom
+
+
+def _call(
+    compute: Callable[..., list[jax.Array]],
+    view: View,
+    numbers: Sequence[jax.Array],
+    images: Sequence[jax.Array],
+    band: _Band,
+    dtypes: Sequence[Any],
+) -> list[jax.Array]:
+    """Return bands of images, (num_rows, width), from what pixels see.
+
+    ``compute(view, numbers, images, seen)`` gives blocks of them, of the given ``dtypes``, given ()
+    arrays and blocks of other bands of images.
+    """
+    height, width, first_row, num_rows = band
+    inputs, inputs_tree = jax.tree.flatten((view, list(numbers), first_row))
+    inputs = [jax.lax.stop_gradient(jnp.asarray(x)) for x in inputs]
+    packed = [x.ndim <= 1 and x.dtype == jnp.float32 for x in inputs]
+    few = [x for x, is_packed in zip(inputs, packed, strict=True) if is_packed]
+    others = [x for x, is_packed in zip(inputs, packed, strict=True) if not is_packed]
+    # In one array, or XLA would compute them in launches of their own.
+    arrays = [jnp.concatenate([x.ravel() for x in few]), *others]
+    num_pixels = num_rows * width
+
+    def kernel(*refs: Any) -> None:
+        of_few, *of_arrays = refs[: len(arrays)]
+        of_images = refs[len(arrays) : -len(dtypes)]
+        start = pl.program_id(0) * BLOCK
+        index = start + jnp.arange(BLOCK, dtype=jnp.int32)
+        # The last block has more pixels than are left.
+        inside = index < num_pixels
+        read, rest = iter(_unpacked(of_few, few)), iter(of_arrays)
+        leaves = [next(read) if is_packed else _scalar(next(rest)) for is_packed in packed]
+        view, numbers, first_row = jax.tree.unflatten(inputs_tree, leaves)
+        images = [triton.load(ref.at[:], mask=inside, other=0) for ref in of_images]
+        row = jax.lax.div(index, np.int32(width)) + first_row
+        column = jax.lax.rem(index, np.int32(width))
+        last = jnp.minimum(start + BLOCK, num_pixels) - 1
+        near = _near(view, band._replace(first_row=first_row), start, last)
+        seen = see(view, rays(view, height, width, row, column), near)
+        results = compute(view, numbers, images, seen)
+        for ref, result in zip(refs[-len(dtypes) :], results, strict=True):
+            triton.store(ref.at[:], result, mask=inside)
+
+    block = pl.BlockSpec((BLOCK,), lambda i: (i,))
+    whole = [pl.BlockSpec(x.shape, lambda _, x=x: (0,) * x.ndim) for x in arrays]
+    outputs = pl.pallas_call(
+        kernel,
+        grid=(pl.cdiv(num_pixels, BLOCK),),
+        in_specs=[*whole, *[block] * len(images)],
+        out_specs=[block] * len(dtypes),
+        out_shape=[jax.ShapeDtypeStruct((num_pixels,), dtype) for dtype in dtypes],
+        interpret=INTERPRET,
+        compiler_params=None
+        if INTERPRET
+        else triton.CompilerParams(num_warps=_WARPS, num_stages=1),
+        name="pixelbrax_draw",
+    )(*arrays, *[jax.lax.stop_gradient(image).reshape(num_pixels) for image in images])
+    return [output.reshape(num_rows, width) for output in outputs]
+
+
+def _unpacked(ref: Any, arrays: Sequence[jax.Array]) -> Iterator[Any]:
+    """Yield the numbers of arrays that are one after the other in ``ref``: tuples, and scalars."""
+    start = 0
+    for array in arrays:
+        numbers = tuple(ref[start + i] for i in range(array.size))
+        yield numbers if array.ndim else numbers[0]
+        start += array.size
+
+
+def _scalar(ref: Any) -> Any:
+    """Return the number that a reference to a scalar is to; other references as they are."""
+    return ref if ref.shape else ref[()]
+
+
+def window_of(
+    view: View,
+    rows: tuple[jax.Array, jax.Array],
+    columns: tuple[jax.Array, jax.Array] | None,
+    height: int,
+    width: int,
+) -> Window:
+    """Return the slopes of rays through pixels and those beside them.
+
+    Rows and columns are () int32, the first and the last; None for all columns.
+    """
+    top, bottom = (0.5 * (height - 1) - row.astype(jnp.float32) for row in rows)
+    along_y = (view.pixel * (bottom - 1.0), view.pixel * (top + 1.0))
+    if columns is None:
+        return None, along_y
+    left, right = (column.astype(jnp.float32) - 0.5 * (width - 1) for column in columns)
+    return (view.pixel * (left - 1.0), view.pixel * (right + 1.0)), along_y
+
+
+def may_see(view: View, window: Window) -> Callable[[int], jax.Array]:
+    """Return a function that tells of the geom of a rank whether rays of a window may hit it.
+
+    32 geoms are looked at in one vector, as is right for a GPU.
+    """
+    count = len(view.geom)
+    kinds = [view.kind[view.geom.index(g)] for g in range(count)]
+    words = [_word(view, window, kinds, first) for first in range(0, count, _GEOMS)]
+
+    def seen(rank: int) -> jax.Array:
+        word, bit = divmod(view.geom[rank], _GEOMS)
+        return ((words[word] >> bit) & 1) != 0
+
+    return seen
+
+
+def _word(view: View, window: Window, kinds: Sequence[int], first: int) -> jax.Array:
+    """Return one bit for each of the geoms from ``first`` on."""
+    kinds = kinds[first : first + _GEOMS]
+    lane = jnp.arange(_GEOMS, dtype=jnp.int32)
+    g = first + jnp.minimum(lane, len(kinds) - 1)
+
+    def where(condition: Callable[[GeomKind], bool]) -> jax.Array:
+        mask = sum([1 << bit for bit, kind in enumerate(kinds) if condition(GeomKind(kind))])
+        return ((np.int32(np.uint32(mask).view(np.int32)) >> lane) & 1) != 0
+
+    size = [view.size[g, k] for k in range(3)]
+    long = where(lambda kind: kind.is_long)
+    half = jnp.where(long, size[1], 0.0)
+    square = size[0] * size[0] + size[1] * size[1] + size[2] * size[2]
+    radius = jnp.where(where(lambda kind: kind.reach == "diagonal"), jnp.sqrt(square), size[0])
+    largest = at_least(at_least(size[0], size[1]), size[2])
+    radius = jnp.where(where(lambda kind: kind.reach == "largest"), largest, radius)
+
+    center = [view.pos[g, k] for k in range(3)]
+    arm = [half * view.xmat[g, k, 2] for k in range(3)]
+    ends = [[c + sign * a for c, a in zip(center, arm, strict=True)] for sign in (-1.0, 1.0)]
+    depths = [-end[2] for end in ends]
+    nearest, farthest = at_most(*depths), at_least(*depths)
+    inside = jnp.ones(lane.shape, bool)
+    for axis, limits in enumerate(window):
+        if limits is None:
+            continue
+        least, greatest = limits
+        reach = [_slopes(end[axis], d, radius) for end, d in zip(ends, depths, strict=True)]
+        low, high = at_most(reach[0][0], reach[1][0]), at_least(reach[0][1], reach[1][1])
+        inside &= (low <= greatest) & (high >= least)
+    seen = (farthest > -radius) & ((nearest <= _CLOSE * radius) | inside)
+    return jnp.sum(jnp.where(seen, jnp.int32(1) << lane, 0))
+
+
+def _slopes(c: jax.Array, d: jax.Array, radius: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return the slopes of the two tangents, for a sphere that is not close."""
+    inv = 1.0 / (d * d - radius * radius)
+    root = radius * jnp.sqrt(at_least(c * c + d * d - radius * radius, 0.0))
+    return (c * d - root) * inv, (c * d + root) * inv

@@ -11,27 +11,14 @@ import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax import spatial
-from pixelbrax_jax.renderer import ground
-from pixelbrax_jax.types import FAR, Camera, Frame, GeomKind, Lamp, Scene
-
-_SHADOW_BIAS = 1e-3
+from pixelbrax_jax.renderer import shading
+from pixelbrax_jax.types import FAR, Camera, Frame, GeomKind, Lamp, Scene, for_each_kind
 
 
 def render(
     scene: Scene, height: int, width: int, first_row: jax.Array | int, num_rows: int
 ) -> Frame:
-    """Return a band of rows of an image of the scene.
-
-    Args:
-        scene: what to draw.
-        height: pixels of the whole image.
-        width: pixels.
-        first_row: () int, the band's first row; may be traced.
-        num_rows: rows of the band.
-
-    Returns:
-        The band, every plane (num_rows, W).
-    """
+    """Return a band of rows of an image of the scene; see ``base.render``."""
     geoms, look, camera = scene.geoms, scene.look, scene.camera
     rays = pixel_rays(camera, height, width, first_row + jnp.arange(num_rows))
     distances, normals = [], []
@@ -57,7 +44,7 @@ def render(
 
     back = camera.xmat[:, 2]
     n_z = normal @ back
-    shade, gleam = look.ambient, jnp.zeros(())
+    shade, highlight = look.ambient, jnp.zeros(())
     if look.headlight is not None:
         shade = shade + look.headlight * jnp.maximum(n_z, 0.0)
         shade = jnp.where(on_ground, jnp.minimum(shade, 1.0), shade)
@@ -71,15 +58,18 @@ def render(
         gloss = jnp.maximum(2.0 * n_l * n_z - to_light @ back, 0.0) ** look.shininess
         gloss = jnp.where(lit, gloss, 0.0)
         shade = shade + look.diffuse * jnp.where(lit, n_l, 0.0) + look.specular * gloss
-        gleam = gleam + look.highlight * gloss
+        highlight = highlight + look.highlight * gloss
     for lamp in look.lamps:
-        more, glitter = _lamplight(scene, lamp, points, normal, nearest)
-        shade, gleam = shade + more, gleam + glitter
+        more, shine = _lamplight(scene, lamp, points, normal, nearest)
+        shade, highlight = shade + more, highlight + shine
     if look.headlight is not None:
         # A texture dims the highlight too.
-        shade, gleam = jnp.where(on_ground, shade + gleam, shade), jnp.where(on_ground, 0.0, gleam)
-    shade, gleam = (jnp.broadcast_to(x, hit.shape)[..., None] for x in (shade, gleam))
-    surface = jnp.clip(color * shade + gleam, 0.0, 1.0)
+        shade, highlight = (
+            jnp.where(on_ground, shade + highlight, shade),
+            jnp.where(on_ground, 0.0, highlight),
+        )
+    shade, highlight = (jnp.broadcast_to(x, hit.shape)[..., None] for x in (shade, highlight))
+    surface = jnp.clip(color * shade + highlight, 0.0, 1.0)
     rise = rays[..., 2:]
     sky = look.sky[0] + jnp.clip(rise, 0.0, 1.0) * (look.sky[1] - look.sky[0])
     if look.sky.shape[0] == 3:
@@ -121,20 +111,12 @@ def _cast_geom(
 def _shaded(
     scene: Scene, origin: jax.Array, rays: jax.Array, until: jax.Array | float, nearest: jax.Array
 ) -> jax.Array:
-    """Return whether another geom than that seen is on the way to the light; planes never are.
-
-    Args:
-        scene: the scene.
-        origin: where rays begin; (3,) or (H, W, 3) metres.
-        rays: (H, W, 3) unit directions.
-        until: metres, where they end.
-        nearest: (H, W) int, the geom seen.
-    """
+    """Return whether another geom than the ``nearest`` is on rays; planes never are."""
     shaded = jnp.zeros(nearest.shape, bool)
     for g, kind in enumerate(scene.geoms.kind):
         if kind != GeomKind.PLANE:
             way, _ = _cast_geom(scene, g, origin, rays)
-            blocked = jnp.isfinite(way) & (way > _SHADOW_BIAS) & (way < until)
+            blocked = jnp.isfinite(way) & (way > shading.SHADOW_BIAS) & (way < until)
             shaded |= blocked & (nearest != g)
     return shaded
 
@@ -149,7 +131,7 @@ def _lamplight(
     n_l = -jnp.sum(ray * normal, -1)
     lit = (along >= lamp.cos_cutoff) & (n_l > 0.0)
     if scene.look.shadows:
-        until = jnp.sum(away * ray, -1) - _SHADOW_BIAS
+        until = jnp.sum(away * ray, -1) - shading.SHADOW_BIAS
         lit &= ~_shaded(scene, lamp.pos, ray, until, nearest)
     strength = jnp.where(lit, jnp.maximum(along, 0.0) ** lamp.exponent, 0.0)
     back = scene.camera.xmat[:, 2]
@@ -256,14 +238,17 @@ def _box(o: jax.Array, d: jax.Array, size: jax.Array) -> tuple[jax.Array, jax.Ar
     return t, jax.nn.one_hot(face, 3, dtype=d.dtype) * outward
 
 
-_LOCAL = {
-    GeomKind.PLANE: _plane,
-    GeomKind.SPHERE: _sphere,
-    GeomKind.CAPSULE: _capsule,
-    GeomKind.ELLIPSOID: _ellipsoid,
-    GeomKind.CYLINDER: _cylinder,
-    GeomKind.BOX: _box,
-}
+_LOCAL = for_each_kind(
+    "renderer.reference",
+    {
+        GeomKind.PLANE: _plane,
+        GeomKind.SPHERE: _sphere,
+        GeomKind.CAPSULE: _capsule,
+        GeomKind.ELLIPSOID: _ellipsoid,
+        GeomKind.CYLINDER: _cylinder,
+        GeomKind.BOX: _box,
+    },
+)
 
 
 def _ground_color(scene: Scene, g: int, rays: jax.Array, height: int) -> jax.Array:
@@ -288,7 +273,7 @@ def _ground_color(scene: Scene, g: int, rays: jax.Array, height: int) -> jax.Arr
         coords = scene.geoms.size[g, :2] + coords * jnp.array([1.0, -1.0])
     coords /= look.ground_pitch
     footprint = footprint / look.ground_pitch
-    fraction = ground.second_color_fraction(
+    fraction = shading.second_color_fraction(
         look.ground, coords[..., 0], coords[..., 1], footprint[..., 0], footprint[..., 1]
     )
     first, second = look.ground_rgb[0], look.ground_rgb[1]

@@ -1,19 +1,27 @@
-"""Light, sky and the ground's color, for pixels of any shape.
+"""Light, sky and the ground's pattern, for pixels of any shape.
 
 As in `intersect.py` a vector is a tuple of three components, each a scalar or an array over pixels,
 and all vectors of a call are in one frame: the camera's, or the world's.
+
+A plane carries a pattern that is a product of two one-dimensional ones, along its own x and y. A
+pixel sees a parallelogram of the plane; the pattern is averaged exactly over the smallest
+axis-aligned rectangle around it, from the pattern's integral, so that it never flickers. Towards
+the horizon the average tends to a constant, where point samples would alias.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from pixelbrax_jax.renderer.bounds import at_least, between
-from pixelbrax_jax.renderer.intersect import Vector, dot
+from pixelbrax_jax.renderer.intersect import Vector, at_least, at_most, between, dot
 from pixelbrax_jax.types import Lamp, Look
+
+LINE_WIDTH = 1.0 / 84.0
+"""Width of a grid line in grid pitches: one texel of the original's texture at 84 pixels."""
 
 SHADOW_BIAS = 1e-3
 """Metres that a shadow ray must travel before a hit counts."""
@@ -22,23 +30,14 @@ SHADOW_BIAS = 1e-3
 def gloss(n_l: jax.Array, n_z: jax.Array, light_z: Any, shininess: int) -> jax.Array:
     """Return Phong's ``max(r_z, 0) ** shininess`` for a viewer at infinity, see ``Look``.
 
-    Args:
-        n_l: product of normal and direction to the light.
-        n_z: product of normal and the camera's back axis.
-        light_z: product of the direction to the light and that axis.
-        shininess: the exponent.
+    It takes the products of normal and direction to the light, of normal and the camera's back
+    axis, and of that direction and that axis.
     """
     return at_least(2.0 * n_l * n_z - light_z, 0.0) ** shininess
 
 
 def beam(lamp: Lamp, pos: Vector, axis: Vector, points: Vector) -> tuple[Vector, Any, Any]:
-    """Return how a lamp shines at points.
-
-    Args:
-        lamp: exponent and cutoff.
-        pos: metres, where it is.
-        axis: unit direction in which it shines.
-        points: metres.
+    """Return how a lamp at ``pos`` that shines along ``axis`` lights points.
 
     Returns:
         Unit directions from the lamp to the points; one over their distances in metres; how
@@ -55,15 +54,46 @@ def beam(lamp: Lamp, pos: Vector, axis: Vector, points: Vector) -> tuple[Vector,
 
 
 def sky(look: Look, rise: jax.Array, channel: int) -> jax.Array:
-    """Return one channel of the sky's color.
-
-    Args:
-        look: whose sky it is.
-        rise: z of unit rays in the world frame.
-        channel: 0 red, 1 green, 2 blue.
-    """
+    """Return one channel of the sky's color, given z of unit rays in the world frame."""
     horizon, above, *below = (look.sky[row, channel] for row in range(look.sky.shape[0]))
     color = horizon + between(0.0, rise, 1.0) * (above - horizon)
     if below:
         color += between(0.0, -rise, 1.0) * (below[0] - horizon)
     return color
+
+
+def _average(
+    integral: Callable[[jax.Array], jax.Array], center: jax.Array, width: jax.Array
+) -> jax.Array:
+    """Return the mean of a periodic function of period 1 over a window, given its integral."""
+    width = at_least(width, 1e-4)
+    return (integral(center + 0.5 * width) - integral(center - 0.5 * width)) / width
+
+
+def _square_wave_integral(x: jax.Array) -> jax.Array:
+    """Return the integral of the wave that is +1 on [0, 1/2) and -1 on [1/2, 1)."""
+    return 0.5 - jnp.abs(x - jnp.floor(x) - 0.5)
+
+
+def _line_integral(x: jax.Array) -> jax.Array:
+    """Return the integral of what is 1 on [0, LINE_WIDTH) and 0 on the rest of [0, 1)."""
+    whole = jnp.floor(x)
+    return LINE_WIDTH * whole + at_most(x - whole, LINE_WIDTH)
+
+
+def second_color_fraction(
+    pattern: str, x: jax.Array, y: jax.Array, width_x: jax.Array, width_y: jax.Array
+) -> jax.Array:
+    """Return how much of the ground's second color a pixel sees, in [0, 1].
+
+    The pattern is ``"checker"`` or ``"grid"``. In pitches of it, (x, y) is the ground at the
+    pixel's center, and the widths are the positive extents of the ground that the pixel sees.
+    """
+    if pattern == "checker":
+        # A checker is the product of two waves whose period is two tiles.
+        wave_x = _average(_square_wave_integral, 0.5 * x, 0.5 * width_x)
+        wave_y = _average(_square_wave_integral, 0.5 * y, 0.5 * width_y)
+        return 0.5 - 0.5 * wave_x * wave_y
+    line_x = _average(_line_integral, x, width_x)
+    line_y = _average(_line_integral, y, width_y)
+    return 1.0 - (1.0 - line_x) * (1.0 - line_y)

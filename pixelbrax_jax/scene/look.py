@@ -66,26 +66,19 @@ LOOKS: dict[str, Look] = {
 }
 
 
-def make_look(
-    look: str | Look = "default", *, shadows: bool | None = None, own: Look | None = None
-) -> Look:
+def make_look(look: str | Look = "default", *, shadows: bool | None = None) -> Look:
     """Return a look by name, or the given one.
 
     Args:
         look: ``"default"``, ``"original"``, ``"dmc"`` or a ``Look``.
         shadows: whether geoms cast shadows; None keeps the look's own choice.
-        own: what a task's model has for ``"dmc"``.
-
-    Returns:
-        The look.
 
     Raises:
         ValueError: the name is unknown.
         TypeError: ``look`` is neither a string nor a ``Look``; ``shadows`` is no truth value.
     """
     if isinstance(look, str):
-        name = check_choice("look", look, LOOKS)
-        look = own if name == "dmc" and own is not None else LOOKS[name]
+        look = LOOKS[check_choice("look", look, LOOKS)]
     elif not isinstance(look, Look):
         raise TypeError(f"look must be a name or a pixelbrax_jax.Look, got {type(look).__name__}.")
     if shadows is None:

@@ -23,9 +23,6 @@ def place(geoms: Geoms, rig: CameraRig, look: Look, xpos: jax.Array, xquat: jax.
         look: light, sky and ground.
         xpos: (L, 3) float32, metres, link origins in the world frame.
         xquat: (L, 4) float32, unit, link orientations in the world frame.
-
-    Returns:
-        The scene in the world frame.
     """
     link = np.array(geoms.link, np.int32)
     if len(xpos):

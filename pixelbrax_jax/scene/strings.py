@@ -34,7 +34,7 @@ def pieces(string: String, ends: jax.Array, num: int) -> tuple[jax.Array, jax.Ar
 
 
 def hang(ends: jax.Array, length: jax.Array, num: int) -> jax.Array:
-    """Return points on a thread under gravity along -z, at equal distances along it.
+    """Return points (num + 1, 3) on a thread under gravity along -z, at equal distances along it.
 
     A hanging thread is a catenary, z = a cosh(x / a) + const. With h and v its horizontal and
     vertical extent and u = h / 2a, its length obeys ``sqrt(length^2 - v^2) / h = sinh(u) / u``, and
@@ -42,11 +42,8 @@ def hang(ends: jax.Array, length: jax.Array, num: int) -> jax.Array:
 
     Args:
         ends: (2, 3) float32, metres.
-        length: () float32, metres.
+        length: () float32, metres; the line is straight where it is too short.
         num: pieces.
-
-    Returns:
-        (num + 1, 3) float32, metres; on the straight line where ``length`` is too short.
     """
     start, end = ends[0], ends[1]
     way = end - start

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pixelbrax_jax import PhysicsState
+from pixelbrax_jax import Physics, PhysicsState
 from tests.envs.toy import GEOMS
 
 TIME_LIMIT = 2
@@ -56,8 +56,8 @@ def true_values(gamma: float) -> dict[str, float]:
     }
 
 
-class Probes:
-    """All tasks; a ``Physics``. The engine's state is the index of the place."""
+class Probes(Physics):
+    """All tasks. The engine's state is the index of the place."""
 
     geoms = GEOMS
     dt = 0.1

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
 
-from pixelbrax_jax.agents.config import TrainConfig
 from pixelbrax_jax.agents.networks.distributions import Normal
+from pixelbrax_jax.agents.on_policy.config import OnPolicyConfig
 from pixelbrax_jax.agents.on_policy.losses import (
     Batch,
     clipped_value_loss,
@@ -20,7 +22,7 @@ from pixelbrax_jax.agents.on_policy.losses import (
 from pixelbrax_jax.agents.optimizer import Optimizer
 
 B = 12
-CONFIG = TrainConfig(clip_coef=0.2, ent_coef=0.03, normalize_advantage="none")
+CONFIG = OnPolicyConfig(clip_coef=0.2, ent_coef=0.03, normalize_advantage="none")
 KEY = jax.random.key(0)
 
 
@@ -68,7 +70,7 @@ def test_the_policy_loss_is_ppo_s():
 )
 def test_the_gradient_stops_where_the_policy_has_moved_far_enough(ratio, advantage, goes_on):
     samples = batch()._replace(advantage=jnp.full(B, advantage))
-    config = TrainConfig(ent_coef=0.0, normalize_advantage="none")
+    config = OnPolicyConfig(ent_coef=0.0, normalize_advantage="none")
 
     def loss(mean):
         now = policy().replace(mean=mean)
@@ -80,9 +82,10 @@ def test_the_gradient_stops_where_the_policy_has_moved_far_enough(ratio, advanta
 
 @pytest.mark.parametrize("normalize_advantage", ["none", "minibatch"])
 def test_samples_without_weight_teach_nothing(normalize_advantage):
-    config = TrainConfig(normalize_advantage=normalize_advantage)
+    config = OnPolicyConfig(normalize_advantage=normalize_advantage)
 
-    def loss(mean, value, samples):
+    @partial(jax.grad, argnums=(0, 1))
+    def gradients(mean, value, samples):
         now = policy().replace(mean=mean)
         return (
             policy_loss(now, samples, config, KEY)[0]
@@ -90,35 +93,24 @@ def test_samples_without_weight_teach_nothing(normalize_advantage):
             + clipped_value_loss(value, samples, 0.2)
         )
 
-    samples = batch()
+    samples, other = batch(), batch(5)
     masked = np.asarray(samples.weight) == 0
-    value = jax.random.normal(jax.random.key(2), (B,))
-    gradients = jax.grad(loss, argnums=(0, 1))(policy().mean, value, samples)
-    for gradient in gradients:
+    given = policy().mean, jax.random.normal(jax.random.key(2), (B,))
+    expected = gradients(*given, samples)
+    for gradient in expected:
         assert (np.asarray(gradient)[masked] == 0).all()
         assert (np.asarray(gradient)[~masked] != 0).any()
     # Nor do they change what the others teach.
-    other = batch(5)
-    fields = ("unclipped_action", "log_prob", "value", "advantage", "returns")
     changed = {
-        name: jnp.where(
-            masked.reshape(-1, *(1,) * (getattr(samples, name).ndim - 1)),
-            100 * getattr(other, name),
-            getattr(samples, name),
-        )
-        for name in fields
+        name: jnp.where(masked.reshape(-1, *(1,) * (new.ndim - 1)), 100 * new, old)
+        for (name, old), new in zip(samples._asdict().items(), other, strict=True)
+        if name not in ("pixels", "state", "weight")
     }
-    again = jax.grad(loss, argnums=(0, 1))(policy().mean, value, samples._replace(**changed))
-    for one, two in zip(gradients, again, strict=True):
+    for one, two in zip(expected, gradients(*given, samples._replace(**changed)), strict=True):
         np.testing.assert_array_equal(one, two)
-
-
-def test_a_batch_in_which_nothing_counts_has_no_gradient():
-    samples = batch()._replace(weight=jnp.zeros(B))
-    gradient = jax.grad(
-        lambda mean: policy_loss(policy().replace(mean=mean), samples, CONFIG, KEY)[0]
-    )(policy().mean)
-    np.testing.assert_array_equal(gradient, 0)
+    # A batch in which nothing counts has no gradient.
+    for gradient in gradients(*given, samples._replace(weight=jnp.zeros(B))):
+        np.testing.assert_array_equal(gradient, 0)
 
 
 def test_normalized_numbers_have_mean_0_and_deviation_1_where_they_count():
@@ -145,7 +137,7 @@ def test_a_clipped_value_gains_nothing_beyond_the_bound(value, loss, slope):
 
 @pytest.mark.parametrize("max_grad_norm", [0.0, 0.5])
 def test_steps_are_those_of_adam_with_each_network_s_gradient_clipped(max_grad_norm):
-    config = TrainConfig(learning_rate=0.01, adam_eps=1e-5, max_grad_norm=max_grad_norm)
+    config = OnPolicyConfig(learning_rate=0.01, adam_eps=1e-5, max_grad_norm=max_grad_norm)
     optimizer = Optimizer(config)
     clip = optax.clip_by_global_norm(max_grad_norm) if max_grad_norm else optax.identity()
     reference = optax.chain(clip, optax.adam(0.01, eps=1e-5))
@@ -170,7 +162,7 @@ def test_steps_are_those_of_adam_with_each_network_s_gradient_clipped(max_grad_n
 
 
 def test_networks_without_a_gradient_stay():
-    optimizer = Optimizer(TrainConfig())
+    optimizer = Optimizer(OnPolicyConfig())
     networks = {name: jnp.ones(3) for name in ("learns", "stays")}
     opt_state = optimizer.init(networks)
     for t in range(3):
@@ -184,10 +176,10 @@ def test_networks_without_a_gradient_stay():
 
 
 def test_the_step_size_falls_along_a_line_to_0():
-    config = TrainConfig(anneal=True, learning_rate=0.1, total_steps=256 * 64 * 8)
+    config = OnPolicyConfig(anneal=True, learning_rate=0.1, total_steps=256 * 64 * 8)
     rate = Optimizer(config).learning_rate
     rates = [float(rate(jnp.uint32(i))) for i in range(10)]
     np.testing.assert_allclose(rates[:9], 0.1 * (1 - np.arange(9) / 8), atol=1e-8)
     assert rates[8] == rates[9] == 0.0
-    constant = Optimizer(TrainConfig(learning_rate=0.1)).learning_rate
+    constant = Optimizer(OnPolicyConfig(learning_rate=0.1)).learning_rate
     assert float(constant(jnp.uint32(2**31))) == pytest.approx(0.1)

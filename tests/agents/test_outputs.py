@@ -16,14 +16,15 @@ import pytest
 from tensorboardX.proto.event_pb2 import Event
 from tensorboardX.record_writer import masked_crc32c
 
+from pixelbrax_jax import stop_signals
 from pixelbrax_jax.agents.on_policy.ppo import PPO, PPOConfig
-from pixelbrax_jax.agents.runner import interruption, metrics, saving, train
-from pixelbrax_jax.agents.runner.checkpoint import CheckpointError, Checkpoints
-from pixelbrax_jax.agents.runner.metrics import AppendedFile, MetricsWriter, read_metrics
+from pixelbrax_jax.agents.runner import metrics, saving, train
+from pixelbrax_jax.agents.runner.checkpoint import CheckpointError, latest_steps
+from pixelbrax_jax.agents.runner.metrics import AppendedFile, open_metrics, read_metrics
 from pixelbrax_jax.agents.runner.progress import Bar, Messages
-from pixelbrax_jax.agents.runner.saving import Saver
+from pixelbrax_jax.agents.runner.saving import Checkpoints
 from pixelbrax_jax.agents.runner.train import RunConfig, run
-from tests.agents.small import PARAMS, SMALL, ball_envs, same
+from tests.agents.small import ABOUT, PARAMS, SMALL, ball_envs, same
 
 PER_ITERATION = SMALL["num_envs"] * SMALL["num_steps"]
 
@@ -84,7 +85,7 @@ def test_no_more_than_so_much_waits(tmp_path, monkeypatch):
 
 def test_records_are_complete_when_there_is_room_again(tmp_path):
     told = []
-    writer = MetricsWriter(tmp_path, {}, first_step=7, report=told.append)
+    writer = open_metrics(tmp_path, {}, told.append, first_step=7)
     with files_of_at_most(100):
         for steps in (10, 20, 2**33):
             writer.write(steps, {"loss/value": 0.5, "learning_rate": 0.25})
@@ -108,7 +109,7 @@ def test_records_are_complete_when_there_is_room_again(tmp_path):
 
 def test_a_disk_that_stays_full_is_told_at_the_end(tmp_path):
     told = []
-    writer = MetricsWriter(tmp_path, {}, report=told.append)
+    writer = open_metrics(tmp_path, {}, told.append)
     writer.write(10, {"x": 1.0})
     with files_of_at_most(60):
         writer.write(20, {"x": 1.0})
@@ -133,7 +134,7 @@ def test_weights_and_biases_may_fail(tmp_path, monkeypatch):
 
     monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(init=lambda **_: Run()))
     told = []
-    writer = MetricsWriter(tmp_path, {}, wandb_project="p", report=told.append)
+    writer = open_metrics(tmp_path, {}, told.append, wandb_project="p")
     for steps in (1, 2, 3):
         writer.write(steps, {"x": 0.0})
     writer.close()
@@ -157,6 +158,14 @@ class BrokenPipe:
         raise BrokenPipeError(32, "Broken pipe")
 
 
+def test_a_bar_is_shown_on_terminals_unless_asked_for(monkeypatch):
+    yes, no = (SimpleNamespace(isatty=lambda told=told: told) for told in (True, False))
+    for terminal in (yes, no, None):
+        monkeypatch.setattr(sys, "stderr", terminal)
+        assert RunConfig().progress == bool(terminal and terminal.isatty())
+        assert RunConfig(progress=True).progress
+
+
 def test_a_bar_that_cannot_be_drawn_is_told_once(monkeypatch):
     monkeypatch.setattr(sys, "stderr", BrokenPipe())
     told = []
@@ -177,7 +186,9 @@ def test_a_run_without_a_reader_is_the_same(tmp_path, monkeypatch):
     quiet = run(ppo(), PARAMS, RunConfig(str(tmp_path / "a"), progress=False))
     monkeypatch.setattr(sys, "stderr", BrokenPipe())
     # A clock that asks for a checkpoint after every iteration, as far as it can.
-    options = RunConfig(str(tmp_path / "b"), checkpoint_minutes=1e-9, keep_checkpoints=9)
+    options = RunConfig(
+        str(tmp_path / "b"), checkpoint_minutes=1e-9, keep_checkpoints=9, progress=True
+    )
     outcome = run(ppo(), PARAMS, options, report=report)
     assert same(outcome.state, quiet.state)
     assert quiet.incomplete == ()
@@ -197,60 +208,56 @@ def test_a_policy_that_cannot_be_written_costs_no_checkpoint(tmp_path, monkeypat
     algorithm = PPO(PPOConfig(**SMALL), ball_envs())
     with pytest.raises(OSError, match=r"policy.jax: No space left on device.*160 steps is whole"):
         run(algorithm, PARAMS, RunConfig(str(tmp_path), progress=False))
-    checkpoints = Checkpoints(tmp_path / "checkpoints", {}, "ppo")
-    assert checkpoints.steps() == [5 * PER_ITERATION]
-    checkpoints.close()
+    assert latest_steps(tmp_path / "checkpoints") == 5 * PER_ITERATION
 
 
 def test_a_checkpoint_is_tried_again(tmp_path, monkeypatch):
     free, now, told = [1 << 40], [0.0], []
     monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=free[0]))
     monkeypatch.setattr(saving, "time", SimpleNamespace(monotonic=lambda: now[0]))
-    checkpoints = Checkpoints(tmp_path, {}, "ppo")
+    checkpoints = Checkpoints(tmp_path, ABOUT, minutes=10, report=told.append)
     state = {"x": jnp.arange(3)}
-    saver = Saver(checkpoints, 0, told.append, every=0, minutes=10)
-    assert not saver.is_due_by_clock()
+    assert not checkpoints.is_due_by_clock()
     now[0] = 600
-    assert saver.is_due_by_clock()
-    saver.save(state, 10, None, last=False)
-    saver.look_after(wait=True)
-    assert not saver.is_due_by_clock()
+    assert checkpoints.is_due_by_clock()
+    checkpoints.save(state, 10, None)
+    checkpoints.look_after(wait=True)
+    assert not checkpoints.is_due_by_clock()
     free[0] = 1
     for steps in (20, 30):
-        saver.save(state, steps, None, last=False)
+        checkpoints.save(state, steps, None)
     (line,) = told
     assert "Training goes on" in line
     now[0] = 661
-    assert saver.is_due_by_clock(), "sooner than usual"
+    assert checkpoints.is_due_by_clock(), "sooner than usual"
     free[0] = 1 << 40
-    saver.save(state, 40, None, last=False)
-    saver.look_after(wait=True)
+    checkpoints.save(state, 40, None)
+    checkpoints.look_after(wait=True)
     assert told[1:] == ["the checkpoint of 40 steps is written"]
     free[0] = 1
     with pytest.raises(CheckpointError, match=r"of 50 steps.*is lost; that of 40 steps stays"):
-        saver.save(state, 50, None, last=True)
+        checkpoints.save(state, 50, None, last=True)
     assert checkpoints.steps() == [10, 40]
     checkpoints.close()
 
 
 def test_a_checkpoint_that_fails_while_it_is_written_leaves_the_others(tmp_path, caplog):
     told = []
-    checkpoints = Checkpoints(tmp_path, {}, "ppo", keep=1)
-    saver = Saver(checkpoints, 0, told.append, every=10, minutes=0)
+    checkpoints = Checkpoints(tmp_path, ABOUT, keep=1, every=10, report=told.append)
     state = {"x": jnp.arange(300_000.0) % 7919 * 1.37}
-    saver.save(state, 10, None, last=True)
+    checkpoints.save(state, 10, None, last=True)
     with files_of_at_most(5_000):
-        saver.save(state, 20, None, last=False)
+        checkpoints.save(state, 20, None)
         end = time.monotonic() + 60
         while not told and time.monotonic() < end:
-            saver.look_after()
+            checkpoints.look_after()
             time.sleep(0.01)
     assert "File too large" in told[0]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["10"], "and nothing half written"
-    assert saver.latest() == 10
+    assert checkpoints.latest() == 10
     assert not [record for record in caplog.records if record.exc_info], "no traceback"
-    assert not saver.is_due_after(29)
-    saver.save(state, 30, None, last=True)
+    assert not checkpoints.is_due_after(29)
+    checkpoints.save(state, 30, None, last=True)
     assert checkpoints.steps() == [30]
     checkpoints.close()
 
@@ -258,8 +265,8 @@ def test_a_checkpoint_that_fails_while_it_is_written_leaves_the_others(tmp_path,
 def test_only_a_second_ctrl_c_stops_at_once(monkeypatch):
     now, lines = [100.0], []
     before = signal.getsignal(signal.SIGINT)
-    monkeypatch.setattr(interruption, "time", SimpleNamespace(monotonic=lambda: now[0]))
-    with interruption.stop_requests(lines.append) as request:
+    monkeypatch.setattr(stop_signals, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    with stop_signals.stop_requests(lines.append) as request:
         assert not request.signal
         for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGTERM, signal.SIGINT):
             signal.raise_signal(number)
@@ -268,7 +275,7 @@ def test_only_a_second_ctrl_c_stops_at_once(monkeypatch):
         assert len(lines) == 1
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
-    with interruption.stop_requests(lines.append):
+    with stop_signals.stop_requests(lines.append):
         # One key press that a wrapper passes on again.
         for _ in range(2):
             signal.raise_signal(signal.SIGINT)
@@ -286,7 +293,7 @@ NUMBERS = [
 @pytest.mark.parametrize("number", NUMBERS)
 def test_what_schedulers_send_is_a_request_to_stop(number):
     lines, before = [], signal.getsignal(number)
-    with interruption.stop_requests(lines.append) as request:
+    with stop_signals.stop_requests(lines.append) as request:
         os.kill(os.getpid(), number)
         assert request.signal == number
     assert lines[0].startswith(f"{number.name}: stopping within two iterations, with a checkpoint")
@@ -299,11 +306,11 @@ def test_signals_that_the_program_uses_stay_its_own(number):
     got = []
     before = signal.signal(number, lambda number, _: got.append(number))
     try:
-        with interruption.stop_requests(got.append) as request:
+        with stop_signals.stop_requests(got.append) as request:
             os.kill(os.getpid(), number)
             assert (request.signal, got) == (0, [number])
         signal.signal(number, signal.SIG_IGN)
-        with interruption.stop_requests(got.append) as request:
+        with stop_signals.stop_requests(got.append) as request:
             os.kill(os.getpid(), number)
             assert (request.signal, got) == (0, [number])
     finally:

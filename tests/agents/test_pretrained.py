@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from pixelbrax_gym.cli import main
 from pixelbrax_jax import list_pretrained, load_policy, make, policy
 from pixelbrax_jax.agents.registry import ALGORITHMS
 from pixelbrax_jax.agents.runner.trained import load_pretrained
-from pixelbrax_jax.cli import main
 
 
 @pytest.mark.parametrize("name", list_pretrained())
@@ -26,7 +26,7 @@ def test_a_pretrained_policy_is_small_and_fits_its_environment(name):
     assert action.shape == (3, env.action_size)
     assert np.all(np.isfinite(action))
     agent = load_pretrained(name)
-    assert agent.algorithm.config.task == name
+    assert agent.algorithm.config.env.task == name
     assert about["algorithm"] in ALGORITHMS
     assert agent.steps == about["steps"]
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from pixelbrax_jax import PixelEnv, VectorPixelEnv
-from pixelbrax_jax.agents.networks.actor import Actor, Critic
+from pixelbrax_jax.agents.networks.actor_critic import Actor, Critic
 from pixelbrax_jax.agents.on_policy.dcpg import DCPG, DCPGConfig
 from pixelbrax_jax.agents.on_policy.ppg import PPG, PPGConfig
 from pixelbrax_jax.agents.on_policy.ppo import PPO, PPOConfig
@@ -76,14 +76,14 @@ def learned(request, envs, images):
     """Values and mean actions by place, of an agent that has learned."""
     make, config = AGENTS[request.param]
     algorithm = make(config, envs)
-    number = algorithm.num_phases or 2
+    number = algorithm.auxiliary_every or 2
 
     @partial(jax.jit, compiler_options=optimized())
     def phase(state):
         state, _ = jax.lax.scan(
             lambda state, _: algorithm.iterate(state, PARAMS), state, length=number
         )
-        return algorithm.auxiliary(state)[0] if algorithm.num_phases else state
+        return algorithm.auxiliary(state)[0] if algorithm.auxiliary_every else state
 
     state = algorithm.init(jax.random.key(0), PARAMS)
     for _ in range(config.num_iterations // number):

@@ -6,17 +6,17 @@ import json
 import zipfile
 from pathlib import Path
 
-import jax
 import pytest
 
 from pixelbrax_jax.agents.on_policy.ppg import PPGConfig
 from pixelbrax_jax.agents.on_policy.ppo import PPO, PPOConfig
 from pixelbrax_jax.agents.runner import settings
-from pixelbrax_jax.agents.runner.checkpoint import CheckpointError, Checkpoints, read_about
-from pixelbrax_jax.agents.runner.seeds import Runs
+from pixelbrax_jax.agents.runner.checkpoint import CheckpointError, read_about
+from pixelbrax_jax.agents.runner.programs import Runs
+from pixelbrax_jax.agents.runner.saving import Checkpoints
 from pixelbrax_jax.agents.runner.train import RunConfig, run
 from pixelbrax_jax.agents.runner.trained import load_config
-from tests.agents.small import PARAMS, SMALL, ball_envs, same
+from tests.agents.small import OPTIONS, PARAMS, SMALL, ball_envs, same
 
 ARCHIVE = Path(__file__).with_name("run_0_2_0.zip")
 """The checkpoint of release 0.2.0 after the first of five iterations of PPO, with ``SMALL``."""
@@ -48,14 +48,11 @@ def change(folder: Path, *, without: tuple[str, ...] = (), **changes) -> None:
 
 
 def restore(folder: Path, algorithm: PPO, name: str = "ppo"):
-    checkpoints = Checkpoints(
-        folder / "checkpoints",
-        settings.settings_of(algorithm, RunConfig()),
-        name,
-        former=settings.former_settings(type(algorithm.config)),
-    )
+    about = settings.describe_run(algorithm, RunConfig()) | {"algorithm": name}
+    former = settings.former_settings(type(algorithm.config))
+    checkpoints = Checkpoints(folder / "checkpoints", about, former=former)
     try:
-        return checkpoints.restore(jax.eval_shape(Runs(algorithm, 1).init, 0, PARAMS))
+        return checkpoints.restore(Runs(algorithm).template(PARAMS))
     finally:
         checkpoints.close()
 
@@ -93,7 +90,7 @@ def test_a_setting_that_a_run_lacks_has_the_default_of_its_time(folder, monkeypa
 def test_a_default_of_0_2_0_that_changes_is_kept_for_older_runs(folder):
     stored = read_about(folder / "checkpoints")["config"]
     former = settings.former_settings(PPOConfig)
-    by_default = former.keys() - {*SMALL, "layout"}
+    by_default = former.keys() - {*SMALL, *OPTIONS, "episode_length", "layout"}
     expected = {name: stored[name] for name in by_default & stored.keys()} | SINCE
     assert {name: former[name] for name in by_default} == expected
 

@@ -10,17 +10,11 @@ import numpy as np
 import pytest
 
 from pixelbrax_jax import PixelEnv, VectorPixelEnv
-from pixelbrax_jax.agents.config import TrainConfig
-from pixelbrax_jax.agents.networks.distributions import Normal
 from pixelbrax_jax.agents.on_policy import phasic
-from pixelbrax_jax.agents.on_policy.experience import Experience
-from pixelbrax_jax.agents.on_policy.rollout import (
-    Decision,
-    collect,
-    minibatch_times,
-    observations,
-    shifted,
-)
+from pixelbrax_jax.agents.on_policy.algorithm import Decision, Experience, minibatch_times
+from pixelbrax_jax.agents.on_policy.ppg import PPG, PPGConfig
+from pixelbrax_jax.agents.rollout import collect, observations, shifted
+from pixelbrax_jax.config import EnvConfig
 from tests.envs.toy import Ball, limited
 
 T, N = 15, 4
@@ -35,11 +29,10 @@ class FastBall(Ball):
     dt = 0.3
 
 
-def decide(pixels, state, key) -> Decision:
+def choose(pixels, state, key):
     """Actions about ``SPEED``; what is seen is kept in place of a value."""
-    raw = SPEED[:, None] + 0.01 * jax.random.normal(key, (N, 1))
-    brightness = pixels.astype(jnp.float32).mean((1, 2, 3))
-    return Decision(raw, raw, brightness, pixels)
+    action = SPEED[:, None] + 0.01 * jax.random.normal(key, (N, 1))
+    return action, Decision(action, None, pixels)
 
 
 CASES = {"one frame": (1, 0), "three frames": (3, 0), "three frames, shifted": (3, 2)}
@@ -51,124 +44,113 @@ def played(request):
     stack, shift = request.param
     env = PixelEnv(FastBall(), height=10, width=12, frame_stack=stack)
     envs = VectorPixelEnv(env, N)
-    play = jax.jit(lambda state, key: collect(envs, state, PARAMS, decide, key, T, shift))
+    play = jax.jit(lambda state, key: collect(envs, state, PARAMS, choose, key, T, shift))
     start, _ = envs.reset(jax.random.key(0), PARAMS)
     middle, first = play(start, jax.random.key(1))
     end, second = play(middle, jax.random.key(2))
+    both = jax.tree.map(
+        lambda *x: np.concatenate(x), *(r.replace(frames=()) for r in (first, second))
+    )
     return SimpleNamespace(
-        envs=envs, play=play, start=start, end=end, rollouts=(first, second), shift=shift,
-        stack=stack, again=jax.jit(lambda f, t: observations(f, t, shift)),
+        envs=envs, play=play, start=start, end=end, rollouts=(first, second), both=both,
+        shift=shift, stack=stack, again=jax.jit(lambda f, t: observations(f, t, shift)),
     )  # fmt: skip
 
 
-def step_by_step(played) -> SimpleNamespace:
-    """The same actions in a plain loop over ``step``: stacks before each step, and timesteps."""
-    state, seen, timesteps, began = played.start, [], [], []
-    for rollout in played.rollouts:
-        for t in range(T):
-            seen.append(np.asarray(played.envs.obs(state)))
-            began.append(np.asarray(state.done))
-            state, timestep = played.envs.step(state, rollout.unclipped_action[t], PARAMS)
-            timesteps.append(timestep)
-    timesteps = jax.tree.map(lambda *x: np.stack(x), *timesteps)
-    return SimpleNamespace(seen=np.stack(seen), began=np.stack(began), timesteps=timesteps)
-
-
-def of_both(played, name: str) -> np.ndarray:
-    return np.concatenate([getattr(rollout, name) for rollout in played.rollouts])
-
-
 def test_a_rollout_is_what_stepping_by_hand_gives(played):
-    expected = step_by_step(played)
-    timesteps = expected.timesteps
+    state, seen, began, timesteps = played.start, [], [], []
+    for action in played.both.choice.unclipped_action:
+        seen.append(np.asarray(played.envs.obs(state)))
+        began.append(np.asarray(state.done))
+        state, timestep = played.envs.step(state, action, PARAMS)
+        timesteps.append(timestep)
+    timesteps = jax.tree.map(lambda *x: np.stack(x), *timesteps)
     assert timesteps.terminated[:, :2].any()
     assert timesteps.truncated[:, 2:].any()
+    both = played.both
     for name in ("terminated", "truncated"):
-        np.testing.assert_array_equal(of_both(played, name), getattr(timesteps, name))
-    np.testing.assert_array_equal(of_both(played, "valid"), ~expected.began)
-    length = timesteps.info["episode_length"]
-    np.testing.assert_array_equal(of_both(played, "episode_length"), length)
+        np.testing.assert_array_equal(getattr(both, name), getattr(timesteps, name))
+    np.testing.assert_array_equal(both.valid, ~np.stack(began))
+    np.testing.assert_array_equal(both.episode_length, timesteps.info["episode_length"])
     # Two programs round in their own ways.
-    np.testing.assert_allclose(of_both(played, "reward"), timesteps.reward, atol=1e-6)
-    np.testing.assert_allclose(
-        of_both(played, "episode_return"), timesteps.info["episode_return"], atol=1e-5
-    )
+    np.testing.assert_allclose(both.reward, timesteps.reward, atol=1e-6)
+    np.testing.assert_allclose(both.episode_return, timesteps.info["episode_return"], atol=1e-5)
     if not played.shift:
-        apart = np.abs(of_both(played, "value").astype(int) - expected.seen)
+        apart = np.abs(both.choice.value.astype(int) - np.stack(seen))
         assert np.mean(apart > 1) <= 0.01
 
 
 def test_a_step_is_valid_unless_it_only_begins_an_episode(played):
-    done, valid = of_both(played, "done"), of_both(played, "valid")
-    assert valid[0].all()
-    np.testing.assert_array_equal(valid[1:], ~done[:-1])
-    length, reward = of_both(played, "episode_length"), of_both(played, "reward")
-    np.testing.assert_array_equal(length == 0, ~valid)
-    assert (reward[~valid] == 0).all()
+    both = played.both
+    assert both.valid[0].all()
+    np.testing.assert_array_equal(both.valid[1:], ~both.done[:-1])
+    np.testing.assert_array_equal(both.episode_length == 0, ~both.valid)
+    assert (both.reward[~both.valid] == 0).all()
     # Among them an end at the last step of the first rollout: the second one begins with a reset.
-    assert done[T - 1].any()
+    assert both.done[T - 1].any()
+
+
+def test_metrics_of_episodes_are_those_of_their_ends(played):
+    both, metrics = played.both, played.both.episode_metrics()
+    assert int(metrics["episode/count"]) == both.done.sum()
+    for name in ("return", "length"):
+        expected = getattr(both, f"episode_{name}")[both.done].sum()
+        assert float(metrics[f"episode/{name}_sum"]) == pytest.approx(expected, rel=1e-5)
 
 
 def test_stacks_put_together_again_are_those_that_were_seen(played):
     everything = jnp.broadcast_to(jnp.arange(T)[:, None], (T, N))
+    some = minibatch_times(jax.random.key(3), T, N, 3)[1]
     for rollout in played.rollouts:
-        seen = np.asarray(rollout.value)
-        again = played.again(rollout.frames, everything)
-        # One environment after the other.
-        np.testing.assert_array_equal(
-            np.reshape(again, (N, T, *seen.shape[2:])).swapaxes(0, 1), seen
-        )
         assert rollout.frames.pixels.shape == (T + played.stack - 1, N, 10, 12, 3)
+        seen = np.asarray(rollout.choice.value)
+        for times in (everything, some):
+            # One environment after the other, times as they were asked for.
+            again = np.reshape(
+                played.again(rollout.frames, times), (N, len(times), *seen.shape[2:])
+            )
+            np.testing.assert_array_equal(again.swapaxes(0, 1), seen[times, np.arange(N)])
     # Stacks across a boundary of episodes have been among them, and they repeat a frame.
-    starts = np.argwhere(~of_both(played, "valid")[:-1])
+    starts = np.argwhere(~played.both.valid[:-1])
     assert len(starts)
-    frames = of_both(played, "value").reshape(2 * T, N, 10, 12, played.stack, 3)
+    frames = played.both.choice.value.reshape(2 * T, N, 10, 12, played.stack, 3)
     for t, i in starts:
         first = frames[t + 1, i]
         np.testing.assert_array_equal(first, np.broadcast_to(first[..., -1:, :], first.shape))
 
 
-def test_stacks_of_any_times_come_in_the_order_asked_for(played):
-    rollout = played.rollouts[1]
-    times = minibatch_times(jax.random.key(3), T, N, 3)[1]
-    again = np.reshape(played.again(rollout.frames, times), (N, T // 3, 10, 12, -1))
-    seen = np.asarray(rollout.value)
-    for row, per_env in enumerate(np.asarray(times)):
-        for i, t in enumerate(per_env):
-            np.testing.assert_array_equal(again[i, row], seen[t, i])
-
-
 def test_the_last_observation_is_that_of_the_state_left_behind(played):
     rollout = played.rollouts[-1]
     last = shifted(played.envs.obs(played.end), rollout.frames.shift, played.shift)
-    np.testing.assert_array_equal(rollout.last_value, last)
+    np.testing.assert_array_equal(rollout.last_choice.value, last)
 
 
 def test_chunks_of_the_buffer_are_the_rollouts(played):
-    config = TrainConfig(
-        height=10, width=12, frame_stack=played.stack, num_envs=N, num_steps=T, encoder="impala",
-        random_shift=played.shift, num_minibatches=1,
+    parts = 3
+    config = PPGConfig(
+        env=EnvConfig(height=10, width=12, frame_stack=played.stack), num_envs=N, num_steps=T,
+        encoder="impala", random_shift=played.shift, num_minibatches=1, num_policy_phases=2,
+        aux_minibatches=2 * parts,
     )  # fmt: skip
-    experiences = [Experience(x, x.reward, x.reward) for x in played.rollouts]
-    buffer = jax.tree.map(
-        lambda x: jnp.zeros((2, *x.shape), x.dtype), phasic._entry(experiences[0])
-    )
-    for slot, experience in enumerate(experiences):
-        buffer = phasic.remember(buffer, jnp.uint32(slot), experience)
-    parts, policy = 3, Normal(jnp.zeros(()), jnp.ones(()), False)
+    entries = [phasic._entry(Experience(x, x.reward, x.reward)) for x in played.rollouts]
+    buffer = jax.tree.map(lambda *x: jnp.stack(x), *entries)
     # Of each environment another chunk: the second and third of each rollout.
     which = np.array([1, 5, 2, 4])
-    chunk = phasic._chunk(config, buffer, jnp.asarray(which), parts, policy)
+    chunk = PPG(config, played.envs)._chunk(buffer, jnp.asarray(which), None)
     size = T // parts
     assert chunk.num_steps == size
-    fields = {"pixels": "value", "returns": "reward", "weight": "valid"}
-    for name, field in (fields | {"unclipped_action": "unclipped_action"}).items():
-        actual = np.asarray(getattr(chunk, name))
-        actual = actual.reshape(N, size, *actual.shape[1:])
-        for i, number in enumerate(which):
-            rollout, first = number // parts, number % parts * size
-            expected = getattr(played.rollouts[rollout], field)[first : first + size, i]
-            np.testing.assert_array_equal(actual[i], expected)
+    for i, number in enumerate(which):
+        rollout, first = played.rollouts[number // parts], number % parts * size
+        wanted = {
+            "pixels": rollout.choice.value,
+            "unclipped_action": rollout.choice.unclipped_action,
+            "returns": rollout.reward,
+            "weight": rollout.valid,
+        }
+        for name, expected in wanted.items():
+            actual = np.asarray(getattr(chunk, name))
+            actual = actual.reshape(N, size, *actual.shape[1:])[i]
+            np.testing.assert_array_equal(actual, expected[first : first + size, i])
 
 
 def test_an_environment_does_not_depend_on_its_neighbours(played):
@@ -179,15 +161,15 @@ def test_an_environment_does_not_depend_on_its_neighbours(played):
     _, changed = played.play(start, jax.random.key(1))
     first = played.rollouts[0]
     assert not np.array_equal(changed.reward[:, 0], first.reward[:, 0])
-    names = ("reward", "done", "valid", "value", "log_prob", "episode_return", "unclipped_action")
-    for name in names:
-        actual, expected = getattr(changed, name), getattr(first, name)
+    for actual, expected in zip(
+        *(jax.tree.leaves(r.replace(frames=(), last_choice=())) for r in (changed, first)),
+        strict=True,
+    ):
         np.testing.assert_array_equal(actual[:, 1:], expected[:, 1:])
 
 
 def test_every_step_draws_its_own_actions(played):
-    raw = of_both(played, "unclipped_action")
-    assert len({step.tobytes() for step in raw}) == 2 * T
+    assert len({step.tobytes() for step in played.both.choice.unclipped_action}) == 2 * T
 
 
 def test_shifts_repeat_the_edge():

@@ -1,4 +1,4 @@
-"""What follows an iteration, where the environments are in a training state, and equal runs."""
+"""When evaluations are due, where the environments are in a training state, and equal runs."""
 
 from __future__ import annotations
 
@@ -10,44 +10,27 @@ import pytest
 from flax import struct
 
 from pixelbrax_jax import PixelEnv, VectorPixelEnv
-from pixelbrax_jax.agents.env_axis import along_envs, as_declared, env_axes, without_envs
 from pixelbrax_jax.agents.on_policy.dcpg import DCPG, DCPGConfig
 from pixelbrax_jax.agents.on_policy.ppg import PPG, PPGConfig
 from pixelbrax_jax.agents.on_policy.ppo import PPO, PPOConfig
-from pixelbrax_jax.agents.runner import programs
 from pixelbrax_jax.agents.runner.evaluate import Evaluator
-from pixelbrax_jax.agents.runner.schedule import Schedule
-from pixelbrax_jax.agents.runner.seeds import Runs
+from pixelbrax_jax.agents.runner.programs import Runs
+from pixelbrax_jax.agents.runner.train import is_due
+from pixelbrax_jax.agents.train_state import along_envs, as_declared, env_axes, without_envs
 from tests.agents.small import OPTIONS, PARAMS, PHASIC, SMALL, ball_envs
 from tests.compilations import counted
 from tests.envs.toy import Ball, limited
 
 ENVS = ball_envs()
 SEVEN = VectorPixelEnv(ENVS.env, 7)
-SCHEDULE = Schedule(num_iterations=10, num_phases=4, log_every=3, num_evals=2)
 
 
-def test_jobs_come_in_their_order():
-    jobs = {number: SCHEDULE.jobs(number) for number in range(1, 11)}
-    every = ("log", "evaluate", "save")
-    assert {n: done for n, done in jobs.items() if done} == {
-        3: ("log",), 5: every, 6: ("log",), 9: ("log",), 10: every,
-    }  # fmt: skip
-    assert SCHEDULE.jobs(1, save=True) == ("log", "save")
-
-
-def test_a_run_that_is_asked_to_stop_saves_first():
-    assert SCHEDULE.jobs(1, stop=True) == ("log", "save", "report_stop")
-    assert SCHEDULE.jobs(5, stop=True) == ("log", "save", "report_stop", "evaluate")
-
-
-def test_phases_and_evaluations_are_spread_evenly():
-    numbers = range(1, 11)
-    assert [n for n in numbers if SCHEDULE.has_auxiliary_phase(n)] == [4, 8]
-    never = Schedule(10, 0, 1, 0)
-    assert not any(never.has_auxiliary_phase(n) or never.evaluates(n) for n in numbers)
-    often = Schedule(num_iterations=3, num_phases=0, log_every=1, num_evals=7)
-    assert all(often.evaluates(n) for n in range(1, 4))
+@pytest.mark.parametrize(
+    ("times", "total", "expected"),
+    [(2, 10, [5, 10]), (3, 10, [4, 7, 10]), (0, 10, []), (7, 3, [1, 2, 3])],
+)
+def test_evaluations_are_spread_evenly(times, total, expected):
+    assert [n for n in range(1, total + 1) if is_due(n, times, total)] == expected
 
 
 @pytest.mark.parametrize(
@@ -111,8 +94,8 @@ def test_equal_settings_are_equal_algorithms():
 def test_a_run_like_one_before_compiles_nothing():
     def train(seed, params):
         algorithm = make_ppo()
-        state = programs.init(Runs(algorithm), jnp.uint32(seed), params)
-        state, _ = programs.iterate(Runs(algorithm), state, params)
+        runs = Runs(algorithm)
+        state, _ = runs.iterate(runs.init(jnp.uint32(seed), params), params)
         env = PixelEnv(ENVS.env.physics, **OPTIONS)
         return Evaluator(algorithm, env, params, num_episodes=2)(state.networks)
 

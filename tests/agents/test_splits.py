@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import imageio.v3 as imageio
@@ -11,13 +10,8 @@ import numpy as np
 import pytest
 
 from pixelbrax_jax.agents.on_policy.ppo import PPOConfig
-from pixelbrax_jax.agents.runner.evaluate import (
-    NoSplitError,
-    make_split,
-    make_splits,
-    splits_of,
-)
 from pixelbrax_jax.agents.runner.settings import clip_digests
+from pixelbrax_jax.agents.runner.splits import NoSplitError, make_split, make_splits, splits_of
 from pixelbrax_jax.distractors import folders
 from pixelbrax_jax.distractors.clips import load_clips
 
@@ -40,7 +34,7 @@ def write_clips(folder: Path, names: str) -> Path:
 
 
 def config(clips: Path | str | None, split: str = "train", distractors: str = "video") -> PPOConfig:
-    return PPOConfig(
+    return PPOConfig().replace(
         task="inverted_pendulum",
         distractors=distractors,
         clips=None if clips is None else str(clips),
@@ -66,7 +60,7 @@ def test_a_run_is_evaluated_on_its_own_split_and_on_the_held_out_one(split, held
         for letter, name in zip("abcdefgh", names, strict=True):
             write_clips(images, letter).joinpath(letter).rename(images / name)
         clips = tmp_path
-    made = make_splits(config(clips, split))
+    made = dict(make_splits(config(clips, split)))
     assert list(made) == ["clean", "train", "test"]
     assert shown(made["train"]) == digests(clips, split)
     assert shown(made["test"]) == digests(clips, held_out)
@@ -79,18 +73,18 @@ def test_clips_of_training_are_no_test(split, tmp_path):
     folder = write_clips(tmp_path / "clips" / ("" if split == "all" else split), "ab").parents[0]
     folder = tmp_path / "clips" if split == "all" else folder
     lines = []
-    made = make_splits(config(folder, split), report=lines.append)
+    made = dict(make_splits(config(folder, split), report=lines.append))
     assert list(made) == ["clean", "train"]
     (line,) = lines
     assert f"no split 'test': of the 2 clips of split {split!r} of {folder}, training" in line
     with pytest.raises(NoSplitError, match="training plays 2; --clips takes others"):
-        make_split(config(folder, split), "test")
+        dict(make_splits(config(folder, split), ["test"]))
 
 
 def test_the_test_split_of_a_folder_must_have_other_clips(tmp_path):
     write_clips(tmp_path / "train", "abc")
     lines = []
-    assert "test" not in make_splits(config(tmp_path), report=lines.append)
+    assert "test" not in dict(make_splits(config(tmp_path), report=lines.append))
     assert lines[0].startswith("no split 'test': ")
     write_clips(tmp_path / "test", "cd")
     with pytest.raises(NoSplitError, match=r"of the 2 clips of split 'test'.*training plays 1;"):
@@ -104,11 +98,11 @@ def test_clips_of_another_folder_are_those_of_training_by_their_content(tmp_path
     write_clips(tmp_path / "copy", "ab")
     write_clips(tmp_path / "others", "cd")
     of_run = config(tmp_path / "there", "all")
-    here = replace(of_run, clips=str(tmp_path / "copy"))
+    here = of_run.replace(clips=str(tmp_path / "copy"))
     assert shown(make_split(here, "train", trained)) == trained
     with pytest.raises(NoSplitError, match="training plays 2"):
         make_split(here, "test", trained)
-    here = replace(of_run, clips=str(tmp_path / "others"))
+    here = of_run.replace(clips=str(tmp_path / "others"))
     assert shown(make_split(here, "test", trained)) == digests(tmp_path / "others", "all")
     with pytest.raises(NoSplitError, match="others are not those of the training"):
         make_split(here, "train", trained)
@@ -124,7 +118,7 @@ def test_without_clips_nothing_is_held_out():
 
 def test_a_folder_that_is_elsewhere_is_told_with_the_place(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(FileNotFoundError, match=rf"at {tmp_path}/clips\..*name .* with --clips"):
+    with pytest.raises(FileNotFoundError, match=rf"name .* with --clips: .* at {tmp_path}/clips\."):
         make_split(config("clips"), "train")
     write_clips(tmp_path / "clips" / "train", "a")
     with pytest.raises(NoSplitError, match=f"^{tmp_path}/clips has no split 'test'"):

@@ -10,9 +10,9 @@ import jax
 import numpy as np
 import pytest
 
+from pixelbrax_gym.cli import main
 from pixelbrax_jax import make, named_rigs, registry
 from pixelbrax_jax.agents.runner.checkpoint import read_about
-from pixelbrax_jax.cli import main
 from tests.agents.small import OPTIONS, PARAMS
 from tests.agents.test_splits import write_clips
 

@@ -13,14 +13,23 @@ from pixelbrax_gym.bench import runner
 from pixelbrax_gym.bench.case import Case, Group
 from pixelbrax_gym.bench.cases import FULL, TASKS
 from pixelbrax_gym.bench.machine import num_cores
-from pixelbrax_gym.bench.plot import DM_CONTROL
 from pixelbrax_gym.bench.tables import interleaved
 from pixelbrax_jax.tasks import DMC_TASKS
 from tests.benchmarks import tables
+from tests.benchmarks.ahead import tables as compiled
+from tests.benchmarks.ahead.case import PROGRAMS, AheadCase
+from tests.benchmarks.ahead.targets import CARDS
 from tests.benchmarks.original import ORIGINAL
 from tests.benchmarks.peers.install import peer_python
 
 HERE = "tests.benchmarks"
+DM_CONTROL = {
+    "halfcheetah": "cheetah",
+    "walker2d": "walker",
+    "ant": "quadruped",
+    "humanoid": "humanoid",
+}
+"""Task -> DM Control's domain of the same class."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +47,7 @@ class PeerCase(Case):
         arguments = {**self.arguments, "cores": num_cores()}
         if self.peer == "mujoco_warp":
             describe = Case("scene", "scene.describe", {"task": arguments["task"]}, HERE)
-            arguments["scene"] = runner.process(describe.command(), {}, 300.0)["values"]
+            arguments["scene"] = runner.run_process(describe.command(), {}, 300.0)["values"]
         script = Path(__file__).parent / f"{self.measure.replace('.', '/')}.py"
         return [python, str(script), json.dumps(arguments)]
 
@@ -57,24 +66,17 @@ def batches() -> Iterator[Case]:
         yield Case("batches", "batches.compare", {"task": task, "sizes": (100, 10, 1000)}, HERE)
 
 
-def sizes() -> Iterator[Case]:
-    """Pixels of 64 x 64."""
-    for task in TASKS:
-        for num_envs in (100, 1000):
-            where = {"task": task, "num_envs": num_envs, "size": 64}
-            yield Case("sizes", "throughput.scan", where)
-            yield Case("sizes", "throughput.renderer", where)
+def distractors() -> Iterator[Case]:
+    """Pixels with each distractor."""
+    for task, num_envs in (("ant", 256), ("ant", 1024), *((task, 1000) for task in TASKS)):
+        where = {"task": task, "num_envs": num_envs}
+        yield Case("distractors", "distractors.compare", where, HERE)
 
 
 def original() -> Iterator[Case]:
     """The settings in which the original's speed is known."""
     for task, num_envs, _ in ORIGINAL:
         yield Case("original", "throughput.scan", {"task": task, "num_envs": num_envs})
-
-
-def clips() -> Iterator[Case]:
-    """From a folder of images to the device."""
-    yield Case("clips", "bank.load", {"size": 84}, HERE)
 
 
 def startup() -> Iterator[Case]:
@@ -84,22 +86,18 @@ def startup() -> Iterator[Case]:
 
 
 def devices() -> Iterator[Case]:
-    """One device and eight, with as many environments in all, and with as many on each."""
-    for num_devices, num_envs in ((1, 64), (8, 64), (8, 512)):
-        where = {"task": "ant", "num_devices": num_devices, "num_envs": num_envs}
-        yield DevicesCase("devices", "scaling.stepping", where, HERE)
+    """Training on emulated devices, with as many cores of this machine."""
     for num_devices, cores, num_envs in ((1, 1, 64), (2, 2, 128), (1, 2, 128), (4, 2, 128)):
         where = {"num_devices": num_devices, "cores": cores, "num_envs": num_envs}
-        yield DevicesCase(
-            "devices", "scaling.training", {"task": "inverted_pendulum", **where}, HERE
-        )
+        where["task"] = "inverted_pendulum"
+        yield DevicesCase("devices", "scaling.training", where, HERE)
 
 
 def peers() -> Iterator[Case]:
     """Others and ourselves, one after the other; all hand NumPy arrays to Python."""
     for task in TASKS:
         for num_envs in (256, 1000):
-            yield Case("peers", "throughput.gymnasium", {"task": task, "num_envs": num_envs})
+            yield Case("peers", "throughput.gymnasium", {"task": task, "num_envs": num_envs}, HERE)
         for processes in (0, "cores", 32):
             where = {"task": task, "domain": DM_CONTROL[task], "processes": processes}
             yield PeerCase("peers", "peers.dm_control_envs", where, peer="dm_control")
@@ -121,6 +119,24 @@ def dmc() -> Iterator[Case]:
         yield PeerCase("dmc", "peers.dm_control_envs", where)
 
 
+def gpu_programs() -> Iterator[Case]:
+    """Programs for NVIDIA GPUs, of which none need be here."""
+    for card in CARDS:
+        for num_envs in (1024, 8192):
+            for task in TASKS:
+                for program in PROGRAMS:
+                    where = {"task": task, "program": program, "num_envs": num_envs, "card": card}
+                    yield AheadCase("gpu-program", "compiling.gpu", where)
+
+
+def tpu_programs() -> Iterator[Case]:
+    """Programs for a TPU, likewise."""
+    for task in ("inverted_pendulum", *TASKS):
+        for program in ("renderer", "step"):
+            where = {"task": task, "program": program, "num_envs": 1024}
+            yield AheadCase("tpu-program", "compiling.tpu", where, platform="tpu")
+
+
 GROUPS = {
     "renderer": FULL["renderer"],
     "startup": Group(
@@ -130,12 +146,12 @@ GROUPS = {
         "first, JAX and Brax when the environment is made.",
     ),
     "adapters": FULL["adapters"],
-    "distractors": FULL["distractors"],
-    "clips": Group(
-        clips,
-        tables.clips,
-        "Images of 854 x 480, as many as the training split of DAVIS-2017 has at most, just "
-        "written and so still in memory; one sample each.",
+    "distractors": Group(
+        distractors,
+        interleaved("num_envs", "distractors"),
+        "With a bank of 60 clips of 70 frames. Ratios are to the speed without: medians over "
+        "rounds, in which all take a turn of 1 to 100 steps in one process, with bootstrap "
+        "intervals of 95 %.",
     ),
     "original": Group(
         original,
@@ -164,8 +180,8 @@ GROUPS = {
     "devices": Group(
         devices,
         tables.devices,
-        "Emulated devices share the cores of the machine: the first table shows what is where, "
-        "and no speed. Ideal is the speed of one device on one core times the number of cores.",
+        "Training, PPO's preset `ci`. Emulated devices share the cores of the machine. Ideal is "
+        "the speed of one device on one core times the number of cores.",
     ),
     "batches": Group(
         batches,
@@ -174,7 +190,20 @@ GROUPS = {
         "in which all take a turn of 16,000 environment steps in one process, with bootstrap "
         "intervals of 95 %.",
     ),
-    "sizes": Group(sizes, tables.sizes, "Observations of 64 x 64."),
     "environments": FULL["environments"],
+    "gpu-program": Group(
+        gpu_programs,
+        compiled.gpu,
+        "Compiled, not run. Parts for the host are launched one after the other, a loop outside a "
+        "graph among them as one; 1 is one CUDA graph. A loop of unknown length counts as one "
+        "turn; outside a graph the host waits for it. Bytes count what every kernel reads and "
+        "writes once. The model takes a kernel's bytes at the bandwidth of the card's data sheet, "
+        "and 1.5 us at least: it compares forms of a program, and is no measurement.",
+    ),
+    "tpu-program": Group(
+        tpu_programs,
+        compiled.tpu,
+        "Compiled for a chip of a TPU v5e, not run. Bytes and times are the estimates of XLA.",
+    ),
 }
 """Parts of the whole benchmark, in the order in which they are measured."""

@@ -1,23 +1,21 @@
-"""Draws docs/dmc.md's tables and learning curves from the results in docs/dmc.
-
-python -m tests.benchmarks.dmc_page
-"""
+"""Tables, figures and learning curves of docs/dmc.md, from the results in docs/dmc."""
 
 from __future__ import annotations
 
 import json
+from contextlib import suppress
+from functools import cache
+from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
 
-from pixelbrax_gym.bench.tables import table
+from pixelbrax_gym.bench.tables import find, number, table
 from pixelbrax_jax.tasks import DMC_TASKS
 from tests.benchmarks import tables
-from tests.benchmarks.pages import redraw
 from tests.benchmarks.results import final, groups, return_at
 
 FOLDER = Path(__file__).parents[2] / "docs" / "dmc"
-PAGE = FOLDER.with_suffix(".md")
 
 
 def rows() -> list[dict]:
@@ -132,12 +130,41 @@ def plot(path: Path) -> None:
     figure.savefig(path, dpi=130)
 
 
-def page_tables() -> dict[str, str]:
-    """All of the page's tables, by name."""
-    return {draw.__name__: f"{draw()}\n" for draw in (speed, physics, learned, tasks)}
+def speeds(task: str) -> tuple[float, float]:
+    """Steps per second of a task, ours and dm_control's."""
+    ours, theirs = (
+        find(rows(), measure, task=task) for measure in ("dmc.pixels", "peers.dm_control_envs")
+    )
+    return ours["values"]["steps_per_second"], theirs["values"]["steps_per_second"]
 
 
-if __name__ == "__main__":
-    if PAGE.exists():
-        redraw(PAGE, page_tables())
-    plot(FOLDER / "learning.png")
+@cache
+def ratios() -> dict[str, float]:
+    """How many times as fast as dm_control, by task, the slowest first."""
+    found = {}
+    for task in dict.fromkeys(row["arguments"]["task"] for row in rows()):
+        with suppress(KeyError, TypeError):  # one side was not timed
+            ours, theirs = speeds(task)
+            found[task] = ours / theirs
+    return dict(sorted(found.items(), key=itemgetter(1)))
+
+
+def named(task: str) -> str:
+    """A task's ratio with its name."""
+    return f"{ratios()[task]:.0f} ({task.removeprefix('dmc_').replace('_', ' ')})"
+
+
+def end(name: str) -> str:
+    """The return at the end of the only run of that name."""
+    (run,) = kept_runs()[name]
+    return f"{final(run)['return']:.0f}"
+
+
+FIGURES = {"speed": speed, "physics": physics, "learned": learned, "tasks": tasks}
+README = {
+    "cheetah": lambda: number(speeds("dmc_cheetah_run")[0]),
+    "cheetah-ratio": lambda: f"{ratios()['dmc_cheetah_run']:.0f}",
+    "slowest": lambda: named(next(iter(ratios()))),
+    "fastest": lambda: named(next(reversed(ratios()))),
+    "reacher": lambda: end("ppo-dmc_reacher_easy"),
+}

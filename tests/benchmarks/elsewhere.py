@@ -6,9 +6,9 @@ python -m tests.benchmarks.elsewhere        a minute
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 
-from pixelbrax_jax.agents.runner.evaluate import Evaluator, make_split
+from pixelbrax_jax.agents.runner.evaluate import Evaluator
+from pixelbrax_jax.agents.runner.splits import make_split
 from pixelbrax_jax.agents.runner.trained import load_pretrained
 from pixelbrax_jax.policy import read_pretrained
 from tests.benchmarks.experiments import EPISODES
@@ -33,7 +33,7 @@ def identity(task: str) -> dict:
 def play(task: str, split: str, changes: dict) -> dict:
     """Play the episodes of an evaluation."""
     agent = load_pretrained(task)
-    environment = make_split(replace(agent.algorithm.config, **changes), split)
+    environment = make_split(agent.algorithm.config.replace(**changes), split)
     result = Evaluator(agent.algorithm, *environment, num_episodes=EPISODES)(agent.networks)
     return {
         "policy": identity(task),

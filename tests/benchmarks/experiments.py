@@ -23,18 +23,17 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
 import pixelbrax_jax
 from pixelbrax_gym.bench.machine import describe_cpu
+from pixelbrax_gym.cli.train import read_first, settings
 from pixelbrax_jax.agents.config import TrainConfig
 from pixelbrax_jax.agents.on_policy.presets import TASK_SETTINGS, preset
 from pixelbrax_jax.agents.registry import ALGORITHMS
 from pixelbrax_jax.agents.runner.checkpoint import read_about
 from pixelbrax_jax.agents.runner.metrics import read_metrics
-from pixelbrax_jax.agents.runner.train_command import parse
 from pixelbrax_jax.agents.runner.trained import load_config
 from pixelbrax_jax.stop_signals import stop_signals
 from pixelbrax_jax.tasks import DMC_TASKS
@@ -160,7 +159,7 @@ def offer(task: str, folder: Path, kept: dict) -> None:
     Returns by other rewards compare with none of the preset's.
     """
     about, last = PRETRAINED / f"{task}.json", kept["evaluations"][-1]
-    reward = preset(kept["algorithm"], "cpu", task).reward_preset
+    reward = preset(kept["algorithm"], "cpu", task).env.reward_preset
     if kept["config"]["reward_preset"] != reward:
         return
     before = json.loads(about.read_text()) if about.exists() else None
@@ -183,7 +182,7 @@ def offer(task: str, folder: Path, kept: dict) -> None:
 
 def run(arguments: list[str], folder: Path, until: float) -> int:
     """Make a run, or go on with it; its exit status, above 128 if it was stopped."""
-    command = [sys.executable, "-m", "pixelbrax_jax.cli", *arguments]
+    command = [sys.executable, "-m", "pixelbrax_gym.cli", *arguments]
     command += ["--resume", "latest", "--output-dir", str(folder)]
     with subprocess.Popen(["nice", "-n", "19", *command], start_new_session=True) as process:
         stop = lambda *_: process.terminate()  # noqa: E731
@@ -202,10 +201,7 @@ def run(arguments: list[str], folder: Path, until: float) -> int:
 def config_of(arguments: list[str]) -> TrainConfig:
     """The settings that a command gives."""
     _, algorithm, *line = arguments
-    chosen = "default"
-    if line[0] == "--preset":
-        _, chosen, *line = line
-    return parse(algorithm, chosen, line)[0]
+    return settings(algorithm, *read_first(line))[0]
 
 
 def is_made(path: Path, arguments: list[str]) -> bool:
@@ -214,7 +210,7 @@ def is_made(path: Path, arguments: list[str]) -> bool:
         return False
     kept, wanted = json.loads(path.read_text()), config_of(arguments)
     # All renderers draw the same.
-    config = replace(load_config(kept), renderer=wanted.renderer)
+    config = load_config(kept).replace(renderer=wanted.env.renderer)
     return kept["revision"] == REVISION and config == wanted
 
 

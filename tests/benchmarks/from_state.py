@@ -12,14 +12,13 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from dataclasses import asdict, replace
 
 from brax.training.agents.ppo import train as ppo
 
 from pixelbrax_jax import BraxEnv, make, wrap_fresh_episodes
-from pixelbrax_jax.agents.config import TrainConfig
+from pixelbrax_jax.agents.config import TrainConfig, describe
 from pixelbrax_jax.agents.on_policy.presets import preset
-from pixelbrax_jax.tasks import REWARD_PRESETS
+from pixelbrax_jax.physics.brax.tasks import REWARD_PRESETS
 from tests.benchmarks.experiments import TASKS
 from tests.benchmarks.results import FOLDER, task_key
 
@@ -31,22 +30,22 @@ def keep(config: TrainConfig) -> None:
 
     What is known of it is written with every evaluation.
     """
-    env = BraxEnv(*make(config, obs_mode="state"))
+    env = BraxEnv(*make(config.env, obs_mode="state"))
     found: dict = {"steps": [], "seconds": [], "return": [], "length": []}
     began = time.monotonic()
 
     def progress(calls: int, metrics: dict) -> None:
-        found["steps"].append(calls * config.action_repeat)
+        found["steps"].append(calls * config.env.action_repeat)
         found["seconds"].append(round(time.monotonic() - began, 1))
         found["return"].append(round(float(metrics["eval/episode_reward"]), 1))
-        found["length"].append(float(metrics["eval/avg_episode_length"]) * config.action_repeat)
-        print(config.task, found["steps"][-1], found["return"][-1], flush=True)
+        found["length"].append(float(metrics["eval/avg_episode_length"]) * config.env.action_repeat)
+        print(config.env.task, found["steps"][-1], found["return"][-1], flush=True)
         known = json.loads(OUTPUT.read_text()) if OUTPUT.exists() else {}
-        OUTPUT.write_text(json.dumps(known | {task_key(asdict(config)): found}) + "\n")
+        OUTPUT.write_text(json.dumps(known | {task_key(describe(config)): found}) + "\n")
 
     ppo.train(
         env,
-        num_timesteps=config.total_steps // config.action_repeat,
+        num_timesteps=config.total_steps // config.env.action_repeat,
         episode_length=env.episode_length,
         wrap_env_fn=wrap_fresh_episodes,
         num_envs=config.num_envs,
@@ -75,8 +74,8 @@ def main() -> None:
     options = parser.parse_args()
     for task in options.tasks:
         config = preset("ppo", "cpu", task)
-        reward = options.reward_preset or config.reward_preset
-        keep(replace(config, reward_preset=reward))
+        reward = options.reward_preset or config.env.reward_preset
+        keep(config.replace(reward_preset=reward))
 
 
 if __name__ == "__main__":

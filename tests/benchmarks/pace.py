@@ -36,9 +36,9 @@ def measure(algorithm: str, task: str) -> dict[str, float]:
         control step afterwards, over whole phases.
     """
     config = preset(algorithm, "cpu", task)
-    steps = ITERATIONS * config.num_envs * config.num_steps * config.action_repeat
+    steps = ITERATIONS * config.num_envs * config.num_steps * config.env.action_repeat
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "pixelbrax_jax.cli", "train", algorithm, "--task", task]
+        command = [sys.executable, "-m", "pixelbrax_gym.cli", "train", algorithm, "--task", task]
         command += ["--preset", "cpu", "--total-steps", str(steps), "--num-evals", "0"]
         command += ["--no-progress", "--output-dir", folder]
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL)

@@ -1,36 +1,29 @@
-"""Tables in pages of the documentation, each between ``<!-- its name -->`` and ``<!-- end -->``."""
+"""Tables and figures in pages, each between ``<!-- its name -->`` and ``<!-- end -->``."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
-from pathlib import Path
+from collections.abc import Callable, Mapping
+
+MARKED = re.compile(r"(<!-- ([\w-]+) -->)(.*?)(<!-- end -->)", re.DOTALL)
+
+Figures = Mapping[str, Callable[[], str]]
 
 
-def redraw(page: Path, tables: Mapping[str, str]) -> None:
-    """Replace what stands between the marks."""
-    text = page.read_text("utf-8")
-    for name, table in tables.items():
-        text = _between(name).sub(lambda found, table=table: found[1] + table + found[3], text)
-    page.write_text(text, "utf-8")
-
-
-def drawn(page: Path, name: str) -> str:
-    """What stands between the marks now.
+def filled(text: str, figures: Figures) -> str:
+    """A page with what its figures are now.
 
     Raises:
-        ValueError: there are no such marks.
+        KeyError: a mark names no figure.
     """
-    found = _between(name).search(page.read_text("utf-8"))
-    if found is None:
-        raise ValueError(f"{page} has no table {name!r}")
-    return found[2]
+
+    def fill(mark: re.Match[str]) -> str:
+        figure = figures[mark[2]]()
+        return f"{mark[1]}\n{figure}\n{mark[4]}" if "\n" in figure else mark[1] + figure + mark[4]
+
+    return MARKED.sub(fill, text)
 
 
-def without_tables(text: str) -> str:
-    """A page's text without what is drawn into it."""
-    return re.sub(r"<!-- [\w-]+ -->\n.*?<!-- end -->", "", text, flags=re.DOTALL)
-
-
-def _between(name: str) -> re.Pattern[str]:
-    return re.compile(f"(<!-- {name} -->\n)(.*?)(<!-- end -->)", re.DOTALL)
+def names(text: str) -> set[str]:
+    """The names of all marks of a page."""
+    return {mark[1] for mark in MARKED.findall(text)}

@@ -1,22 +1,21 @@
-"""Draws tables of performance.md, measurements.md and accelerators.md from what is kept.
-
-python -m tests.benchmarks.performance
-"""
+"""Tables and figures of speed, from the results that are kept in docs/benchmarks."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
+from functools import cache, partial
 from pathlib import Path
+from typing import Any
 
-from pixelbrax_gym.bench.ahead import tables as compiled
-from pixelbrax_gym.bench.ahead.case import PROGRAMS
 from pixelbrax_gym.bench.cases import TASKS
 from pixelbrax_gym.bench.tables import cell, find, number, ratio, table, title, value
-from tests.benchmarks.pages import redraw
+from tests.benchmarks.ahead import tables as compiled
+from tests.benchmarks.ahead.case import PROGRAMS
+from tests.benchmarks.ahead.targets import LAUNCH_SECONDS
+from tests.benchmarks.original import ORIGINAL
 
 DOCS = Path(__file__).parents[2] / "docs"
-PAGE = DOCS / "performance.md"
-FORMS_PAGE = DOCS / "measurements.md"
 LEFT_OUT = {
     "card",
     "kernels",
@@ -26,7 +25,6 @@ LEFT_OUT = {
     "registers",
 }
 """Columns of the report on programs that the page does without."""
-PROGRAMS_PAGE = DOCS / "accelerators.md"
 ADAPTERS = {
     "Gymnasium, jax": '`gymnasium.make_vec`, `output="jax"`',
     "Gymnasium, numpy": '`gymnasium.make_vec`, `output="numpy"`',
@@ -54,10 +52,34 @@ PEERS = (
 )
 
 
+@cache
+def read(name: str) -> Any:
+    """A JSON file in docs."""
+    return json.loads((DOCS / name).read_text("utf-8"))
+
+
 def rows_of(machine: str, group: str) -> list[dict]:
     """Outcomes of a group: ``machine`` is a file's name without its ending."""
-    kept = json.loads((DOCS / "benchmarks" / f"{machine}.json").read_text("utf-8"))
-    return [row for row in kept["cases"].values() if row["group"] == group]
+    cases = read(f"benchmarks/{machine}.json")["cases"]
+    return [row for row in cases.values() if row["group"] == group]
+
+
+def measured(machine: str, group: str, measure: str, **arguments: Any) -> Any:
+    """Values of an outcome."""
+    row = find(rows_of(machine, group), measure, **arguments)
+    assert row is not None, (machine, group, measure, arguments)
+    return row["values"]
+
+
+def span(values: Iterable[float], form: str = "{:.2f}") -> str:
+    """The least and the largest."""
+    values = list(values)
+    return f"{form.format(min(values))} to {form.format(max(values))}"
+
+
+def rounded(value: float, digits: int) -> str:
+    """So many significant digits, thousands apart."""
+    return f"{float(f'{value:.{digits - 1}e}'):,.0f}"
 
 
 def environments() -> str:
@@ -88,80 +110,180 @@ def peers() -> str:
     return table(("who", "steps per second", "PixelBrax is faster by"), lines)
 
 
-def adapters() -> str:
-    """What an adapter costs."""
-    return _ratios("adapters.compare", "adapter", "adapters", ADAPTERS, (256, 1))
-
-
-def distractors() -> str:
-    """What distractors cost."""
-    return _ratios("distractors.compare", "distractors", "distractors", DISTRACTORS, (256, 1024))
-
-
-def _ratios(
-    measure: str, column: str, group: str, names: dict[str, str], counts: tuple[int, ...]
-) -> str:
-    rows = rows_of("cpu-avx512", group)
-    found = {}
-    for count in counts:
-        row = find(rows, measure, task="ant", num_envs=count)
-        found[count] = {line[column]: line["ratio"] for line in row["values"]}
+def comparison(group: str, column: str, names: dict[str, str], counts: tuple[int, ...]) -> str:
+    """Ratios of speed of Ant, interleaved, over the number of environments."""
+    found = {count: _lines(group, column, count) for count in counts}
     lines = [
-        [text, *(f"{found[count][name]:.2f}" for count in counts)] for name, text in names.items()
+        [text, *(f"{found[count][name]['ratio']:.2f}" for count in counts)]
+        for name, text in names.items()
     ]
     heads = [f"{count} environment{'s' if count > 1 else ''}" for count in counts]
     return table((column, *heads), lines)
 
 
-def forms(area: str) -> str:
-    """Forms of the same program, and how fast they were beside another."""
-    kept = json.loads((DOCS / "benchmarks" / "forms.json").read_text("utf-8"))["rows"]
-    lines = []
-    for row in (row for row in kept if row["area"] == area):
-        speed, low, high = (row[name] and number(row[name]) for name in ("ratio", "low", "high"))
-        interval = f" ({low} to {high})" if low else ""
-        about = (row["form"], row["against"], row["where"])
-        lines.append([*about, f"{speed}{interval}", "yes" if row["kept"] else ""])
-    return table(("form", "against", "where", "speed", "kept"), lines)
+def _lines(group: str, column: str, num_envs: int) -> dict[str, dict[str, Any]]:
+    row = measured("cpu-avx512", group, f"{group}.compare", task="ant", num_envs=num_envs)
+    # The loop beside TorchRL has another autoreset mode; the first is meant.
+    return {line[column]: line for line in reversed(row)}
 
 
-def forms_tables() -> dict[str, str]:
-    """All of the contributors' page's tables, by name."""
-    return {area: f"{forms(area)}\n" for area in ("physics", "renderer")}
-
-
-def programs_tables() -> dict[str, str]:
-    """Tables of programs that are compiled and not run, by name.
-
-    Of the GPUs the H100 alone, of many environments Ant alone, and no steps in a loop.
-    """
-    cards = [
-        row
-        for row in rows_of("programs", "gpu-program")
-        if row["arguments"]["card"] == "H100" and row["arguments"]["program"] != "scan"
-        if row["arguments"]["num_envs"] == 1024 or row["arguments"]["task"] == "ant"
+def programs() -> str:
+    """Programs for an H100: 1024 environments of each task, and Ant's 8192."""
+    shown = [
+        find(
+            rows_of("programs", "gpu-program"),
+            "compiling.gpu",
+            **{"task": task, "num_envs": num_envs, "program": program, "card": "H100"},
+        )
+        for task, num_envs in (*((task, 1024) for task in TASKS), ("ant", 8192))
+        for program in PROGRAMS
+        if program != "scan"
     ]
-    cards.sort(key=_place)
-    chips = sorted(rows_of("programs", "tpu-program"), key=_place)
-    return {
-        "gpu-programs": f"{compiled.gpu(cards, LEFT_OUT)}\n",
-        "tpu-programs": f"{compiled.tpu(chips)}\n",
-    }
+    return compiled.gpu(shown, LEFT_OUT)
 
 
-def _place(row: dict) -> tuple[int, int, int]:
-    about = row["arguments"]
-    tasks = ("inverted_pendulum", *TASKS)
-    return about["num_envs"], tasks.index(about["task"]), PROGRAMS.index(about["program"])
+def tpu_programs() -> str:
+    """Programs for a TPU."""
+    return compiled.tpu(
+        [
+            row
+            for row in rows_of("programs", "tpu-program")
+            if row["arguments"]["task"] in ("inverted_pendulum", "ant")
+        ]
+    )
 
 
-def tables() -> dict[str, str]:
-    """All of the page's tables, by name."""
-    drawings = (environments, peers, adapters, distractors)
-    return {draw.__name__: f"{draw()}\n" for draw in drawings}
+def ant() -> float:
+    """Steps per second of 256 Ants, as peers are measured."""
+    where = {"task": "ant", "num_envs": 256}
+    return measured("cpu-avx2", "peers", "throughput.gymnasium", **where)["steps_per_second"]
 
 
-if __name__ == "__main__":
-    redraw(PAGE, tables())
-    redraw(FORMS_PAGE, forms_tables())
-    redraw(PROGRAMS_PAGE, programs_tables())
+def dm_control() -> float:
+    """The same of DM Control's quadruped in 32 processes."""
+    where = {"task": "ant", "processes": 32}
+    return measured("cpu-avx2", "peers", "peers.dm_control_envs", **where)["steps_per_second"]
+
+
+def frames(peer: str) -> str:
+    """Frames per second of 256 Ants."""
+    row = measured("cpu-avx2", "peers", peer, task="ant", num_envs=256, size=84)
+    return number(row["frames_per_second"])
+
+
+def distractor_ratios() -> str:
+    """Speed of Ant with distractors over that without."""
+    return span(
+        line["ratio"]
+        for num_envs in (256, 1024)
+        for name, line in _lines("distractors", "distractors", num_envs).items()
+        if not name.startswith("none")
+    )
+
+
+def batches(num_envs: int) -> str:
+    """Speed with so many environments over that with a hundred."""
+    return span(
+        line["ratio"]
+        for task in TASKS
+        for line in measured("cpu-avx512", "batches", "batches.compare", task=task)
+        if line["num_envs"] == num_envs
+    )
+
+
+def held() -> str:
+    """Kilobytes of an environment with pixels."""
+    rows = rows_of("cpu-avx512", "environments")
+    pixels = [row for row in rows if row["arguments"].get("obs_mode") == "pixels"]
+    return span((row["values"]["bytes_per_env"] / 1e3 for row in pixels), "{:.0f}")
+
+
+def to_original() -> str:
+    """How many times as fast as the original."""
+    ratios = (
+        measured("cpu-avx2", "original", "throughput.scan", task=task, num_envs=num_envs)[
+            "steps_per_second"
+        ]
+        / theirs
+        for task, num_envs, theirs in ORIGINAL
+    )
+    return " to ".join(rounded(x, 2) for x in sorted(ratios)[::4])
+
+
+def startup(cache: str, stage: str = "import to first step") -> float:
+    """Seconds of a stage."""
+    return measured("cpu-avx512", "startup", "startup.first_frame", cache=cache)["seconds"][stage]
+
+
+def training(num_devices: int, cores: int) -> float:
+    """Steps per second of training on devices with so many cores together."""
+    where = {"num_devices": num_devices, "cores": cores}
+    return measured("cpu-avx512", "devices", "scaling.training", **where)["steps_per_second"]
+
+
+def h100(task: str, program: str) -> dict[str, Any]:
+    """What the compiler for an H100 made of a program."""
+    where = {"task": task, "program": program, "num_envs": 1024, "card": "H100"}
+    return measured("programs", "gpu-program", "compiling.gpu", **where)
+
+
+def traffic(program: str) -> list[float]:
+    """Bytes moved over bytes of frames, by task."""
+    rows = [h100(task, program) for task in TASKS]
+    return [(row["read_bytes"] + row["written_bytes"]) / row["output_bytes"] for row in rows]
+
+
+def pixel_launches() -> str:
+    """Launches that pixels add to a step."""
+    steps = ((h100(task, "step"), h100(task, "state step")) for task in TASKS)
+    return " or ".join(sorted({str(step["launches"] - state["launches"]) for step, state in steps}))
+
+
+def tpu_megabytes(name: str) -> str:
+    """Megabytes of drawing Ants on a TPU."""
+    where = {"task": "ant", "program": "renderer"}
+    return f"{measured('programs', 'tpu-program', 'compiling.tpu', **where)[name] / 1e6:.0f}"
+
+
+README = {
+    "ant": lambda: number(ant()),
+    "dm-control": lambda: f"{dm_control():.0f}",
+    "distractors": distractor_ratios,
+}
+
+PERFORMANCE = {
+    "environments": environments,
+    "peers": peers,
+    "adapters": partial(comparison, "adapters", "adapter", ADAPTERS, (256, 1)),
+    "distractors": partial(comparison, "distractors", "distractors", DISTRACTORS, (256, 1024)),
+    "ants": lambda: (
+        f"{rounded(ant(), 1)} to "
+        + rounded(_lines("adapters", "adapter", 256)["Gymnasium, torch"]["steps_per_second"], 1)
+    ),
+    "dm-control": lambda: f"{dm_control():.0f}",
+    "batches-1000": partial(batches, 1000),
+    "batches-10": partial(batches, 10),
+    "kilobytes": held,
+    "frames-warp": partial(frames, "peers.mujoco_warp_renderer"),
+    "frames": partial(frames, "throughput.renderer"),
+    "original": lambda: span((row[2] for row in ORIGINAL), "{:.0f}"),
+    "to-original": to_original,
+    "scan": lambda: f"{_lines('adapters', 'adapter', 1)['JAX scan']['ratio']:.1f}",
+    "startup": lambda: f"{startup('none'):.0f}",
+    "startup-warm": lambda: f"{startup('warm'):.0f}",
+    "startup-again": lambda: f"{startup('none', 'make, reset and step once more'):.2f}",
+    "training-1": lambda: rounded(training(1, 1), 2),
+    "training-2": lambda: rounded(training(2, 2), 2),
+    "training-share": lambda: f"{training(2, 2) / training(1, 1) / 2:.2f}",
+}
+
+ACCELERATORS = {
+    "gpu-programs": programs,
+    "tpu-programs": tpu_programs,
+    "traffic": lambda: span(traffic("renderer")),
+    "traffic-plain": lambda: f"{max(traffic('plain renderer')):.0f}",
+    "pixel-launches": pixel_launches,
+    "launch-seconds": lambda: f"{LAUNCH_SECONDS * 1e6:.1f}",
+    "tpu-moved": partial(tpu_megabytes, "accessed_bytes"),
+    "tpu-frames": partial(tpu_megabytes, "output_bytes"),
+}

@@ -1,15 +1,11 @@
-"""Draws docs/results.md's tables and plots from the runs that `tests.benchmarks.experiments` kept.
-
-    python -m tests.benchmarks.results
-
-What a random policy, and no action, earn in the same tasks is played once and kept beside them.
-"""
+"""Tables, figures and plots of docs/results.md, from the runs that `experiments.py` kept."""
 
 from __future__ import annotations
 
 import json
+import math
 import re
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 
@@ -18,10 +14,10 @@ from pixelbrax_jax import list_pretrained
 from pixelbrax_jax.agents.on_policy.presets import preset
 from pixelbrax_jax.policy import read_pretrained
 from tests.benchmarks.experiments import DOCS, TASKS
-from tests.benchmarks.pages import redraw
+from tests.benchmarks.pages import Figures
+from tests.benchmarks.performance import rounded, span
 
 FOLDER = DOCS / "results"
-PAGE = FOLDER.with_suffix(".md")
 MINUTES = (1, 3, 5, 15)
 WINDOW = 60.0
 """Seconds whose training episodes make one point."""
@@ -57,14 +53,7 @@ def clocked(runs: dict[str, dict]) -> dict[str, dict]:
 
 
 def return_at(run: dict, when: float, clock: str = "seconds", window: float = WINDOW) -> float:
-    """Mean return of the episodes that ended within a window before; NaN beyond the run.
-
-    Args:
-        run: what is kept of it.
-        when: on that clock.
-        clock: ``"seconds"`` or ``"steps"``.
-        window: on that clock.
-    """
+    """Mean return of the episodes that ended within a window before, by seconds or steps."""
     times = np.array(run[clock])
     if times[-1] < when:
         return float("nan")
@@ -158,7 +147,7 @@ def clean_table(runs: dict[str, list[dict]]) -> str:
                     f"{min(distance(run, without[key]['random']) for run in seeds):.0f}",
                 ]
             )
-    return markdown_table(heads, lines) + "\n"
+    return markdown_table(heads, lines)
 
 
 def baselines_table(runs: dict[str, list[dict]]) -> str:
@@ -172,7 +161,7 @@ def baselines_table(runs: dict[str, list[dict]]) -> str:
         if seen := from_state.get(key):
             line += [f"{seen['return'][-1]:,.0f}", f"{seen['steps'][-1] / 1e6:.1f}"]
         lines.append([title(key, list(tasks)), *line, *[""] * (4 - len(line))])
-    return markdown_table(heads, lines) + "\n"
+    return markdown_table(heads, lines)
 
 
 def held_out_ratio(seeds: list[dict]) -> float:
@@ -213,7 +202,7 @@ def distracted_table(runs: dict[str, list[dict]]) -> str:
                 f"{np.mean(plain):,.0f}" if plain else "",
             ]
         )
-    return markdown_table(heads, lines) + "\n"
+    return markdown_table(heads, lines)
 
 
 def pretrained_table() -> str:
@@ -239,45 +228,7 @@ def pretrained_table() -> str:
                 about["versions"]["pixelbrax"],
             ]
         )
-    return markdown_table(heads, lines) + "\n"
-
-
-def noisier() -> dict[str, float]:
-    """Returns of whole runs on Ant that began with a standard deviation of 0.5, by name."""
-    return {name: run["clean/return"] for name, run in read("search.json")["whole runs"].items()}
-
-
-def centering_table() -> str:
-    """What whole runs reach with pixels as they come, and around zero, in Markdown."""
-    centered = {name: final(run)["return"] for name, run in kept_runs().items()} | noisier()
-    both = {
-        run["name"]: {"before": run["clean/return"], "after": centered[run["name"]]}
-        for run in read("centering.json")["runs"]
-        if run["name"] in centered
-    }
-    cells: dict[str, dict[str, str]] = {}
-    for name, pairs in groups(both).items():
-        algorithm, task = name.split("-", 1)
-        before, after = (np.mean([pair[when] for pair in pairs]) for when in ("before", "after"))
-        cells.setdefault(task, {})[algorithm.upper()] = f"{before:,.0f} → {after:,.0f}"
-    agents = ("PPO", "PPG", "DCPG")
-    lines = [
-        [task.replace("-brax", " (brax)").replace("-video", ", `paper-video`")]
-        + [of_task[agent] for agent in agents]
-        for task, of_task in cells.items()
-    ]
-    return markdown_table(("task", *agents), lines) + "\n"
-
-
-def tables(runs: dict[str, list[dict]]) -> dict[str, str]:
-    """All of the page's tables, by name."""
-    return {
-        "clean": clean_table(runs),
-        "baselines": baselines_table(runs),
-        "distracted": distracted_table(runs),
-        "pretrained": pretrained_table(),
-        "centering": centering_table(),
-    }
+    return markdown_table(heads, lines)
 
 
 @cache
@@ -287,18 +238,79 @@ def kept_runs() -> dict[str, dict]:
     return clocked({path.stem: json.loads(path.read_text("utf-8")) for path in files})
 
 
-def main() -> None:
-    """Draw everything."""
+@cache
+def seeds_of() -> dict[str, list[dict]]:
+    """The runs by name; those of one name differ in their seeds alone."""
+    return groups(kept_runs())
+
+
+def mean_end(name: str, digits: int = 2) -> str:
+    """Mean return at the end of the runs of that name."""
+    return rounded(np.mean([final(run)["return"] for run in seeds_of()[name]]), digits)
+
+
+def mean_length(name: str) -> str:
+    """Control steps of an episode at the end."""
+    return f"{np.mean([final(run)['length'] for run in seeds_of()[name]]):.0f}"
+
+
+def least_distance(kind: str) -> str:
+    """Standard errors by which every run without distractors is above ``random`` or ``none``."""
+    untrained = read("untrained.json")
+    least = min(
+        distance(run, untrained[task][kind])
+        for task, of_task in by_task(seeds_of()).items()
+        for seeds in of_task.values()
+        for run in seeds
+    )
+    return f"{math.floor(least)}"
+
+
+def with_clips() -> list[list[dict]]:
+    """Runs under videos, by algorithm and task."""
+    return [seeds for seeds in seeds_of().values() if seeds[0]["config"]["clips"]]
+
+
+def error_of_ratio(run: dict) -> float:
+    """Standard error of a run's return under held-out clips over that under those of training."""
+    ends = final(run, "test"), final(run, "train")
+    relative = (end["standard_error"] / end["return"] for end in ends)
+    return held_out_ratio([run]) * math.hypot(*relative)
+
+
+def elsewhere(name: str) -> str:
+    """What a pretrained policy earns where it was not trained."""
+    return f"{read('elsewhere.json')[name]['return']:,.0f}"
+
+
+FIGURES: Figures = {
+    "clean": lambda: clean_table(seeds_of()),
+    "baselines": lambda: baselines_table(seeds_of()),
+    "distracted": lambda: distracted_table(seeds_of()),
+    "pretrained": pretrained_table,
+    **{task: partial(mean_end, f"ppo-{task}") for task in TASKS},
+    **{f"{task}-length": partial(mean_length, f"ppo-{task}") for task in ("walker2d", "humanoid")},
+    "humanoid-long": partial(mean_end, "ppo-humanoid-long", 3),
+    "halfcheetah-long": partial(mean_end, "ppo-halfcheetah-long"),
+    "halfcheetah-longest": partial(mean_end, "ppo-halfcheetah-longest-slow"),
+    "above-random": partial(least_distance, "random"),
+    "above-none": partial(least_distance, "none"),
+    "held-out": lambda: span(map(held_out_ratio, with_clips())),
+    "held-out-errors": lambda: span(error_of_ratio(run) for seeds in with_clips() for run in seeds),
+    "under-video": partial(elsewhere, "halfcheetah under paper-video"),
+    "under-color": partial(elsewhere, "halfcheetah under paper-color"),
+    "by-brax": partial(elsewhere, "walker2d by Brax's reward"),
+}
+
+
+def plot() -> None:
+    """Draw the learning curves; what is earned without learning is played once and kept."""
     # Drawing and playing need more than tables do.
     from tests.benchmarks.baselines import play_baselines
     from tests.benchmarks.results_plot import draw
 
-    runs = groups(kept_runs())
-    if not runs:
-        raise SystemExit("no run is kept yet: python -m tests.benchmarks.experiments makes them")
-    tasks = by_task(runs)
+    tasks = by_task(seeds_of())
     play_baselines({key: next(iter(g.values()))[0]["config"] for key, g in tasks.items()})
-    redraw(PAGE, tables(runs))
     panels = {}
     for key, of_task in tasks.items():
         # Runs of the presets' own length and rewards.
@@ -306,7 +318,3 @@ def main() -> None:
         if shown:
             panels[title(key, list(tasks))] = (shown, read("untrained.json")[key])
     draw(panels, FOLDER / "clean.png")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,43 +1,50 @@
 """Measures all that ``pixelbrax bench --full`` does, and more.
 
-python -m tests.benchmarks.run                      all but peers; hours
+python -m tests.benchmarks.run                      all but what takes other packages; hours
 python -m tests.benchmarks.run --only startup       one part; minutes
 python -m tests.benchmarks.run --only peers         others beside us, installed on first use
 python -m tests.benchmarks.run --only dmc           every task of the DM Control Suite; half an hour
+python -m tests.benchmarks.run --only gpu-program   programs for an H100, compiled; half an hour
 """
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
 
 from pixelbrax_gym.bench.cases import TASKS
-from pixelbrax_gym.bench.command import add_options, run
+from pixelbrax_gym.cli import bench
 from pixelbrax_jax.tasks import DMC_TASKS
+from pixelbrax_jax.validation import check_choice
 from tests.benchmarks.cases import GROUPS
+
+ON_REQUEST = ("peers", "dmc", "gpu-program", "tpu-program")
+"""They need what is not installed with the tests: OpenGL, other simulators, compilers."""
+
+
+@dataclass(frozen=True)
+class Options(bench.Options):
+    """Measures all that ``pixelbrax bench --full`` does, and more."""
+
+    full: bool = True
+    output_dir: Path = Path("runs/benchmarks")
+    only: tuple[str, ...] = ()  # type: ignore[assignment]
+    task: tuple[str, ...] = ()  # type: ignore[assignment]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the benchmark.
-
-    Args:
-        arguments: of the command line; None means those of this process.
-
-    Returns:
-        The exit status: 1 if a case failed for another reason than memory or something absent.
-    """
-    parser = argparse.ArgumentParser(
-        prog="python -m tests.benchmarks.run",
-        description=__doc__,
-        formatter_class=argparse.RawTextHelpFormatter,
-    )
-    add_options(parser, list(GROUPS), "runs/benchmarks", (*TASKS, *DMC_TASKS))
-    parser.add_argument("--peers", action="store_true", help="measure peers too")
-    options = parser.parse_args(arguments)
-    # The two need what is not installed with the tests: OpenGL, and other simulators.
-    names = [name for name in GROUPS if name not in ("peers", "dmc") or options.peers]
-    return run(parser.prog, options, GROUPS, options.only or names)
+    """Run the benchmark; the exit status is as that of ``pixelbrax bench``."""
+    options = tyro.cli(Options, description=__doc__, args=arguments)
+    for name in options.only:
+        check_choice("part", name, GROUPS)
+    for name in options.task:
+        check_choice("task", name, ("inverted_pendulum", *TASKS, *DMC_TASKS))
+    names = options.only or [name for name in GROUPS if name not in ON_REQUEST]
+    return bench.measure_groups(options, GROUPS, names)
 
 
 if __name__ == "__main__":

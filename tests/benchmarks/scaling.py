@@ -1,52 +1,20 @@
-"""Stepping and training on one device and on several."""
+"""Training on one device and on several."""
 
 from __future__ import annotations
 
 import os
 import sys
-from dataclasses import replace
 from typing import Any
 
 import jax
 
-import pixelbrax_jax as pb
 from pixelbrax_gym.bench.case import ABSENT
 from pixelbrax_gym.bench.timing import compiled, rate
 from pixelbrax_jax.agents.config import make_env
 from pixelbrax_jax.agents.on_policy.ppo import PPO
 from pixelbrax_jax.agents.on_policy.presets import preset
-from pixelbrax_jax.agents.runner.sharding import replicate, state_shardings
+from pixelbrax_jax.agents.runner.devices import replicate, state_shardings
 from pixelbrax_jax.envs.sharded import ShardedVectorEnv, make_env_mesh
-
-
-def stepping(task: str, num_devices: int, num_envs: int) -> dict[str, Any]:
-    """Environments spread over devices; on a CPU these are emulated and share its cores."""
-    if jax.device_count() < num_devices:
-        sys.stderr.write(f"there are {jax.device_count()} devices, not {num_devices}\n")
-        sys.exit(ABSENT)
-    env, params = pb.make(task)
-    venv = ShardedVectorEnv(env, num_envs, make_env_mesh(num_devices))
-    step = jax.jit(venv.step, donate_argnums=0, compiler_options=pb.compiler_options(venv))
-    state, timestep = venv.reset(jax.random.key(0), params)
-    shape = (num_envs, env.action_size)
-    action = jax.random.uniform(jax.random.key(1), shape, minval=-1.0, maxval=1.0)
-    on_each = sum(
-        leaf.addressable_shards[0].data.nbytes for leaf in jax.tree.leaves((state, timestep))
-    )
-    carry = {"state": state}
-    del state, timestep
-
-    def run(calls: int) -> Any:
-        for _ in range(calls):
-            carry["state"], timestep = step(carry["state"], action, params)
-        return timestep
-
-    speed = rate(run)
-    return {
-        "steps_per_second": num_envs * speed["median"],
-        "speed": speed,
-        "bytes_on_a_device": on_each,
-    }
 
 
 def training(task: str, num_devices: int, cores: int, num_envs: int) -> dict[str, Any]:
@@ -64,7 +32,7 @@ def training(task: str, num_devices: int, cores: int, num_envs: int) -> dict[str
         sys.exit(ABSENT)
     # Before JAX makes its threads.
     os.sched_setaffinity(0, allowed[:cores])
-    config = replace(preset("ppo", "ci"), task=task, num_envs=num_envs)  # type: ignore[arg-type]
+    config = preset("ppo", "ci", task, num_envs=num_envs)
     env, params = make_env(config)
     mesh = make_env_mesh(num_devices)
     algorithm = PPO(config, ShardedVectorEnv(env, num_envs, mesh))  # type: ignore[arg-type]

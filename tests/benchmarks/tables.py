@@ -8,22 +8,6 @@ from pixelbrax_gym.bench.tables import cell, find, number, ratio, succeeded, tab
 from tests.benchmarks.original import ORIGINAL
 
 
-def sizes(rows: list[Row]) -> str:
-    lines = []
-    for row in rows:
-        if row["measure"] == "throughput.scan":
-            frames = find(rows, "throughput.renderer", **row["arguments"])
-            lines.append(
-                [
-                    title(row["arguments"]["task"]),
-                    row["arguments"]["num_envs"],
-                    cell(row, "steps_per_second"),
-                    cell(frames, "frames_per_second"),
-                ]
-            )
-    return table(("64 x 64", "environments", "pixels, steps/s", "renderer, frames/s"), lines)
-
-
 def original(rows: list[Row]) -> str:
     lines = []
     for task, num_envs, theirs in ORIGINAL:
@@ -44,52 +28,23 @@ def startup(rows: list[Row]) -> str:
     return table(("compilation cache", *(f"{stage}, s" for stage in stages)), lines)
 
 
-def clips(rows: list[Row]) -> str:
-    lines = [
-        [
-            number(row["values"]["frames"]),
-            number(row["values"]["file_bytes"] / 1e6),
-            number(row["values"]["bank_bytes"] / 1e6),
-            *(number(seconds) for seconds in row["values"]["seconds"].values()),
-        ]
-        for row in succeeded(rows)
-    ]
-    stages = (f"{stage}, s" for row in succeeded(rows)[:1] for stage in row["values"]["seconds"])
-    return table(("frames", "MB of files", "MB on the device", *stages), lines)
-
-
 def devices(rows: list[Row]) -> str:
-    lines = [
-        [
-            row["arguments"]["num_devices"],
-            row["arguments"]["num_envs"],
-            number(row["values"]["steps_per_second"]),
-            number(row["values"]["bytes_on_a_device"] / 1e6),
-        ]
-        for row in succeeded(rows)
-        if row["measure"] == "scaling.stepping"
-    ]
-    stepping = table(("devices", "environments", "steps/s", "MB on a device"), lines)
     alone = value(find(rows, "scaling.training", num_devices=1, cores=1), "steps_per_second")
     lines = []
     for row in succeeded(rows):
-        if row["measure"] == "scaling.training":
-            where, speed = row["arguments"], row["values"]["steps_per_second"]
-            share = ratio(speed, alone and alone * where["cores"])
-            compilation = number(row["values"]["compile_seconds"])
-            lines.append(
-                [
-                    where["num_devices"],
-                    where["cores"],
-                    where["num_envs"],
-                    number(speed),
-                    share,
-                    compilation,
-                ]
-            )
-    heads = ("devices", "cores", "environments", "steps/s", "of ideal", "compilation, s")
-    training = f"\n\nTraining, PPO's preset `ci`:\n\n{table(heads, lines)}" if lines else ""
-    return stepping + training
+        where, values = row["arguments"], row["values"]
+        speed = values["steps_per_second"]
+        lines.append(
+            [
+                *(where[name] for name in ("num_devices", "cores", "num_envs")),
+                number(speed),
+                ratio(speed, alone and alone * where["cores"]),
+                number(values["compile_seconds"]),
+            ]
+        )
+    return table(
+        ("devices", "cores", "environments", "steps/s", "of ideal", "compilation, s"), lines
+    )
 
 
 def dmc(rows: list[Row]) -> str:

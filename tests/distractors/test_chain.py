@@ -13,13 +13,14 @@ from PIL import Image
 
 import pixelbrax_jax as pb
 from pixelbrax_jax import distractors
+from pixelbrax_jax.distractors import Color, MovingCamera, Video
 from pixelbrax_jax.distractors.base import Chain
 from pixelbrax_jax.distractors.presets import resolve
 from pixelbrax_jax.envs.pixel_env import PixelEnv
 from tests.distractors.conftest import SIZE, make_bank, make_clips
 from tests.envs.toy import PARAMS, Ball
 
-ALL = (distractors.Color(), distractors.Camera(scale=0.3), distractors.Video())
+ALL = (Color(), MovingCamera(scale=0.3), Video())
 WITH_CLIPS = PARAMS.replace(clips=make_clips())
 ACTIONS = np.random.default_rng(0).uniform(-1, 1, (30, 8, 1)).astype(np.float32)
 
@@ -91,7 +92,7 @@ def test_other_modes_begin_the_same_episodes(runs):
 
 
 def test_frames_advance_once_for_each_step_under_action_repeat():
-    loop = distractors.Video(dynamics="loop", num_clips=1, random_start=False)
+    loop = Video(dynamics="loop", num_clips=1, random_start=False)
     seen = rollout((loop,), action_repeat=2, episode_length=100)
     frames = seen.info["video_frame"][:, 0].tolist()
     ended = np.flatnonzero(seen.terminated[:, 0])
@@ -100,7 +101,7 @@ def test_frames_advance_once_for_each_step_under_action_repeat():
 
 
 def test_an_early_time_limit_does_not_move_the_video():
-    loop = distractors.Video(dynamics="loop", num_clips=1, random_start=False)
+    loop = Video(dynamics="loop", num_clips=1, random_start=False)
     env = PixelEnv(Ball(), **SIZE, distractors=(loop,))
     params = WITH_CLIPS.replace(episode_length=np.int32(6))
     state, _ = env.reset(jax.random.key(0), params)
@@ -121,7 +122,7 @@ def test_order_of_giving_does_not_matter(runs):
 
 def test_two_of_a_kind():
     with pytest.raises(ValueError, match="two distractors of kind 'color'"):
-        Chain((distractors.Color(), distractors.Color(scale=0.1)))
+        Chain((Color(), Color(scale=0.1)))
 
 
 def test_what_cannot_work_together_is_refused():
@@ -142,7 +143,7 @@ def test_what_cannot_work_together_is_refused():
         (("color",), TypeError, "expected a Distractor, got str; names are for"),
         ((Nameless(),), TypeError, "Nameless needs a kind"),
         ((Reset(),), ValueError, "Reset needs a stream, a positive integer, got 0"),
-        ((Twin(), distractors.Color()), ValueError, "twin, color must differ in their streams"),
+        ((Twin(), Color()), ValueError, "twin, color must differ in their streams"),
         ((Unhashable(),), TypeError, "Unhashable cannot be hashed; make it a frozen"),
     ):
         with pytest.raises(error, match=message):
@@ -166,7 +167,7 @@ def test_a_distractor_of_your_own():
         def change_frame(self, state, frame, backdrop):
             return frame.replace(r=state * frame.r, g=state * frame.g, b=state * frame.b)
 
-    env = PixelEnv(Ball(), **SIZE, distractors=(Darkness(), distractors.Color(scale=0.0)))
+    env = PixelEnv(Ball(), **SIZE, distractors=(Darkness(), Color(scale=0.0)))
     clean = PixelEnv(Ball(), **SIZE)
     state, _ = env.reset(jax.random.key(0), PARAMS)
     bare, _ = clean.reset(jax.random.key(0), PARAMS)
@@ -178,7 +179,7 @@ def test_a_distractor_of_your_own():
 
 def test_presets():
     assert distractors.preset("paper-video", "ant") == (
-        distractors.Video(mode="overlay", alpha=0.5, dynamics="loop"),
+        Video(mode="overlay", alpha=0.5, dynamics="loop"),
     )
     for level, scale, clips in (("easy", 0.1, 4), ("medium", 0.2, 8), ("hard", 0.3, None)):
         camera, video, color = distractors.preset(f"dcs-{level}", "ant")
@@ -215,10 +216,10 @@ def test_ground_under_videos_of_dm_controls_tasks():
 
 
 def test_names_and_objects_may_be_mixed():
-    assert resolve("color", "ant") == (distractors.Color(),)
-    assert resolve(("video", distractors.Color(scale=0.1)), "ant") == (
-        distractors.Video(),
-        distractors.Color(scale=0.1),
+    assert resolve("color", "ant") == (Color(),)
+    assert resolve(("video", Color(scale=0.1)), "ant") == (
+        Video(),
+        Color(scale=0.1),
     )
     with pytest.raises(ValueError, match=r"unknown distractor: 'dcs-eazy'.*mean 'dcs-easy'"):
         resolve("dcs-eazy", "ant")
@@ -269,3 +270,34 @@ def test_make_shares_clips_and_warns_of_procedural_ones():
         pb.make("inverted_pendulum", distractors="video", clips=bank, split="test", **options)
     with pytest.raises(ValueError, match="unknown split of procedural clips: 'val'"):
         pb.make("inverted_pendulum", distractors="video", clips="procedural", split="val")
+
+
+@pytest.mark.parametrize(
+    ("distractor", "options", "message"),
+    [
+        (Color, {"mode": "pixel"}, "unknown mode of Color: 'pixel'.*frame, geom"),
+        (Color, {"dynamics": "random"}, "unknown dynamics of Color"),
+        (Color, {"distribution": "gauss"}, "unknown distribution of Color"),
+        (Color, {"scale": 2.0}, r"scale of Color must lie in \[0, 1\], got 2.0"),
+        (Color, {"scale": float("nan")}, r"scale of Color must lie in \[0, 1\], got nan"),
+        (Color, {"mode": "geom", "materials": "self"}, r"must be a tuple of names, .* got 'self'"),
+        (
+            Color,
+            {"mode": "geom", "materials": ["self"]},
+            r"must be a tuple of names, .* got \['self'\]",
+        ),
+        (Color, {"mode": "geom", "materials": ("",)}, r"must be a tuple of names, .* got \(''"),
+        (Color, {"scale": "0.3"}, r"scale of Color must lie in \[0, 1\], got '0.3'"),
+        (Video, {"mode": "foreground"}, "unknown mode of Video: 'foreground'.*overlay"),
+        (Video, {"dynamics": "ping-pong"}, "Did you mean 'pingpong'"),
+        (Video, {"alpha": 1.5}, r"alpha of Video must lie in \[0, 1\], got 1.5"),
+        (Video, {"ground_alpha": -0.1}, r"ground_alpha of Video must lie in \[0, 1\], got -0.1"),
+        (Video, {"mode": "overlay", "ground_alpha": 0.0}, "mode='background' alone"),
+        (Video, {"num_clips": 0}, "num_clips of Video must be a positive integer, got 0"),
+        (MovingCamera, {"scale": -1}, r"scale of MovingCamera must lie in \[0, 1\], got -1"),
+        (Color, {"sky": True}, r"sky and materials of Color .* mode='geom' alone"),
+    ],
+)
+def test_options_are_checked(distractor, options, message):
+    with pytest.raises(ValueError, match=message):
+        distractor(**options)

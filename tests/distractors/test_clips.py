@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pixelbrax_jax import cli, distractors, load_clips
+from pixelbrax_gym import cli
+from pixelbrax_jax import distractors, load_clips
 from pixelbrax_jax.distractors import clips as clips_module
 from pixelbrax_jax.distractors import procedural
 

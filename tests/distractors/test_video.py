@@ -143,19 +143,3 @@ def test_no_clips():
     env = PixelEnv(Ball(), **SIZE, distractors=(distractors.Video(),))
     with pytest.raises(ValueError, match=r"Video needs clips.*load_clips"):
         env.reset(jax.random.key(0), PARAMS)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"mode": "foreground"}, "unknown mode of Video: 'foreground'.*overlay"),
-        ({"dynamics": "ping-pong"}, "Did you mean 'pingpong'"),
-        ({"alpha": 1.5}, r"alpha of Video must lie in \[0, 1\], got 1.5"),
-        ({"ground_alpha": -0.1}, r"ground_alpha of Video must lie in \[0, 1\], got -0.1"),
-        ({"mode": "overlay", "ground_alpha": 0.0}, "mode='background' alone"),
-        ({"num_clips": 0}, "num_clips of Video must be a positive integer, got 0"),
-    ],
-)
-def test_options_are_checked(options, message):
-    with pytest.raises(ValueError, match=message):
-        distractors.Video(**options)

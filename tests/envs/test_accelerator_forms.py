@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pixelbrax_jax.envs import autoreset, observe
+from pixelbrax_jax._platform import frame_stack, resets
 from tests.envs.test_vector import ACTIONS, PARAMS, N, make
 
 
@@ -15,14 +15,15 @@ def lowered_for(platform: str, fn, *args) -> str:
     return jax.jit(fn).trace(*args).lower(lowering_platforms=(platform,)).as_text()
 
 
-@pytest.mark.parametrize("frame_stack", [1, 2, 3])
-def test_frames_are_pushed_alike(frame_stack):
+@pytest.mark.parametrize("depth", [1, 2, 3])
+def test_frames_are_pushed_alike(depth):
     draw = np.random.default_rng(0)
-    frames = draw.integers(0, 256, (N, 5, 7, 3 * frame_stack), np.uint8)
+    frames = draw.integers(0, 256, (N, 5, 7, 3 * depth), np.uint8)
     newest = draw.integers(0, 2**24, (N, 5, 7), np.uint32)
     is_first = jnp.arange(N) % 2 == 0
     one, other = (
-        jax.vmap(push)(frames, newest, is_first) for push in (observe._concatenate, observe._shift)
+        jax.vmap(push)(frames, newest, is_first)
+        for push in (frame_stack._concatenate, frame_stack._shift)
     )
     np.testing.assert_array_equal(one, other)
     # The newest frame comes last, red first.
@@ -42,7 +43,7 @@ def test_environments_are_reset_alike():
     arguments = (state.key, state.sim.episode + 1)
     one, other = (
         jax.jit(replace, static_argnums=0)(reset, arguments, mask, state.sim)
-        for replace in (autoreset.replace_rows, autoreset._select_rows)
+        for replace in (resets.replace_rows, resets._select_rows)
     )
     jax.tree.map(np.testing.assert_array_equal, one, other)
     np.testing.assert_array_equal(other.episode, mask)
@@ -50,7 +51,7 @@ def test_environments_are_reset_alike():
 
 def test_an_accelerator_does_not_wait_for_the_host_in_a_step():
     """A loop whose turns depend on data is read by the host in every turn."""
-    venv = make("next_step", physics_batching="vmap")
+    venv = make("next_step")
     state, _ = venv.reset(jax.random.key(0), PARAMS)
     text = {
         platform: lowered_for(platform, venv.step, state, ACTIONS, PARAMS)
@@ -58,7 +59,7 @@ def test_an_accelerator_does_not_wait_for_the_host_in_a_step():
     }
     assert "stablehlo.while" in text["cpu"]
     # The bands in which an image is drawn are counted.
-    counted = make("next_step", physics_batching="vmap", obs_mode="state")
+    counted = make("next_step", obs_mode="state")
     state, _ = counted.reset(jax.random.key(0), PARAMS)
     assert "stablehlo.while" not in lowered_for("cuda", counted.step, state, ACTIONS, PARAMS)
 
@@ -70,7 +71,7 @@ def test_a_reset_that_tries_again_stays_with_the_rows_that_need_it():
     rows, mask = jnp.arange(1.0, 6.0), jnp.arange(5) < 2
 
     def put(rows, mask):
-        return autoreset.reset_rows(reset, (rows,), mask, rows)
+        return resets.reset_rows(reset, (rows,), mask, rows)
 
     np.testing.assert_array_equal(put(rows, mask), [16.0, 16.0, 3.0, 4.0, 5.0])
     text = lowered_for("cuda", put, rows, mask)

@@ -42,7 +42,7 @@ def test_environment_does_not_depend_on_the_batch(largest, num_envs):
     large_state, large = largest
     small_state, small = rollout(num_envs)
     rows = slice(0, num_envs)
-    # What is drawn and counted is equal to the bit ...
+    # What is sampled and counted is equal to the bit ...
     for name in ("terminated", "truncated"):
         np.testing.assert_array_equal(getattr(small, name), getattr(large, name)[:, rows])
     np.testing.assert_array_equal(

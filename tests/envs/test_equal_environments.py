@@ -28,7 +28,7 @@ def use(env: pb.PixelEnv, params: pb.EnvParams, seed: int = 0) -> None:
 def test_nothing_is_compiled_twice():
     use(*pb.make(TASK, **SIZE))
     red = {"geoms": np.float32([[1.0, 0.0, 0.0]])}
-    rig = pb.rig((0.0, -3.0, 0.5), (0.0, 0.0, 0.0), 40.0)
+    rig = pb.make_rig((0.0, -3.0, 0.5), (0.0, 0.0, 0.0), 40.0)
     changes = {
         "the same again": {},
         "time limit": {"episode_length": 7},

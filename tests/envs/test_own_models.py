@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 import pixelbrax_jax as pb
-from pixelbrax_jax.physics.geometry import read_geoms
-from pixelbrax_jax.physics.model_scene import with_sites
+from pixelbrax_jax.physics.geometry import site_shapes
 from pixelbrax_jax.physics.viewpoints import followed_body
 from tests.envs.toy import Ball
 
@@ -119,8 +118,7 @@ def test_sites_are_where_mujoco_has_them(made):
 
 
 def test_groups_hide_sites_too():
-    geoms = with_sites(model(), read_geoms(model()), (3,))
-    assert [name for name in geoms.name if name.startswith("site/")] == ["site/hidden"]
+    assert [site.name for site in site_shapes(model(), (3,))] == ["site/hidden"]
 
 
 def test_cameras_by_name(task, made):

@@ -12,8 +12,9 @@ import pytest
 
 import pixelbrax_jax
 from pixelbrax_jax import EnvConfig, PixelEnv, check_env
-from pixelbrax_jax.envs import observe
+from pixelbrax_jax._platform.frame_stack import unpack
 from pixelbrax_jax.envs.check import ContractError
+from pixelbrax_jax.renderer.base import pack
 from pixelbrax_jax.types import Frame
 from tests.envs.toy import PARAMS, Ball, limited
 
@@ -27,7 +28,7 @@ def make(**options) -> PixelEnv:
 def test_pack_rounds_to_the_nearest_level():
     level = np.linspace(0, 1, 1021, dtype=np.float32).reshape(1, -1)
     frame = Frame(r=level, g=1 - level, b=level**2, depth=None, seg=None, ground=None)
-    pixels = observe.unpack(observe.pack(frame))
+    pixels = unpack(pack(frame))
     for c, plane in enumerate((level, 1 - level, level**2)):
         np.testing.assert_array_equal(pixels[..., c], np.floor(255 * plane + np.float32(0.5)))
 
@@ -264,7 +265,7 @@ class TestMake:
         assert set(parameters) == {field.name for field in dataclasses.fields(EnvConfig)}
 
     def test_a_rig_must_follow_a_link_that_exists(self):
-        rig = pixelbrax_jax.rig((0, -3, 1), (0, 0, 0), 40.0, link=99)
+        rig = pixelbrax_jax.make_rig((0, -3, 1), (0, 0, 0), 40.0, link=99)
         with pytest.raises(ValueError, match="follows link 99, but task 'ant' has only 9 links"):
             pixelbrax_jax.make("ant", camera=rig)
 

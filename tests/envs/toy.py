@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pixelbrax_jax import EnvParams, GeomKind, Geoms, PhysicsState, make_look, rig
+from pixelbrax_jax import EnvParams, GeomKind, Geoms, Physics, PhysicsState, make_look, make_rig
 
 GEOMS = Geoms(
     kind=(int(GeomKind.PLANE), int(GeomKind.SPHERE)),
@@ -19,7 +19,7 @@ GEOMS = Geoms(
     rgb=np.array([[0.5, 0.5, 0.5], [0.9, 0.3, 0.1]], np.float32),
 )
 PARAMS = EnvParams(
-    geoms=GEOMS, rig=rig((0.0, -4.0, 1.0), (0.0, 0.0, 0.0), 50.0), look=make_look("default")
+    geoms=GEOMS, rig=make_rig((0.0, -4.0, 1.0), (0.0, 0.0, 0.0), 50.0), look=make_look("default")
 )
 
 
@@ -28,7 +28,7 @@ def limited(episode_length: int) -> EnvParams:
     return PARAMS.replace(episode_length=np.int32(episode_length))
 
 
-class Ball:
+class Ball(Physics):
     """The action is the ball's velocity; beyond x = 1 the task ends. NaN actions diverge.
 
     The reward is the new position, the state observation the position and the count of steps.

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from pixelbrax_gym import TorchPolicy
-from pixelbrax_jax.agents.runner.export import save_policy
+from pixelbrax_jax.agents.runner.trained import save_policy
 from tests.agents.small import PHASIC, SMALL, Agent, ball_envs, same
 from tests.gpu.processes import deterministic
 
@@ -46,7 +46,7 @@ def test_an_exported_policy_acts_on_tensors_of_the_device(tmp_path, device):
 def test_ppo_learns_to_balance(tmp_path):
     """A smoke test: as on a CPU, the pole stands for most of an episode in the end."""
     folder = tmp_path / "run"
-    command = [sys.executable, "-m", "pixelbrax_jax.cli", "train", "ppo", "--preset", "cpu"]
+    command = [sys.executable, "-m", "pixelbrax_gym.cli", "train", "ppo", "--preset", "cpu"]
     command += ["--task", "inverted_pendulum", "--total-steps", "500000", "--num-evals", "1"]
     command += ["--eval-episodes", "32", "--output-dir", str(folder)]
     subprocess.run(command, check=True, timeout=1500, env=deterministic())

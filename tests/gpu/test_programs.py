@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,8 +11,10 @@ import pytest
 
 import pixelbrax_jax as pb
 from pixelbrax_gym.bench import throughput
+from pixelbrax_jax.renderer import choice
 from pixelbrax_jax.tasks import TASKS
 from tests.gpu.processes import deterministic, told
+from tests.renderer.interpreted import interpreted_kernel
 
 pytestmark = pytest.mark.gpu
 
@@ -41,19 +45,23 @@ def test_the_kernel_draws_what_the_plain_renderer_does(task, shadows, device):
     """At most one level apart on all but a thousandth of the pixels."""
     if device == "cpu" and (task != "inverted_pendulum" or shadows):
         pytest.skip("a CPU computes the kernel slowly; one task is enough there")
-    kernel = "pallas" if device == "cuda" else "pallas-interpret"
     size = 84 if device == "cuda" else 24
     frames = []
-    for renderer in (kernel, "fused"):
-        env, params = pb.make(
-            task, renderer=renderer, shadows=shadows, height=size, width=size, backend=None
-        )
-        states = throughput.first_states(env, params, 5)
-        draw = jax.jit(jax.vmap(env.draw, in_axes=(0, None)))
-        words = np.asarray(draw(states, params))
-        frames.append(words[..., None].view(np.uint8).astype(int))
+    with nullcontext() if device == "cuda" else interpreted_kernel():
+        for renderer in ("pallas", "fused"):
+            env, params = pb.make(task, renderer=renderer, shadows=shadows, height=size, width=size)
+            states = throughput.first_states(env, params, 5)
+            draw = jax.jit(jax.vmap(env.draw, in_axes=(0, None)))
+            words = np.asarray(draw(states, params))
+            frames.append(words[..., None].view(np.uint8).astype(int))
     apart = np.abs(frames[0] - frames[1]).max(-1)
     assert np.mean(apart <= 1) >= 0.999
+
+
+def test_the_kernel_passes_its_check(device):
+    if device != "cuda":
+        pytest.skip("there is no NVIDIA GPU")
+    assert choice.kernel_check().passed, choice.kernel_check().text
 
 
 def test_a_step_of_the_device_is_that_of_a_cpu(device):
@@ -62,9 +70,7 @@ def test_a_step_of_the_device_is_that_of_a_cpu(device):
     rewards = []
     for place in (jax.devices()[0], jax.devices("cpu")[0]):
         with jax.default_device(place):
-            env, params = pb.make(
-                task, backend="spring", height=24, width=24, physics_batching="vmap"
-            )
+            env, params = pb.make(task, backend="spring", height=24, width=24)
             params = params.replace(episode_length=np.int32(10))
             envs = pb.VectorPixelEnv(env, 4)
             state, _ = envs.reset(jax.random.key(0), params)

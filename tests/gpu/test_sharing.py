@@ -175,5 +175,5 @@ def test_torch_has_memory_beside_jax(setting):
 
 @pytest.mark.cuda_only
 def test_the_doctor_is_content():
-    assert not [f for f in doctor.diagnose(doctor.inspect()) if f.level == "trouble"]
+    assert not [f for f in doctor.diagnose(doctor.inspect()) if f.level == "problem"]
     assert dlpack.default_torch_device().type == "cuda"

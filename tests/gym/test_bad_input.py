@@ -27,7 +27,10 @@ from tests.gym.conftest import ID, TASK
         ({"camera": "nowhere"}, "camera"),
         ({"look": "nice"}, "unknown look"),
         ({"split": "test"}, "split='test' is given, but no distractor is: add"),
-        ({"backend": "mjx"}, "registered with its own physics"),
+        (
+            {"backend": "mjx"},
+            "for Brax.s tasks alone, .* choose it where it was registered",
+        ),
         ({"max_episode_steps": 0}, "max_episode_steps must be a positive integer"),
         ({"max_episode_steps": -2}, "max_episode_steps must be a positive integer"),
     ],

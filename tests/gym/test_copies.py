@@ -151,7 +151,7 @@ def faster(before, after, action):
 
 
 def test_physics_of_your_own():
-    from pixelbrax_jax.physics.brax.tasks import load_brax_env
+    from pixelbrax_jax.physics.brax.loading import load_brax_env
 
     physics = pixelbrax_jax.BraxPhysics(load_brax_env("inverted_pendulum", "spring"), reward=faster)
     other = pickle.loads(pickle.dumps(physics))

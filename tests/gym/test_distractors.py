@@ -17,7 +17,7 @@ from tests.gym.conftest import ID, SIZE, TASK
 ALL = (
     distractors.Video(mode="overlay"),
     "color",
-    distractors.Camera(scale=0.2),
+    distractors.MovingCamera(scale=0.2),
 )
 OPTIONS = {"distractors": ALL, "clips": make_bank(height=12, width=12), "episode_length": 6}
 ACTIONS = np.array([[-0.2], [0.9], [1.0]], np.float32)

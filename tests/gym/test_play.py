@@ -9,9 +9,9 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 
-from pixelbrax_gym import play
+from pixelbrax_gym.cli import main, play
 from pixelbrax_gym.gymnasium.env import GymnasiumEnv
-from pixelbrax_jax.cli import main
+from pixelbrax_gym.gymnasium.window import Window
 
 TASK = "inverted_pendulum"
 SHORT = ("--num-frames", "3", "--size", "40")
@@ -50,13 +50,13 @@ def test_a_window_until_it_is_closed(monkeypatch):
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     shown = []
 
-    def show(self, image, original=play.Window.show):
+    def show(self, image, original=Window.show):
         shown.append(image)
         if len(shown) == 2:
             pygame.event.post(pygame.event.Event(pygame.QUIT))
         original(self, image)
 
-    monkeypatch.setattr(play.Window, "show", show)
+    monkeypatch.setattr(Window, "show", show)
     assert main(["play", TASK, "--size", "40"]) == 0
     assert len(shown) == 2
     assert pygame.display.get_surface() is None

@@ -65,7 +65,7 @@ def through_json(env):
 
 OBJECTS = {
     "distractors": (distractors.Color(scale=0.2), "camera"),
-    "camera": pixelbrax_jax.rig((0.0, -3.0, 1.0), (0.0, 0.0, 0.1), 45.0),
+    "camera": pixelbrax_jax.make_rig((0.0, -3.0, 1.0), (0.0, 0.0, 0.1), 45.0),
     "look": pixelbrax_jax.make_look("dmc", shadows=False),
 }
 SIZE = {"height": 12, "width": 12, "frame_stack": 1}
@@ -133,7 +133,7 @@ def test_what_json_has_nothing_for_is_named():
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [
-        ({"look": {"ground": "grid"}}, ValueError, "needs an entry 'type', one of Camera,"),
+        ({"look": {"ground": "grid"}}, ValueError, "needs an entry 'type', one of MovingCamera,"),
         ({"look": {"type": "Lok"}}, ValueError, "unknown entry 'type': 'Lok'.*'Look'"),
         ({"distractors": {"type": "color", "scal": 1}}, TypeError, "'scal'.*'scale'"),
         ({"distractors": [{"type": "no_such:Path"}]}, ValueError, "no_such:Path.*No module named"),

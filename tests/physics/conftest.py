@@ -13,8 +13,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from pixelbrax_jax.physics import make_physics
 from pixelbrax_jax.physics.mujoco_compatibility import loading_silenced
+from pixelbrax_jax.registry import make_physics
 from pixelbrax_jax.types import Geoms
 
 # Tests look at a few steps; compiling takes longer than running, so it is done hastily.

@@ -4,9 +4,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from pixelbrax_jax.physics.geometry import read_geoms
+from pixelbrax_jax.physics.geometry import as_geoms, geom_shapes
 from pixelbrax_jax.tasks import BRAX_TASKS
-from pixelbrax_jax.types import GeomKind
+from pixelbrax_jax.types import GeomKind, for_each_kind
 
 LOOKS = """
 <mujoco>
@@ -32,6 +32,10 @@ LOOKS = """
   </worldbody>
 </mujoco>
 """
+
+
+def read_geoms(model, **options):
+    return as_geoms(geom_shapes(model, **options))
 
 
 def viewer(model):
@@ -96,17 +100,13 @@ def test_replaced_color():
     assert row["box/10"] == row["glass"]
 
 
-def test_unknown_geom_in_colors():
-    model = mujoco.MjModel.from_xml_string(LOOKS)
-    with pytest.raises(ValueError, match=r"unknown geom: 'grund'.*Did you mean 'ground'"):
-        read_geoms(model, colors={"grund": (0, 0, 0)})
-
-
 @pytest.mark.parametrize("color", [(0, 0, 2), (0, 0), (0, 0, float("nan")), (255, 0, 0)])
 def test_bad_color(color):
     model = mujoco.MjModel.from_xml_string(LOOKS)
     with pytest.raises(ValueError, match=r"color of geom 'ground' .* \[0, 1\], got"):
         read_geoms(model, colors={"ground": color})
+    with pytest.raises(ValueError, match=r"unknown geom: 'grund'.*Did you mean 'ground'"):
+        read_geoms(model, colors={"grund": (0, 0, 0)})
 
 
 MESH = """
@@ -121,34 +121,12 @@ MESH = """
 """
 
 
-def test_visible_mesh():
-    model = mujoco.MjModel.from_xml_string(MESH.format(more=""))
-    expected = (
-        r"geom 'shell' is a mesh, which cannot be drawn; supported: plane, sphere, capsule, "
-        r"ellipsoid, cylinder, box\. Replace it by these primitives, .* alpha 0"
-    )
-    with pytest.raises(ValueError, match=expected):
-        read_geoms(model)
-
-
-@pytest.mark.parametrize("more", ['rgba="1 1 1 0"', 'group="4"'])
-def test_hidden_mesh_is_no_concern(more):
-    assert read_geoms(mujoco.MjModel.from_xml_string(MESH.format(more=more))).name == ("ball",)
-
-
-def test_visible_height_field():
-    model = mujoco.MjModel.from_xml_string(
-        """
-        <mujoco>
-          <asset><hfield name="hills" nrow="3" ncol="3" size="1 1 1 1"/></asset>
-          <worldbody><geom type="hfield" hfield="hills"/></worldbody>
-        </mujoco>
-        """
-    )
-    with pytest.raises(ValueError, match="geom 'hfield/0' is a hfield, which cannot be drawn"):
-        read_geoms(model)
-
-
+HILLS = """
+<mujoco>
+  <asset><hfield name="hills" nrow="3" ncol="3" size="1 1 1 1"/></asset>
+  <worldbody><geom type="hfield" hfield="hills"/></worldbody>
+</mujoco>
+"""
 SKIN = """
 <mujoco>
   <deformable>
@@ -159,26 +137,36 @@ SKIN = """
   <worldbody><body name="b"><geom name="ball" size=".1"/></body></worldbody>
 </mujoco>
 """
+CLOTH = """
+<mujoco><worldbody>
+  <flexcomp name="cloth" type="grid" count="3 3 1" spacing=".1 .1 .1" dim="2" mass="1"
+            radius=".01"/>
+</worldbody></mujoco>
+"""
 
 
-def test_visible_skin():
-    with pytest.raises(ValueError, match=r"skin 'hide' cannot be drawn: hide it with alpha 0, .*2"):
-        read_geoms(mujoco.MjModel.from_xml_string(SKIN.format(more='group="2"')))
+@pytest.mark.parametrize(
+    ("xml", "message"),
+    [
+        (
+            MESH.format(more=""),
+            r"geom 'shell' is a mesh, which cannot be drawn; supported: plane, sphere, capsule, "
+            r"ellipsoid, cylinder, box\. Replace it by these primitives, .* alpha 0",
+        ),
+        (HILLS, "geom 'hfield/0' is a hfield, which cannot be drawn"),
+        (SKIN.format(more='group="2"'), r"skin 'hide' cannot be drawn: hide it with alpha 0, .*2"),
+        (CLOTH, "flex 'cloth' cannot be drawn"),
+    ],
+)
+def test_what_cannot_be_drawn_is_named(xml, message):
+    with pytest.raises(ValueError, match=message):
+        read_geoms(mujoco.MjModel.from_xml_string(xml))
 
 
 @pytest.mark.parametrize("more", ['rgba="1 1 1 0"', 'group="4"'])
-def test_hidden_skin_is_no_concern(more):
-    assert read_geoms(mujoco.MjModel.from_xml_string(SKIN.format(more=more))).name == ("ball",)
-
-
-def test_visible_flex():
-    cloth = """
-    <mujoco><worldbody>
-      <flexcomp name="cloth" type="grid" count="3 3 1" spacing=".1 .1 .1" dim="2" mass="1"
-                radius=".01"/>
-    </worldbody></mujoco>"""
-    with pytest.raises(ValueError, match="flex 'cloth' cannot be drawn"):
-        read_geoms(mujoco.MjModel.from_xml_string(cloth))
+@pytest.mark.parametrize("xml", [MESH, SKIN], ids=["mesh", "skin"])
+def test_what_is_hidden_is_no_concern(xml, more):
+    assert read_geoms(mujoco.MjModel.from_xml_string(xml.format(more=more))).name == ("ball",)
 
 
 def test_task_colors_name_geoms_that_exist(program):
@@ -239,3 +227,12 @@ def test_targets_stand_out(task, names, deuteranope, program):
 def test_kinds_are_mujocos_numbers():
     for kind in GeomKind:
         assert int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind.name}")) == kind
+
+
+def test_a_kind_without_a_formula_is_an_error():
+    """Which each table raises when it is imported."""
+    with pytest.raises(TypeError, match=r"formulas must have one entry for each .* wrong for BOX"):
+        for_each_kind("formulas", dict.fromkeys(set(GeomKind) - {GeomKind.BOX}))
+    for numbers in ((6,), (6, 3), (6, 3, "far"), (6, 0, "first")):
+        with pytest.raises(TypeError, match="GeomKind 6 needs a number of sizes and a reach"):
+            GeomKind.__new_member__(GeomKind, *numbers)

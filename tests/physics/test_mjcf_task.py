@@ -6,9 +6,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from pixelbrax_jax.physics.base import Kinematics, Physics
+from pixelbrax_jax.physics.base import Physics
 from pixelbrax_jax.physics.brax.mjcf import mjcf_physics
-from pixelbrax_jax.tasks import BRAX_BACKENDS
+from pixelbrax_jax.physics.brax.tasks import BACKENDS as BRAX_BACKENDS
 
 # A cart with a leaning pole; the knob is a body without a joint, rotated by Euler angles.
 CART = """
@@ -172,28 +172,21 @@ def test_missing_file(tmp_path):
         build("arm.xml")
 
 
-def test_broken_xml():
-    with pytest.raises(ValueError, match=r"MuJoCo cannot compile the given XML: (.|\n)*wrldbody"):
-        build("<mujoco><wrldbody/></mujoco>")
+MESH = """<asset><mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset>
+<worldbody><geom name="statue" type="mesh" mesh="m"/>"""
 
 
-def test_no_actuator():
-    with pytest.raises(ValueError, match="the model has no actuator"):
-        build(CART[: CART.index("<actuator>")] + "</mujoco>")
-
-
-def test_no_joint():
-    with pytest.raises(ValueError, match="the model has no joint"):
-        build('<mujoco><worldbody><geom size=".1"/></worldbody></mujoco>')
-
-
-def test_mesh():
-    xml = CART.replace(
-        "<worldbody>",
-        '<asset><mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset><worldbody>'
-        '<geom name="statue" type="mesh" mesh="m"/>',
-    )
-    with pytest.raises(ValueError, match="geom 'statue' is a mesh, which cannot be drawn"):
+@pytest.mark.parametrize(
+    ("xml", "message"),
+    [
+        ("<mujoco><wrldbody/></mujoco>", r"MuJoCo cannot compile the given XML: (.|\n)*wrldbody"),
+        (CART[: CART.index("<actuator>")] + "</mujoco>", "the model has no actuator"),
+        ('<mujoco><worldbody><geom size=".1"/></worldbody></mujoco>', "the model has no joint"),
+        (CART.replace("<worldbody>", MESH), "geom 'statue' is a mesh, which cannot be drawn"),
+    ],
+)
+def test_models_that_are_no_task(xml, message):
+    with pytest.raises(ValueError, match=message):
         build(xml)
 
 
@@ -247,7 +240,3 @@ def test_models_beyond_mujoco_xla(backend):
 
 def test_energy_is_only_reported():
     build(CART.replace('"0.01"/>', '"0.01"><flag energy="enable"/></option>'))
-
-
-def test_view_is_public():
-    assert Kinematics.__dataclass_fields__.keys() == {"q", "qd", "xpos", "xquat"}

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pixelbrax_jax.physics.brax.omissions import check_simulated, omissions
-from pixelbrax_jax.tasks import BRAX_BACKENDS
+from pixelbrax_jax.physics.brax.tasks import BACKENDS as BRAX_BACKENDS
 
 ARM = """
 <mujoco>
@@ -62,8 +62,29 @@ def balls(attributes):
     return [(BALL, f'"ball" {attributes} size')]
 
 
+def floor(attributes):
+    return [(FLOOR, f"{FLOOR} {attributes}")]
+
+
+def option(attributes):
+    return [(OPTION, f"{OPTION} {attributes}")]
+
+
+def at_the_end(element):
+    return [(END, element + END)]
+
+
 SPRING, LIMITS, WATER = elbow('stiffness="3"'), elbow('range="-20 20"'), 'density="1000"'
+CLAMPED = motor('ctrlrange="-.1 .1"')
 SPRUNG = '<fixed name="pull" stiffness="9"><joint joint="elbow" coef="2"/></fixed>'
+LOCK = '<equality><joint name="lock" joint1="elbow"/></equality>'
+SLANTED = '<pair geom1="floor" geom2="ball" friction="1 .01 .005 1e-4 1e-4"/>'
+WATERY = option(WATER)
+
+
+def general(attributes):
+    return push(f'<general name="push" joint="elbow" gear="2" {attributes}/>')
+
 
 # Where a feature changes nothing by itself, the third column is what it is compared with.
 EVERYWHERE = [
@@ -72,20 +93,13 @@ EVERYWHERE = [
     ("armature (actuator 'push')", motor('armature=".1"'), []),
     ("damping (actuator 'push')", motor('damping=".5"'), []),
     ("delay (actuator 'push')", motor('delay=".05" nsample="20"'), []),
-    (
-        "option actuatorgroupdisable (actuator 'push')",
-        [(OPTION, f'{OPTION} actuatorgroupdisable="0"')],
-        [],
-    ),
+    ("option actuatorgroupdisable (actuator 'push')", option('actuatorgroupdisable="0"'), []),
     (
         "ellipsoid fluid forces (geom 'hand')",
-        [
-            (OPTION, f"{OPTION} {WATER}"),
-            ('name="hand" type', 'name="hand" fluidshape="ellipsoid" type'),
-        ],
-        [(OPTION, f"{OPTION} {WATER}")],
+        [*WATERY, ('name="hand" type', 'name="hand" fluidshape="ellipsoid" type')],
+        WATERY,
     ),
-    ("surface velocity (geom 'floor')", [(FLOOR, f'{FLOOR} surfacevel="1 0 0"')], []),
+    ("surface velocity (geom 'floor')", floor('surfacevel="1 0 0"'), []),
     ("flag spring='disable'", SPRING + flag("spring"), SPRING),
     ("flag damper='disable'", elbow('damping="1"') + flag("damper"), elbow('damping="1"')),
 ]
@@ -94,29 +108,13 @@ IN_BRAX = [
     ("springref (joint 'elbow')", elbow('stiffness="3" springref="40"'), SPRING),
     ("actuatorfrcrange (joint 'elbow')", elbow('actuatorfrcrange="-.1 .1"'), []),
     ("gravity compensation (body 'arm')", [(ARM_BODY, f'{ARM_BODY} gravcomp="1"')], []),
-    (
-        "equality constraints (equality 'lock')",
-        [(END, f'<equality><joint name="lock" joint1="elbow"/></equality>{END}')],
-        [],
-    ),
-    (
-        "tendons (tendon 'pull')",
-        [(END, f"<tendon>{SPRUNG}</tendon>{END}")],
-        [],
-    ),
-    (
-        "activation dynamics (actuator 'push')",
-        push('<general name="push" joint="elbow" dyntype="filter" dynprm=".1" gear="2"/>'),
-        [],
-    ),
-    (
-        "constant bias (actuator 'push')",
-        push('<general name="push" joint="elbow" biastype="affine" biasprm="2 0 0" gear="2"/>'),
-        [],
-    ),
+    ("equality constraints (equality 'lock')", at_the_end(LOCK), []),
+    ("tendons (tendon 'pull')", at_the_end(f"<tendon>{SPRUNG}</tendon>"), []),
+    ("activation dynamics (actuator 'push')", general('dyntype="filter" dynprm=".1"'), []),
+    ("constant bias (actuator 'push')", general('biastype="affine" biasprm="2 0 0"'), []),
     (
         "gain types other than fixed (actuator 'push')",
-        push('<general name="push" joint="elbow" gaintype="affine" gainprm="1 3 0" gear="2"/>'),
+        general('gaintype="affine" gainprm="1 3 0"'),
         [],
     ),
     (
@@ -132,34 +130,20 @@ IN_BRAX = [
         push('<motor name="push" joint="ball" gear="0 0 50 0 0 0"/>'),
         push('<motor name="push" joint="ball" gear="0 0 0 0 0 0"/>'),
     ),
-    (
-        "condim 1 (geoms 'floor' and 'ball')",
-        [*balls('condim="1"'), (FLOOR, f'{FLOOR} condim="1"')],
-        [],
-    ),
+    ("condim 1 (geoms 'floor' and 'ball')", balls('condim="1"') + floor('condim="1"'), []),
     ("condim 6 (geoms 'floor' and 'ball')", balls('condim="6" friction="1 .1 .1"'), []),
     (
         "friction that differs by direction (geoms 'floor' and 'ball')",
-        [
-            (
-                END,
-                '<contact><pair geom1="floor" geom2="ball" friction="1 .01 .005 1e-4 1e-4"/>'
-                f"</contact>{END}",
-            )
-        ],
+        at_the_end(f"<contact>{SLANTED}</contact>"),
         [],
     ),
-    ("option wind", [(OPTION, f'{OPTION} {WATER} wind="1 0 2"')], [(OPTION, f"{OPTION} {WATER}")]),
-    ("option integrator='rk4'", [(OPTION, f'{OPTION} integrator="RK4"')], []),
+    ("option wind", option(f'{WATER} wind="1 0 2"'), WATERY),
+    ("option integrator='rk4'", option('integrator="RK4"'), []),
     ("flag constraint='disable'", LIMITS + flag("constraint"), LIMITS),
     ("flag limit='disable'", LIMITS + flag("limit"), LIMITS),
     ("flag gravity='disable'", flag("gravity"), []),
     ("flag actuation='disable'", flag("actuation"), []),
-    (
-        "flag clampctrl='disable'",
-        motor('ctrlrange="-.1 .1"') + flag("clampctrl"),
-        motor('ctrlrange="-.1 .1"'),
-    ),
+    ("flag clampctrl='disable'", CLAMPED + flag("clampctrl"), CLAMPED),
 ]
 IN_MAXIMAL = [
     ("damping (joint 'elbow')", elbow('damping=".5"'), []),
@@ -171,10 +155,11 @@ IN_MAXIMAL = [
         push(""),
     ),
 ]
+# What single backends have no formula for.
 ODD = [
     ("priority (geom 'ball')", balls('priority="1"')),
-    ("option cone='elliptic'", [(OPTION, f'{OPTION} cone="elliptic"')]),
-    ("option impratio=2", [(OPTION, f'{OPTION} impratio="2"')]),
+    ("option cone='elliptic'", option('cone="elliptic"')),
+    ("option impratio=2", option('impratio="2"')),
     ("ref (joint 'elbow')", elbow('ref="30"')),
     ("ball joints (joint 'elbow')", [(ELBOW, '"elbow" type="ball"'), (PUSH, "")]),
     ("limits beyond half a turn (joint 'elbow')", elbow('range="-200 200"')),

@@ -171,11 +171,73 @@ def test_every_paper_setting_belongs_to_a_task_that_differs():
         for name, spec in BRAX_TASKS.items()
         if spec.paper_options or spec.paper_unscaled or spec.paper_reward
     }
-    assert changed == {
-        "humanoid",
-        "humanoidstandup",
-        "inverted_pendulum",
-        "pusher",
-        "swimmer",
-        "walker2d",
-    }
+    unscaled = {"humanoid", "humanoidstandup", "inverted_pendulum", "pusher"}
+    assert changed == unscaled | {"swimmer", "walker2d"}
+
+
+PENDULUM = "inverted_double_pendulum"
+# (cart, first hinge, second hinge) -> tip (x, z); agrees with MuJoCo's site "tip".
+TIPS = [
+    ((0, 0, 0), (0, 1.2)),
+    ((0, 0, np.pi / 2), (0.6, 0.6)),
+    ((0, 0, np.pi), (0, 0)),
+    ((0, 0.3, -0.3), (0.1773, 1.1732)),
+    ((0.2, 0.5, 0.7), (1.0469, 0.7440)),
+]
+backends = pytest.mark.parametrize(
+    "backend",
+    [
+        pytest.param(name, marks=() if name == "generalized" else pytest.mark.slow)
+        for name in BRAX_TASKS[PENDULUM].backends
+    ],
+)
+
+
+def tip_of(physics, state, geom_pose):
+    """Center of the far end cap of the upper pole, as an image shows it."""
+    index = physics.geoms.name.index("cpole2")
+    pos, mat = geom_pose(physics.geoms, state, index)
+    half = float(physics.geoms.size[index, 1])
+    ends = [pos + mat[:, 2] * half, pos - mat[:, 2] * half]
+    hinge = np.asarray(state.xpos[physics.link_names.index("pole2")])
+    return max(ends, key=lambda end: np.linalg.norm(end - hinge))
+
+
+@backends
+def test_tip(backend, program, geom_pose):
+    compiled = program(PENDULUM, backend)
+    for q, (x, z) in TIPS:
+        state = compiled.from_qpos(np.array(q, np.float32))
+        tip = tip_of(compiled.physics, state, geom_pose)
+        np.testing.assert_allclose(tip, [x, 0, z], atol=1e-4, err_msg=str(q))
+
+
+@backends
+def test_fallen_upper_pole_ends_the_episode_without_a_bonus(backend, program, geom_pose):
+    compiled = program(PENDULUM, backend)
+    fallen = compiled.from_qpos(np.array([0, 0, np.pi / 2], np.float32))
+    assert not fallen.terminated
+    state = compiled.step(fallen, np.zeros(1, np.float32))
+    assert state.terminated
+    assert not state.non_finite
+    assert state.reward < 0
+    np.testing.assert_allclose(
+        state.reward, pendulum_reward(compiled.physics, state, geom_pose, alive=0), atol=1e-4
+    )
+
+
+@backends
+def test_upright_pole_earns_the_bonus(backend, program, geom_pose):
+    compiled = program(PENDULUM, backend)
+    upright = compiled.from_qpos(np.array([0, 0.01, 0.02], np.float32))
+    state = compiled.step(upright, np.full(1, 0.1, np.float32))
+    assert not state.terminated
+    np.testing.assert_allclose(
+        state.reward, pendulum_reward(compiled.physics, state, geom_pose, alive=10), atol=1e-4
+    )
+
+
+def pendulum_reward(physics, state, geom_pose, alive):
+    x, _, z = tip_of(physics, state, geom_pose)
+    _, v1, v2 = np.asarray(state.engine.pipeline.qd)
+    return alive - (0.01 * x**2 + (z - 2) ** 2) - (1e-3 * v1**2 + 5e-3 * v2**2)

@@ -6,7 +6,9 @@ import mujoco
 import numpy as np
 
 
-def drawn(model: mujoco.MjModel, data: mujoco.MjData, camera: int) -> list[tuple[str, object]]:
+def shown_geoms(
+    model: mujoco.MjModel, data: mujoco.MjData, camera: int
+) -> list[tuple[str, object]]:
     """Names and abstract geoms of everything that MuJoCo shows by default."""
     scene, view = mujoco.MjvScene(model, 2000), mujoco.MjvCamera()
     view.type, view.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, camera
@@ -35,7 +37,7 @@ def cast(
     Returns:
         (size, size) str, name of what is seen, ``""`` for the sky; (size, size) depth, metres.
     """
-    shown = drawn(model, data, camera)
+    shown = shown_geoms(model, data, camera)
     spec = mujoco.MjSpec()
     for _, geom in shown:
         kind = mujoco.mjtGeom(int(geom.type))

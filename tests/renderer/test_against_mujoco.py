@@ -13,7 +13,8 @@ from brax.io import mjcf
 from etils import epath
 
 import pixelbrax_jax
-from pixelbrax_jax import place, render
+from pixelbrax_jax.renderer.base import render
+from pixelbrax_jax.scene.place import place
 from pixelbrax_jax.tasks import BRAX_TASKS
 from pixelbrax_jax.types import FAR
 from tests.renderer import scenes
@@ -21,7 +22,9 @@ from tests.renderer.mujoco_rays import cast
 
 SIZE = 32
 NUM_POSES = 20
-RENDERERS = ("fused", pytest.param("pallas-interpret", marks=pytest.mark.slow))
+RENDERERS = ("fused", pytest.param("pallas", marks=pytest.mark.slow))
+
+pytestmark = pytest.mark.usefixtures("interpreted")
 
 
 def compare(model: mujoco.MjModel, batch, shown: list[int], renderer: str) -> None:

@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from pixelbrax_jax.renderer.bounds import at_least, at_most, between
+from pixelbrax_jax.renderer.intersect import at_least, at_most, between
 
 NAN = np.float32("nan")
 

@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pixelbrax_jax import GeomKind, make_look, render
-from pixelbrax_jax.renderer import ground
+from pixelbrax_jax import GeomKind, make_look
+from pixelbrax_jax.renderer import shading
+from pixelbrax_jax.renderer.base import render
 from pixelbrax_jax.types import FAR
 from tests.renderer import scenes
 
@@ -130,7 +131,7 @@ class TestGround:
         rng = np.random.default_rng(0)
         x, y = rng.uniform(-3, 3, (2, 20))
         width_x, width_y = rng.uniform(0.05, 3, (2, 20))
-        share = ground.second_color_fraction(pattern, x, y, width_x, width_y)
+        share = shading.second_color_fraction(pattern, x, y, width_x, width_y)
         steps = (np.arange(400) + 0.5) / 400 - 0.5
         for k in range(20):
             px = (x[k] + width_x[k] * steps)[:, None]
@@ -138,7 +139,7 @@ class TestGround:
             if pattern == "checker":
                 second = (np.floor(px) + np.floor(py)) % 2 == 1
             else:
-                second = (px % 1 < ground.LINE_WIDTH) | (py % 1 < ground.LINE_WIDTH)
+                second = (px % 1 < shading.LINE_WIDTH) | (py % 1 < shading.LINE_WIDTH)
             assert share[k] == pytest.approx(second.mean(), abs=0.01)
 
     @pytest.mark.parametrize("look", ["default", "original"])

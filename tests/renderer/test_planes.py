@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pixelbrax_jax import GeomKind, Geoms, make_look, render
+from pixelbrax_jax import GeomKind, Geoms, make_look
+from pixelbrax_jax.renderer.base import render
 from pixelbrax_jax.types import FAR, Scene
 from tests.renderer import scenes
-from tests.renderer.test_gradients import zeros_like
 
 SIZE = 40
 RENDERERS = ("fused", "reference")
@@ -183,52 +183,3 @@ def test_fused_draws_what_the_reference_draws():
             assert np.mean(np.abs(a - b) > 2 / 255) < 0.005
         both = same & (plain.depth < FAR)
         np.testing.assert_allclose(fast.depth[both], plain.depth[both], rtol=1e-3)
-
-
-@pytest.fixture(scope="module")
-def program():
-    def values(scene):
-        frame = render(scene, 24, 24)
-        return jnp.stack([frame.r, frame.b, jnp.where(frame.seg >= 0, frame.depth, 0.0)]), frame.seg
-
-    return jax.jit(values), jax.jit(jax.jvp, static_argnums=0), values
-
-
-def test_gradients_are_finite_and_right_inside(program):
-    draw, _, values = program
-    rng = np.random.default_rng(0)
-    step, checked = 1e-3, 0
-    derivative = jax.jit(lambda s, d: jax.jvp(lambda x: values(x)[0], (s,), (d,))[1])
-    reverse = jax.jit(jax.grad(lambda s: jnp.sum(values(s)[0] ** 2)))
-    for seed in range(2):
-        scene = random_strip(seed)
-        look = scene.look.replace(
-            ground_rgb=scene.look.ground_rgb[:1].repeat(2, 0),
-            highlight=np.float32(0.0),
-            shadows=False,
-        )
-        scene = jax.tree.map(jnp.asarray, scene.replace(look=look))
-        assert all(bool(jnp.isfinite(x).all()) for x in jax.tree.leaves(reverse(scene)))
-        zero = zeros_like(scene)
-        tangent = zero.replace(
-            pos=jnp.asarray(rng.normal(size=scene.pos.shape), jnp.float32),
-            geoms=zero.geoms.replace(
-                size=jnp.asarray(rng.normal(size=scene.geoms.size.shape), jnp.float32)
-            ),
-        )
-        ahead, seg_ahead = draw(jax.tree.map(lambda x, d: x + step * d, scene, tangent))
-        behind, seg_behind = draw(jax.tree.map(lambda x, d: x - step * d, scene, tangent))
-        seg = np.asarray(draw(scene)[1])
-        exact = np.asarray(derivative(scene, tangent))
-        assert np.isfinite(exact).all()
-        numeric = np.asarray(ahead - behind) / (2 * step)
-        padded = np.pad(seg, 1, mode="edge")
-        calm = (np.asarray(seg_ahead) == seg) & (np.asarray(seg_behind) == seg)
-        for dy in range(3):
-            for dx in range(3):
-                calm &= padded[dy : dy + 24, dx : dx + 24] == seg
-        error = np.abs(exact - numeric)[:, calm]
-        # A kink of the lights' clipping is not what is tested.
-        assert np.mean(error > 0.05 * (0.05 + np.abs(numeric[:, calm]))) < 0.03
-        checked += calm.sum()
-    assert checked > 200

@@ -5,22 +5,32 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pixelbrax_jax import list_envs, make_look, register, rig
-from pixelbrax_jax.scene.cameras import make_rig, rigs_of
+from pixelbrax_jax import EnvConfig, list_envs, make_look, make_rig, register
+from pixelbrax_jax.envs import making
+from pixelbrax_jax.scene.cameras import choose_rig, with_sides
+from tests.envs.toy import Ball
 
 OWN = {
-    "default": rig((0, -3, 1), (0, 0, 1), 45.0, link=2, track=(1.0, 1.0, 1.0)),
-    "side": rig((0, -2, 1), (0, 0, 1), 30.0),
-    "back": rig((-2, 0, 1), (0, 0, 1), 60.0),
+    "default": make_rig((0, -3, 1), (0, 0, 1), 45.0, link=2, track=(1.0, 1.0, 1.0)),
+    "side": make_rig((0, -2, 1), (0, 0, 1), 30.0),
+    "back": make_rig((-2, 0, 1), (0, 0, 1), 60.0),
 }
 
 
-def test_a_models_own_look_stands_for_dmc_alone():
+def test_a_models_own_look_is_the_default_one():
     own = make_look("dmc").replace(ambient=np.float32(0.7))
-    assert make_look("dmc", own=own) is own
-    assert make_look("default", own=own) is make_look("default")
-    assert make_look("dmc", own=own, shadows=False).ambient == np.float32(0.7)
-    assert make_look("dmc").ambient == np.float32(0.4)
+
+    class Lit(Ball):
+        look = own
+
+    def chosen(look, **options):
+        config = EnvConfig("ball", look=look, **options)
+        return making._look(config, Lit())
+
+    assert chosen("default") is chosen("dmc") is own
+    assert chosen("original") is make_look("original")
+    assert chosen("dmc", shadows=False).ambient == np.float32(0.7)
+    assert making._look(EnvConfig("ball"), Ball()) is make_look("default")
 
 
 def test_dmcs_look_is_the_suites():
@@ -35,18 +45,13 @@ def test_dmcs_look_is_the_suites():
 
 
 def test_cameras_of_a_model_are_rigs_by_name():
-    rigs = rigs_of("a task", OWN)
-    assert next(iter(rigs)) == "default"
-    assert set(rigs) == {"default", "side", "front", "top", "back"}
+    rigs = with_sides(OWN)
+    assert list(rigs) == ["default", "side", "front", "top", "back"]
     for name, own in OWN.items():
         assert rigs[name] is own
-    assert make_rig("a task", "back", OWN) is OWN["back"]
+    assert choose_rig("a task", "back", rigs) is OWN["back"]
     with pytest.raises(ValueError, match=r"unknown camera of task 'a task': 'bakc'.*mean 'back'"):
-        make_rig("a task", "bakc", OWN)
-
-
-def test_a_row_of_a_task_comes_before_a_fallback():
-    assert rigs_of("ant", OWN["back"])["default"] is rigs_of("ant")["default"]
+        choose_rig("a task", "bakc", rigs)
 
 
 def test_a_task_with_a_camera_of_another_kind_is_not_registered():

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pixelbrax_jax import GeomKind, Geoms, make_look, place, rig
+from pixelbrax_jax import GeomKind, Geoms, make_look, make_rig
+from pixelbrax_jax.scene.place import place
 from pixelbrax_jax.scene.strings import hang
 from pixelbrax_jax.types import Lamp, String
 
@@ -86,7 +87,7 @@ def test_place_stretches_strings_and_carries_lamps():
     look = make_look("default").replace(lamps=(lamp,))
     xpos = jnp.array([[9.0, 9.0, 9.0], [3.0, 0.0, 2.0]])
     half_turn = jnp.array([[1.0, 0, 0, 0], [0.0, 1.0, 0.0, 0.0]])  # about x: its z is down
-    view = rig((0, -4, 1), (0, 0, 1), 45.0)
+    view = make_rig((0, -4, 1), (0, 0, 1), 45.0)
     scene = place(geoms, view, look, xpos, half_turn)
     # From (0, 0, 2) to link 1's (3, 0, 2) and 0.5 down.
     end = np.array([3.0, 0.0, 1.5])

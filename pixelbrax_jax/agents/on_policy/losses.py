@@ -1,17 +1,110 @@
-"""The terms that the algorithms' losses are made of, and their metrics."""
+"""What on-policy algorithms learn towards: returns, advantages, and the terms of their losses."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from flax import struct
 
-from pixelbrax_jax.agents.config import TrainConfig
 from pixelbrax_jax.agents.networks.distributions import Normal
-from pixelbrax_jax.agents.on_policy.rollout import Rollout, at_times, observations
+from pixelbrax_jax.agents.on_policy.config import OnPolicyConfig
+from pixelbrax_jax.agents.train_state import Metrics, along_envs, without_envs
 
-Metrics = dict[str, jax.Array]
+
+def gae(
+    reward: jax.Array,
+    value: jax.Array,
+    last_value: jax.Array,
+    terminated: jax.Array,
+    truncated: jax.Array,
+    gamma: float,
+    gae_lambda: float,
+) -> tuple[jax.Array, jax.Array]:
+    """Return generalised advantage estimates (Schulman et al., arXiv 1506.02438).
+
+    ``delta_t = r_t + gamma (1 - d_t) V(o_{t+1}) - V(o_t)`` and
+    ``A_t = delta_t + gamma lambda (1 - d_t) (1 - u_t) A_{t+1}``, where d is termination and u is
+    truncation. ``o_{t+1}`` is the observation that the step returned, also of the step that ended
+    the episode: a time limit does not make the future worthless.
+
+    Returns:
+        Advantages and returns ``A_t + V(o_t)``, (T, N) float32 each, of arrays (T, N) and the
+        (N,) value of the last observation. At a step that only begins an episode both are without
+        meaning.
+    """
+    following = jnp.concatenate([value[1:], last_value[None]])
+    delta = reward + gamma * jnp.where(terminated, 0.0, following) - value
+
+    def backwards(later: jax.Array, now: tuple[jax.Array, jax.Array]) -> tuple[Any, jax.Array]:
+        delta, over = now
+        advantage = delta + gamma * gae_lambda * jnp.where(over, 0.0, later)
+        return advantage, advantage
+
+    over = terminated | truncated
+    _, advantage = jax.lax.scan(backwards, jnp.zeros_like(last_value), (delta, over), reverse=True)
+    return advantage, advantage + value
+
+
+class RewardScaler(struct.PyTreeNode):
+    """Divides rewards by the standard deviation of discounted returns seen so far.
+
+    ``G_t = gamma G_{t-1} + r_t``, from 0 in every episode; rewards become
+    ``clip(r / sqrt(var(G) + 1e-8), -10, 10)``, as in OpenAI's baselines and PPG
+    (arXiv 2009.04416).
+
+    Attributes:
+        discounted: (N,) float32, G of each environment.
+        count: () float32, number of returns seen; to 24 bits.
+        mean: () float32.
+        square: () float32, mean squared deviation from the mean.
+    """
+
+    discounted: jax.Array = along_envs(0)
+    count: jax.Array = without_envs()
+    mean: jax.Array = without_envs()
+    square: jax.Array = without_envs()
+
+    @classmethod
+    def start(cls, num_envs: int) -> RewardScaler:
+        """Return a scaler that has seen nothing."""
+        zero = jnp.float32(0.0)
+        return cls(discounted=jnp.zeros(num_envs), count=zero, mean=zero, square=zero)
+
+    @property
+    def scale(self) -> jax.Array:
+        """() float32, what a reward is divided by."""
+        return jnp.sqrt(self.square + 1e-8)
+
+    def __call__(
+        self, reward: jax.Array, done: jax.Array, valid: jax.Array, gamma: float
+    ) -> tuple[RewardScaler, jax.Array]:
+        """Return the scaler that has seen a rollout, (T, N) each, and its rewards, scaled."""
+
+        def forwards(before: jax.Array, now: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
+            reward, done = now
+            discounted = gamma * before + reward
+            return jnp.where(done, 0.0, discounted), discounted
+
+        after, seen = jax.lax.scan(forwards, self.discounted, (reward, done))
+        number = jnp.sum(valid, dtype=jnp.float32)
+        weight = valid / jnp.maximum(number, 1)
+        mean = jnp.sum(weight * seen)
+        square = jnp.sum(weight * (seen - mean) ** 2)
+        # Chan et al.'s union of two samples, in fractions of their sizes.
+        count = self.count + number
+        fraction = number / jnp.maximum(count, 1.0)
+        shift = mean - self.mean
+        scaler = RewardScaler(
+            discounted=after,
+            count=count,
+            mean=self.mean + fraction * shift,
+            square=(1 - fraction) * self.square
+            + fraction * square
+            + fraction * (1 - fraction) * shift**2,
+        )
+        return scaler, jnp.clip(reward / scaler.scale, -10.0, 10.0)
 
 
 class Batch(NamedTuple):
@@ -36,27 +129,6 @@ class Batch(NamedTuple):
     weight: jax.Array
 
 
-def batch_at(
-    config: TrainConfig,
-    rollout: Rollout,
-    advantage: jax.Array,
-    returns: jax.Array,
-    times: jax.Array,
-) -> Batch:
-    """Return the samples of some times, (B, N) int32."""
-    frames = rollout.frames
-    return Batch(
-        pixels=observations(frames, times, config.random_shift),
-        state=None if frames.state is None else at_times(frames.state, times),
-        unclipped_action=at_times(rollout.unclipped_action, times),
-        log_prob=at_times(rollout.log_prob, times),
-        value=at_times(rollout.value, times),
-        advantage=at_times(advantage, times),
-        returns=at_times(returns, times),
-        weight=at_times(rollout.valid, times).astype(jnp.float32),
-    )
-
-
 def mean(x: jax.Array, weight: jax.Array) -> jax.Array:
     """Return () weighted mean; 0 where nothing has weight."""
     return jnp.sum(x * weight) / jnp.maximum(jnp.sum(weight), 1.0)
@@ -69,18 +141,12 @@ def normalized(x: jax.Array, weight: jax.Array) -> jax.Array:
 
 
 def policy_loss(
-    policy: Normal, batch: Batch, config: TrainConfig, key: jax.Array
+    policy: Normal, batch: Batch, config: OnPolicyConfig, key: jax.Array
 ) -> tuple[jax.Array, Metrics]:
     """Return PPO's clipped objective and the entropy bonus (Schulman et al., arXiv 1707.06347).
 
     ``- mean min(rho A, clip(rho, 1 - eps, 1 + eps) A) - c_H H`` with the ratio
-    ``rho = exp(log pi(a) - log pi_old(a))``.
-
-    Args:
-        policy: today's, of the batch's observations.
-        batch: the samples.
-        config: settings.
-        key: for entropies that are estimated.
+    ``rho = exp(log pi(a) - log pi_old(a))``. The key is for entropies that are estimated.
     """
     advantage = batch.advantage
     if config.normalize_advantage == "minibatch":
@@ -91,12 +157,16 @@ def policy_loss(
     objective = mean(jnp.minimum(ratio * advantage, clipped * advantage), batch.weight)
     entropy = mean(policy.entropy(key), batch.weight)
     outside = jnp.abs(ratio - 1.0) > config.clip_coef
+    std = policy.std
     return -objective - config.ent_coef * entropy, {
         "loss/policy": -objective,
         "policy/entropy": entropy,
         # Schulman's estimator, http://joschu.net/blog/kl-approx.html
         "policy/approx_kl": mean(ratio - 1.0 - log_ratio, batch.weight),
         "policy/clip_fraction": mean(outside, batch.weight),
+        "policy/std_min": std.min(),
+        "policy/std_mean": std.mean(),
+        "policy/std_max": std.max(),
     }
 
 
@@ -110,8 +180,3 @@ def clipped_value_loss(value: jax.Array, batch: Batch, clip_coef: float) -> jax.
     near = batch.value + jnp.clip(value - batch.value, -clip_coef, clip_coef)
     error = jnp.maximum((value - batch.returns) ** 2, (near - batch.returns) ** 2)
     return 0.5 * mean(error, batch.weight)
-
-
-def policy_metrics(std: jax.Array) -> Metrics:
-    """Return what is logged of a policy's standard deviations, (..., A)."""
-    return {"policy/std_min": std.min(), "policy/std_mean": std.mean(), "policy/std_max": std.max()}

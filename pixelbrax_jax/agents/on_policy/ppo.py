@@ -8,30 +8,24 @@ from typing import ClassVar
 
 import jax
 
-from pixelbrax_jax.agents.algorithm import Algorithm
 from pixelbrax_jax.agents.config import TrainConfig, check_positive
-from pixelbrax_jax.agents.on_policy.actor_critic import ActorCritic
-from pixelbrax_jax.agents.on_policy.experience import gather
+from pixelbrax_jax.agents.networks.actor_critic import ActorCritic
+from pixelbrax_jax.agents.on_policy.algorithm import Experience, OnPolicy, OnPolicyState
+from pixelbrax_jax.agents.on_policy.config import OnPolicyConfig
 from pixelbrax_jax.agents.on_policy.losses import (
     Batch,
-    Metrics,
     clipped_value_loss,
     policy_loss,
-    policy_metrics,
     value_loss,
 )
-from pixelbrax_jax.agents.on_policy.update import update
-from pixelbrax_jax.agents.optimizer import Networks, Optimizer
-from pixelbrax_jax.agents.train_state import TrainState, update_key
-from pixelbrax_jax.flags import under_default_flags
-from pixelbrax_jax.types import EnvParams
+from pixelbrax_jax.agents.train_state import Metrics, Networks, update_key
 from pixelbrax_jax.validation import check_choice, check_positive_int
 
 LAYOUTS = ("separate", "shared")
 
 
 @dataclass(frozen=True)
-class PPOConfig(TrainConfig):
+class PPOConfig(OnPolicyConfig):
     """Settings of PPO."""
 
     layout: str = "separate"
@@ -46,11 +40,7 @@ class PPOConfig(TrainConfig):
     """Approximate KL divergence beyond which an update stops early."""
 
     def __post_init__(self) -> None:
-        """Check the settings.
-
-        Raises:
-            ValueError: a setting is out of range; the message says what is allowed.
-        """
+        """Check the settings."""
         super().__post_init__()
         check_choice("layout", self.layout, LAYOUTS)
         check_positive_int("update_epochs", self.update_epochs)
@@ -64,7 +54,7 @@ class PPOConfig(TrainConfig):
 
 
 @dataclass(frozen=True)
-class PPO(Algorithm):
+class PPO(OnPolicy):
     """PPO with its settings, in the given environments."""
 
     config: PPOConfig
@@ -74,38 +64,28 @@ class PPO(Algorithm):
     @cached_property
     def agent(self) -> ActorCritic:
         """Its networks."""
-        return ActorCritic(self.config, self.envs, shared=self.config.layout == "shared")
+        shared = self.config.layout == "shared"
+        return self.make_agent(shared=shared, has_value=shared)
 
-    @under_default_flags
-    def iterate(self, state: TrainState, env_params: EnvParams) -> tuple[TrainState, Metrics]:
-        """As ``Algorithm.iterate``."""
-        config, agent = self.config, self.agent
-        key, iteration = update_key(state), state.iteration
-        state, experience, metrics = gather(
-            config, self.envs, state, env_params, agent.decide(state.networks)
-        )
-
-        def loss(networks: Networks, batch: Batch, key: jax.Array) -> tuple[jax.Array, Metrics]:
-            policy, value = agent(networks, batch.pixels, batch.state)
-            loss, metrics = policy_loss(policy, batch, config, key)
-            if config.clip_value:
-                error = clipped_value_loss(value, batch, config.clip_coef)
-            else:
-                error = value_loss(value, batch.returns, batch.weight)
-            metrics |= {"loss/value": error} | policy_metrics(policy.std)
-            return loss + config.vf_coef * error, metrics
-
-        networks, opt_state, update_metrics = update(
-            config,
-            loss,
-            state.networks,
-            state.opt_state,
+    def learn(self, state: OnPolicyState, experience: Experience) -> tuple[OnPolicyState, Metrics]:
+        """As ``OnPolicy.learn``."""
+        config = self.config
+        return self.update(
+            state,
+            self.loss,
             experience,
             config.update_epochs,
-            key,
-            iteration,
+            update_key(state),
             target_kl=config.target_kl,
         )
-        state = state.replace(networks=networks, opt_state=opt_state)
-        rate = Optimizer(config).learning_rate(iteration)
-        return state, metrics | update_metrics | {"learning_rate": rate}
+
+    def loss(self, networks: Networks, batch: Batch, key: jax.Array) -> tuple[jax.Array, Metrics]:
+        """Return the loss of a batch, and scalars to log."""
+        config = self.config
+        policy, value = self.agent(networks, batch.pixels, batch.state)
+        loss, metrics = policy_loss(policy, batch, config, key)
+        if config.clip_value:
+            error = clipped_value_loss(value, batch, config.clip_coef)
+        else:
+            error = value_loss(value, batch.returns, batch.weight)
+        return loss + config.vf_coef * error, metrics | {"loss/value": error}

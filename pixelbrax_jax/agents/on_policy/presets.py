@@ -162,16 +162,20 @@ TASK_SETTINGS: dict[str, dict[str, dict[str, dict[str, Any]]]] = {
 other tasks."""
 
 
-def preset(algorithm: str, name: str = "default", task: str | None = None) -> TrainConfig:
+def preset(
+    algorithm: str, name: str = "default", task: str | None = None, **changes: Any
+) -> TrainConfig:
     """Return the settings of a preset.
 
     Args:
         algorithm: ``"ppo"``, ``"ppg"`` or ``"dcpg"``.
         name: ``"default"``, ``"deacrep"``, ``"procgen"``, ``"ci"`` or ``"cpu"``.
         task: name of the task; None means the preset's own.
+        **changes: settings that shall be others, as of ``TrainConfig.replace``.
 
     Raises:
-        ValueError: one of them is unknown, or the preset has no settings for the task.
+        ValueError: one of them is unknown or out of range, or the preset has no settings for the
+            task.
     """
     check_choice("algorithm", algorithm, ALGORITHMS)
     check_choice("preset", name, [n for n in PRESETS if n == "default" or algorithm in PRESETS[n]])
@@ -179,7 +183,7 @@ def preset(algorithm: str, name: str = "default", task: str | None = None) -> Tr
     if task is not None:
         settings = settings | {"task": task}
     if of_tasks := TASK_SETTINGS.get(name, {}).get(algorithm):
-        task = settings.get("task", kind.task)
+        task = settings.get("task", kind().env.task)
         check_choice(f"task of the preset {name!r}", task, of_tasks)
         settings = settings | of_tasks[task]
-    return kind(**settings)
+    return kind().replace(**settings | changes)

@@ -1,49 +1,26 @@
-"""How good a policy is: fixed episodes, with and without distractors."""
+"""How good a policy is: whole episodes, the same ones every time."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pixelbrax_jax.agents.config import TrainConfig, make_env
-from pixelbrax_jax.agents.optimizer import Networks
-from pixelbrax_jax.agents.runner.settings import clip_digests, shared_clips
-from pixelbrax_jax.cache import whole_path
+from pixelbrax_jax.agents.runner.progress import Report, silent
+from pixelbrax_jax.agents.runner.settings import place_of
+from pixelbrax_jax.agents.runner.splits import make_splits
+from pixelbrax_jax.agents.runner.trained import Player, Trained, with_clips
+from pixelbrax_jax.agents.train_state import Networks
 from pixelbrax_jax.compilation import jit
-from pixelbrax_jax.distractors import folders, procedural
-from pixelbrax_jax.distractors.presets import resolve
-from pixelbrax_jax.distractors.video import Video
-from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.flags import default_flags
 from pixelbrax_jax.types import EnvParams, EnvState
-from pixelbrax_jax.validation import check_choice
-
-SPLITS = ("clean", "train", "test")
-
-HELD_OUT = {"train": "test", "paper-train": "paper-test"}
-"""Split of the clips that training plays -> the one kept for tests. Of another split the test
-plays the same one, of another folder."""
-
-WITHOUT_DISTRACTORS: dict[str, Any] = {"distractors": (), "clips": None, "split": "train"}
-"""Options of an environment that shows none, whatever its other options are."""
-
-
-class Player(Protocol):
-    """What chooses actions; hashable. Every ``Algorithm`` does."""
-
-    @property
-    def config(self) -> TrainConfig:
-        """Settings of its training."""
-
-    def act(self, networks: Networks, pixels: jax.Array, key: jax.Array | None = None) -> jax.Array:
-        """As ``Algorithm.act``."""
+from pixelbrax_jax.validation import check_positive_int
 
 
 @dataclass(frozen=True)
@@ -69,128 +46,6 @@ class Result:
         if len(self.returns) < 2:
             return float("nan")
         return float(self.returns.std(ddof=1) / np.sqrt(len(self.returns)))
-
-
-class NoSplitError(ValueError):
-    """A split is not there, or would not be what its name says."""
-
-
-def _silent(line: str) -> None:
-    del line
-
-
-def make_splits(
-    config: TrainConfig,
-    shown: Sequence[str] | None = None,
-    report: Callable[[str], None] = _silent,
-) -> dict[str, tuple[PixelEnv, EnvParams]]:
-    """Return environments to evaluate in, by name of the split.
-
-    ``clean`` has no distractors, ``train`` those of the training, and ``test`` the same with clips
-    that training never shows: those of the split ``test``, or ``paper-test`` where training plays
-    ``paper-train``. A split that there is not is left out. Without distractors there is only
-    ``clean``, and without a video no ``test``.
-
-    Args:
-        config: of the training.
-        shown: digests of the clips that training plays, as of ``clip_digests``; None takes those
-            that ``config`` names.
-        report: gets a line about a split that is left out.
-    """
-    made = {}
-    for name in splits_of(config):
-        try:
-            made[name] = make_split(config, name, shown)
-        except NoSplitError as error:
-            report(f"no split {name!r}: {error}")
-    return made
-
-
-def splits_of(config: TrainConfig) -> tuple[str, ...]:
-    """Return names of the splits that there may be."""
-    if not config.distractors:
-        return SPLITS[:1]
-    plays = any(isinstance(link, Video) for link in resolve(config.distractors, config.task))
-    return SPLITS if plays else SPLITS[:2]
-
-
-def make_split(
-    config: TrainConfig, name: str, shown: Sequence[str] | None = None
-) -> tuple[PixelEnv, EnvParams]:
-    """Return one of the environments of `make_splits`.
-
-    Args:
-        config: of the training, or with other clips.
-        name: of the split.
-        shown: digests of the clips that training plays; None takes those that ``config`` names.
-
-    Raises:
-        NoSplitError: ``train`` would not show the clips of the training, or ``test`` would show
-            some of them, or there are no clips for it.
-        ValueError: there is no such split.
-        FileNotFoundError: the folder of the clips is missing.
-    """
-    check_choice("split", name, SPLITS)
-    names = splits_of(config)
-    if name not in names:
-        lacks = (
-            "clips, and the run played" if config.distractors else "distractors, and the run had"
-        )
-        raise ValueError(
-            f"split {name!r} is for {lacks} none; there is only {' and '.join(map(repr, names))}."
-        )
-    if name == "clean":
-        return _make(config, **WITHOUT_DISTRACTORS)
-    if name == "train":
-        env, params = _make(config)
-        if shown and clip_digests(params.clips) != list(shown):
-            raise NoSplitError(
-                f"the clips of split {config.split!r} of {_source(config)} are not those of the "
-                "training."
-            )
-        return env, params
-    split = HELD_OUT.get(config.split, config.split)
-    _check_there(config, split)
-    shown = shown or clip_digests(_make(config)[1].clips)
-    env, params = _make(config, split=split)
-    played = clip_digests(params.clips)
-    if shared := shared_clips(played, shown):
-        raise NoSplitError(
-            f"of the {len(played)} clips of split {split!r} of {_source(config)}, training plays "
-            f"{shared}; --clips takes others."
-        )
-    return env, params
-
-
-def _make(config: TrainConfig, **changes: Any) -> tuple[PixelEnv, EnvParams]:
-    try:
-        # What training sees of the state, evaluation need not.
-        return make_env(config, obs_mode="pixels", **changes)
-    except FileNotFoundError as error:
-        if _source(config) == "procedural":
-            raise
-        raise FileNotFoundError(
-            f"{error} If the clips of the run are elsewhere, name their folder with --clips."
-        ) from error
-
-
-def _check_there(config: TrainConfig, split: str) -> None:
-    """Reject a split that the clips have not.
-
-    Raises:
-        NoSplitError: saying which there are.
-    """
-    try:
-        if _source(config) == "procedural":
-            check_choice("split of procedural clips", split, procedural.SPLITS)
-        else:
-            folders.find(whole_path(_source(config)), split)
-    except (ValueError, FileNotFoundError) as error:
-        raise NoSplitError(str(error)) from error
-
-
-def _source(config: TrainConfig) -> str:
-    return str(config.clips or "procedural")
 
 
 class Evaluator:
@@ -222,14 +77,15 @@ class Evaluator:
         """
         envs = VectorPixelEnv(env, num_episodes, "disabled")
         self._play = partial(_play, envs, algorithm, deterministic)
+        self._acting = algorithm.acting
         with default_flags():
             self._key = jax.random.key(seed)
         self._params = env_params
 
     def __call__(self, networks: Networks) -> Result:
         """Play the episodes of a policy."""
-        actor = {"actor": networks["actor"]}
-        returns, lengths = jax.device_get(self._play(actor, self._key, self._params))
+        acting = {name: networks[name] for name in self._acting}
+        returns, lengths = jax.device_get(self._play(acting, self._key, self._params))
         return Result(returns=returns.astype(np.float64), lengths=lengths)
 
 
@@ -267,6 +123,65 @@ def _play(
     results = (nothing.astype(bool), nothing, nothing.astype(jnp.int32))
     carry = jax.lax.while_loop(goes_on, step, (state, jnp.int32(0), results))
     return carry[2][1], carry[2][2]
+
+
+def evaluate(
+    agent: Trained,
+    *,
+    episodes: int = 32,
+    splits: Sequence[str] = (),
+    clips: str | None = None,
+    report: Report = silent,
+) -> Iterator[dict[str, Any]]:
+    """Yield a row for each split, as soon as its episodes are played: what JSON has.
+
+    Args:
+        agent: who plays, with mean actions.
+        episodes: of each split.
+        splits: names, all of which must be there; without any, those that are there.
+        clips: folder of the clips, in place of that of the training.
+        report: gets a line about what is left out or not known.
+
+    Raises:
+        ValueError: an option is out of range, or there is no such split.
+        FileNotFoundError: the folder of the clips is missing.
+    """
+    check_positive_int("episodes", episodes)
+    config, shown = with_clips(agent, clips)
+    if clips and not shown:
+        report(f"the run has no digest of its clips; those of {clips} are taken for them")
+    for name, (env, params) in make_splits(config, splits, shown=shown, report=report):
+        result = Evaluator(agent.algorithm, env, params, num_episodes=episodes)(agent.networks)
+        row = {
+            "steps": agent.steps,
+            "seed": agent.seed,
+            "split": name,
+            "episodes": episodes,
+            "return": result.mean,
+            "length": float(result.lengths.mean()),
+        }
+        if params.clips is not None:
+            row["clips"] = place_of(str(config.env.clips or "procedural"))
+        if episodes > 1:
+            row["standard_error"] = result.standard_error
+        yield row
+
+
+def together(runs: Sequence[Result]) -> tuple[Result, dict[str, float]]:
+    """Return all episodes of several runs, and what is logged of them, by name."""
+    logged = {}
+    if len(runs) > 1:
+        middle = interquartile_mean(np.array([run.mean for run in runs]))
+        logged = {f"return/run_{number}": run.mean for number, run in enumerate(runs)}
+        logged |= {"iqm": middle.value, "iqm_low": middle.low, "iqm_high": middle.high}
+    result = Result(
+        returns=np.concatenate([run.returns for run in runs]),
+        lengths=np.concatenate([run.lengths for run in runs]),
+    )
+    logged |= {"return": result.mean, "length": float(result.lengths.mean())}
+    if len(result.returns) > 1:
+        logged["standard_error"] = result.standard_error
+    return result, logged
 
 
 @dataclass(frozen=True)

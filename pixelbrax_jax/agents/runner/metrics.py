@@ -7,14 +7,17 @@ import os
 import socket
 import struct
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from tensorboardX.proto.event_pb2 import Event, SessionLog
+from tensorboardX.proto.summary_pb2 import Summary
+from tensorboardX.record_writer import masked_crc32c
 
-from pixelbrax_jax.agents.runner.progress import reason
+from pixelbrax_jax.agents.runner.progress import Report, reason
 
 _SUMS = ("episode/return_sum", "episode/length_sum", "episode/count")
 
@@ -23,14 +26,11 @@ _MAX_WAITING = 64 * 2**20
 
 
 def summarize(records: list[Mapping[str, Any]]) -> dict[str, float]:
-    """Return one record of several iterations.
+    """Return one record of several iterations, of which some may have more names than others.
 
-    Episodes count equally, whichever iteration they ended in; all else is the mean over
-    iterations. Without a finished episode there is no return and no length.
-
-    Args:
-        records: metrics of iterations; some may have more names than others. Of several runs
-            they have a leading axis; the summary is over all of them, with each run's return.
+    Episodes count equally, whichever iteration they ended in; all else is the mean. Without a
+    finished episode there is no return and no length. Metrics of several runs have a leading axis,
+    over which the record is too, with each run's return.
     """
     names = {name: None for record in records for name in record}
     values = {
@@ -56,20 +56,15 @@ class AppendedFile:
     """
 
     def __init__(self, path: Path) -> None:
-        """Open the file.
-
-        Args:
-            path: of the file, which is made if need be.
-        """
+        """Open the file, which is made if need be."""
         self._file = path.open("ab", buffering=0)
         self._waiting = bytearray()
         self._ended = False
 
     def append(self, block: bytes = b"") -> None:
-        """Write what waits, then a block.
+        """Write what waits, then a block; an OSError if some of it waits still.
 
-        Raises:
-            OSError: some of it waits still, or more than 64 MiB did, behind which the file ends.
+        The file ends where more than 64 MiB would have to wait.
         """
         self._ended = self._ended or len(self._waiting) + len(block) > _MAX_WAITING
         if not self._ended:
@@ -81,166 +76,112 @@ class AppendedFile:
             raise OSError("more waited for room on the disk than is kept in memory")
 
     def close(self) -> None:
-        """Write what waits and close the file.
-
-        Raises:
-            OSError: some of it could not be written.
-        """
+        """Write what waits and close the file, or raise an OSError."""
         try:
             self.append()
         finally:
             self._file.close()
 
 
-class _Lines:
-    """``metrics.jsonl``."""
+@dataclass
+class _Output:
+    """A place that records are written to; both functions may raise."""
 
-    def __init__(self, path: Path) -> None:
-        self._file = AppendedFile(path)
-        self.close = self._file.close
+    name: str
+    write: Callable[[int, float, Mapping[str, float]], None]
+    """Takes steps, seconds and the record."""
+    close: Callable[[], None]
+    retries: bool = True
+    """Whether ``write`` keeps what it could not write, and tries again the next time."""
+    failure: str = ""
+    """Why records are missing; empty while none is."""
+    last: int = 0
+    """Steps of the last record that is there for certain."""
 
-    def write(self, steps: int, seconds: float, record: Mapping[str, float]) -> None:
+
+def _lines(path: Path) -> _Output:
+    """Open ``metrics.jsonl``."""
+    file = AppendedFile(path)
+
+    def write(steps: int, seconds: float, record: Mapping[str, float]) -> None:
         line = {"steps": steps, "seconds": round(seconds, 3)} | dict(record)
-        self._file.append(json.dumps(line).encode() + b"\n")
+        file.append(json.dumps(line).encode() + b"\n")
+
+    return _Output(str(path), write, file.close)
 
 
-class _TensorBoard:
-    """An event file of TensorBoard.
+def _tensorboard(folder: Path, first_step: int) -> _Output:
+    """Open an event file of TensorBoard.
 
     It is written by the thread that trains. tensorboardX's own writer has a thread that ends at
     the first error, behind which ``add_scalar`` blocks for ever.
     """
+    folder.mkdir(parents=True, exist_ok=True)
+    name = f"events.out.tfevents.{int(time.time())}.{socket.gethostname()}.{os.getpid()}"
+    file = AppendedFile(folder / name)
 
-    def __init__(self, folder: Path, first_step: int) -> None:
-        from tensorboardX.proto.event_pb2 import Event, SessionLog
-
-        folder.mkdir(parents=True, exist_ok=True)
-        name = f"events.out.tfevents.{int(time.time())}.{socket.gethostname()}.{os.getpid()}"
-        self._file = AppendedFile(folder / name)
-        self.close = self._file.close
-        # TensorBoard forgets what an earlier attempt wrote beyond this step.
-        first_step = first_step + 1 if first_step else 0
-        self._add(Event(step=first_step, file_version="brain.Event:2"))
-        self._add(Event(step=first_step, session_log=SessionLog(status=SessionLog.START)))
-
-    def write(self, steps: int, seconds: float, record: Mapping[str, float]) -> None:
-        del seconds
-        from tensorboardX.proto.event_pb2 import Event
-        from tensorboardX.proto.summary_pb2 import Summary
-
-        values = [Summary.Value(tag=name, simple_value=value) for name, value in record.items()]
-        self._add(Event(step=steps, summary=Summary(value=values)))
-
-    def _add(self, event: Any) -> None:
+    def add(event: Any) -> None:
         """Append an event in the TFRecord format: length and bytes, each with its checksum."""
-        from tensorboardX.record_writer import masked_crc32c
-
         event.wall_time = time.time()
         data = event.SerializeToString()
         length = struct.pack("<Q", len(data))
         ends = [struct.pack("<I", masked_crc32c(part)) for part in (length, data)]
-        self._file.append(length + ends[0] + data + ends[1])
+        file.append(length + ends[0] + data + ends[1])
 
-
-class _WandB:
-    """A run of Weights & Biases."""
-
-    def __init__(self, project: str, config: dict[str, Any], folder: Path) -> None:
-        try:
-            import wandb
-        except ImportError as error:
-            raise ImportError(
-                "wandb_project is given, but wandb is not installed: pip install wandb"
-            ) from error
-        self._run = wandb.init(project=project, config=config, dir=str(folder))
-        self.close = self._run.finish
-
-    def write(self, steps: int, seconds: float, record: Mapping[str, float]) -> None:
+    def write(steps: int, seconds: float, record: Mapping[str, float]) -> None:
         del seconds
-        self._run.log(dict(record) | {"steps": steps})
+        values = [Summary.Value(tag=name, simple_value=value) for name, value in record.items()]
+        add(Event(step=steps, summary=Summary(value=values)))
+
+    # TensorBoard forgets what an earlier attempt wrote beyond this step.
+    first_step = first_step + 1 if first_step else 0
+    add(Event(step=first_step, file_version="brain.Event:2"))
+    add(Event(step=first_step, session_log=SessionLog(status=SessionLog.START)))
+    return _Output(str(folder), write, file.close)
 
 
-@dataclass
-class _Output:
-    """A place that records are written to.
+def _wandb(project: str, config: dict[str, Any], folder: Path) -> _Output:
+    """Begin a run of Weights & Biases."""
+    try:
+        import wandb
+    except ImportError as error:
+        raise ImportError(
+            "wandb_project is given, but wandb is not installed: pip install wandb"
+        ) from error
+    run = wandb.init(project=project, config=config, dir=str(folder))
 
-    Attributes:
-        name: as messages have it.
-        writer: has ``write`` and ``close``, which may raise.
-        retries: whether ``write`` keeps what it could not write, and tries again the next time.
-        failure: why records are missing; empty while none is.
-        last: steps of the last record that is there for certain.
-    """
+    def write(steps: int, seconds: float, record: Mapping[str, float]) -> None:
+        del seconds
+        run.log(dict(record) | {"steps": steps})
 
-    name: str
-    writer: Any
-    retries: bool
-    failure: str = ""
-    last: int = 0
+    return _Output("Weights & Biases", write, run.finish, retries=False)
 
 
 class MetricsWriter:
-    """Writes records to ``metrics.jsonl`` and TensorBoard, and to Weights & Biases if asked.
+    """Writes records to all outputs of `open_metrics`, or to none.
 
-    Once it is open none of them can raise: what fails is reported, once, and the others go on.
-
-    The settings are written to ``config.json``, for people and scripts; nothing reads it back.
-
-    Attributes:
-        path: of the JSONL file: one object a line with ``steps``, ``seconds`` and the metrics.
+    It never raises: what fails is reported, once, and the others go on.
     """
 
     def __init__(
         self,
-        folder: Path,
-        config: dict[str, Any],
-        *,
-        first_step: int = 0,
-        wandb_project: str | None = None,
-        report: Callable[[str], None],
+        report: Report,
+        outputs: Sequence[_Output] = (),
+        seconds: float = 0.0,
     ) -> None:
-        """Open the files.
-
-        Args:
-            folder: where they are.
-            config: settings by name, as JSON has them.
-            first_step: control steps at which the run goes on; later records of an earlier
-                attempt are dropped, for they will be written again.
-            wandb_project: project of Weights & Biases; None writes nothing there.
-            report: gets a line about what cannot be written.
-
-        Raises:
-            ImportError: a project is given, but wandb is not installed.
-            OSError: a file cannot be opened.
-        """
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / "config.json").write_text(json.dumps(config, indent=2) + "\n", "utf-8")
-        self.path = folder / "metrics.jsonl"
+        """Start the clock at ``seconds``."""
         self._report = report
-        self._seconds = _keep_until(self.path, first_step)
-        self._began = time.monotonic()
-        board = folder / "tensorboard"
-        self._outputs = [
-            _Output(str(self.path), _Lines(self.path), retries=True, last=first_step),
-            _Output(str(board), _TensorBoard(board, first_step), retries=True, last=first_step),
-        ]
-        if wandb_project is not None:
-            wandb = _WandB(wandb_project, config, folder)
-            self._outputs.append(_Output("Weights & Biases", wandb, retries=False, last=first_step))
+        self._outputs = outputs
+        self._began = time.monotonic() - seconds
 
     def write(self, steps: int, record: Mapping[str, float]) -> None:
-        """Write one record.
-
-        Args:
-            steps: control steps so far, any size.
-            record: numbers by name.
-        """
-        seconds = self._seconds + time.monotonic() - self._began
+        """Write one record, of so many control steps."""
+        seconds = time.monotonic() - self._began
         for output in self._outputs:
             if output.failure and not output.retries:
                 continue
             try:
-                output.writer.write(steps, seconds, record)
+                output.write(steps, seconds, record)
             except Exception as error:
                 self._fail(output, error)
                 continue
@@ -253,7 +194,7 @@ class MetricsWriter:
         """Close the files."""
         for output in self._outputs:
             try:
-                output.writer.close()
+                output.close()
             except Exception as error:
                 self._fail(output, error)
             else:
@@ -270,25 +211,37 @@ class MetricsWriter:
 
     def _fail(self, output: _Output, error: Exception) -> None:
         if not output.failure:
-            then = "its records wait in memory" if output.retries else f"all are in {self.path}"
+            lines = self._outputs[0].name
+            then = "its records wait in memory" if output.retries else f"all are in {lines}"
             self._report(
                 f"cannot write to {output.name}: {reason(error)}; training goes on, {then}"
             )
         output.failure = reason(error)
 
 
-class NoWriter:
-    """What processes other than the first write: nothing."""
+def open_metrics(
+    folder: Path,
+    config: dict[str, Any],
+    report: Report,
+    *,
+    first_step: int = 0,
+    wandb_project: str | None = None,
+) -> MetricsWriter:
+    """Open ``metrics.jsonl``, TensorBoard's file and, if asked, Weights & Biases; or raise.
 
-    def write(self, steps: int, record: Mapping[str, float]) -> None:
-        """Do nothing."""
-
-    def close(self) -> None:
-        """Do nothing."""
-
-    def missing(self) -> list[str]:
-        """Do nothing."""
-        return []
+    ``config`` is written to ``config.json`` for people and scripts; nothing reads it back. Records
+    of an earlier attempt beyond ``first_step`` are dropped, for they will be written again.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "config.json").write_text(json.dumps(config, indent=2) + "\n", "utf-8")
+    path = folder / "metrics.jsonl"
+    seconds = _keep_until(path, first_step)
+    outputs = [_lines(path), _tensorboard(folder / "tensorboard", first_step)]
+    if wandb_project is not None:
+        outputs.append(_wandb(wandb_project, config, folder))
+    for output in outputs:
+        output.last = first_step
+    return MetricsWriter(report, outputs, seconds)
 
 
 def read_metrics(path: str | Path) -> list[dict[str, float]]:

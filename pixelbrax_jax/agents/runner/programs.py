@@ -1,16 +1,20 @@
-"""The compiled programs of training; equal runs share them."""
+"""One or several seeds of an algorithm, trained by one compiled program."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
-from pixelbrax_jax.agents.on_policy.losses import Metrics
-from pixelbrax_jax.agents.runner.seeds import Runs
-from pixelbrax_jax.agents.runner.sharding import mesh_of, replicated, state_shardings
-from pixelbrax_jax.agents.train_state import TrainState
+from pixelbrax_jax._platform.batches import map_runs
+from pixelbrax_jax.agents.algorithm import Algorithm
+from pixelbrax_jax.agents.runner.devices import mesh_of, replicated, state_shardings
+from pixelbrax_jax.agents.train_state import Metrics, TrainState
 from pixelbrax_jax.compilation import jit
+from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.types import EnvParams
 
 
@@ -18,32 +22,80 @@ def _env(runs: Runs) -> Any:
     return runs.algorithm.envs.env
 
 
-@jit(_env, static_argnums=0)
-def init(runs: Runs, seed: jax.Array, env_params: EnvParams) -> TrainState:
-    """As ``Runs.init``."""
-    return _spread(runs, runs.init(seed, env_params), {})[0]
+@dataclass(frozen=True)
+class Runs:
+    """Runs of an algorithm; equal ones share compiled programs.
 
+    With several, states and metrics have a leading axis S. On an accelerator the runs go side by
+    side. On a CPU they take turns within the program: convolutions with a kernel for each run are
+    slow there, and gain nothing.
 
-# The state before an iteration is not needed after it: its memory is used again.
+    Attributes:
+        algorithm: with its settings.
+        num_seeds: S.
+    """
 
+    algorithm: Algorithm
+    num_seeds: int = 1
 
-@jit(_env, static_argnums=0, donate_argnums=1)
-def iterate(runs: Runs, state: TrainState, env_params: EnvParams) -> tuple[TrainState, Metrics]:
-    """As ``Runs.iterate``."""
-    return _spread(runs, *runs.iterate(state, env_params))
+    @jit(_env, static_argnums=0)
+    def init(self, seed: jax.Array, env_params: EnvParams) -> TrainState:
+        """Return the state before the first iteration; each run has the seed after the last."""
+        return self._spread(self._init(seed, env_params), {})[0]
 
+    @under_default_flags
+    def _init(self, seed: jax.Array, env_params: EnvParams) -> TrainState:
+        if self.num_seeds == 1:
+            keys = jax.random.key(seed)
+        else:
+            keys = jnp.stack([jax.random.key(seed + i) for i in range(self.num_seeds)])
+        return self._each(self.algorithm.init, keys, env_params)
 
-@jit(_env, static_argnums=0, donate_argnums=1)
-def auxiliary(runs: Runs, state: TrainState) -> tuple[TrainState, Metrics]:
-    """As ``Runs.auxiliary``."""
-    return _spread(runs, *runs.auxiliary(state))
+    # The state before an iteration is not needed after it: its memory is used again.
 
+    @jit(_env, static_argnums=0, donate_argnums=1)
+    def iterate(self, state: TrainState, env_params: EnvParams) -> tuple[TrainState, Metrics]:
+        """As ``Algorithm.iterate``."""
+        return self._spread(*self._each(self.algorithm.iterate, state, env_params))
 
-def _spread(runs: Runs, state: TrainState, metrics: Metrics) -> tuple[TrainState, Metrics]:
-    """Spread the state over the devices, and give all of them the metrics."""
-    mesh = mesh_of(runs.algorithm)
-    if mesh is None:
-        return state, metrics
-    shardings = state_shardings(mesh, state, runs.num_seeds)
-    state = jax.lax.with_sharding_constraint(state, shardings)
-    return state, jax.lax.with_sharding_constraint(metrics, replicated(mesh))
+    @jit(_env, static_argnums=0, donate_argnums=1)
+    def auxiliary(self, state: TrainState) -> tuple[TrainState, Metrics]:
+        """As ``Algorithm.auxiliary``."""
+        return self._spread(*self._each(self.algorithm.auxiliary, state))
+
+    def template(self, env_params: EnvParams) -> TrainState:
+        """Return shapes, dtypes and, of several devices, shardings of the state."""
+        template: TrainState = jax.eval_shape(self._init, jnp.uint32(0), env_params)
+        mesh = mesh_of(self.algorithm)
+        if mesh is None:
+            return template
+        return jax.tree.map(
+            lambda leaf, sharding: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding),
+            template,
+            state_shardings(mesh, template, self.num_seeds),
+        )
+
+    def split(self, tree: Any) -> list[Any]:
+        """Return each run's part of a tree."""
+        if self.num_seeds == 1:
+            return [tree]
+        return [jax.tree.map(lambda x, i=i: x[i], tree) for i in range(self.num_seeds)]
+
+    def _each(self, function: Callable[..., Any], first: Any, *others: Any) -> Any:
+        """Map ``function`` over the runs of its first argument."""
+        if self.num_seeds == 1:
+            return function(first, *others)
+
+        def one(first: Any) -> Any:
+            return function(first, *others)
+
+        return map_runs(one, first)
+
+    def _spread(self, state: TrainState, metrics: Metrics) -> tuple[TrainState, Metrics]:
+        """Spread the state over the devices, and give all of them the metrics."""
+        mesh = mesh_of(self.algorithm)
+        if mesh is None:
+            return state, metrics
+        shardings = state_shardings(mesh, state, self.num_seeds)
+        state = jax.lax.with_sharding_constraint(state, shardings)
+        return state, jax.lax.with_sharding_constraint(metrics, replicated(mesh))

@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import suppress
-from typing import Any
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+
+from tqdm import tqdm
+
+Report = Callable[[str], object]
+"""Gets lines about what is going on; it may raise."""
+
+
+def silent(line: str) -> None:
+    """Drop a line."""
+    del line
 
 
 def reason(error: BaseException) -> str:
@@ -14,13 +23,9 @@ def reason(error: BaseException) -> str:
 
 
 class Messages:
-    """Passes lines on for as long as that is possible.
+    """Passes lines on; ``failure`` tells why one could not be written, and is empty otherwise."""
 
-    Attributes:
-        failure: why a line could not be written; empty if all were.
-    """
-
-    def __init__(self, report: Callable[[str], None]) -> None:
+    def __init__(self, report: Report) -> None:
         self._report = report
         self.failure = ""
 
@@ -33,62 +38,39 @@ class Messages:
 
 
 class Bar:
-    """tqdm's progress bar, or nothing.
+    """tqdm's progress bar, or nothing; ``failure`` as of `Messages`."""
 
-    Attributes:
-        failure: why the bar could not be drawn; empty if it could.
-    """
-
-    def __init__(self, shown: bool, total: int, report: Callable[[str], None]) -> None:
-        """Draw the bar.
-
-        Args:
-            shown: whether there is one.
-            total: number of iterations.
-            report: gets a line if the bar fails.
-        """
-        self._bar: Any = None
+    def __init__(self, shown: bool, total: int, report: Report) -> None:
+        """Draw the bar of ``total`` iterations; ``report`` gets a line if that fails."""
         self._report = report
         self.failure = ""
-        if shown:
-            from tqdm import tqdm
-
-            try:
-                self._bar = tqdm(total=total, unit="iteration")
-            except Exception as error:
-                self._fail(error)
+        self._bar = tqdm(disable=True)
+        with self._watched():
+            self._bar = tqdm(total=total, unit="iteration", disable=not shown)
 
     def update(self, number: int, record: dict[str, float] | None = None) -> None:
-        """Add iterations, and show the return of a record if it has one.
-
-        Args:
-            number: of iterations.
-            record: metrics by name.
-        """
-        if self._bar is None:
-            return
-        try:
+        """Add iterations, and show the return of a record if it has one."""
+        with self._watched():
             self._bar.update(number)
             if record and "episode/return" in record:
                 self._bar.set_postfix(episode_return=f"{record['episode/return']:.1f}")
-        except Exception as error:
-            self._fail(error)
 
     def close(self) -> None:
         """Draw the bar a last time."""
-        if self._bar is None:
-            return
-        try:
+        with self._watched():
             self._bar.close()
-        except Exception as error:
-            self._fail(error)
 
-    def _fail(self, error: Exception) -> None:
-        bar, self._bar = self._bar, None
-        # Left open, it would be drawn again beneath every line.
-        with suppress(Exception):
-            bar.close()
-        self.failure = reason(error)
-        self._report(
-            f"the progress bar cannot be drawn: {self.failure}; the run goes on without it"
-        )
+    @contextmanager
+    def _watched(self) -> Iterator[None]:
+        """Give the bar up if it cannot be drawn."""
+        try:
+            yield
+        except Exception as error:
+            bar, self._bar = self._bar, tqdm(disable=True)
+            # Left open, it would be drawn again beneath every line.
+            with suppress(Exception):
+                bar.close()
+            self.failure = reason(error)
+            self._report(
+                f"the progress bar cannot be drawn: {self.failure}; the run goes on without it"
+            )

@@ -1,9 +1,7 @@
-"""``pixelbrax record``: a video of a trained agent."""
+"""A video of a trained agent."""
 
 from __future__ import annotations
 
-import argparse
-import sys
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -12,42 +10,13 @@ from typing import Any
 import jax
 import numpy as np
 
-from pixelbrax_jax.agents.runner.checkpoint import CheckpointError
-from pixelbrax_jax.agents.runner.evaluate import SPLITS, make_split
-from pixelbrax_jax.agents.runner.trained import Trained, load_chosen, with_clips
+from pixelbrax_jax.agents.runner.splits import SPLITS, make_split
+from pixelbrax_jax.agents.runner.trained import Trained, with_clips
 from pixelbrax_jax.compilation import compiler_options
 from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.flags import default_flags
 from pixelbrax_jax.validation import check_choice, check_positive_int
 from pixelbrax_jax.video import write_frames
-
-
-def record(options: argparse.Namespace) -> int:
-    """Run the command; see ``pixelbrax record --help``.
-
-    Returns:
-        The exit status.
-    """
-    try:
-        agent = load_chosen(options)
-        split = options.split or ("train" if agent.algorithm.config.distractors else "clean")
-        run = [f"run{options.run_index}"] if options.run_index else []
-        name = "_".join([options.pretrained or str(agent.steps), split, *run])
-        path = write_video(
-            agent,
-            options.output or Path(options.folder or "") / "videos" / f"{name}.mp4",
-            split=split,
-            clips=options.clips,
-            grid=options.grid,
-            size=options.size,
-            num_frames=options.num_frames,
-            seed=options.seed,
-        )
-    except (CheckpointError, ValueError, OSError, ImportError) as error:
-        sys.stderr.write(f"pixelbrax record: {error}\n")
-        return 1
-    sys.stdout.write(f"{path}\n")
-    return 0
 
 
 def write_video(
@@ -65,16 +34,13 @@ def write_video(
 
     Args:
         agent: who plays, with mean actions.
-        path: of the video; its suffix decides the format.
+        path: of the video, which is returned; its suffix decides the format.
         split: ``"clean"``, ``"train"`` or ``"test"``.
         clips: folder of the clips, in place of that of the training.
         grid: episodes a side.
         size: pixels of one episode, square.
         num_frames: at most.
         seed: of the episodes.
-
-    Returns:
-        The video's path.
 
     Raises:
         NoSplitError: the clips are not those of the split.

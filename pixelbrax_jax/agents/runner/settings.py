@@ -1,11 +1,12 @@
-"""Settings of a run as they are stored, and those of a stored run beside the ones of today."""
+"""Settings of a run, how they are stored, and with which of them a stored run may go on."""
 
 from __future__ import annotations
 
 import hashlib
+import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, dataclass, field, fields
 from importlib import metadata
 from typing import Any
 
@@ -13,10 +14,13 @@ import jax
 import numpy as np
 
 from pixelbrax_jax.agents.algorithm import Algorithm
-from pixelbrax_jax.agents.config import TrainConfig, describe
-from pixelbrax_jax.agents.runner.run_config import RunConfig
+from pixelbrax_jax.agents.config import TrainConfig, check_count, check_positive, describe
 from pixelbrax_jax.cache import whole_path
+from pixelbrax_jax.config import ENV_OPTIONS
 from pixelbrax_jax.types import Clips
+from pixelbrax_jax.validation import check_choice, check_positive_int
+
+RESUME = ("never", "latest")
 
 FORMER_DEFAULTS: dict[str, Any] = {}
 """Values, by name, of settings in runs that do not store them, where those are not the defaults. A
@@ -28,33 +32,97 @@ OF_RUNS = ("seed", "seeds")
 _PACKAGES = ("pixelbrax", "jax", "jaxlib", "brax", "mujoco", "flax", "optax")
 """Packages whose versions a run's last bits depend on."""
 
+_GONE = {"physics_batching"}
+"""Settings of former releases that changed no result."""
+
 _FREE = ("total_steps", "memory_budget_gb")
 """Settings that a run may go on with although they differ."""
 
 
-def settings_of(algorithm: Algorithm, options: RunConfig) -> dict[str, Any]:
-    """Return what decides the result of a run, as JSON has it; a folder of clips from the root."""
+def _on_terminal() -> bool:
+    return bool(getattr(sys.stderr, "isatty", bool)())
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """What is done around the training; nothing but the seeds changes a bit of it.
+
+    Raises:
+        ValueError: a setting is out of range; the message says what is allowed.
+    """
+
+    output_dir: str = "runs/train"
+    """Folder of logs, checkpoints and the policy."""
+    seed: int = 0
+    """Seed of the run."""
+    seeds: int = 1
+    """Runs in one program, of the seeds ``seed``, ``seed`` + 1, ..."""
+    resume: str = "never"
+    """``latest`` goes on from the latest checkpoint in the folder, if there is one."""
+    log_training_metrics: bool = True
+    """Whether metrics of the training itself are logged."""
+    log_every: int = 1
+    """Iterations that one record sums up."""
+    num_evals: int = 0
+    """Evaluations, evenly over the run, the last at its end; 0 never makes such environments."""
+    eval_episodes: int = 32
+    """Episodes of an evaluation, for each split."""
+    checkpoint_every: int = 0
+    """Control steps between checkpoints, besides those by the clock, at evaluations and at the end;
+    0 writes no more than those."""
+    checkpoint_minutes: float = 10.0
+    """Minutes without a checkpoint after which one is written; 0 goes by no clock."""
+    keep_checkpoints: int = 3
+    """Latest checkpoints that are kept, besides the best."""
+    wandb_project: str | None = None
+    """Project of Weights & Biases; none writes nothing there."""
+    progress: bool = field(default_factory=_on_terminal)
+    """Whether a progress bar is shown; by default where stderr is a terminal."""
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        check_choice("resume", self.resume, RESUME)
+        for name in ("seeds", "log_every", "eval_episodes", "keep_checkpoints"):
+            check_positive_int(name, getattr(self, name))
+        for name in ("seed", "num_evals", "checkpoint_every"):
+            check_count(name, getattr(self, name))
+        check_positive("checkpoint_minutes", self.checkpoint_minutes, or_zero=True)
+        if self.seed + self.seeds > 2**32:
+            raise ValueError(
+                f"seeds must be below 2**32, got seed={self.seed} and seeds={self.seeds}."
+            )
+
+
+def describe_run(
+    algorithm: Algorithm, options: RunConfig, clips: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Return what decides the result of a run, as JSON has it: algorithm, settings, clips.
+
+    ``clips`` are digests of what is played. Those of made clips are not stored: their name tells
+    them, and they may differ in a pixel from one processor to the next.
+    """
     settings = describe(algorithm.config) | {name: getattr(options, name) for name in OF_RUNS}
-    return settings | {"clips": place_of(settings["clips"])}
+    settings["clips"] = place_of(settings["clips"])
+    made = settings["clips"] in (None, "procedural")
+    return {
+        "algorithm": algorithm.name,
+        "config": settings,
+        "clips": None if made else list(clips) or None,
+    }
 
 
 def former_settings(kind: type[TrainConfig]) -> dict[str, Any]:
-    """Return the values that settings had in a stored run that lacks them, by name.
-
-    Args:
-        kind: the class of the run's settings.
-    """
+    """Return by name what a stored run had for settings that it lacks; ``kind`` is their class."""
     defaults = {field.name: field.default for field in (*fields(kind), *fields(RunConfig))}
-    names = {*(field.name for field in fields(kind)), *OF_RUNS}
-    known = {n: v for n, v in (defaults | FORMER_DEFAULTS).items() if n in names}
-    plain = {n: list(v) if isinstance(v, tuple) else v for n, v in known.items()}
+    names = {*ENV_OPTIONS, *(field.name for field in fields(kind)), *OF_RUNS} - {"env"}
+    known = vars(defaults["env"]) | defaults | FORMER_DEFAULTS
+    plain = {n: list(v) if isinstance(v, tuple) else v for n, v in known.items() if n in names}
     return {name: value for name, value in plain.items() if value is not MISSING}
 
 
 def versions() -> dict[str, str]:
     """Return versions of packages, and number and kind of devices."""
-    kind = jax.devices()[0].device_kind
-    found = {"devices": f"{jax.device_count()} x {kind}"}
+    found = {"devices": f"{jax.device_count()} x {jax.devices()[0].device_kind}"}
     for name in _PACKAGES:
         with suppress(metadata.PackageNotFoundError):
             found[name] = metadata.version(name)
@@ -62,13 +130,8 @@ def versions() -> dict[str, str]:
 
 
 def unknown_settings(about: Mapping[str, Any], known: Mapping[str, Any]) -> str:
-    """Return a sentence on stored settings that this release lacks; empty if it has all of them.
-
-    Args:
-        about: what is stored beside a checkpoint.
-        known: all settings of this release.
-    """
-    names = [name for name in about["config"] if name not in known]
+    """Return a sentence on what is stored in ``about`` and not ``known`` here; empty if nothing."""
+    names = [name for name in about["config"] if name not in known and name not in _GONE]
     if not names:
         return ""
     written = about.get("versions", {}).get("pixelbrax", "another release")
@@ -80,21 +143,18 @@ def unknown_settings(about: Mapping[str, Any], known: Mapping[str, Any]) -> str:
 
 
 def differences(about: Mapping[str, Any], own: Mapping[str, Any]) -> list[str]:
-    """Return the settings with which a run may not go on, one line each.
+    """Return the settings with which a stored run may not go on, one line each.
 
-    Args:
-        about: what is stored beside the checkpoint, with all settings.
-        own: the same of the run that shall go on.
+    Both are of ``describe_run``: ``about`` as stored, ``own`` of the run that shall go on.
     """
     old, new = about["config"], own["config"]
     free = {name for name in _FREE if name != "total_steps" or not new.get("anneal")}
-    found = [
-        f"{name}: {old.get(name)!r} there, {new[name]!r} here"
-        if name in new
-        else f"{name}: {old[name]!r} there, unknown here"
-        for name in sorted((old.keys() | new.keys()) - free - {"clips"})
-        if name not in new or old.get(name) != new[name]
-    ]
+    found = []
+    for name in sorted((old.keys() | new.keys()) - free - _GONE - {"clips"}):
+        if name not in new:
+            found.append(f"{name}: {old[name]!r} there, unknown here")
+        elif old.get(name) != new[name]:
+            found.append(f"{name}: {old.get(name)!r} there, {new[name]!r} here")
     there, here = (place_of(settings.get("clips")) or "procedural" for settings in (old, new))
     if about.get("clips") and own.get("clips"):
         if about["clips"] != own["clips"]:
@@ -111,31 +171,13 @@ def clip_digests(clips: Clips | None) -> list[str]:
     if clips is None:
         return []
     pixels, *parts = jax.device_get((clips.packed, clips.first, clips.length))
-    return [_digest(pixels[first : first + length]) for first, length in zip(*parts, strict=True)]
-
-
-def stored_clips(config: TrainConfig, digests: Sequence[str]) -> Sequence[str] | None:
-    """Return what is stored of a run's clips; None of those that are made, which their name tells.
-
-    Made ones may differ in a pixel from one processor to the next.
-
-    Args:
-        config: of the run.
-        digests: of its clips.
-    """
-    made = config.clips is None or config.clips == "procedural"
-    return None if made else digests or None
-
-
-def shared_clips(some: Sequence[str], others: Sequence[str]) -> int:
-    """Return how many of some clips, by their digests, are among others."""
-    return sum(digest in others for digest in some)
-
-
-def _digest(frames: np.ndarray) -> str:
-    digest = hashlib.sha256(repr(frames.shape).encode())
-    digest.update(np.ascontiguousarray(frames).data)
-    return digest.hexdigest()[:32]
+    found = []
+    for first, length in zip(*parts, strict=True):
+        frames = np.ascontiguousarray(pixels[first : first + length])
+        digest = hashlib.sha256(repr(frames.shape).encode())
+        digest.update(frames.data)
+        found.append(digest.hexdigest()[:32])
+    return found
 
 
 def place_of(clips: str | None) -> str | None:

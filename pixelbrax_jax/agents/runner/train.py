@@ -3,47 +3,47 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from contextlib import closing
-from dataclasses import dataclass
+from contextlib import closing, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
+from pixelbrax_jax._platform.lowering import default_platform
 from pixelbrax_jax.agents.algorithm import Algorithm
-from pixelbrax_jax.agents.runner import programs
-from pixelbrax_jax.agents.runner.checkpoint import CheckpointError, Checkpoints
-from pixelbrax_jax.agents.runner.evaluate import Evaluator, Result, interquartile_mean, make_splits
-from pixelbrax_jax.agents.runner.export import save_policy
-from pixelbrax_jax.agents.runner.interruption import StopRequest, stop_requests
-from pixelbrax_jax.agents.runner.memory import check_memory
-from pixelbrax_jax.agents.runner.metrics import MetricsWriter, NoWriter, summarize
-from pixelbrax_jax.agents.runner.progress import Bar, Messages, reason
-from pixelbrax_jax.agents.runner.run_config import RunConfig
-from pixelbrax_jax.agents.runner.saving import Saver
-from pixelbrax_jax.agents.runner.schedule import Schedule
-from pixelbrax_jax.agents.runner.seeds import Runs
-from pixelbrax_jax.agents.runner.settings import (
-    clip_digests,
-    former_settings,
-    settings_of,
-    stored_clips,
-)
-from pixelbrax_jax.agents.runner.sharding import (
+from pixelbrax_jax.agents.config import TrainConfig, make_env
+from pixelbrax_jax.agents.registry import make_algorithm
+from pixelbrax_jax.agents.runner.checkpoint import CheckpointError
+from pixelbrax_jax.agents.runner.devices import (
     any_process,
+    check_memory,
     highest,
     mesh_of,
     replicate,
-    state_shardings,
 )
-from pixelbrax_jax.agents.train_state import TrainState
+from pixelbrax_jax.agents.runner.evaluate import Evaluator, Result, together
+from pixelbrax_jax.agents.runner.metrics import MetricsWriter, open_metrics, summarize
+from pixelbrax_jax.agents.runner.programs import Runs
+from pixelbrax_jax.agents.runner.progress import Bar, Messages, Report, reason, silent
+from pixelbrax_jax.agents.runner.saving import Checkpoints
+from pixelbrax_jax.agents.runner.settings import (
+    RunConfig,
+    clip_digests,
+    describe_run,
+    former_settings,
+)
+from pixelbrax_jax.agents.runner.splits import make_splits
+from pixelbrax_jax.agents.runner.trained import save_policy
+from pixelbrax_jax.agents.train_state import TrainState, kept, parts_not_kept
 from pixelbrax_jax.envs.pixel_env import PixelEnv
-from pixelbrax_jax.stop_signals import signal_name
+from pixelbrax_jax.envs.sharded import ShardedVectorEnv, make_env_mesh
+from pixelbrax_jax.envs.vector import VectorPixelEnv
+from pixelbrax_jax.stop_signals import StopRequest, signal_name, stop_requests
 from pixelbrax_jax.types import EnvParams
 
-__all__ = ["Outcome", "RunConfig", "TrainingDivergedError", "run"]
+__all__ = ["Outcome", "RunConfig", "TrainingDivergedError", "run", "train"]
 
 Splits = dict[str, tuple[PixelEnv, EnvParams]]
 """Environments to evaluate in, and their parameters, by name."""
@@ -74,8 +74,22 @@ class Outcome:
     incomplete: tuple[str, ...] = ()
 
 
-def _silent(line: str) -> None:
-    del line
+def train(config: TrainConfig, options: RunConfig, report: Report = silent) -> Outcome:
+    """Make the environments that settings name, on all devices, and `run` their algorithm."""
+    env, env_params = make_env(config)
+    devices = jax.device_count()
+    envs: Any = VectorPixelEnv(env, config.num_envs)
+    if devices > 1:
+        envs = ShardedVectorEnv(env, config.num_envs, make_env_mesh())
+    algorithm = make_algorithm(config, envs)
+    with suppress(Exception):  # as in `run`
+        report(
+            f"{algorithm.name} on {config.env.task}, {config.num_envs} environments, {devices} "
+            f"{default_platform()} device{'s' * (devices > 1)}, {config.num_iterations} "
+            f"iterations of {config.steps_per_iteration} control steps; "
+            f"into {Path(options.output_dir).resolve()}"
+        )
+    return run(algorithm, env_params, options, report=report)
 
 
 def run(
@@ -83,7 +97,7 @@ def run(
     env_params: EnvParams,
     options: RunConfig,
     *,
-    report: Callable[[str], None] = _silent,
+    report: Report = silent,
     splits: Splits | None = None,
 ) -> Outcome:
     """Train to the end, or until it is interrupted.
@@ -102,67 +116,53 @@ def run(
             environments of your own are not.
 
     Raises:
-        CheckpointError: the folder cannot be written to, or holds another run, or the last
-            checkpoint cannot be written.
+        CheckpointError: the folder cannot be written to, or holds another run or a longer one, or
+            the last checkpoint cannot be written.
         OSError: files of records cannot be opened, or the policy cannot be written.
         MemoryError: what must be stored would not fit.
         TrainingDivergedError: a loss is not finite; the last good checkpoint stays.
     """
     messages = Messages(report)
     with stop_requests(report) as stop:
-        return _run(algorithm, env_params, options, messages, splits, stop)
-
-
-def _run(
-    algorithm: Algorithm,
-    env_params: EnvParams,
-    options: RunConfig,
-    report: Messages,
-    splits: Splits | None,
-    stop: StopRequest,
-) -> Outcome:
-    runs, mesh = Runs(algorithm, options.seeds), mesh_of(algorithm)
-    seed, shown = jax.device_put(np.uint32(options.seed)), clip_digests(env_params.clips)
-    if mesh is not None:
-        env_params = replicate(mesh, env_params)
-    template = jax.eval_shape(runs.init, seed, env_params)
-    if mesh is not None:
-        template = jax.tree.map(
-            lambda leaf, sharding: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding),
-            template,
-            state_shardings(mesh, template, options.seeds),
+        runs, mesh = Runs(algorithm, options.seeds), mesh_of(algorithm)
+        shown = clip_digests(env_params.clips)
+        if mesh is not None:
+            env_params = replicate(mesh, env_params)
+        template = runs.template(env_params)
+        check_memory(algorithm, template, messages)
+        checkpoints = Checkpoints(
+            Path(options.output_dir) / "checkpoints",
+            describe_run(algorithm, options, shown),
+            keep=options.keep_checkpoints,
+            former=former_settings(type(algorithm.config)),
+            every=options.checkpoint_every,
+            minutes=options.checkpoint_minutes,
+            report=messages,
         )
-    check_memory(algorithm, template, report)
-    checkpoints = Checkpoints(
-        Path(options.output_dir) / "checkpoints",
-        settings_of(algorithm, options),
-        algorithm.name,
-        keep=options.keep_checkpoints,
-        former=former_settings(type(algorithm.config)),
-        clips=stored_clips(algorithm.config, shown),
-    )
-    try:
-        if _goes_on(checkpoints, options, report):
-            state = checkpoints.restore(template)
-            if others := checkpoints.other_versions():
-                report(f"going on under other versions, so not to the bit: {', '.join(others)}")
-            report(f"going on from the checkpoint of {_steps(algorithm, state)} steps")
-        else:
-            state = programs.init(runs, seed, env_params)
-        if options.num_evals and splits is None:
-            splits = make_splits(algorithm.config, shown, report)
-        return _Run(runs, env_params, options, checkpoints, report, splits or {}, stop).train(state)
-    finally:
-        checkpoints.close()
+        with closing(checkpoints):
+            seed = jax.device_put(np.uint32(options.seed))
+            if _goes_on(checkpoints, options, messages):
+                state = _restored(checkpoints, template, algorithm, messages)
+                if left_out := parts_not_kept(state):
+                    fresh = runs.init(seed, env_params)
+                    state = state.replace(**{name: getattr(fresh, name) for name in left_out})
+            else:
+                state = runs.init(seed, env_params)
+            if not options.num_evals:
+                splits = {}
+            elif splits is None:
+                made = make_splits(algorithm.config, shown=shown, report=messages)
+                splits = dict(made)
+            evaluators = {
+                name: Evaluator(algorithm, env, params, num_episodes=options.eval_episodes)
+                for name, (env, params) in splits.items()
+            }
+            one = _Run(runs, env_params, options, checkpoints, messages, stop, evaluators)
+            return one.train(state)
 
 
-def _goes_on(checkpoints: Checkpoints, options: RunConfig, report: Messages) -> bool:
-    """Return whether the run goes on from a checkpoint.
-
-    Raises:
-        FileExistsError: there is one of an earlier run.
-        CheckpointError: only some processes see it.
-    """
+def _goes_on(checkpoints: Checkpoints, options: RunConfig, report: Report) -> bool:
+    """Return whether the run goes on from a checkpoint, or raise if it may not."""
     found = bool(checkpoints.steps())
     if any_process(found) and any_process(not found):
         raise CheckpointError(
@@ -179,87 +179,83 @@ def _goes_on(checkpoints: Checkpoints, options: RunConfig, report: Messages) -> 
     return found
 
 
+def _restored(
+    checkpoints: Checkpoints, template: TrainState, algorithm: Algorithm, report: Report
+) -> TrainState:
+    """Return the state of the latest checkpoint, or raise if it is not of this run."""
+    state = checkpoints.restore(kept(template))
+    steps, config = _steps(algorithm, state), algorithm.config
+    if steps > config.num_iterations * config.steps_per_iteration:
+        raise CheckpointError(
+            f"total_steps={config.total_steps} are fewer than the {steps} that the run in "
+            f"{checkpoints.folder} has had; give at least as many, or another --output-dir."
+        )
+    if others := checkpoints.other_versions():
+        report(f"going on under other versions, so not to the bit: {', '.join(others)}")
+    report(f"going on from the checkpoint of {steps} steps")
+    return state
+
+
+@dataclass
 class _Run:
     """One call of `run`: the loop over iterations, and what follows each."""
 
-    def __init__(
-        self,
-        runs: Runs,
-        env_params: EnvParams,
-        options: RunConfig,
-        checkpoints: Checkpoints,
-        report: Messages,
-        splits: Splits,
-        stop: StopRequest,
-    ) -> None:
-        self._runs = runs
-        self._algorithm = runs.algorithm
-        self._config = runs.algorithm.config
-        self._params = env_params
-        self._options = options
-        self._checkpoints = checkpoints
-        self._report = report
-        self._stop = stop
-        self._folder = Path(options.output_dir)
-        self._schedule = Schedule(
-            self._config.num_iterations,
-            runs.algorithm.num_phases,
-            options.log_every,
-            options.num_evals,
-        )
-        self._first = jax.process_index() == 0
-        self._evaluators: dict[str, Evaluator] = {}
-        if options.num_evals:
-            for split, (env, params) in splits.items():
-                self._evaluators[split] = Evaluator(
-                    runs.algorithm, env, params, num_episodes=options.eval_episodes
-                )
-        self._pending: list[dict[str, Any]] = []
-        self._record: dict[str, float] = {}
-        self._results: dict[str, Result] = {}
-        self._evaluated_steps = -1
-        self._timed_steps, self._timed_since = 0, 0.0
+    runs: Runs
+    env_params: EnvParams
+    options: RunConfig
+    checkpoints: Checkpoints
+    report: Messages
+    stop: StopRequest
+    evaluators: dict[str, Evaluator]
+    pending: list[dict[str, Any]] = field(default_factory=list)
+    """Metrics of iterations that no record sums up yet."""
+    record: dict[str, float] = field(default_factory=dict)
+    results: dict[str, Result] = field(default_factory=dict)
+    evaluated_steps: int = -1
+    timed_steps: int = 0
+    timed_since: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.algorithm = self.runs.algorithm
+        self.config = self.algorithm.config
+        self.folder = Path(self.options.output_dir)
+        self.is_first = jax.process_index() == 0
 
     def train(self, state: TrainState) -> Outcome:
         """Train from ``state`` to the end, or until a signal."""
-        began = steps = _steps(self._algorithm, state)
-        total = self._config.num_iterations
-        writer = self._open_writer(steps)
+        began = steps = _steps(self.algorithm, state)
+        self.writer = self.open_writer(steps)
         try:
-            bar = Bar(self._options.progress and self._first, total, self._report)
-            with closing(bar):
-                state, steps, stopped_by = self._iterations(state, steps, writer, bar)
-            if not stopped_by or steps > began:
-                self._export(state, steps)
+            shown = self.options.progress and self.is_first
+            self.bar = Bar(shown, self.config.num_iterations, self.report)
+            with closing(self.bar):
+                state, steps, stopped_by = self.iterations(state, steps)
+            if self.is_first and (not stopped_by or steps > began):
+                self.export(state, steps)
         finally:
-            writer.close()
-            for line in (missing := writer.missing()):
-                self._report(line)
+            self.writer.close()
+            for line in (missing := self.writer.missing()):
+                self.report(line)
         if not stopped_by:
-            self._report(f"done after {steps} steps; checkpoints and policy in {self._folder}")
-        failed = {"the progress bar": bar.failure, "messages": self._report.failure}
-        incomplete = [f"{name} could not be shown: {why}" for name, why in failed.items() if why]
-        return Outcome(
-            state,
-            self._record,
-            self._results,
-            bool(stopped_by),
-            stopped_by,
-            (*missing, *incomplete),
-        )
+            self.report(f"done after {steps} steps; checkpoints and policy in {self.folder}")
+        failed = {"the progress bar": self.bar.failure, "messages": self.report.failure}
+        hidden = [f"{name} could not be shown: {why}" for name, why in failed.items() if why]
+        incomplete = (*missing, *hidden)
+        interrupted = bool(stopped_by)
+        return Outcome(state, self.record, self.results, interrupted, stopped_by, incomplete)
 
-    def _open_writer(self, steps: int) -> MetricsWriter | NoWriter:
-        writer: MetricsWriter | NoWriter = NoWriter()
-        failure: Exception | None = None
-        if self._first:
+    def open_writer(self, steps: int) -> MetricsWriter:
+        """Open the files of records in the first process, or raise in all of them."""
+        writer, failure = MetricsWriter(self.report), None
+        if self.is_first:
+            settings = describe_run(self.algorithm, self.options)["config"]
             try:
-                writer = MetricsWriter(
-                    self._folder,
-                    {"algorithm": self._algorithm.name}
-                    | settings_of(self._algorithm, self._options),
+                writer = open_metrics(
+                    self.folder,
+                    {"algorithm": self.algorithm.name} | settings,
+                    self.report,
                     first_step=steps,
-                    wandb_project=self._options.wandb_project,
-                    report=self._report,
+                    wandb_project=self.options.wandb_project,
                 )
             except (ImportError, OSError) as error:
                 failure = error
@@ -267,173 +263,139 @@ class _Run:
             raise failure or RuntimeError("process 0 cannot write metrics; it says why.")
         return writer
 
-    def _iterations(
-        self, state: TrainState, steps: int, writer: MetricsWriter | NoWriter, bar: Bar
-    ) -> tuple[TrainState, int, int]:
-        """Train to the end, or until a signal.
-
-        Returns:
-            The state, its steps, and the signal's number or 0.
-        """
-        per_iteration, total = self._config.steps_per_iteration, self._config.num_iterations
+    def iterations(self, state: TrainState, steps: int) -> tuple[TrainState, int, int]:
+        """Return the state at the end or behind a signal, its steps, the signal's number or 0."""
+        per_iteration, total = self.config.steps_per_iteration, self.config.num_iterations
         done = steps // per_iteration
-        bar.update(done)
+        self.bar.update(done)
         if done >= total:
-            self._report(f"the run has had its {steps} steps")
+            self.report(f"the run has had its {steps} steps")
             return state, steps, 0
-        if stopped_by := highest(self._stop.signal)[0]:
+        if stopped_by := highest(self.stop.signal)[0]:
             left = f"go on from {steps} steps with --resume latest" if steps else "nothing is lost"
-            self._report(f"stopped by {signal_name(stopped_by)} before the first iteration; {left}")
+            self.report(f"stopped by {signal_name(stopped_by)} before the first iteration; {left}")
             return state, steps, stopped_by
-        self._report("compiling")
-        saver = Saver(
-            self._checkpoints,
-            steps,
-            self._report,
-            every=self._options.checkpoint_every,
-            minutes=self._options.checkpoint_minutes,
-        )
-        self._restart_timer(steps)
+        self.report("compiling")
+        self.restart_timer(steps)
         for number in range(done + 1, total + 1):
-            state, steps = self._iterate(state, number), number * per_iteration
-            bar.update(1)
+            state, steps = self.iterate(state, number), number * per_iteration
+            self.bar.update(1)
             # The clock is that of the first process.
-            by_clock = self._first and saver.is_due_by_clock()
-            stopped_by, due = highest(self._stop.signal, int(by_clock))
+            by_clock = self.is_first and self.checkpoints.is_due_by_clock()
+            stopped_by, due = highest(self.stop.signal, int(by_clock))
             stopped_by = 0 if number == total else stopped_by
-            jobs = self._schedule.jobs(
-                number, save=bool(due) or saver.is_due_after(steps), stop=bool(stopped_by)
-            )
-            for job in jobs:
-                match job:
-                    case "log":
-                        self._log(steps, writer, bar, saver)
-                    case "evaluate":
-                        writer.write(steps, self._evaluate(state, steps))
-                    case "save":
-                        last = number == total or bool(stopped_by)
-                        saver.save(state, steps, self._score(steps), last=last)
-                    case "report_stop":
-                        self._report(
-                            f"stopped by {signal_name(stopped_by)} after {steps} steps; go on with "
-                            "--resume latest"
-                        )
-            if "save" not in jobs:
-                saver.look_after()
-            if jobs:
-                self._restart_timer(steps)
+            last = number == total or bool(stopped_by)
+            evaluates = is_due(number, self.options.num_evals, total)
+            saves = last or evaluates or bool(due) or self.checkpoints.is_due_after(steps)
+            logs = saves or number % self.options.log_every == 0
+            if logs:
+                self.log(steps)
+            if evaluates and not stopped_by:
+                self.evaluate(state, steps)
+            if saves:
+                self.checkpoints.save(kept(state), steps, self.score(steps), last=last)
+            else:
+                self.checkpoints.look_after()
             if stopped_by:
+                self.report(
+                    f"stopped by {signal_name(stopped_by)} after {steps} steps; go on with "
+                    "--resume latest"
+                )
+                # Behind the checkpoint: whoever is asked to stop may soon be killed.
+                if evaluates:
+                    self.evaluate(state, steps)
                 break
+            if logs:
+                self.restart_timer(steps)
         return state, steps, stopped_by
 
-    def _iterate(self, state: TrainState, number: int) -> TrainState:
+    def iterate(self, state: TrainState, number: int) -> TrainState:
         """Run iteration ``number``, and the auxiliary phase if it is due."""
-        state, metrics = programs.iterate(self._runs, state, self._params)
-        if self._schedule.has_auxiliary_phase(number):
-            state, aux_metrics = programs.auxiliary(self._runs, state)
+        state, metrics = self.runs.iterate(state, self.env_params)
+        phases = self.algorithm.auxiliary_every
+        if phases and number % phases == 0:
+            state, aux_metrics = self.runs.auxiliary(state)
             metrics |= aux_metrics
-        self._pending.append(metrics)
+        self.pending.append(metrics)
         # One iteration is under way and the next one waits; were there more, the bar would run
         # ahead and Ctrl-C would wait for all of them.
-        jax.block_until_ready(self._pending[-2:-1])
+        jax.block_until_ready(self.pending[-2:-1])
         return state
 
-    def _restart_timer(self, steps: int) -> None:
-        self._timed_since, self._timed_steps = time.perf_counter(), steps
+    def restart_timer(self, steps: int) -> None:
+        self.timed_since, self.timed_steps = time.perf_counter(), steps
 
-    def _log(self, steps: int, writer: MetricsWriter | NoWriter, bar: Bar, saver: Saver) -> None:
-        """Write the metrics of the latest iterations.
-
-        Raises:
-            TrainingDivergedError: one is not finite.
-        """
-        if self._pending:
-            records = jax.device_get(self._pending)
-            self._pending = []
+    def log(self, steps: int) -> None:
+        """Write the metrics of the latest iterations, or raise a TrainingDivergedError."""
+        if self.pending:
+            records = jax.device_get(self.pending)
+            self.pending = []
             for record in records:
-                self._check_finite(record, steps, saver)
-            self._record = summarize(records)
-        if self._options.log_training_metrics:
-            seconds = time.perf_counter() - self._timed_since
-            self._record["speed/steps_per_second"] = (steps - self._timed_steps) / seconds
-            writer.write(steps, self._record)
-        bar.update(0, self._record)
+                self.check_finite(record, steps)
+            self.record = summarize(records)
+        if self.options.log_training_metrics:
+            seconds = time.perf_counter() - self.timed_since
+            self.record["speed/steps_per_second"] = (steps - self.timed_steps) / seconds
+            self.writer.write(steps, self.record)
+        self.bar.update(0, self.record)
 
-    def _check_finite(self, record: dict[str, Any], steps: int, saver: Saver) -> None:
+    def check_finite(self, record: dict[str, Any], steps: int) -> None:
         wrong = {name: ~np.isfinite(value) for name, value in record.items()}
         wrong = {name: where for name, where in wrong.items() if where.any()}
         if not wrong:
             return
         seeds = ""
-        if self._options.seeds > 1:
+        if self.options.seeds > 1:
             those = np.flatnonzero(np.any(list(wrong.values()), axis=0))
-            names = (str(self._options.seed + int(i)) for i in those)
-            seeds = f" of seed {', '.join(names)}"
-        saver.look_after(wait=True)
-        latest = saver.latest()
-        kept = "there is none" if latest is None else f"that of {latest} steps is good"
+            seeds = f" of seed {', '.join(str(self.options.seed + int(i)) for i in those)}"
+        self.checkpoints.look_after(wait=True)
+        latest = self.checkpoints.latest()
+        good = "there is none" if latest is None else f"that of {latest} steps is good"
         raise TrainingDivergedError(
             f"not finite within the iterations before step {steps}{seeds}: {', '.join(wrong)}. Of "
-            f"the checkpoints {kept}. Begin anew in another --output-dir; a lower learning_rate or "
+            f"the checkpoints {good}. Begin anew in another --output-dir; a lower learning_rate or "
             "max_grad_norm may help."
         )
 
-    def _export(self, state: TrainState, steps: int) -> None:
-        """Write the policies.
+    def evaluate(self, state: TrainState, steps: int) -> None:
+        """Evaluate each run in each split, and log it."""
+        record: dict[str, float] = {}
+        policies = self.runs.split(jax.device_get(state.networks))
+        for split, evaluator in self.evaluators.items():
+            result, logged = together([evaluator(networks) for networks in policies])
+            self.results[split] = result
+            record |= {f"eval/{split}/{name}": value for name, value in logged.items()}
+            line = f"{split}: return {result.mean:.1f}"
+            if "standard_error" in logged:
+                line += f" +- {result.standard_error:.1f} (standard error)"
+            self.report(line)
+        self.evaluated_steps = steps
+        self.writer.write(steps, record)
 
-        Raises:
-            OSError: one cannot be written.
-        """
-        if not self._first:
-            return
-        for i, networks in enumerate(self._runs.split(jax.device_get(state.networks))):
-            several = self._runs.num_seeds > 1
-            name = f"policy_seed{self._options.seed + i}.jax" if several else "policy.jax"
+    def score(self, steps: int) -> float | None:
+        """Return by what the best checkpoint is chosen: one measure for all those of a run."""
+        if self.options.num_evals:
+            return self.results["clean"].mean if self.evaluated_steps == steps else None
+        return self.record.get("episode/return")
+
+    def export(self, state: TrainState, steps: int) -> None:
+        """Write the policies, or raise an OSError."""
+        for i, networks in enumerate(self.runs.split(jax.device_get(state.networks))):
+            several = self.runs.num_seeds > 1
+            name = f"policy_seed{self.options.seed + i}.jax" if several else "policy.jax"
             try:
-                save_policy(self._algorithm, networks, self._folder / name)
+                save_policy(self.algorithm, networks, self.folder / name)
             except OSError as error:
                 raise OSError(
-                    f"cannot write {self._folder / name}: {reason(error)}. The checkpoint of "
+                    f"cannot write {self.folder / name}: {reason(error)}. The checkpoint of "
                     f"{steps} steps is whole: make room, and the same command with --resume latest "
                     "writes the policy at its end."
                 ) from error
 
-    def _evaluate(self, state: TrainState, steps: int) -> dict[str, float]:
-        """Evaluate each run in each split, and return what is logged of it."""
-        record = {}
-        policies = self._runs.split(jax.device_get(state.networks))
-        for split, evaluator in self._evaluators.items():
-            runs = [evaluator(networks) for networks in policies]
-            if len(runs) > 1:
-                middle = interquartile_mean(np.array([run.mean for run in runs]))
-                for number, run in enumerate(runs):
-                    record[f"eval/{split}/return/run_{number}"] = run.mean
-                record[f"eval/{split}/iqm"] = middle.value
-                record[f"eval/{split}/iqm_low"] = middle.low
-                record[f"eval/{split}/iqm_high"] = middle.high
-            result = self._results[split] = Result(
-                returns=np.concatenate([run.returns for run in runs]),
-                lengths=np.concatenate([run.lengths for run in runs]),
-            )
-            record[f"eval/{split}/return"] = result.mean
-            record[f"eval/{split}/length"] = float(result.lengths.mean())
-            line = f"{split}: return {result.mean:.1f}"
-            if len(result.returns) > 1:
-                record[f"eval/{split}/standard_error"] = result.standard_error
-                line += f" +- {result.standard_error:.1f} (standard error)"
-            self._report(line)
-        self._evaluated_steps = steps
-        return record
 
-    def _score(self, steps: int) -> float | None:
-        """Return by what the best checkpoint is chosen: one measure for all those of a run.
-
-        It is the return in clean episodes of this moment, and without evaluations that of the
-        latest training episodes.
-        """
-        if self._options.num_evals:
-            return self._results["clean"].mean if self._evaluated_steps == steps else None
-        return self._record.get("episode/return")
+def is_due(number: int, times: int, total: int) -> bool:
+    """Return whether one of ``times``, spread evenly over ``total``, follows the ``number``-th."""
+    return number * times // total > (number - 1) * times // total
 
 
 def _steps(algorithm: Algorithm, state: TrainState) -> int:

@@ -33,14 +33,10 @@ class _NumpyWithOldClip:
 
 
 def accept_old_clip(module: ModuleType) -> None:
-    """Let one module call ``jp.clip(x, a_min=...)``, which JAX no longer accepts.
+    """Let a module that knows ``jax.numpy`` as ``jp`` call ``jp.clip(x, a_min=...)``.
 
-    Brax's fluid forces (the swimmer) do. Only the name ``jp`` inside ``module`` is replaced,
-    and only where JAX lacks the argument, so a call that used to raise now works and every
-    other call in the process is untouched.
-
-    Args:
-        module: a module that knows ``jax.numpy`` as ``jp``.
+    Brax's fluid forces (the swimmer) do, and JAX no longer accepts it. Only the name inside that
+    module is replaced, and only where JAX lacks the argument.
     """
     if "a_min" not in inspect.signature(jnp.clip).parameters and vars(module)["jp"] is jnp:
         vars(module)["jp"] = _NumpyWithOldClip()
@@ -65,14 +61,10 @@ class _JaxWithReplicated:
 
 
 def accept_device_put_replicated(module: ModuleType) -> None:
-    """Let one module call ``jax.device_put_replicated``, which JAX no longer has.
+    """Let a module that knows JAX as ``jax`` call ``jax.device_put_replicated``.
 
-    Brax's trainers do. Only the name ``jax`` inside ``module`` is replaced, and only where JAX
-    lacks the function, so a call that used to raise now works and every other call in the
-    process is untouched.
-
-    Args:
-        module: a module that knows JAX as ``jax``.
+    Brax's trainers do, and JAX no longer has it. Only the name inside that module is replaced, and
+    only where JAX lacks the function.
     """
     if not hasattr(jax, "device_put_replicated") and vars(module)["jax"] is jax:
         vars(module)["jax"] = _JaxWithReplicated()

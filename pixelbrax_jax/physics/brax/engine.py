@@ -5,28 +5,28 @@ from __future__ import annotations
 import contextlib
 import copy
 from collections.abc import Callable, Collection, Hashable, Iterator, Mapping
-from typing import Any
+from importlib import import_module
+from types import ModuleType
+from typing import Any, NamedTuple
 from uuid import uuid4
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from flax import struct
 
 from pixelbrax_jax.flags import as_by_default, default_flags, under_default_flags
 from pixelbrax_jax.physics.base import Kinematics, RewardFn
 from pixelbrax_jax.physics.brax.compatibility import accept_old_clip
-from pixelbrax_jax.physics.brax.pickling import with_modules, without_modules
-from pixelbrax_jax.physics.divergence import GuardedPhysics
-from pixelbrax_jax.physics.geometry import VISIBLE_GROUPS, read_geoms
-from pixelbrax_jax.physics.model_scene import COM_LINK, tracked_body, with_sites
+from pixelbrax_jax.physics.divergence import GuardedPhysics, Recipe
+from pixelbrax_jax.physics.geometry import VISIBLE_GROUPS, as_geoms, geom_shapes, site_shapes
+from pixelbrax_jax.physics.model_scene import COM_LINK, tracked_body
 from pixelbrax_jax.physics.mujoco_compatibility import import_silenced, known_warnings_silenced
+from pixelbrax_jax.physics.opengl import mujoco
 from pixelbrax_jax.physics.poses import check_pose, with_unit_rotations
-from pixelbrax_jax.physics.recipe import Recipe
+from pixelbrax_jax.physics.task import Color
 from pixelbrax_jax.physics.viewpoints import followed_body, read_rigs, unfit_cameras
 from pixelbrax_jax.spatial import quat_normalize, rotate
-from pixelbrax_jax.tasks import Color
 from pixelbrax_jax.types import CameraRig, PhysicsState
 
 with import_silenced():
@@ -45,13 +45,7 @@ _TRAINING_WRAPPERS = (
 
 @struct.dataclass
 class BraxCarry:
-    """What Brax needs for the next step and ``PhysicsState`` does not hold already.
-
-    Attributes:
-        pipeline: the backend's state.
-        metrics: Brax's metrics of the last step.
-        info: Brax's info.
-    """
+    """What Brax needs for the next step and ``PhysicsState`` does not hold already."""
 
     pipeline: Any
     metrics: dict[str, Any]
@@ -69,9 +63,8 @@ class BraxPhysics(GuardedPhysics):
     On the ``"mjx"`` backend link poses are one physics step older than joint positions after a
     ``step`` (never after a ``reset``), because MuJoCo computes them before it integrates.
 
-    Beyond the interface it has ``followed_link``; and ``rigs`` and ``unfit_cameras``, of the
-    model's own cameras. If one of these follows a center of mass, there is a link ``camera/com``
-    after those of the bodies.
+    If one of the model's cameras follows a center of mass, there is a link ``camera/com`` after
+    those of the bodies.
     """
 
     @default_flags()
@@ -82,7 +75,7 @@ class BraxPhysics(GuardedPhysics):
         colors: Mapping[str, Color] | None = None,
         drawn_radius: Mapping[str, float] | None = None,
         geom_groups: Collection[int] = VISIBLE_GROUPS,
-        sites_and_cameras: bool = True,
+        rigs: Mapping[str, CameraRig] | None = None,
         unscale_actions: bool = False,
         reward: RewardFn | None = None,
         identity: Hashable | None = None,
@@ -91,10 +84,11 @@ class BraxPhysics(GuardedPhysics):
 
         Args:
             env: a bare environment, such as ``brax.envs.get_environment("ant")``.
-            colors: replacements for colors by geom name, see ``read_geoms``.
-            drawn_radius: metres by name of a sphere to draw larger, see ``read_geoms``.
+            colors: replacements for colors by geom name, see ``geom_shapes``.
+            drawn_radius: metres by name of a sphere to draw larger, see ``geom_shapes``.
             geom_groups: MuJoCo's groups of geoms and sites that are visible.
-            sites_and_cameras: whether the model's sites are drawn and its cameras are viewpoints.
+            rigs: the task's viewpoints by name, in a picture without the model's sites; None draws
+                the sites and has the model's cameras as viewpoints.
             unscale_actions: for environments that map actions from [-1, 1] to the control
                 range: undo that map, so that costs and actuators see the action as given.
             reward: replaces the environment's reward; called with the state before the step,
@@ -104,15 +98,15 @@ class BraxPhysics(GuardedPhysics):
                 keeps nothing but it if it is a ``Recipe``.
 
         Raises:
-            ValueError: if ``env`` is wrapped for training, has no MuJoCo model, does not
-                observe one flat array, changes the tree of its state in ``step``, uses
-                features its backend lacks, or has geoms that cannot be drawn.
+            ValueError: ``env`` is wrapped for training, has no MuJoCo model, does not observe one
+                flat array, changes the tree of its state in ``step``, uses features its backend
+                lacks, or has geoms that cannot be drawn.
         """
         _check_env(env)
-        env = _shorten(env)
+        env = _changed(env, _shorten)
         accept_old_clip(fluid)
         model: mujoco.MjModel = env.unwrapped.sys.mj_model
-        self.geoms = read_geoms(
+        shapes = geom_shapes(
             model, colors=colors, drawn_radius=drawn_radius, geom_groups=geom_groups
         )
         # Brax keeps the time step in float32; six digits give back the model's own number.
@@ -122,42 +116,38 @@ class BraxPhysics(GuardedPhysics):
         self.link_names = tuple(
             model.body(i).name or f"link/{i - 1}" for i in range(1, model.nbody)
         )
-        self.followed_link = 0
-        self.rigs: dict[str, CameraRig] = {}
-        self.unfit_cameras: dict[str, str] = {}
         self._com_masses: np.ndarray | None = None
-        if sites_and_cameras:
-            self.geoms = with_sites(model, self.geoms, geom_groups)
+        if rigs is not None:
+            self.rigs = rigs
+        else:
+            # Their materials have no names here, as those of geoms have none.
+            shapes += [site._replace(material="") for site in site_shapes(model, geom_groups)]
             self.followed_link = max(followed_body(model) - 1, 0)
             self._read_cameras(model)
+        self.geoms = as_geoms(shapes)
         self._model = model
         self._source = env
         self._env = _replace_init(env, self._init)
         self._reward = reward
         self._control_range = _control_range(model) if unscale_actions else None
-        self._identity: Hashable = uuid4() if identity is None else identity
+        self._identity = uuid4() if identity is None else identity
         self._options = {
             "colors": colors,
             "drawn_radius": drawn_radius,
             "geom_groups": geom_groups,
-            "sites_and_cameras": sites_and_cameras,
+            "rigs": rigs,
             "unscale_actions": unscale_actions,
             "reward": reward,
             "identity": self._identity,
         }
         self._check_shapes()
 
-    def __eq__(self, other: object) -> bool:
-        return type(self) is type(other) and self._identity == getattr(other, "_identity", None)
-
-    def __hash__(self) -> int:
-        return hash(self._identity)
-
     def __reduce_ex__(self, protocol: Any) -> Any:
         """Return what is pickled: how it is made, or of which environment."""
         if isinstance(self._identity, Recipe):
             return super().__reduce_ex__(protocol)
-        return _restore, (type(self), without_modules(self._source), self._options)
+        env = _replace(self._source, ModuleType, lambda module: _Module(module.__name__))
+        return _restore, (type(self), env, self._options)
 
     def _read_cameras(self, model: mujoco.MjModel) -> None:
         com_link = len(self.link_names)
@@ -174,23 +164,11 @@ class BraxPhysics(GuardedPhysics):
     def from_qpos(
         self, q: jax.Array, qd: jax.Array | None = None, *, key: jax.Array | None = None
     ) -> PhysicsState:
-        """Return the first state of an episode, in a chosen pose.
+        """See ``Physics.from_qpos``.
 
-        Runs the environment's reset with its joint positions and velocities replaced, so the
-        observation and everything else agree with the pose. ``terminated`` is false even if
-        the task would end in this pose; the next step says so.
-
-        Args:
-            q: (Q,) float32, joint positions, see ``Kinematics``; quaternions of any length.
-            qd: (V,) float32, joint velocities, 0 if not given.
-            key: decides what the environment samples besides ``q`` and ``qd``; none of the
-                built-in tasks samples anything else.
-
-        Returns:
-            A state that ``step`` accepts.
-
-        Raises:
-            ValueError: for a wrong shape.
+        The environment's reset runs with its joint positions and velocities replaced, so that the
+        observation and everything else agree with the pose. None of the built-in tasks samples
+        anything besides.
         """
         q, qd = check_pose(self._model, q, qd)
 
@@ -201,11 +179,7 @@ class BraxPhysics(GuardedPhysics):
         return self._guard_first(self._first_state(_replace_init(self._source, init), key))
 
     def _step(self, state: PhysicsState, action: jax.Array) -> PhysicsState:
-        """See ``Physics.step``.
-
-        Raises:
-            ValueError: when traced, if the action's shape is not ``(action_size,)``.
-        """
+        """See ``Physics.step``."""
         action = jnp.asarray(action, jnp.float32)
         if action.shape != (self.action_size,):
             raise ValueError(f"action must have shape ({self.action_size},), got {action.shape}")
@@ -308,8 +282,25 @@ class BraxPhysics(GuardedPhysics):
             raise ValueError(f"done must be a scalar, got shape {after.terminated.shape}")
 
 
+class _Module(NamedTuple):
+    """Stands in a pickle for a module: environments hold that of their backend."""
+
+    name: str
+
+
+def _replace(env: envs.Env, kind: type, by: Callable[[Any], Any]) -> envs.Env:
+    """Copy an environment and its wrappers, with other objects in place of those of a kind."""
+    changed = copy.copy(env)
+    for name, value in vars(env).items():
+        if isinstance(value, kind):
+            setattr(changed, name, by(value))
+        elif isinstance(value, envs.Env):
+            setattr(changed, name, _replace(value, kind, by))
+    return changed
+
+
 def _restore(cls: type[BraxPhysics], env: envs.Env, options: dict[str, Any]) -> BraxPhysics:
-    return cls(with_modules(env), **options)
+    return cls(_replace(env, _Module, lambda module: import_module(module.name)), **options)
 
 
 def kinematics(pipeline_state: Any) -> Kinematics:
@@ -350,24 +341,24 @@ def _explained(backend: str) -> Iterator[None]:
         ) from error
 
 
-def _shorten(env: envs.Env) -> envs.Env:
-    """Copy ``env``, down through its wrappers, with a system of 32 bits, whatever made it."""
+def _changed(env: envs.Env, change: Callable[[envs.Env], None]) -> envs.Env:
+    """Copy ``env``, down through its wrappers, and change what they wrap."""
     clone = copy.copy(env)
     if isinstance(env, envs.Wrapper):
-        clone.env = _shorten(env.env)
+        clone.env = _changed(env.env, change)
     else:
-        clone.sys = jax.tree.map(as_by_default, env.sys)
+        change(clone)
     return clone
+
+
+def _shorten(env: envs.Env) -> None:
+    """Give an environment a system of 32 bits, whatever made it."""
+    env.sys = jax.tree.map(as_by_default, env.sys)
 
 
 def _replace_init(env: envs.Env, init: Callable[..., Any]) -> envs.Env:
-    """Copy ``env``, down through its wrappers, with another ``pipeline_init``."""
-    clone = copy.copy(env)
-    if isinstance(env, envs.Wrapper):
-        clone.env = _replace_init(env.env, init)
-    else:
-        clone.pipeline_init = init
-    return clone
+    """Copy ``env`` with another ``pipeline_init``."""
+    return _changed(env, lambda clone: setattr(clone, "pipeline_init", init))
 
 
 def _as_dtype(leaf: Any, dtype: Any) -> jax.Array:

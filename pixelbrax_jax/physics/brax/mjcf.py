@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from pixelbrax_jax.flags import default_flags
 from pixelbrax_jax.physics.base import Kinematics, ResetFn, RewardFn
 from pixelbrax_jax.physics.brax.engine import BraxPhysics, kinematics
 from pixelbrax_jax.physics.brax.omissions import check_simulated
-from pixelbrax_jax.physics.geometry import VISIBLE_GROUPS, read_geoms
+from pixelbrax_jax.physics.brax.tasks import BACKENDS
+from pixelbrax_jax.physics.geometry import VISIBLE_GROUPS, geom_shapes
 from pixelbrax_jax.physics.mujoco_compatibility import import_silenced, loading_silenced
-from pixelbrax_jax.tasks import BRAX_BACKENDS, Color
+from pixelbrax_jax.physics.opengl import mujoco
+from pixelbrax_jax.physics.task import Color
 
 with import_silenced():
     from brax import envs
@@ -43,35 +44,22 @@ def joint_state(after: Kinematics) -> jax.Array:
     return jnp.concatenate([after.q, after.qd])
 
 
-@dataclass(frozen=True, eq=False)
-class MjcfTask:
-    """What a model needs to become a task. Functions are pure and see ONE environment.
-
-    Attributes:
-        reward: of the state before a step, the state after it and the (A,) action in [-1, 1];
-            returns a scalar.
-        terminated: of the state after a step; returns a () bool, true when the task ended.
-        observation: of a state; returns the (S,) float state observation.
-        reset_noise: joint positions and velocities start within plus or minus this of
-            ``init_q`` and 0, uniformly (metres, radians, per second).
-        n_frames: physics steps per control step.
-        init_q: (Q,) joint positions to start from; None for the model's own.
-        reset: samples joint positions and velocities, in place of ``reset_noise`` and ``init_q``.
-    """
+class _Task(NamedTuple):
+    """What a model needs to become a task; see ``mjcf_physics``."""
 
     reward: RewardFn
-    terminated: Callable[[Kinematics], jax.Array] = never
-    observation: Callable[[Kinematics], jax.Array] = joint_state
-    reset_noise: float = 0.01
-    n_frames: int = 5
-    init_q: np.ndarray | None = None
-    reset: ResetFn | None = None
+    terminated: Callable[[Kinematics], jax.Array]
+    observation: Callable[[Kinematics], jax.Array]
+    reset_noise: float
+    n_frames: int
+    init_q: np.ndarray | None
+    reset: ResetFn | None
 
 
 class MjcfEnv(envs.PipelineEnv):
-    """A Brax environment for any model, with the formulas of an ``MjcfTask``."""
+    """A Brax environment for any model."""
 
-    def __init__(self, model: mujoco.MjModel, task: MjcfTask, backend: str):
+    def __init__(self, model: mujoco.MjModel, task: _Task, backend: str):
         system = _load(model, backend)
         super().__init__(system, backend=backend, n_frames=task.n_frames)
         self._task = task
@@ -139,14 +127,18 @@ def mjcf_physics(
     drawn as geoms are, named ``site/<name>``. Cameras of the model are viewpoints by their names,
     see ``named_rigs``.
 
+    The functions are pure and see ONE environment.
+
     Args:
         source: a file, or the XML itself.
-        reward: see ``MjcfTask``.
-        terminated: see ``MjcfTask``.
-        observation: see ``MjcfTask``.
-        reset_noise: see ``MjcfTask``; 0.01 by default.
-        n_frames: see ``MjcfTask``; the control step lasts this many of the model's time steps.
-        init_q: see ``MjcfTask``.
+        reward: of the state before a step, the state after it and the (A,) action in [-1, 1];
+            returns a scalar.
+        terminated: of the state after a step; returns a () bool, true when the task ended.
+        observation: of a state; returns the (S,) float state observation.
+        reset_noise: joint positions and velocities start within plus or minus this of
+            ``init_q`` and 0, uniformly (metres, radians, per second); 0.01 by default.
+        n_frames: the model's time steps per control step.
+        init_q: (Q,) joint positions to start from; None for the model's own.
         reset: samples the joint positions and velocities that an episode starts from, of a PRNG
             key; a goal for each episode is a body with joints that no actuator moves. In place of
             ``init_q`` and ``reset_noise``.
@@ -155,16 +147,13 @@ def mjcf_physics(
         colors: replacements for the model's colors by geom name, red, green, blue in [0, 1].
         geom_groups: MuJoCo's groups of geoms and sites that are visible.
 
-    Returns:
-        The physics, to be used as any other.
-
     Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if the model cannot be compiled, simulated or drawn, has no joint or no
+        FileNotFoundError: there is no such file.
+        ValueError: the model cannot be compiled, simulated or drawn, has no joint or no
             actuator, has what the backend would leave out, ``reset`` is given with ``init_q`` or
             ``reset_noise``, or a function returns the wrong shape or dtype.
     """
-    check_choice("backend", backend, BRAX_BACKENDS)
+    check_choice("backend", backend, BACKENDS)
     if reset is not None and (reset_noise is not None or init_q is not None):
         raise ValueError(
             "reset samples the whole initial state: leave reset_noise and init_q out, and add the "
@@ -176,16 +165,19 @@ def mjcf_physics(
     if n_frames < 1 or n_frames != int(n_frames):
         raise ValueError(f"n_frames must be a positive integer, got {n_frames}")
     model = _compile(source)
-    _check_model(model, backend)
+    if model.nv == 0:
+        raise ValueError("the model has no joint, so nothing can move")
+    if model.nu == 0:
+        raise ValueError("the model has no actuator, so an agent could not act on it")
+    check_simulated(model, backend)
     # A geom that cannot be drawn should be reported before anything slow is loaded.
-    read_geoms(model, colors=colors, geom_groups=geom_groups)
+    geom_shapes(model, colors=colors, geom_groups=geom_groups)
     if init_q is not None:
         init_q = np.asarray(init_q, np.float32)
         if init_q.shape != (model.nq,):
             raise ValueError(f"init_q must have shape ({model.nq},), got {init_q.shape}")
-    task = MjcfTask(
-        reward, terminated, observation, float(reset_noise), int(n_frames), init_q, reset
-    )
+    noise, frames = float(reset_noise), int(n_frames)
+    task = _Task(reward, terminated, observation, noise, frames, init_q, reset)
     _check_functions(task, model)
     return BraxPhysics(MjcfEnv(model, task, backend), colors=colors, geom_groups=geom_groups)
 
@@ -208,14 +200,6 @@ def _compile(source: str | Path) -> mujoco.MjModel:
             return spec.compile()
     except ValueError as error:
         raise ValueError(f"MuJoCo cannot compile {what}: {error}") from error
-
-
-def _check_model(model: mujoco.MjModel, backend: str) -> None:
-    if model.nv == 0:
-        raise ValueError("the model has no joint, so nothing can move")
-    if model.nu == 0:
-        raise ValueError("the model has no actuator, so an agent could not act on it")
-    check_simulated(model, backend)
 
 
 def _load(model: mujoco.MjModel, backend: str) -> mjcf.System:
@@ -246,41 +230,33 @@ def _load(model: mujoco.MjModel, backend: str) -> mjcf.System:
     return system
 
 
-def _check_functions(task: MjcfTask, model: mujoco.MjModel) -> None:
-    links = model.nbody - 1
-    shapes = jax.eval_shape(
-        lambda: Kinematics(
-            q=jnp.zeros(model.nq),
-            qd=jnp.zeros(model.nv),
-            xpos=jnp.zeros((links, 3)),
-            xquat=jnp.zeros((links, 4)),
+def _check_functions(task: _Task, model: mujoco.MjModel) -> None:
+    def zeros(*shape: int) -> Any:
+        return jax.ShapeDtypeStruct(shape, jnp.float32)
+
+    links, action = model.nbody - 1, zeros(model.nu)
+    state = Kinematics(zeros(model.nq), zeros(model.nv), zeros(links, 3), zeros(links, 4))
+    _check_result("reward", "a scalar number", jax.eval_shape(task.reward, state, state, action))
+    _check_result("terminated", "a scalar bool", jax.eval_shape(task.terminated, state))
+    _check_result("observation", "a flat float array", jax.eval_shape(task.observation, state))
+    if task.reset is None:
+        return
+    start = jax.eval_shape(task.reset, jax.random.key(0))
+    shapes = jax.tree.map(lambda leaf: leaf.shape, start)
+    if not isinstance(shapes, tuple | list) or list(shapes) != [(model.nq,), (model.nv,)]:
+        raise ValueError(
+            f"reset must return joint positions ({model.nq},) and velocities ({model.nv},), "
+            f"got {shapes}"
         )
-    )
-    action = jax.ShapeDtypeStruct((model.nu,), jnp.float32)
-    _check_result("reward", "a scalar number", jax.eval_shape(task.reward, shapes, shapes, action))
-    _check_result("terminated", "a scalar bool", jax.eval_shape(task.terminated, shapes))
-    _check_result("observation", "a flat float array", jax.eval_shape(task.observation, shapes))
-    if task.reset is not None:
-        start = jax.eval_shape(task.reset, jax.random.key(0))
-        expected = [(model.nq,), (model.nv,)]
-        if not isinstance(start, tuple | list) or [getattr(x, "shape", None) for x in start] != (
-            expected
-        ):
-            got = jax.tree.map(lambda leaf: leaf.shape, start)
-            raise ValueError(
-                f"reset must return joint positions ({model.nq},) and velocities ({model.nv},), "
-                f"got {got}"
-            )
 
 
 def _check_result(name: str, expected: str, result: object) -> None:
     shape, dtype = getattr(result, "shape", None), getattr(result, "dtype", None)
     if shape is not None and dtype is not None:
-        is_bool, is_float = dtype == jnp.bool_, jnp.issubdtype(dtype, jnp.floating)
-        is_number = is_float or jnp.issubdtype(dtype, jnp.integer)
+        is_float = jnp.issubdtype(dtype, jnp.floating)
         fits = {
-            "reward": shape == () and is_number,
-            "terminated": shape == () and is_bool,
+            "reward": shape == () and (is_float or jnp.issubdtype(dtype, jnp.integer)),
+            "terminated": shape == () and dtype == jnp.bool_,
             "observation": len(shape) == 1 and shape[0] > 0 and is_float,
         }[name]
         if fits:

@@ -10,10 +10,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-import mujoco
 import numpy as np
 
 from pixelbrax_jax.physics.mujoco_compatibility import import_silenced
+from pixelbrax_jax.physics.opengl import mujoco
 
 with import_silenced():
     from mujoco.mjx._src.collision_driver import geom_pairs
@@ -36,23 +36,14 @@ _MOST_NAMES = 5
 
 
 class Omission(NamedTuple):
-    """A feature of a model that a backend does not simulate.
-
-    Attributes:
-        feature: what it is, and of which elements of the model.
-        in_mjx: whether MuJoCo XLA leaves it out too.
-    """
+    """A feature that a backend does not simulate, with the elements that have it."""
 
     feature: str
     in_mjx: bool
 
 
 def check_simulated(model: mujoco.MjModel, backend: str) -> None:
-    """Raise an error that names all that a backend would leave out of a model.
-
-    Args:
-        model: a compiled model.
-        backend: one of ``tasks.BRAX_BACKENDS``.
+    """Raise an error that names all that a backend would leave out of a compiled model.
 
     Raises:
         ValueError: there is something; the message says what to do about it.
@@ -73,12 +64,7 @@ def check_simulated(model: mujoco.MjModel, backend: str) -> None:
 
 
 def omissions(model: mujoco.MjModel, backend: str) -> list[Omission]:
-    """Return what a backend leaves out of a model.
-
-    Args:
-        model: a compiled model.
-        backend: one of ``tasks.BRAX_BACKENDS``.
-    """
+    """Return what a backend leaves out of a compiled model."""
     found = [Omission(feature, True) for feature in _in_all(model)]
     if backend != "mjx":
         found += [Omission(feature, False) for feature in _in_brax(model)]

@@ -1,95 +1,218 @@
-"""The built-in tasks that Brax simulates."""
+"""The tasks that Brax simulates, one row each, and the options that they alone have.
+
+Plain names and numbers, so that reading them loads nothing.
+"""
 
 from __future__ import annotations
 
-from functools import lru_cache
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
-import jax
-import jax.numpy as jnp
-
-from pixelbrax_jax.physics.base import Kinematics
-from pixelbrax_jax.physics.brax.engine import BraxPhysics
-from pixelbrax_jax.physics.mujoco_compatibility import (
-    import_silenced,
-    load_onto_own_device,
-    loading_silenced,
-)
-from pixelbrax_jax.physics.recipe import Recipe
-from pixelbrax_jax.tasks import BRAX_TASKS, REWARD_PRESETS
+from pixelbrax_jax.physics.task import Color, Task, by_name
 from pixelbrax_jax.validation import check_choice
 
-with import_silenced():
-    from brax import envs
-    from mujoco.mjx._src import io as mjx_io
+BACKENDS = ("generalized", "mjx", "positional", "spring")
+"""Names of Brax's physics backends."""
+
+REWARD_PRESETS = ("brax", "paper")
+
+_Point = tuple[float, float, float]
 
 
-def distance_swum(before: Kinematics, after: Kinematics, action: jax.Array) -> jax.Array:
-    """Return the distance of the swimmer's root from the origin, minus a control cost."""
-    del before
-    return jnp.linalg.norm(after.q[:2]) - 1e-9 * jnp.sum(action**2)
-
-
-_PAPER_REWARDS = {"distance_swum": distance_swum}
-
-
-def make_physics(
-    task: str, *, backend: str | None = None, reward_preset: str = "brax"
-) -> BraxPhysics:
-    """Make the physics of a built-in task.
-
-    Equal arguments give equal objects, and the same one as long as few others are asked for.
-
-    Args:
-        task: a name in ``BRAX_TASKS``.
-        backend: a backend that the task supports; None for its default.
-        reward_preset: ``"brax"`` for the rewards of the installed Brax, or ``"paper"`` for
-            those of arXiv 2502.00021 where they differ: walker2d weighs forward speed ten
-            times, the swimmer earns its distance from the origin, and humanoid,
-            humanoidstandup, inverted_pendulum and pusher take actions unscaled. Dynamics are
-            the installed Brax's with either.
-
-    Returns:
-        The physics.
+@dataclass(frozen=True, kw_only=True)
+class BraxOptions:
+    """Options of Brax's tasks alone.
 
     Raises:
-        ValueError: for an unknown name; the message lists what is allowed.
+        ValueError: an option is out of range; the message says what is allowed.
     """
-    row = BRAX_TASKS[check_choice("task", task, BRAX_TASKS)]
-    check_choice("reward_preset", reward_preset, REWARD_PRESETS)
-    backend = row.default_backend if backend is None else backend
-    check_choice(f"backend of task {task!r}", backend, row.backends)
-    return _load(task, backend, reward_preset)
+
+    backend: str | None = None
+    """Physics backend: ``spring``, ``positional``, ``generalized`` or ``mjx``; None means the
+    task's own. For Brax's tasks alone."""
+    reward_preset: str = "brax"
+    """``brax``, or ``paper`` for the rewards of arXiv 2502.00021; for Brax's tasks alone."""
+
+    def __post_init__(self) -> None:
+        """Check what is the same for all tasks."""
+        check_choice("reward_preset", self.reward_preset, REWARD_PRESETS)
 
 
-# Loading a model takes a second. One that is dropped and loaded again equals the first.
-@lru_cache(maxsize=16)
-def _load(task: str, backend: str, reward_preset: str) -> BraxPhysics:
-    row, paper = BRAX_TASKS[task], reward_preset == "paper"
-    reward = _PAPER_REWARDS[row.paper_reward] if paper and row.paper_reward else None
-    return BraxPhysics(
-        load_brax_env(task, backend, **(row.paper_options if paper else {})),
-        colors=row.colors,
-        drawn_radius=row.drawn_radius,
-        # These tasks' pictures and viewpoints are those of the original.
-        sites_and_cameras=False,
-        unscale_actions=paper and row.paper_unscaled,
-        reward=reward,
-        identity=Recipe(_load, (task, backend, reward_preset)),
-    )
+@dataclass(frozen=True)
+class Viewpoint:
+    """Where a task is seen from.
 
-
-def load_brax_env(name: str, backend: str, **options: Any) -> envs.Env:
-    """Load one of Brax's own environments, bare, without its known warnings.
-
-    Args:
-        name: Brax's name of the task.
-        backend: Brax's name of the backend.
-        **options: further arguments of the environment's class.
-
-    Returns:
-        The environment.
+    Attributes:
+        eye: metres; relative to the followed link in x and y.
+        target: metres, likewise; the point looked at.
+        fovy: vertical field of view, degrees.
+        link: index of the followed link, -1 for a camera at rest.
+        up: the world direction that is up in the image.
     """
-    load_onto_own_device(mjx_io)
-    with loading_silenced():
-        return envs.get_environment(name, backend=backend, **options)
+
+    eye: _Point
+    target: _Point
+    fovy: float
+    link: int = -1
+    up: _Point = (0.0, 0.0, 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class BraxTask(Task):
+    """A task of Brax's; its name is Brax's too.
+
+    Attributes:
+        default_backend: the physics backend used by default.
+        camera: the default viewpoint.
+        original_camera: that of the paper, None where it has none.
+        backends: those that simulate the task sanely, sorted.
+        colors: colors by geom name that replace the model's.
+        drawn_radius: metres, spheres by name that are drawn larger than they are.
+        paper_options: arguments of Brax's environment for the "paper" reward preset.
+        paper_unscaled: whether that preset hands actions to costs and actuators as they are,
+            where Brax first maps them from [-1, 1] to the control range. The actuators still clip
+            to that range.
+        paper_reward: name of that preset's reward in ``loading``, None for Brax's.
+    """
+
+    default_backend: str
+    camera: Viewpoint
+    original_camera: Viewpoint | None
+    backends: tuple[str, ...] = BACKENDS
+    colors: Mapping[str, Color] = field(default_factory=dict)
+    drawn_radius: Mapping[str, float] = field(default_factory=dict)
+    paper_options: Mapping[str, float] = field(default_factory=dict)
+    paper_unscaled: bool = False
+    paper_reward: str | None = None
+
+
+# Okabe and Ito's palette (Color Universal Design, 2008) can be distinguished with any color vision.
+_SKY_BLUE = (0.337, 0.706, 0.914)
+_YELLOW = (0.941, 0.894, 0.259)
+_VERMILLION = (0.835, 0.369, 0.0)
+_RED = (1.0, 0.0, 0.0)
+
+# Viewpoints of the original renderer (arXiv 2502.00021). It gives a horizontal field of view; at
+# its square images that is the vertical one too.
+_ANT = Viewpoint((1.6, -1.6, 3.5), (0.0, 0.0, 0.0), 40.0, link=0)
+_PLANAR = Viewpoint((0.0, -2.1, 0.8), (0.0, 0.0, 0.6), 55.0, link=0)
+_HUMANOID = Viewpoint((1.7, -1.7, 1.5), (0.0, 0.0, 1.1), 50.0, link=0)
+_CART = Viewpoint((0.0, -2.3, 0.0), (0.0, 0.0, 0.0), 55.0)
+_PUSHER = Viewpoint((1.6, 1.6, 0.75), (0.0, 0.0, 0.0), 50.0, link=0)
+_REACHER = Viewpoint((0.0, -0.01, 0.81), (0.0, 0.0, 0.0), 45.0, link=0, up=(0.0, 1.0, 1.0))
+_SWIMMER = Viewpoint((2.4, 2.4, 1.25), (0.0, 0.0, 0.0), 50.0, link=1)
+# The original aims above the lying torso, which then sits at the lower edge.
+_LYING = Viewpoint((2.2, -2.2, 1.7), (0.0, 0.0, 0.55), 50.0, link=0)
+
+# Default backends are those of the paper, which leaves the choice open for ant, humanoid and
+# humanoidstandup and lacks the double pendulum.
+TASKS = by_name(
+    [
+        BraxTask(
+            "ant",
+            "PixelBrax/Ant-v0",
+            "A four-legged body runs along x; ends when its torso is too low or too high.",
+            "spring",
+            _ANT,
+            _ANT,
+            # Brax's reset noise puts feet below the ground. The positional backend throws such an
+            # ant into the air: a quarter of the episodes ends within four steps.
+            backends=("generalized", "mjx", "spring"),
+        ),
+        BraxTask(
+            "halfcheetah",
+            "PixelBrax/HalfCheetah-v0",
+            "A planar two-legged body runs along x; never ends early.",
+            "spring",
+            _PLANAR,
+            _PLANAR,
+        ),
+        BraxTask(
+            "hopper",
+            "PixelBrax/Hopper-v0",
+            "A planar one-legged body hops along x; ends when it falls.",
+            "positional",
+            _PLANAR,
+            _PLANAR,
+        ),
+        BraxTask(
+            "humanoid",
+            "PixelBrax/Humanoid-v0",
+            "A humanoid runs along x; ends when its torso is too low or too high.",
+            "spring",
+            _HUMANOID,
+            _HUMANOID,
+            paper_unscaled=True,
+        ),
+        BraxTask(
+            "humanoidstandup",
+            "PixelBrax/HumanoidStandup-v0",
+            "A humanoid that lies on its back stands up; never ends early.",
+            "spring",
+            _LYING,
+            _HUMANOID,
+            paper_unscaled=True,
+        ),
+        BraxTask(
+            "inverted_double_pendulum",
+            "PixelBrax/InvertedDoublePendulum-v0",
+            "A cart balances two poles in a row; ends when the tip sinks to 1 m.",
+            "generalized",
+            Viewpoint((0.0, -3.0, 0.6), (0.0, 0.0, 0.6), 55.0),
+            None,
+        ),
+        BraxTask(
+            "inverted_pendulum",
+            "PixelBrax/InvertedPendulum-v0",
+            "A cart balances a pole; ends when it tilts by more than 0.2 rad.",
+            "generalized",
+            _CART,
+            _CART,
+            paper_unscaled=True,
+        ),
+        # The paper's pusher also has another object; its physics are not reproduced.
+        BraxTask(
+            "pusher",
+            "PixelBrax/Pusher-v0",
+            "A robot arm pushes a cylinder to a goal; never ends early.",
+            "generalized",
+            _PUSHER,
+            _PUSHER,
+            # The goal disc has no name in Brax's model, only its place in the list.
+            colors={"object_geom": _SKY_BLUE, "capsule/20": _VERMILLION},
+            paper_unscaled=True,
+        ),
+        BraxTask(
+            "reacher",
+            "PixelBrax/Reacher-v0",
+            "A planar arm of two joints reaches for a target; never ends early.",
+            "generalized",
+            _REACHER,
+            _REACHER,
+            colors={"fingertip": _YELLOW, "target": _RED},
+            # At 84 pixels their 9 and 10 mm are two pixels.
+            drawn_radius={"fingertip": 0.015, "target": 0.018},
+        ),
+        BraxTask(
+            "swimmer",
+            "PixelBrax/Swimmer-v0",
+            "A planar chain of three links swims along x; never ends early.",
+            "generalized",
+            _SWIMMER,
+            _SWIMMER,
+            # Brax itself refuses the swimmer on other backends.
+            backends=("generalized",),
+            paper_reward="distance_swum",
+        ),
+        BraxTask(
+            "walker2d",
+            "PixelBrax/Walker2d-v0",
+            "A planar two-legged body walks along x; ends when it falls.",
+            "spring",
+            _PLANAR,
+            _PLANAR,
+            paper_options={"forward_reward_weight": 10.0},
+        ),
+    ]
+)
+"""Brax's tasks by name."""

@@ -12,7 +12,8 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import mujoco
+
+from pixelbrax_jax.physics.opengl import mujoco
 
 FREE, STICKING, SLIPPING = range(3)
 

@@ -26,17 +26,8 @@ def aligned_with_capsules(
 
     The cone of friction is a pyramid, and so it matters which way its edges point. MuJoCo points
     the first along the capsule, however steep that is; MuJoCo XLA along an axis of the world where
-    the capsule is steeper than 60 degrees, which changes single control steps of the humanoid by
-    up to 0.3 rad/s.
-
-    Args:
-        model: ``mujoco.mjx.Model``.
-        data: ``mujoco.mjx.Data`` with the places of geoms.
-        key: the kind of collision.
-        geom: (G, 2) int, pairs of a plane and a capsule.
-
-    Returns:
-        Distances (2 G,) and places (2 G, 3) in metres, and frames (2 G, 3, 3), the normal first.
+    the capsule is steeper than 60 degrees, which changes single control steps of the humanoid by up
+    to 0.3 rad/s.
     """
     dist, pos, frame = _theirs(model, data, key, geom)
     normal = data.geom_xmat[geom[:, 0]][:, :, 2]

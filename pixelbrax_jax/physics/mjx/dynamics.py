@@ -8,11 +8,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import mujoco
 from flax import struct
 
 from pixelbrax_jax.physics.mjx.substitutes import substituted
 from pixelbrax_jax.physics.mujoco_compatibility import import_silenced, load_onto_own_device
+from pixelbrax_jax.physics.opengl import mujoco
 
 with import_silenced():
     from mujoco import mjx
@@ -41,12 +41,7 @@ class MjxState(struct.PyTreeNode):
 
 
 class Dynamics:
-    """A model's motion, for one environment.
-
-    Attributes:
-        model: the compiled model.
-        reads_forces: whether sensors of forces and accelerations are computed.
-    """
+    """A model's motion, for one environment."""
 
     def __init__(
         self,
@@ -88,13 +83,7 @@ class Dynamics:
         qvel: jax.Array | None = None,
         target: jax.Array | None = None,
     ) -> MjxState:
-        """Return a state without control, activation or a solution to start from.
-
-        Args:
-            qpos: (Q,) float32, joint positions.
-            qvel: (V,) float32, joint velocities; None means at rest.
-            target: (3,) or (7,) float32, as in the state; None for tasks without.
-        """
+        """Return a state at rest if there are no velocities, without control or activation."""
         model = self.model
         return MjxState(
             qpos=jnp.asarray(qpos, jnp.float32),
@@ -107,10 +96,6 @@ class Dynamics:
 
     def step(self, state: MjxState, num_steps: int) -> tuple[MjxState, jax.Array]:
         """Advance by physics steps under the state's controls.
-
-        Args:
-            state: where to start.
-            num_steps: how many, at least 1.
 
         Returns:
             The state afterwards, and all sensors as the last step read them before it moved.
@@ -132,9 +117,6 @@ class Dynamics:
 
     def at_rest(self, state: MjxState) -> tuple[MjxState, jax.Array]:
         """Find the forces in a first state, with actuators off, as DM Control's resets do.
-
-        Args:
-            state: a first state.
 
         Returns:
             The state with accelerations to start the solver from, and all sensors.
@@ -183,12 +165,7 @@ class Dynamics:
         return data.site_xpos[row], data.site_xmat[row]
 
     def clearance(self, qpos: jax.Array, geom: str) -> jax.Array:
-        """Return () metres between a geom and the nearest one, negative where they overlap.
-
-        Args:
-            qpos: (Q,) float32, joint positions.
-            geom: its name.
-        """
+        """Return () metres between a geom and the nearest one, negative where they overlap."""
         contact = self._contact(qpos)
         is_of_it = jnp.any(contact.geom == self.model.geom(geom).id, axis=-1)
         return jnp.min(jnp.where(is_of_it, contact.dist, jnp.inf))

@@ -3,26 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Hashable
+from types import MappingProxyType
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from pixelbrax_jax.flags import default_flags, under_default_flags
 from pixelbrax_jax.physics.divergence import GuardedPhysics
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics, MjxState
-from pixelbrax_jax.physics.mjx.snapshot import Snapshot
-from pixelbrax_jax.physics.mjx.task import DmcTask, Start
+from pixelbrax_jax.physics.mjx.formulas import Formulas, Snapshot, Start
 from pixelbrax_jax.physics.model_scene import COM_LINK, TARGET_LINK, read_scene, tracked_body
+from pixelbrax_jax.physics.opengl import mujoco
 from pixelbrax_jax.physics.poses import check_pose, with_unit_rotations
 from pixelbrax_jax.physics.viewpoints import unfit_cameras
 from pixelbrax_jax.types import PhysicsState
-
-# XLA's library for sums and products on a CPU, YNNPACK, takes longer for the small ones of these
-# models than the loops that XLA writes itself.
-_COMPILER_OPTIONS = {"xla_cpu_experimental_ynn_fusion_type": ""}
 
 _UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 
@@ -32,30 +28,28 @@ class MjxPhysics(GuardedPhysics):
 
     Links are the model's bodies without the world; then ``camera/com``, the centre of mass that
     cameras and lights follow, and ``target``, this episode's target, where a task has them.
-
-    Beyond the interface it has ``rigs``, the model's cameras by name, with the task's own as
-    ``default``; ``look``, the model's lights, sky and ground; ``batch_last``, whether a CPU
-    computes a batch faster with the environments as last axis; and ``compiler_options``.
     """
 
     backend = "mjx"
+    # XLA's library for sums and products on a CPU, YNNPACK, takes longer for the small ones of
+    # these models than the loops that XLA writes itself.
+    compiler_options = MappingProxyType({"xla_cpu_experimental_ynn_fusion_type": ""})
 
     @default_flags()
-    def __init__(self, task: DmcTask, model: mujoco.MjModel, *, identity: Hashable):
+    def __init__(self, formulas: Formulas, model: mujoco.MjModel, *, identity: Hashable):
         """Put the model on the device and read what is drawn; compile nothing.
 
         Args:
-            task: the task.
+            formulas: those of the task.
             model: the compiled model of its domain; changed as the task wants it.
-            identity: objects of one identity are equal, and environments over them share compiled
-                programs. A pickle keeps nothing but it if it is a ``Recipe``.
+            identity: objects of one identity are equal.
 
         Raises:
             ValueError: the model has something visible that cannot be drawn.
             NotImplementedError: the model has features that MuJoCo XLA lacks.
         """
-        task.edit(model)
-        scene = read_scene(model, task.camera, movable=task.movable)
+        formulas.edit(model)
+        scene = read_scene(model, formulas.camera, movable=formulas.movable)
         self.geoms, self.look = scene.geoms, scene.look
         self.rigs = scene.rigs | {"default": scene.rig}
         self.unfit_cameras = unfit_cameras(model)
@@ -63,16 +57,15 @@ class MjxPhysics(GuardedPhysics):
         self.link_names = (*bodies, *scene.links)
         self.dynamics = Dynamics(
             model,
-            reads_forces=task.reads_forces,
-            out_of_reach=task.out_of_reach,
-            target_body=task.target_body,
+            reads_forces=formulas.reads_forces,
+            out_of_reach=formulas.out_of_reach,
+            target_body=formulas.target_body,
         )
         # The product of decimals is not the decimal: 0.0025 * 10 shall be 0.025.
-        self.dt = float(f"{model.opt.timestep * task.substeps:.6g}")
+        self.dt = float(f"{model.opt.timestep * formulas.substeps:.6g}")
         self.action_size = int(model.nu)
-        self.batch_last = task.batch_last
-        self.compiler_options = _COMPILER_OPTIONS
-        self._task = task
+        self.batch_last = formulas.batch_last
+        self._formulas = formulas
         self._model = model
         self._tracked_body = tracked_body(model)
         self._extra_links = scene.links
@@ -83,18 +76,11 @@ class MjxPhysics(GuardedPhysics):
         first = jax.eval_shape(self.reset, jax.random.key(0))
         self.state_size = int(first.obs.shape[0])
 
-    def __eq__(self, other: object) -> bool:
-        return type(self) is type(other) and self._identity == getattr(other, "_identity", None)
-
-    def __hash__(self) -> int:
-        return hash(self._identity)
-
     def control(self, action: jax.Array) -> jax.Array:
-        """Return the controls that an action stands for.
+        """Return the controls that an action (A,) stands for.
 
-        Args:
-            action: (A,) float32; [-1, 1] is mapped to the control range of each actuator, which
-                is [-1, 1] too but for the quadruped.
+        [-1, 1] is mapped to the control range of each actuator, which is [-1, 1] too but for the
+        quadruped.
         """
         action = jnp.asarray(action, jnp.float32)
         if self._is_unit_range:
@@ -109,9 +95,6 @@ class MjxPhysics(GuardedPhysics):
             state: joint positions and velocities, controls and target.
             sensors: readings of all sensors, of which those of forces and accelerations are
                 taken as they are and the others computed.
-
-        Returns:
-            Links, observation and reward of the state.
         """
         data = self.dynamics.refresh(state, sensors)
         seen = Snapshot(self._model, data, state.target)
@@ -120,61 +103,35 @@ class MjxPhysics(GuardedPhysics):
             engine=state,
             xpos=xpos,
             xquat=xquat,
-            obs=self._task.observe(seen).astype(jnp.float32),
-            reward=self._task.reward(seen).astype(jnp.float32),
+            obs=self._formulas.observe(seen).astype(jnp.float32),
+            reward=self._formulas.reward(seen).astype(jnp.float32),
             terminated=jnp.zeros((), bool),
             non_finite=jnp.zeros((), bool),
         )
 
     def first(self, key: jax.Array) -> tuple[MjxState, jax.Array]:
-        """Draw an initial state.
-
-        Args:
-            key: PRNG key.
-
-        Returns:
-            The state, and readings of all sensors as ``observe`` takes them.
-        """
-        return self._settle(self._task.start(self.dynamics, key))
+        """Sample an initial state; return it and the sensors as ``observe`` takes them."""
+        return self._settle(self._formulas.start(self.dynamics, key))
 
     @under_default_flags
     def from_qpos(
         self, q: jax.Array, qd: jax.Array | None = None, *, key: jax.Array | None = None
     ) -> PhysicsState:
-        """Return the first state of an episode, in a chosen pose.
-
-        Args:
-            q: (Q,) float32, joint positions in MuJoCo's order; quaternions of any length.
-            qd: (V,) float32, joint velocities, 0 if not given.
-            key: decides the episode's target, where the task has one that is no joint.
-
-        Returns:
-            A state that ``step`` accepts.
-
-        Raises:
-            ValueError: for a wrong shape.
-        """
+        """See ``Physics.from_qpos``; ``key`` decides a target that is no joint."""
         q, qd = check_pose(self._model, q, qd)
-        start = self._task.start(self.dynamics, jax.random.key(0) if key is None else key)
+        start = self._formulas.start(self.dynamics, jax.random.key(0) if key is None else key)
         start = start.replace(qpos=with_unit_rotations(self._model, q), qvel=qd)
         return self._guard_first(self.observe(*self._settle(start)))
 
     def _settle(self, start: Start) -> tuple[MjxState, jax.Array]:
         state = self.dynamics.state(start.qpos, start.qvel, start.target)
         sensors = jnp.zeros(self._model.nsensordata)
-        if self._task.starts_with_forces:
+        if self._formulas.starts_with_forces:
             state, sensors = self.dynamics.at_rest(state)
         return state, sensors
 
     def move(self, state: MjxState, action: jax.Array) -> tuple[MjxState, jax.Array]:
-        """Advance by one control step, without looking at where it leads.
-
-        Args:
-            state: a state.
-            action: (A,) float32.
-
-        Returns:
-            The next state, and readings of all sensors as ``observe`` takes them.
+        """Advance by one control step; return the state and the sensors as ``observe`` takes them.
 
         Raises:
             ValueError: when traced, if the action's shape is not ``(action_size,)``.
@@ -182,7 +139,7 @@ class MjxPhysics(GuardedPhysics):
         action = jnp.asarray(action, jnp.float32)
         if action.shape != (self.action_size,):
             raise ValueError(f"action must have shape ({self.action_size},), got {action.shape}")
-        return self.dynamics.step(state.replace(ctrl=self.control(action)), self._task.substeps)
+        return self.dynamics.step(state.replace(ctrl=self.control(action)), self._formulas.substeps)
 
     def _reset(self, key: jax.Array) -> PhysicsState:
         """See ``Physics.reset``."""

@@ -11,10 +11,9 @@ from importlib.util import find_spec
 from pathlib import Path
 from xml.etree import ElementTree
 
-import mujoco
-
 from pixelbrax_jax.extras import install_extra
 from pixelbrax_jax.physics.mujoco_compatibility import loading_silenced
+from pixelbrax_jax.physics.opengl import mujoco
 
 KNOWN_VERSION = "1.0.50"
 """The release of dm_control whose models the tests compare with."""
@@ -57,9 +56,6 @@ def load_model(domain: str, **options: float) -> mujoco.MjModel:
         domain: file name in DM Control's suite, without ending.
         **options: what the domain's generator takes: ``max_contacts`` of the manipulator,
             ``num_bodies`` of the swimmer, ``floor_size`` of the quadruped, metres.
-
-    Returns:
-        The model, which the caller may change.
 
     Raises:
         ImportError: dm_control is not installed; the message has the line that installs it.
@@ -133,10 +129,6 @@ def _grow_swimmer(root: ElementTree.Element, *, num_bodies: int) -> None:
 
     Each has a hinge with a motor, and a site with a velocimeter and a gyroscope. Joints bend up to
     360 degrees by the number of bodies, and cameras stand as far away as the chain is long.
-
-    Args:
-        root: the XML of a swimmer that is only a head; changed in place.
-        num_bodies: bodies of the chain, the head included.
     """
     parent = _find(root, "./worldbody/body")
     actuator = ElementTree.SubElement(root, "actuator")
@@ -159,12 +151,7 @@ def _grow_swimmer(root: ElementTree.Element, *, num_bodies: int) -> None:
 
 
 def _strip_quadruped(root: ElementTree.Element, *, floor_size: float) -> None:
-    """Take away what walking does not need, and size the floor, as DM Control does.
-
-    Args:
-        root: the XML of the quadruped; changed in place.
-        floor_size: half the edge of the floor, metres.
-    """
+    """Take away what walking does not need; half an edge of the floor is ``floor_size`` metres."""
     _find(root, ".//geom[@name='floor']").set("size", f"{floor_size} {floor_size} .5")
     walls = [f"geom[@name='wall_{side}']" for side in ("px", "py", "nx", "ny")]
     unused = [*walls, "geom[@name='terrain']", "site[@name='target']", "body[@name='ball']"]
@@ -177,12 +164,7 @@ def _strip_quadruped(root: ElementTree.Element, *, floor_size: float) -> None:
 
 
 def _keep_ball(root: ElementTree.Element, *, max_contacts: int) -> None:
-    """Take away the things that bringing the ball does not need, as DM Control does.
-
-    Args:
-        root: the XML of the manipulator; changed in place.
-        max_contacts: how many contacts MuJoCo XLA takes into account, the deepest.
-    """
+    """Take away what the ball does not need; MuJoCo XLA takes the deepest ``max_contacts``."""
     world = _find(root, "./worldbody")
     for name in ("cup", "peg", "slot", "target_peg"):
         world.remove(_find(world, f"body[@name='{name}']"))

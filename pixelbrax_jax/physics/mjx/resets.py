@@ -1,4 +1,4 @@
-"""How initial states are drawn."""
+"""How initial states are sampled."""
 
 from __future__ import annotations
 
@@ -6,30 +6,23 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics
-from pixelbrax_jax.physics.mjx.task import Start
+from pixelbrax_jax.physics.mjx.formulas import Start
+from pixelbrax_jax.physics.opengl import mujoco
 
 MAX_ATTEMPTS = 1000
-"""Draws of a pose after which one that touches something is taken."""
+"""Samples of a pose after which one that touches something is taken."""
 
 
 def random_joints(model: mujoco.MjModel, key: jax.Array) -> jax.Array:
-    """Draw joint positions as DM Control's ``randomize_limited_and_rotational_joints`` does.
+    """Sample joint positions (Q,) as DM Control's ``randomize_limited_and_rotational_joints`` does.
 
     Limited hinges and sliders are uniform in their range, other hinges in [-pi, pi]. A free joint
-    keeps its place, and its quaternion is drawn uniformly from [0, 1]^4 and normalised, which is
+    keeps its place, and its quaternion is sampled uniformly from [0, 1]^4 and normalised, which is
     not uniform over rotations: DM Control keeps it so for the sake of its results. The suite's
     tasks that ask for it have no ball joints.
-
-    Args:
-        model: the compiled model.
-        key: PRNG key.
-
-    Returns:
-        (Q,) float32, metres, radians, unit quaternions.
     """
     low, high = np.array(model.qpos0), np.array(model.qpos0)
     rotations = []
@@ -52,23 +45,23 @@ def random_joints(model: mujoco.MjModel, key: jax.Array) -> jax.Array:
 
 
 def random_rotation(key: jax.Array) -> jax.Array:
-    """Draw a (4,) float32 unit quaternion, uniformly over rotations."""
+    """Sample a (4,) float32 unit quaternion, uniformly over rotations."""
     quat = jax.random.normal(key, (4,))
     return quat / jnp.linalg.norm(quat)
 
 
 def free_of_contact(
-    dynamics: Dynamics, key: jax.Array, draw: Callable[[jax.Array, Start], Start]
+    dynamics: Dynamics, key: jax.Array, sample: Callable[[jax.Array, Start], Start]
 ) -> Start:
-    """Draw initial states until no geoms touch.
+    """Sample initial states until no geoms touch.
 
     Args:
         dynamics: the model's motion.
         key: PRNG key.
-        draw: returns an initial state for a key and the state drawn before, at first all zeros.
+        sample: returns an initial state for a key and the sample before, at first all zeros.
 
     Returns:
-        The state; after ``MAX_ATTEMPTS`` draws the last one, whatever it touches.
+        The state; after ``MAX_ATTEMPTS`` samples the last one, whatever it touches.
     """
 
     def again(carry: tuple[jax.Array, Start, jax.Array]) -> jax.Array:
@@ -79,10 +72,10 @@ def free_of_contact(
         carry: tuple[jax.Array, Start, jax.Array],
     ) -> tuple[jax.Array, Start, jax.Array]:
         number, before, _ = carry
-        start = draw(jax.random.fold_in(key, number), before)
+        start = sample(jax.random.fold_in(key, number), before)
         return number + 1, start, dynamics.touches(start.qpos)
 
     zeros = Start(jnp.zeros(dynamics.model.nq), jnp.zeros(dynamics.model.nv))
-    shapes = jax.eval_shape(draw, key, zeros)
+    shapes = jax.eval_shape(sample, key, zeros)
     nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
     return jax.lax.while_loop(again, attempt, (jnp.int32(0), nothing, jnp.bool_(True)))[1]

@@ -6,12 +6,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from pixelbrax_jax.physics.mjx import elimination
 from pixelbrax_jax.physics.mjx.cones import Cones
 from pixelbrax_jax.physics.mujoco_compatibility import import_silenced
+from pixelbrax_jax.physics.opengl import mujoco
 
 with import_silenced():
     from mujoco.mjx._src import support
@@ -126,13 +126,6 @@ def solve(model: Any, data: Any) -> Any:
     Costs are quadratic between kinks, so that Newton's step is exact once the right constraints are
     active: the loop ends where a whole step leaves them as they are. Those of elliptic cones are
     not where contacts slip: there it ends where forces are as expected after a whole step.
-
-    Args:
-        model: ``mujoco.mjx.Model`` that ``is_supported``.
-        data: ``mujoco.mjx.Data`` with constraints and accelerations without them.
-
-    Returns:
-        ``data`` with ``qacc``, ``qfrc_constraint`` and ``efc_force``.
     """
     impl = data._impl
     # MuJoCo's order: equalities, dry friction, then limits and contacts.

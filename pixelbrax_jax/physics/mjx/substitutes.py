@@ -9,12 +9,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import mujoco
 
+from pixelbrax_jax._platform.lowering import by_platform
 from pixelbrax_jax.physics.mjx import elimination
 from pixelbrax_jax.physics.mjx.contact_frames import PAIR, aligned_with_capsules
 from pixelbrax_jax.physics.mjx.solver import is_supported, solve
 from pixelbrax_jax.physics.mujoco_compatibility import import_silenced
+from pixelbrax_jax.physics.opengl import mujoco
 
 with import_silenced():
     from mujoco.mjx._src import collision_driver, scan, smooth, support
@@ -31,20 +32,17 @@ _lock = threading.RLock()
 
 @contextmanager
 def substituted(model: mujoco.MjModel) -> Iterator[None]:
-    """Trace with contact frames, small equations, scans of long chains and solver of our own.
+    """Trace steps of a model with functions of our own in place of some of MuJoCo XLA's.
 
     What is traced elsewhere before and after is not affected; what another thread traces with
     MuJoCo XLA in the meantime, without this block, has them too.
-
-    Args:
-        model: whose steps are traced.
     """
     changes: list[tuple[dict[Any, Any], Any, Any]] = [
         (collision_driver._COLLISION_FUNC, PAIR, aligned_with_capsules),
         (vars(smooth), "factor_m", factor_m),
         (vars(smooth), "solve_m", solve_m),
     ]
-    if _longest_chain(model) > _SHORT and jax.default_backend() == "cpu":
+    if _longest_chain(model) > _SHORT:
         changes.append((vars(scan), "body_tree", body_tree))
     if is_supported(model):
         changes.append((vars(mjx_solver), "solve", solve))
@@ -67,7 +65,8 @@ def body_tree(model: Any, of_body: Any, *args: Any, **options: Any) -> Any:
     """
 
     def level(*values: Any) -> Any:
-        return jax.lax.optimization_barrier(of_body(*values))
+        barrier = jax.lax.optimization_barrier
+        return by_platform(of_body(*values), cpu=barrier, default=lambda found: found)
 
     return _body_tree(model, level, *args, **options)
 
@@ -87,19 +86,40 @@ def factor_m(model: Any, data: Any) -> Any:
     and wait for ever once as many batches are at it as there are threads. Euler's method factorises
     inertia with damping, which XLA would do beside the solver's; here it needs its accelerations.
     """
-    if _is_eliminated(model):
+    inertia = data._impl.M
+
+    def factors(inertia: jax.Array, acceleration: jax.Array) -> jax.Array:
+        nothing = (0 * acceleration).sum()  # XLA does not know: it might be NaN.
+        return _factor_m(model, data.tree_replace({"_impl.M": inertia + nothing}))._impl.qLD
+
+    def no_factors(inertia: jax.Array, acceleration: jax.Array) -> jax.Array:
         # What another thread traces meanwhile might read factors: not those of another state.
-        return data.tree_replace({"_impl.qLD": jnp.full_like(data._impl.M, jnp.nan)})
-    nothing = (0 * data.qacc).sum()  # XLA does not know: it might be NaN.
-    return _factor_m(model, data.tree_replace({"_impl.M": data._impl.M + nothing}))
+        del acceleration
+        return jnp.full_like(inertia, jnp.nan)
+
+    if _is_small(model):
+        found = by_platform(inertia, data.qacc, cpu=no_factors, default=factors)
+        return data.tree_replace({"_impl.qLD": found})
+    nothing = (0 * data.qacc).sum()
+    return _factor_m(model, data.tree_replace({"_impl.M": inertia + nothing}))
 
 
 def solve_m(model: Any, data: Any, right: Any) -> Any:
-    """Solve for inertia as ``mujoco.mjx._src.smooth.solve_m`` does, without factors if faster."""
-    if _is_eliminated(model):
-        return elimination.solve(data._impl.M, right)
-    return _solve_m(model, data, right)
+    """Solve for inertia as ``mujoco.mjx._src.smooth.solve_m`` does, on a CPU without factors."""
+    if not _is_small(model):
+        return _solve_m(model, data, right)
+
+    def by_factors(inertia: jax.Array, factors: jax.Array, right: jax.Array) -> jax.Array:
+        del inertia
+        return _solve_m(model, data.tree_replace({"_impl.qLD": factors}), right)
+
+    def by_elimination(inertia: jax.Array, factors: jax.Array, right: jax.Array) -> jax.Array:
+        del factors
+        return elimination.eliminate(inertia, right)
+
+    arguments = data._impl.M, data._impl.qLD, right
+    return by_platform(*arguments, cpu=by_elimination, default=by_factors)
 
 
-def _is_eliminated(model: Any) -> bool:
-    return not support.is_sparse(model) and elimination.is_faster(model.nv)
+def _is_small(model: Any) -> bool:
+    return not support.is_sparse(model) and model.nv <= elimination.LARGEST

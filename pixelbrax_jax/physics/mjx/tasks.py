@@ -1,69 +1,68 @@
-"""The tasks of the DM Control Suite, by name."""
+"""The tasks of the DM Control Suite, one row each; reading them loads nothing."""
 
 from __future__ import annotations
 
-from functools import lru_cache
-from importlib import import_module
+from dataclasses import dataclass
 
-from pixelbrax_jax.physics.mjx.engine import MjxPhysics
-from pixelbrax_jax.physics.mjx.models import load_model
-from pixelbrax_jax.physics.mjx.task import DmcTask
-from pixelbrax_jax.physics.recipe import Recipe
-from pixelbrax_jax.tasks import DMC_TASKS
-from pixelbrax_jax.validation import check_choice
+from pixelbrax_jax.physics.task import Task, by_name
 
 
-def make_physics(
-    task: str, *, backend: str | None = None, reward_preset: str = "brax"
-) -> MjxPhysics:
-    """Make the physics of a task of the DM Control Suite.
+@dataclass(frozen=True, eq=False)
+class DmcTask(Task):
+    """A task of the DM Control Suite.
 
-    Equal arguments give equal objects, and the same one as long as few others are asked for.
-
-    Args:
-        task: a name in ``DMC_TASKS``.
-        backend: ``"mjx"``, or None for the same.
-        reward_preset: ``"brax"``, which is the only one here: rewards are DM Control's.
-
-    Returns:
-        The physics.
-
-    Raises:
-        ImportError: dm_control is not installed; the message has the line that installs it.
-        ValueError: for an unknown name; the message lists what is allowed.
+    Attributes:
+        domain: the suite's name of its domain, which is its module in ``domains``.
+        task: the suite's name of the task, under which that module has its formulas.
     """
-    row = DMC_TASKS[check_choice("task", task, DMC_TASKS)]
-    if backend is not None:
-        check_choice(f"backend of task {task!r}", backend, row.backends)
-    if reward_preset != "brax":
-        raise ValueError(
-            f"reward_preset={reward_preset!r}, but task {task!r} has DM Control's own rewards: "
-            "leave the option out."
-        )
-    return _load(task)
+
+    domain: str
+    task: str
+
+    def other_names(self) -> tuple[str, ...]:
+        """Return DM Control's names of it, with and without the domain."""
+        return (*super().other_names(), self.name, f"{self.domain}_{self.task}", self.task)
 
 
-def dmc_task(task: str) -> DmcTask:
-    """Return what a task consists of.
-
-    Args:
-        task: a name in ``DMC_TASKS``.
-
-    Returns:
-        Its model, initial states, observation and reward.
-
-    Raises:
-        ValueError: there is no such task; the message lists those there are.
-    """
-    row = DMC_TASKS[check_choice("task", task, DMC_TASKS)]
-    module = import_module(f"pixelbrax_jax.physics.mjx.domains.{row.domain}")
-    parts: DmcTask = module.TASKS[row.task]
-    return parts
+def _dmc(domain: str, task: str, summary: str) -> DmcTask:
+    words = f"{domain}_{task}".split("_")
+    camel = "".join(word[:1].upper() + word[1:] for word in words)
+    return DmcTask(f"dmc_{domain}_{task}", f"PixelBrax/DMC-{camel}-v0", summary, domain, task)
 
 
-# Loading a model takes a second. One that is dropped and loaded again equals the first.
-@lru_cache(maxsize=16)
-def _load(task: str) -> MjxPhysics:
-    parts = dmc_task(task)
-    model = load_model(parts.domain, **parts.options)
-    return MjxPhysics(parts, model, identity=Recipe(_load, (task,)))
+# None of them ends before the time limit.
+TASKS = by_name(
+    [
+        _dmc("acrobot", "swingup", "Two poles in a row swing up, moved at the elbow."),
+        _dmc("acrobot", "swingup_sparse", "The same, rewarded at the target alone."),
+        _dmc("ball_in_cup", "catch", "A cup on springs catches a ball on a string."),
+        _dmc("cartpole", "balance", "A cart balances a pole that begins upright."),
+        _dmc("cartpole", "balance_sparse", "The same, rewarded near upright alone."),
+        _dmc("cartpole", "swingup", "A cart swings up a pole and balances it."),
+        _dmc("cartpole", "swingup_sparse", "The same, rewarded near upright alone."),
+        _dmc("cheetah", "run", "A planar two-legged body runs along x."),
+        _dmc("finger", "spin", "A finger spins a body on a hinge."),
+        _dmc("finger", "turn_easy", "A finger turns a body's tip into a large target."),
+        _dmc("finger", "turn_hard", "A finger turns a body's tip into a small target."),
+        _dmc("fish", "upright", "A fish rights itself."),
+        _dmc("fish", "swim", "A fish swims to a target."),
+        _dmc("hopper", "stand", "A planar one-legged body stands up."),
+        _dmc("hopper", "hop", "A planar one-legged body hops along x."),
+        _dmc("humanoid", "stand", "A humanoid stands still."),
+        _dmc("humanoid", "walk", "A humanoid walks in any direction."),
+        _dmc("humanoid", "run", "A humanoid runs in any direction."),
+        _dmc("manipulator", "bring_ball", "An arm with two fingers brings a ball to a target."),
+        _dmc("pendulum", "swingup", "A pendulum swings up, rewarded near upright alone."),
+        _dmc("point_mass", "easy", "A point is pushed to the middle of an arena."),
+        _dmc("quadruped", "walk", "A four-legged body walks forward."),
+        _dmc("quadruped", "run", "A four-legged body runs forward."),
+        _dmc("reacher", "easy", "A planar arm reaches for a large target."),
+        _dmc("reacher", "hard", "A planar arm reaches for a small target."),
+        _dmc("swimmer", "swimmer6", "A planar chain of six bodies swims to a target."),
+        _dmc("swimmer", "swimmer15", "A planar chain of fifteen bodies swims to a target."),
+        _dmc("walker", "stand", "A planar two-legged body stands up."),
+        _dmc("walker", "walk", "A planar two-legged body walks along x."),
+        _dmc("walker", "run", "A planar two-legged body runs along x."),
+    ]
+)
+"""Tasks of the DM Control Suite by name."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from pixelbrax_gym.bench.packages import install_packages
+from tests.benchmarks.packages import install_packages
 
 HOME = Path(__file__).parents[3] / ".venv-peers"
 

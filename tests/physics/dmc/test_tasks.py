@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import itertools
+import re
 from importlib import metadata
 
 import jax
@@ -15,14 +16,14 @@ from jax.extend import core
 from mujoco.mjx._src import collision_driver
 
 import pixelbrax_jax as pb
-from pixelbrax_jax.physics import make_physics
 from pixelbrax_jax.physics.mjx import models
 from pixelbrax_jax.physics.mjx.elimination import LARGEST
 from pixelbrax_jax.physics.mjx.solver import is_supported
+from pixelbrax_jax.registry import make_physics
 from pixelbrax_jax.tasks import BRAX_TASKS, DMC_TASKS
-from tests.cpu.equations import equations
 from tests.physics.dmc import oracle
 from tests.physics.dmc.test_against_dm_control import FAST
+from tests.platform.equations import equations
 from tests.xla_flags import optimized
 
 EACH = [
@@ -102,18 +103,18 @@ def test_every_domains_models_are_known():
         assert domain in models.KNOWN_MODELS
 
 
-@needs_models
-def test_rewards_and_backends_are_dm_controls_own():
-    with pytest.raises(ValueError, match="DM Control's own rewards"):
-        pb.make("dmc_cartpole_swingup", reward_preset="paper")
-    with pytest.raises(ValueError, match="allowed: mjx"):
-        pb.make("dmc_cartpole_swingup", backend="spring")
+@pytest.mark.parametrize("option", [{"reward_preset": "paper"}, {"backend": "mjx"}])
+def test_options_of_braxs_tasks_are_refused_by_name(option):
+    ((name, value),) = option.items()
+    message = f"{name}='{value}' is for Brax's tasks alone, and task 'dmc_cartpole_swingup' is none"
+    with pytest.raises(ValueError, match=message):
+        pb.make("dmc_cartpole_swingup", **option)
 
 
 @needs_models
 def test_equal_tasks_are_equal():
     task, other, _ = FAST
-    assert make_physics(task) == make_physics(task, backend="mjx")
+    assert make_physics(task) == make_physics(task)
     assert hash(make_physics(task)) == hash(make_physics(task))
     assert make_physics(task) != make_physics(other)
 
@@ -168,12 +169,14 @@ def test_a_step_factorises_one_matrix_after_the_other(task):
     """Threads of jaxlib 0.10 wait for each other otherwise: 128 humanoids never moved."""
     dynamics = make_physics(task).dynamics
     state = jax.eval_shape(dynamics.state, jax.ShapeDtypeStruct((dynamics.model.nq,), jnp.float32))
-    step = jax.make_jaxpr(lambda state: dynamics.step(state, 1))(state)
+    step = jax.jit(lambda state: dynamics.step(state, 1)).trace(state)
     if dynamics.model.nv > LARGEST:
-        assert count_factorised(step.jaxpr) > 1
+        assert count_factorised(step.jaxpr.jaxpr) > 1
+        assert_in_turn(step.jaxpr.jaxpr)
     elif is_supported(dynamics.model):
-        assert count_factorised(step.jaxpr) == 0
-    assert_in_turn(step.jaxpr)
+        for platform, factorises in (("cpu", False), ("cuda", True)):
+            program = step.lower(lowering_platforms=(platform,)).as_text()
+            assert bool(re.search("cholesky|potrf", program)) == factorises
 
 
 @needs_models

@@ -8,13 +8,11 @@ import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics
-from pixelbrax_jax.physics.mjx.rewards import tolerance
-from pixelbrax_jax.physics.mjx.snapshot import Snapshot, joined
-from pixelbrax_jax.physics.mjx.task import DmcTask, Start
+from pixelbrax_jax.physics.mjx.formulas import Formulas, Snapshot, Start, joined, tolerance
 
 
 def _start(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Draw both angles uniformly."""
+    """Sample both angles uniformly."""
     return Start(jax.random.uniform(key, (dynamics.model.nq,), minval=-jnp.pi, maxval=jnp.pi))
 
 
@@ -31,13 +29,8 @@ def _reward(seen: Snapshot, *, margin: float) -> jax.Array:
     return tolerance(distance, (0.0, radius), margin=margin)
 
 
-def _task(margin: float) -> DmcTask:
-    return DmcTask(
-        "acrobot",
-        _start,
-        _observe,
-        partial(_reward, margin=margin),
-    )
+def _task(margin: float) -> Formulas:
+    return Formulas(_start, _observe, partial(_reward, margin=margin))
 
 
 TASKS = {"swingup": _task(1.0), "swingup_sparse": _task(0.0)}

@@ -6,24 +6,23 @@ import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics
+from pixelbrax_jax.physics.mjx.formulas import Formulas, Snapshot, Start, joined
 from pixelbrax_jax.physics.mjx.resets import free_of_contact
-from pixelbrax_jax.physics.mjx.snapshot import Snapshot, joined
-from pixelbrax_jax.physics.mjx.task import DmcTask, Start
 
 
 def _start(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Draw a place of the ball where it touches nothing; the cup is at rest in its middle."""
+    """Sample a place of the ball where it touches nothing; the cup is at rest in its middle."""
     model = dynamics.model
     x, z = (int(model.joint(name).qposadr[0]) for name in ("ball_x", "ball_z"))
 
-    def draw(key: jax.Array, before: Start) -> Start:
+    def sample(key: jax.Array, before: Start) -> Start:
         del before
         place = jax.random.uniform(
             key, (2,), minval=jnp.array([-0.2, 0.2]), maxval=jnp.array([0.2, 0.5])
         )
         return Start(jnp.asarray(model.qpos0, jnp.float32).at[jnp.array([x, z])].set(place))
 
-    return free_of_contact(dynamics, key, draw)
+    return free_of_contact(dynamics, key, sample)
 
 
 def _observe(seen: Snapshot) -> jax.Array:
@@ -37,4 +36,4 @@ def _reward(seen: Snapshot) -> jax.Array:
     return jnp.where((offset[0] < size[0]) & (offset[2] < size[2]), 1.0, 0.0)
 
 
-TASKS = {"catch": DmcTask("ball_in_cup", _start, _observe, _reward, substeps=10)}
+TASKS = {"catch": Formulas(_start, _observe, _reward, substeps=10)}

@@ -6,19 +6,17 @@ import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics
-from pixelbrax_jax.physics.mjx.rewards import tolerance
-from pixelbrax_jax.physics.mjx.snapshot import Snapshot, joined
-from pixelbrax_jax.physics.mjx.task import DmcTask, Start
+from pixelbrax_jax.physics.mjx.formulas import Formulas, Snapshot, Start, joined, tolerance
 
 
 def _start_hanging(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Draw a cart near the middle with its pole down."""
+    """Sample a cart near the middle with its pole down."""
     noise = 0.01 * jax.random.normal(key, (2, dynamics.model.nq))
     return Start(jnp.array([0.0, jnp.pi]) + noise[0], noise[1])
 
 
 def _start_upright(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Draw a cart near the middle with its pole almost upright."""
+    """Sample a cart near the middle with its pole almost upright."""
     pose, speed = jax.random.split(key)
     reach = jnp.array([0.1, 0.034])
     qpos = jax.random.uniform(pose, (2,), minval=-reach, maxval=reach)
@@ -47,8 +45,8 @@ def _reward_sparse(seen: Snapshot) -> jax.Array:
 
 
 TASKS = {
-    "balance": DmcTask("cartpole", _start_upright, _observe, _reward),
-    "balance_sparse": DmcTask("cartpole", _start_upright, _observe, _reward_sparse),
-    "swingup": DmcTask("cartpole", _start_hanging, _observe, _reward),
-    "swingup_sparse": DmcTask("cartpole", _start_hanging, _observe, _reward_sparse),
+    "balance": Formulas(_start_upright, _observe, _reward),
+    "balance_sparse": Formulas(_start_upright, _observe, _reward_sparse),
+    "swingup": Formulas(_start_hanging, _observe, _reward),
+    "swingup_sparse": Formulas(_start_hanging, _observe, _reward_sparse),
 }

@@ -4,23 +4,21 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics
+from pixelbrax_jax.physics.mjx.formulas import Formulas, Snapshot, Start, joined, rising
 from pixelbrax_jax.physics.mjx.resets import random_joints
-from pixelbrax_jax.physics.mjx.rewards import tolerance
-from pixelbrax_jax.physics.mjx.snapshot import Snapshot, joined
-from pixelbrax_jax.physics.mjx.task import DmcTask, Start
+from pixelbrax_jax.physics.opengl import mujoco
 
 _RUN_SPEED = 10.0
 _SETTLING_STEPS = 200
 
 
 def _start(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Draw limited joints uniformly, then let the body fall for 200 physics steps.
+    """Sample limited joints uniformly, then let the body fall for 200 physics steps.
 
-    DM Control draws joint positions after the forces of the model's own pose are known. The first
+    DM Control samples joint positions after the forces of the model's own pose are known. The first
     of these steps moves by them, and so by the same velocity in every episode.
     """
     model = dynamics.model
@@ -43,13 +41,7 @@ def _observe(seen: Snapshot) -> jax.Array:
 
 def _reward(seen: Snapshot) -> jax.Array:
     """Return the speed along x as a fraction of 10 m/s."""
-    return tolerance(
-        seen.sensor("torso_subtreelinvel")[0],
-        (_RUN_SPEED, jnp.inf),
-        margin=_RUN_SPEED,
-        value_at_margin=0.0,
-        sigmoid="linear",
-    )
+    return rising(seen.sensor("torso_subtreelinvel")[0], _RUN_SPEED, margin=_RUN_SPEED)
 
 
-TASKS = {"run": DmcTask("cheetah", _start, _observe, _reward)}
+TASKS = {"run": Formulas(_start, _observe, _reward)}

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 
 import jax
 import jax.numpy as jnp
-import mujoco
 
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics
+from pixelbrax_jax.physics.mjx.formulas import Formulas, Snapshot, Start, joined
 from pixelbrax_jax.physics.mjx.resets import free_of_contact, random_joints
-from pixelbrax_jax.physics.mjx.snapshot import Snapshot, joined
-from pixelbrax_jax.physics.mjx.task import DmcTask, Start
+from pixelbrax_jax.physics.opengl import mujoco
 
 _SPIN_VELOCITY = 15.0
 
@@ -22,12 +20,12 @@ meets is the fingertip and the spinner's caps."""
 
 
 def _start_spin(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Draw joints that let nothing touch."""
+    """Sample joints that let nothing touch."""
     return free_of_contact(dynamics, key, lambda key, _: Start(random_joints(dynamics.model, key)))
 
 
 def _start_turn(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Draw joints, and a target on the circle that the body's tip can reach."""
+    """Sample joints, and a target on the circle that the body's tip can reach."""
     model = dynamics.model
     angle_key, pose_key = jax.random.split(key)
     angle = jax.random.uniform(angle_key, (), minval=-jnp.pi, maxval=jnp.pi)
@@ -83,33 +81,16 @@ def _resize_target(model: mujoco.MjModel, *, radius: float) -> None:
     model.site("target").size[0] = radius
 
 
-def _task(
-    start: Callable[[Dynamics, jax.Array], Start],
-    observe: Callable[[Snapshot], jax.Array],
-    reward: Callable[[Snapshot], jax.Array],
-    edit: Callable[[mujoco.MjModel], None],
-    movable: tuple[str, ...] = (),
-) -> DmcTask:
-    return DmcTask(
-        "finger",
-        start,
-        observe,
-        reward,
-        substeps=2,
-        out_of_reach=_OUT_OF_REACH,
-        edit=edit,
-        movable=movable,
-        reads_forces=True,
-    )
+_task = partial(Formulas, substeps=2, out_of_reach=_OUT_OF_REACH, reads_forces=True)
 
 
-def _turn(radius: float) -> DmcTask:
+def _turn(radius: float) -> Formulas:
     edit = partial(_resize_target, radius=radius)
-    return _task(_start_turn, _observe_turn, _reward_turn, edit, movable=("target",))
+    return _task(_start_turn, _observe_turn, _reward_turn, edit=edit, movable=("target",))
 
 
 TASKS = {
-    "spin": _task(_start_spin, _observe_spin, _reward_spin, _edit_spin),
+    "spin": _task(_start_spin, _observe_spin, _reward_spin, edit=_edit_spin),
     "turn_easy": _turn(0.07),
     "turn_hard": _turn(0.03),
 }

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-import mujoco
 
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics
+from pixelbrax_jax.physics.mjx.formulas import Formulas, Snapshot, Start, joined, tolerance
 from pixelbrax_jax.physics.mjx.resets import random_rotation
-from pixelbrax_jax.physics.mjx.rewards import tolerance
-from pixelbrax_jax.physics.mjx.snapshot import Snapshot, joined
-from pixelbrax_jax.physics.mjx.task import DmcTask, Start
+from pixelbrax_jax.physics.opengl import mujoco
 
 _JOINTS = (
     "tail1",
@@ -24,7 +22,7 @@ _JOINTS = (
 
 
 def _start_upright(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Draw any rotation, and joints within 0.2 rad."""
+    """Sample any rotation, and joints within 0.2 rad."""
     rotation, joints = jax.random.split(key)
     model = dynamics.model
     bend = jax.random.uniform(joints, (model.nq - 7,), minval=-0.2, maxval=0.2)
@@ -33,7 +31,7 @@ def _start_upright(dynamics: Dynamics, key: jax.Array) -> Start:
 
 
 def _start_swim(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Draw what uprighting draws, and a target in a box."""
+    """Sample what uprighting samples, and a target in a box."""
     fish, target = jax.random.split(key)
     low, high = jnp.array([-0.4, -0.4, 0.1]), jnp.array([0.4, 0.4, 0.3])
     place = jax.random.uniform(target, (3,), minval=low, maxval=high)
@@ -74,10 +72,8 @@ def _hide_target(model: mujoco.MjModel) -> None:
 
 
 TASKS = {
-    "upright": DmcTask(
-        "fish", _start_upright, _observe_upright, _reward_upright, substeps=10, edit=_hide_target
+    "upright": Formulas(
+        _start_upright, _observe_upright, _reward_upright, substeps=10, edit=_hide_target
     ),
-    "swim": DmcTask(
-        "fish", _start_swim, _observe_swim, _reward_swim, substeps=10, movable=("target",)
-    ),
+    "swim": Formulas(_start_swim, _observe_swim, _reward_swim, substeps=10, movable=("target",)),
 }

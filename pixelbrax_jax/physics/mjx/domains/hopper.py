@@ -8,17 +8,15 @@ import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics
+from pixelbrax_jax.physics.mjx.formulas import Formulas, Snapshot, Start, joined, rising, tolerance
 from pixelbrax_jax.physics.mjx.resets import random_joints
-from pixelbrax_jax.physics.mjx.rewards import tolerance
-from pixelbrax_jax.physics.mjx.snapshot import Snapshot, joined
-from pixelbrax_jax.physics.mjx.task import DmcTask, Start
 
 _STAND_HEIGHT = 0.6
 _HOP_SPEED = 2.0
 
 
 def _start(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Draw joints and the root's angle; contacts are not looked for."""
+    """Sample joints and the root's angle; contacts are not looked for."""
     return Start(random_joints(dynamics.model, key))
 
 
@@ -42,25 +40,13 @@ def _reward_stand(seen: Snapshot) -> jax.Array:
 
 def _reward_hop(seen: Snapshot) -> jax.Array:
     """Return 1 for standing at 2 m/s along x, less for slower."""
-    hopping = tolerance(
-        seen.sensor("torso_subtreelinvel")[0],
-        (_HOP_SPEED, jnp.inf),
-        margin=_HOP_SPEED / 2,
-        value_at_margin=0.5,
-        sigmoid="linear",
-    )
-    return _standing(seen) * hopping
+    speed = seen.sensor("torso_subtreelinvel")[0]
+    return _standing(seen) * rising(speed, _HOP_SPEED, _HOP_SPEED / 2, value_at_margin=0.5)
 
 
-def _task(reward: Callable[[Snapshot], jax.Array]) -> DmcTask:
-    return DmcTask(
-        "hopper",
-        _start,
-        _observe,
-        reward,
-        substeps=4,
-        reads_forces=True,
-        starts_with_forces=True,
+def _task(reward: Callable[[Snapshot], jax.Array]) -> Formulas:
+    return Formulas(
+        _start, _observe, reward, substeps=4, reads_forces=True, starts_with_forces=True
     )
 
 

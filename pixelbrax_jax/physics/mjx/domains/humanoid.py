@@ -8,16 +8,14 @@ import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics
+from pixelbrax_jax.physics.mjx.formulas import Formulas, Snapshot, Start, joined, rising, tolerance
 from pixelbrax_jax.physics.mjx.resets import free_of_contact, random_joints
-from pixelbrax_jax.physics.mjx.rewards import tolerance
-from pixelbrax_jax.physics.mjx.snapshot import Snapshot, joined
-from pixelbrax_jax.physics.mjx.task import DmcTask, Start
 
 _STAND_HEIGHT = 1.4
 
 
 def _start(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Draw joints and the root's rotation that let nothing touch."""
+    """Sample joints and the root's rotation that let nothing touch."""
     return free_of_contact(dynamics, key, lambda key, _: Start(random_joints(dynamics.model, key)))
 
 
@@ -39,32 +37,18 @@ def _observe(seen: Snapshot) -> jax.Array:
 def _reward(seen: Snapshot, *, speed: float) -> jax.Array:
     """Return a product: head high, torso upright, little force, and the wanted speed."""
     standing = tolerance(seen.xpos("head")[2], (_STAND_HEIGHT, jnp.inf), margin=_STAND_HEIGHT / 4)
-    upright = tolerance(
-        seen.xmat("torso")[2, 2],
-        (0.9, jnp.inf),
-        margin=1.9,
-        value_at_margin=0.0,
-        sigmoid="linear",
-    )
+    upright = rising(seen.xmat("torso")[2, 2], 0.9, margin=1.9)
     small = tolerance(seen.ctrl, margin=1.0, value_at_margin=0.0, sigmoid="quadratic")
     stand = (4 + jnp.mean(small)) / 5 * standing * upright
     velocity = seen.sensor("torso_subtreelinvel")[:2]
     if speed == 0:
         return stand * jnp.mean(tolerance(velocity, margin=2.0))
-    move = tolerance(
-        jnp.linalg.norm(velocity),
-        (speed, jnp.inf),
-        margin=speed,
-        value_at_margin=0.0,
-        sigmoid="linear",
-    )
+    move = rising(jnp.linalg.norm(velocity), speed, margin=speed)
     return stand * (5 * move + 1) / 6
 
 
-def _task(speed: float) -> DmcTask:
-    return DmcTask(
-        "humanoid", _start, _observe, partial(_reward, speed=speed), batch_last=False, substeps=5
-    )
+def _task(speed: float) -> Formulas:
+    return Formulas(_start, _observe, partial(_reward, speed=speed), batch_last=False, substeps=5)
 
 
 TASKS = {"stand": _task(0.0), "walk": _task(1.0), "run": _task(10.0)}

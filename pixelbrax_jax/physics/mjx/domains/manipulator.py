@@ -6,14 +6,12 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics
+from pixelbrax_jax.physics.mjx.formulas import Formulas, Snapshot, Start, joined, tolerance
 from pixelbrax_jax.physics.mjx.resets import free_of_contact
-from pixelbrax_jax.physics.mjx.rewards import tolerance
-from pixelbrax_jax.physics.mjx.snapshot import Snapshot, joined
-from pixelbrax_jax.physics.mjx.task import DmcTask, Start
+from pixelbrax_jax.physics.opengl import mujoco
 
 _ARM = (
     "arm_root",
@@ -30,7 +28,7 @@ _TOUCH = ("palm_touch", "finger_touch", "thumb_touch", "fingertip_touch", "thumb
 _TARGET = "target_ball"
 
 _IN_HAND, _AT_TARGET = 0.1, 0.1
-"""Probabilities of where the ball is in a draw; else it is anywhere."""
+"""Probabilities of where the ball is in a sample; else it is anywhere."""
 
 _MAX_CONTACTS = 24
 """Of 148 that there can be: random actions make 10 at most, and all take three times as long."""
@@ -40,14 +38,14 @@ _NEAR = 0.01
 
 
 def _start(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Draw joints, target and ball until nothing touches."""
-    return free_of_contact(dynamics, key, partial(_draw, dynamics))
+    """Sample joints, target and ball until nothing touches."""
+    return free_of_contact(dynamics, key, partial(_sample, dynamics))
 
 
-def _draw(dynamics: Dynamics, key: jax.Array, before: Start) -> Start:
-    """Draw the arm, a target, and a ball in the hand, at the target or anywhere, and then moving.
+def _sample(dynamics: Dynamics, key: jax.Array, before: Start) -> Start:
+    """Sample the arm, a target, and a ball in the hand, at the target or anywhere, and then moving.
 
-    A ball in the hand or at the target is as fast as the one of the draw ``before``: DM Control
+    A ball in the hand or at the target is as fast as the one of the sample ``before``: DM Control
     starts again without stopping it.
     """
     model = dynamics.model
@@ -80,7 +78,7 @@ def _positions(model: mujoco.MjModel, *joints: str) -> np.ndarray:
 
 
 def _arm(model: mujoco.MjModel, key: jax.Array) -> jax.Array:
-    """Draw the arm's joints, uniformly in their range or all round, radians."""
+    """Sample the arm's joints, uniformly in their range or all round, radians."""
     rows = [model.joint(name).id for name in _ARM]
     limited = model.jnt_limited[rows].astype(bool)[:, None]
     low, high = np.where(limited, model.jnt_range[rows], [-np.pi, np.pi]).T.astype(np.float32)
@@ -120,8 +118,7 @@ def _reward(seen: Snapshot) -> jax.Array:
 
 
 TASKS = {
-    "bring_ball": DmcTask(
-        "manipulator",
+    "bring_ball": Formulas(
         _start,
         _observe,
         _reward,

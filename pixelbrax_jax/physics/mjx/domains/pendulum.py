@@ -8,15 +8,13 @@ import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics
-from pixelbrax_jax.physics.mjx.rewards import tolerance
-from pixelbrax_jax.physics.mjx.snapshot import Snapshot, joined
-from pixelbrax_jax.physics.mjx.task import DmcTask, Start
+from pixelbrax_jax.physics.mjx.formulas import Formulas, Snapshot, Start, joined, tolerance
 
 _COSINE_BOUND = math.cos(math.radians(8))
 
 
 def _start(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Draw any angle."""
+    """Sample any angle."""
     return Start(jax.random.uniform(key, (dynamics.model.nq,), minval=-jnp.pi, maxval=jnp.pi))
 
 
@@ -31,4 +29,4 @@ def _reward(seen: Snapshot) -> jax.Array:
     return tolerance(seen.xmat("pole")[2, 2], (_COSINE_BOUND, 1.0))
 
 
-TASKS = {"swingup": DmcTask("pendulum", _start, _observe, _reward)}
+TASKS = {"swingup": Formulas(_start, _observe, _reward)}

@@ -6,14 +6,12 @@ import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics
+from pixelbrax_jax.physics.mjx.formulas import Formulas, Snapshot, Start, joined, tolerance
 from pixelbrax_jax.physics.mjx.resets import random_joints
-from pixelbrax_jax.physics.mjx.rewards import tolerance
-from pixelbrax_jax.physics.mjx.snapshot import Snapshot, joined
-from pixelbrax_jax.physics.mjx.task import DmcTask, Start
 
 
 def _start(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Draw a place in the arena."""
+    """Sample a place in the arena."""
     return Start(random_joints(dynamics.model, key))
 
 
@@ -30,4 +28,4 @@ def _reward(seen: Snapshot) -> jax.Array:
     return near * (jnp.mean(small) + 4) / 5
 
 
-TASKS = {"easy": DmcTask("point_mass", _start, _observe, _reward)}
+TASKS = {"easy": Formulas(_start, _observe, _reward)}

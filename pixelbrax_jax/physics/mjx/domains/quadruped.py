@@ -6,14 +6,12 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics
+from pixelbrax_jax.physics.mjx.formulas import Formulas, Snapshot, Start, joined, rising
 from pixelbrax_jax.physics.mjx.resets import random_rotation
-from pixelbrax_jax.physics.mjx.rewards import tolerance
-from pixelbrax_jax.physics.mjx.snapshot import Snapshot, joined
-from pixelbrax_jax.physics.mjx.task import DmcTask, Start
+from pixelbrax_jax.physics.opengl import mujoco
 
 _LIFT = 0.01
 """Metres between two heights that are tried."""
@@ -23,7 +21,7 @@ _EPISODE = 20.0
 
 
 def _start(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Draw any rotation, at the lowest height, in whole centimetres, where nothing touches.
+    """Sample any rotation, at the lowest height, in whole centimetres, where nothing touches.
 
     DM Control begins at height 0 and lifts until there is no contact. All distances from the floor
     grow by what the body is lifted, so that the height is known from those at height 0.
@@ -57,26 +55,12 @@ def _observe(seen: Snapshot) -> jax.Array:
 
 def _reward(seen: Snapshot, *, speed: float) -> jax.Array:
     """Return uprightness times the wanted speed along the torso's x axis."""
-    upright = tolerance(
-        seen.xmat("torso")[2, 2],
-        (1.0, jnp.inf),
-        margin=2.0,
-        value_at_margin=0.0,
-        sigmoid="linear",
-    )
-    move = tolerance(
-        seen.sensor("velocimeter")[0],
-        (speed, jnp.inf),
-        margin=speed,
-        value_at_margin=0.5,
-        sigmoid="linear",
-    )
-    return upright * move
+    upright = rising(seen.xmat("torso")[2, 2], 1.0, margin=2.0)
+    return upright * rising(seen.sensor("velocimeter")[0], speed, speed, value_at_margin=0.5)
 
 
-def _task(speed: float) -> DmcTask:
-    return DmcTask(
-        "quadruped",
+def _task(speed: float) -> Formulas:
+    return Formulas(
         _start,
         _observe,
         partial(_reward, speed=speed),

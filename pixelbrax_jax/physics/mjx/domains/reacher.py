@@ -6,17 +6,15 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-import mujoco
 
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics
+from pixelbrax_jax.physics.mjx.formulas import Formulas, Snapshot, Start, joined, tolerance
 from pixelbrax_jax.physics.mjx.resets import random_joints
-from pixelbrax_jax.physics.mjx.rewards import tolerance
-from pixelbrax_jax.physics.mjx.snapshot import Snapshot, joined
-from pixelbrax_jax.physics.mjx.task import DmcTask, Start
+from pixelbrax_jax.physics.opengl import mujoco
 
 
 def _start(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Draw joints, and a target from 5 to 20 cm away from the shoulder."""
+    """Sample joints, and a target from 5 to 20 cm away from the shoulder."""
     joints, angle, radius = jax.random.split(key, 3)
     model = dynamics.model
     angle = jax.random.uniform(angle, (), minval=0.0, maxval=2 * jnp.pi)
@@ -45,9 +43,9 @@ def _resize_target(model: mujoco.MjModel, *, radius: float) -> None:
     model.geom("target").size[0] = radius
 
 
-def _task(radius: float) -> DmcTask:
+def _task(radius: float) -> Formulas:
     edit = partial(_resize_target, radius=radius)
-    return DmcTask("reacher", _start, _observe, _reward, edit=edit, movable=("target",))
+    return Formulas(_start, _observe, _reward, edit=edit, movable=("target",))
 
 
 TASKS = {"easy": _task(0.05), "hard": _task(0.015)}

@@ -6,17 +6,15 @@ import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics
+from pixelbrax_jax.physics.mjx.formulas import Formulas, Snapshot, Start, joined, tolerance
 from pixelbrax_jax.physics.mjx.resets import random_joints
-from pixelbrax_jax.physics.mjx.rewards import tolerance
-from pixelbrax_jax.physics.mjx.snapshot import Snapshot, joined
-from pixelbrax_jax.physics.mjx.task import DmcTask, Start
 
 _FIRST_BODY_SENSOR = 12
 """Readings of nose, target and head's axes, which come before the bodies' velocities."""
 
 
 def _start(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Draw joints and heading, and a target that is near in one of five episodes."""
+    """Sample joints and heading, and a target that is near in one of five episodes."""
     joints, near, place = jax.random.split(key, 3)
     model = dynamics.model
     reach = jnp.where(jax.random.uniform(near) < 0.2, 0.3, 2.0)
@@ -44,9 +42,8 @@ def _reward(seen: Snapshot) -> jax.Array:
     return tolerance(distance, (0.0, radius), margin=5 * radius, sigmoid="long_tail")
 
 
-def _task(num_bodies: int) -> DmcTask:
-    return DmcTask(
-        "swimmer",
+def _task(num_bodies: int) -> Formulas:
+    return Formulas(
         _start,
         _observe,
         _reward,

@@ -8,16 +8,14 @@ import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics
+from pixelbrax_jax.physics.mjx.formulas import Formulas, Snapshot, Start, joined, rising, tolerance
 from pixelbrax_jax.physics.mjx.resets import random_joints
-from pixelbrax_jax.physics.mjx.rewards import tolerance
-from pixelbrax_jax.physics.mjx.snapshot import Snapshot, joined
-from pixelbrax_jax.physics.mjx.task import DmcTask, Start
 
 _STAND_HEIGHT = 1.2
 
 
 def _start(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Draw joints and the root's angle; contacts are not looked for."""
+    """Sample joints and the root's angle; contacts are not looked for."""
     return Start(random_joints(dynamics.model, key))
 
 
@@ -33,18 +31,13 @@ def _reward(seen: Snapshot, *, speed: float) -> jax.Array:
     stand = (3 * standing + (1 + seen.xmat("torso")[2, 2]) / 2) / 4
     if speed == 0:
         return stand
-    move = tolerance(
-        seen.sensor("torso_subtreelinvel")[0],
-        (speed, jnp.inf),
-        margin=speed / 2,
-        value_at_margin=0.5,
-        sigmoid="linear",
-    )
+    x_speed = seen.sensor("torso_subtreelinvel")[0]
+    move = rising(x_speed, speed, speed / 2, value_at_margin=0.5)
     return stand * (5 * move + 1) / 6
 
 
-def _task(speed: float) -> DmcTask:
-    return DmcTask("walker", _start, _observe, partial(_reward, speed=speed), substeps=10)
+def _task(speed: float) -> Formulas:
+    return Formulas(_start, _observe, partial(_reward, speed=speed), substeps=10)
 
 
 TASKS = {"stand": _task(0.0), "walk": _task(1.0), "run": _task(8.0)}

@@ -1,0 +1,158 @@
+"""The command ``pixelbrax``.
+
+Every module here is a command of that name: the first line of its docstring is its line in
+``pixelbrax --help``, and its ``run(arguments)`` returns the exit status.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from difflib import get_close_matches
+from importlib import import_module
+from pathlib import Path
+from pkgutil import iter_modules
+from typing import Any, TypeVar
+
+from pixelbrax_gym.bench.machine import installed_version
+from pixelbrax_jax.extras import install_extra
+
+Options = TypeVar("Options")
+
+
+class CommandError(Exception):
+    """What a command reports in one line, of an error that has another type."""
+
+
+class UsageError(Exception):
+    """Options do not go together; the message names the fix."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command.
+
+    Args:
+        arguments: of the command line; None means those of this process.
+
+    Returns:
+        The exit status: 0 when all is well, 1 for an error, 2 for a wrong command line, and 128
+        plus its number for a signal to stop, as shells have it: 130 for Ctrl-C.
+    """
+    first, *rest = (sys.argv[1:] if arguments is None else arguments) or [""]
+    if first in ("-h", "--help"):
+        sys.stdout.write(_help())
+        return 0
+    if first == "--version":
+        sys.stdout.write(f"{installed_version('pixelbrax') or 'not installed'}\n")
+        return 0
+    if first not in commands():
+        near = get_close_matches(first, commands(), 1)
+        meant = f" Did you mean {near[0]!r}?" if near else ""
+        told = f"unknown command {first!r}.{meant}" if first else "name a command."
+        sys.stderr.write(f"pixelbrax: {told}\n\n{_help()}")
+        return 2
+    _find_modules_here()
+    try:
+        with _warnings_of(first):
+            status: int = import_module(f"{__name__}.{first}").run(rest)
+            return status
+    except KeyboardInterrupt:
+        return 128 + signal.SIGINT
+    except UsageError as error:
+        say(first, error)
+        return 2
+    # Anything else is a defect, with a traceback.
+    except (CommandError, ValueError, OSError, ImportError, MemoryError) as error:
+        say(first, error)
+        return 1
+    finally:
+        for stream in filter(None, (sys.stdout, sys.stderr)):
+            _flush(stream)
+
+
+def say(command: str, message: object) -> None:
+    """Write a line to stderr, if anybody is left to read it."""
+    with suppress(OSError, ValueError):
+        sys.stderr.write(f"pixelbrax {command}: {message}\n")
+
+
+def commands() -> list[str]:
+    """Return the names of all commands."""
+    return sorted(found.name for found in iter_modules(__path__) if not found.name.startswith("_"))
+
+
+def parse(command: str, kind: type[Options], arguments: Sequence[str]) -> Options:
+    """Return a command's options.
+
+    Args:
+        command: its name.
+        kind: a dataclass: its docstring describes the command, and each field is an option.
+        arguments: those behind the command's name.
+
+    Raises:
+        SystemExit: an option or its value is unknown, or help is asked for.
+    """
+    import tyro
+
+    return tyro.cli(kind, prog=f"pixelbrax {command}", args=arguments)
+
+
+@contextmanager
+def needs_extra(name: str) -> Iterator[None]:
+    """Have an ImportError say how to install what is missing."""
+    try:
+        yield
+    except ImportError as error:
+        raise ImportError(f"{error}; try: {install_extra(name)}") from error
+
+
+def _help() -> str:
+    lines = []
+    for name in commands():
+        about = (import_module(f"{__name__}.{name}").__doc__ or "").partition("\n")[0]
+        lines.append(f"  {name:10}{about}\n")
+    return (
+        "usage: pixelbrax COMMAND [options]\n\nContinuous control from pixels, on JAX.\n\n"
+        f"commands:\n{''.join(lines)}\n"
+        "'pixelbrax COMMAND --help' lists the options of one; 'pixelbrax --version' tells the "
+        "release.\n"
+    )
+
+
+def _find_modules_here() -> None:
+    """Let modules with tasks of the user's be found in the current folder, as `python -m` does.
+
+    It comes last, so that no file in it hides a library.
+    """
+    with suppress(OSError):  # the folder is deleted
+        if not {"", (here := str(Path.cwd()))}.intersection(sys.path):
+            sys.path.append(here)
+
+
+@contextmanager
+def _warnings_of(command: str) -> Iterator[None]:
+    """Write warnings in one line, without the line of source that raises them."""
+
+    def show(message: Warning | str, *_: Any, **__: Any) -> None:
+        say(command, message)
+
+    with warnings.catch_warnings():
+        if not sys.warnoptions:
+            warnings.simplefilter("default", UserWarning)
+        warnings.showwarning = show
+        yield
+
+
+def _flush(stream: Any) -> None:
+    """Empty a stream, or give up its text: Python would exit with 120 on account of it."""
+    try:
+        stream.flush()
+    except ValueError:  # It is closed.
+        return
+    except OSError:
+        with Path(os.devnull).open("wb") as nowhere, suppress(OSError):
+            os.dup2(nowhere.fileno(), stream.fileno())

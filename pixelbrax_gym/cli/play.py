@@ -1,0 +1,160 @@
+"""See a task as an agent sees it."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from itertools import islice
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+from tyro.conf import Positional, arg
+
+from pixelbrax_gym.cli import CommandError, parse, say
+from pixelbrax_jax.extras import install_extra
+from pixelbrax_jax.validation import check_positive_int
+
+if TYPE_CHECKING:
+    from pixelbrax_gym.gymnasium.env import GymnasiumEnv
+
+ENV_OPTIONS = ("backend", "camera", "look", "shadows", "distractors", "clips", "split")
+"""Options of an environment that the command takes; one that is not given stays as it is."""
+
+Act = Callable[[np.ndarray], np.ndarray]
+"""Gives an (A,) float32 action for an (H, W, 3 K) uint8 observation."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Plays a task in a window, or into an animated image where there is no display."""
+
+    task: Annotated[Positional[str], arg(metavar="TASK")]
+    """As ant; 'pixelbrax tasks' lists them; or MODULE:NAME, which imports the module first."""
+    policy: Literal["random", "zero", "pretrained"] = "random"
+    """Who acts; pretrained comes with the package for some tasks."""
+    backend: str | None = None
+    """Of the physics."""
+    camera: str | None = None
+    """As top; an unknown one lists those of the task."""
+    look: str | None = None
+    """default, original or dmc."""
+    shadows: bool = False
+    """Geoms cast shadows."""
+    distractors: tuple[str, ...] = ()
+    """Such as dcs-easy, or paper-color."""
+    clips: str | None = None
+    """Of videos: procedural, or a folder."""
+    split: str | None = None
+    """Of the clips: train, test, ..."""
+    observation: bool = False
+    """Show the observation's own pixels, enlarged."""
+    size: int = 336
+    """Pixels, square."""
+    seed: int = 0
+    """Of the episodes."""
+    gif: str | None = None
+    """Write this .gif or .mp4, and open no window."""
+    num_frames: int = 200
+    """Of the file."""
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run the command. Ctrl-C leaves a whole file."""
+    options = parse("play", Options, arguments)
+    from pixelbrax_jax.video import NO_WRITER, write_frames
+
+    check_positive_int("size", options.size)
+    check_positive_int("num_frames", options.num_frames)
+    try:
+        env, act = _make(options)
+    except TypeError as error:
+        raise CommandError(str(error)) from error
+    lacking = "" if options.gif else _why_no_window()
+    # Of a task module:name, not all systems have files so called.
+    name = options.task.rpartition(":")[2]
+    written = options.gif or (f"{name}.gif" if lacking else None)
+    if written and None in map(find_spec, ("imageio_ffmpeg", "PIL")):
+        raise ImportError(f"{lacking}; {NO_WRITER}" if lacking else NO_WRITER)
+    if lacking:
+        say("play", f"{lacking}; writing {written} in its place")
+    say("play", "compiling, which may take two minutes")
+    shown = images(env, act, options.seed, options.size if options.observation else None)
+    fps = env.metadata["render_fps"]
+    if written is None:
+        _show(shown, fps, f"PixelBrax {options.task}")
+    else:
+        path = write_frames(written, islice(shown, options.num_frames), fps)
+        sys.stdout.write(f"{path.resolve()}\n")
+    return 0
+
+
+def images(env: GymnasiumEnv, act: Act, seed: int, observed: int | None) -> Iterator[np.ndarray]:
+    """Play for ever, and yield (H, W, 3) uint8 images.
+
+    They are what ``render`` draws; or, ``observed``, the newest frame of the observation, enlarged
+    by a whole factor to about so many pixels.
+    """
+    obs, _ = env.reset(seed=seed)
+    while True:
+        if observed is None:
+            yield np.asarray(env.render())
+        else:
+            factor = max(1, round(observed / max(obs.shape[:2])))
+            yield obs[..., -3:].repeat(factor, axis=0).repeat(factor, axis=1)
+        obs, _, terminated, truncated, _ = env.step(act(obs))
+        if terminated or truncated:
+            obs, _ = env.reset()
+
+
+def _make(options: Options) -> tuple[GymnasiumEnv, Act]:
+    import jax
+
+    from pixelbrax_gym.gymnasium.env import GymnasiumEnv
+    from pixelbrax_jax.policy import load_policy
+
+    given = {name: getattr(options, name) for name in ENV_OPTIONS}
+    given = {name: value for name, value in given.items() if value not in (None, False, ())}
+    policy = None
+    if options.policy == "pretrained":
+        policy = load_policy(options.task)
+        given = (policy.env_options or {}) | given
+    task: Any = given.pop("task", options.task)
+    env = GymnasiumEnv(
+        task,
+        render_mode="rgb_array",
+        render_height=options.size,
+        render_width=options.size,
+        **given,
+    )
+    if policy is not None:
+        return env, lambda obs: jax.device_get(policy(jax.device_put(np.asarray(obs)[None])))[0]
+    if options.policy == "zero":
+        return env, lambda _: np.zeros(env.action_space.shape or (), np.float32)
+    env.action_space.seed(options.seed)
+    return env, lambda _: env.action_space.sample()
+
+
+def _show(shown: Iterator[np.ndarray], fps: int, title: str) -> None:
+    from pixelbrax_gym.gymnasium.window import Window
+
+    window = Window(title, fps)
+    try:
+        for image in shown:
+            window.show(image)
+            if window.closed:
+                return
+    finally:
+        window.close()
+
+
+def _why_no_window() -> str:
+    """Say why no window can be opened; nothing if one can."""
+    if find_spec("pygame") is None:
+        return f"no window, for pygame is missing; try: {install_extra('human')}"
+    known = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
+    if sys.platform == "linux" and not any(map(os.environ.get, known)):
+        return "no window, for there is no display"
+    return ""

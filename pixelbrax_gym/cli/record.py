@@ -1,0 +1,52 @@
+"""Make a video of a trained agent."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pixelbrax_gym.cli import parse
+from pixelbrax_gym.cli.evaluate import AgentOptions, load
+
+
+@dataclass(frozen=True)
+class Options(AgentOptions):
+    """Plays several episodes of a checkpoint side by side and writes an MP4."""
+
+    output: str | None = None
+    """An .mp4 or .gif; videos/<steps>_<split>.mp4 in the folder by default."""
+    split: str | None = None
+    """clean, train or test; by default train, or clean without distractors."""
+    grid: int = 3
+    """Episodes a side."""
+    size: int = 168
+    """Pixels of one episode, square."""
+    num_frames: int = 300
+    """At most."""
+    seed: int = 0
+    """Of the episodes."""
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run the command."""
+    options = parse("record", Options, arguments)
+    agent = load(options)
+    from pixelbrax_jax.agents.runner.record import write_video
+
+    split = options.split or ("train" if agent.algorithm.config.env.distractors else "clean")
+    run = [f"run{options.run_index}"] if options.run_index else []
+    name = "_".join([options.pretrained or str(agent.steps), split, *run])
+    path = write_video(
+        agent,
+        options.output or Path(options.folder or "") / "videos" / f"{name}.mp4",
+        split=split,
+        clips=options.clips,
+        grid=options.grid,
+        size=options.size,
+        num_frames=options.num_frames,
+        seed=options.seed,
+    )
+    sys.stdout.write(f"{path}\n")
+    return 0

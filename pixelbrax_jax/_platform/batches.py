@@ -1,0 +1,85 @@
+"""Functions of one row for all rows of a batch, as the device computes them fastest."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from pixelbrax_jax._platform.interpreter import batch_last
+from pixelbrax_jax._platform.lowering import by_platform, trace_once
+
+_CHUNK = 128
+"""Largest number of rows that a CPU computes together, so that what it computes on the way stays in
+its caches; see `chunk_size`."""
+
+Step = Callable[..., tuple[Any, jax.Array]]
+
+
+def step_rows(
+    step: Step, state: Any, rows: Any, shared: Any, *, last: bool = True
+) -> tuple[Any, jax.Array]:
+    """Step every row of a batch, as ``jax.vmap(step, (0, 0, None))(state, rows, shared)``.
+
+    A CPU steps the rows chunk by chunk; the results differ from those of ``jax.vmap`` by rounding.
+
+    Args:
+        step: of one row; returns its next state, of the same tree, and a () float32.
+        state: tree of arrays with a leading axis N.
+        rows: what else differs from row to row, likewise.
+        shared: what is the same for all.
+        last: whether, on a CPU, the batch is the last axis of intermediate results, see
+            ``batch_last``; else it is the first.
+
+    Returns:
+        The next states and (N,) results.
+    """
+    step = trace_once(step)
+    together = jax.vmap(step, in_axes=(0, 0, None))
+    if len(jax.tree.leaves(state)[0]) == 1:
+        return together(state, rows, shared)
+    in_chunks = partial(_step_chunks, step, last)
+    moved: tuple[Any, jax.Array] = by_platform(state, rows, shared, cpu=in_chunks, default=together)
+    return moved
+
+
+def map_runs(function: Callable[[Any], Any], runs: Any) -> Any:
+    """Return ``jax.vmap(function)(runs)``; on a CPU one run after the other."""
+    function = trace_once(function)
+    return by_platform(runs, cpu=partial(jax.lax.map, function), default=jax.vmap(function))
+
+
+def _step_chunks(
+    step: Step, last: bool, state: Any, rows: Any, shared: Any
+) -> tuple[Any, jax.Array]:
+    num_rows = len(jax.tree.leaves(state)[0])
+    batch = batch_last if last else jax.vmap
+    step_chunk = batch(step, in_axes=(0, 0, None))
+    size = chunk_size(num_rows)
+    if size == num_rows:
+        return step_chunk(state, rows, shared)
+
+    # Some engines carry empty arrays, of which no dimension can be left to be found.
+    def chunks(x: jax.Array) -> jax.Array:
+        return x.reshape(num_rows // size, size, *x.shape[1:])
+
+    states, rows = jax.tree.map(chunks, (state, rows))
+
+    def put(i: jax.Array, carry: tuple[Any, jax.Array]) -> tuple[Any, jax.Array]:
+        chunk = jax.tree.map(lambda x: x[i], (carry[0], rows))
+        moved = step_chunk(*chunk, shared)
+        return jax.tree.map(lambda x, new: x.at[i].set(new), carry, moved)
+
+    # In place: the results of `jax.lax.map` would be cleared first and copied afterwards.
+    carry = (states, jnp.zeros((num_rows // size, size), jnp.float32))
+    moved = jax.lax.fori_loop(0, num_rows // size, put, carry)
+    return jax.tree.map(lambda x: x.reshape(num_rows, *x.shape[2:]), moved)
+
+
+def chunk_size(num_rows: int) -> int:
+    """Return the largest divisor of ``num_rows`` from half of ``_CHUNK`` to it; if none, all."""
+    sizes = range(min(_CHUNK, num_rows), _CHUNK // 2 - 1, -1)
+    return next((size for size in sizes if num_rows % size == 0), num_rows)

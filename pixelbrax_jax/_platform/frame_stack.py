@@ -1,0 +1,50 @@
+"""Stacks of frames, which each device writes fastest in another way."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pixelbrax_jax._platform.lowering import by_platform
+
+
+def unpack(packed: jax.Array) -> jax.Array:
+    """Unpack pixels, channels last: (..., H, W) uint32 -> (..., H, W, 3) uint8."""
+    return jax.lax.bitcast_convert_type(packed, jnp.uint8)[..., :3]
+
+
+def push(frames: jax.Array, newest: jax.Array, is_first: jax.Array) -> jax.Array:
+    """Return the frame stack after one more frame.
+
+    Args:
+        frames: (H, W, 3 K) uint8, oldest first.
+        newest: (H, W) uint32 packed pixels.
+        is_first: () bool, the first frame of an episode: the stack becomes K copies of ``newest``.
+
+    Returns:
+        (H, W, 3 K) uint8.
+    """
+    pushed: jax.Array = by_platform(frames, newest, is_first, cpu=_concatenate, default=_shift)
+    return pushed
+
+
+def _concatenate(frames: jax.Array, newest: jax.Array, is_first: jax.Array) -> jax.Array:
+    """See ``push``; one frame after the other, as a CPU copies fastest."""
+    pixels = unpack(newest)
+    copies = jnp.tile(pixels, (1, 1, frames.shape[-1] // 3 - 1))
+    older = jnp.where(is_first, copies, frames[..., 3:])
+    return jnp.concatenate([older, pixels], axis=-1)
+
+
+def _shift(frames: jax.Array, newest: jax.Array, is_first: jax.Array) -> jax.Array:
+    """See ``push``; number by number.
+
+    A GPU writes a concatenation of bytes byte by byte, and this in words.
+    """
+    channel = np.arange(frames.shape[-1])
+    is_new = channel >= len(channel) - 3
+    shifts = np.asarray(8 * (channel % 3), np.uint32)
+    repeated = (newest[..., None] >> shifts).astype(jnp.uint8)
+    shifted = jnp.pad(frames[..., 3:], ((0, 0), (0, 0), (0, 3)))
+    return jnp.where(is_first | is_new, repeated, shifted)

@@ -1,0 +1,88 @@
+"""Work for those rows of a batch alone that need it, such as environments that are reset."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from pixelbrax_jax._platform.lowering import by_platform, trace_once
+
+_BLOCK = 32
+"""Environments that are reset together; their number is rounded up to a multiple."""
+
+
+def reset_rows(
+    fn: Callable[..., Any], arguments: tuple[Any, ...], mask: jax.Array, rows: Any
+) -> Any:
+    """Return ``rows`` with those where ``mask`` reset.
+
+    A CPU resets the masked rows alone, in a loop whose length depends on the mask. An accelerator
+    would wait for the host in every turn of such a loop: it resets all rows and selects. A reset
+    that tries until it succeeds waits in any case, and is done for masked rows alone. Arguments
+    are those of ``replace_rows``.
+    """
+    fn = trace_once(fn)
+    row = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), arguments)
+    replace = partial(replace_rows, fn)
+    if _has_open_loop(jax.make_jaxpr(fn)(*row).jaxpr):
+        return replace(arguments, mask, rows)
+    return by_platform(arguments, mask, rows, cpu=replace, default=partial(_select_rows, fn))
+
+
+def replace_rows(
+    fn: Callable[..., Any], arguments: tuple[Any, ...], mask: jax.Array, rows: Any
+) -> Any:
+    """Return ``rows`` with ``fn`` of the arguments' rows in place of those where ``mask``.
+
+    The work is done in blocks and grows with the number of masked rows, not with N: most steps
+    end no episode, and a select over the whole batch would pay for all of them.
+
+    The loop carries which rows are left. With a counter in their place XLA takes what the blocks
+    have in common, such as physics at the initial pose, out of the loop and into every step.
+
+    Args:
+        fn: of one row of each argument; returns one row of ``rows``.
+        arguments: trees of arrays with a leading axis N.
+        mask: (N,) bool.
+        rows: tree of arrays with a leading axis N.
+    """
+    num_rows = mask.shape[0]
+    block = min(_BLOCK, num_rows)
+
+    def put(carry: tuple[jax.Array, Any]) -> tuple[jax.Array, Any]:
+        left, rows = carry
+        # Past the last one of those left: read as the last row, never written.
+        index = jnp.nonzero(left, size=block, fill_value=num_rows)[0]
+        inputs = jax.tree.map(lambda x: jnp.take(x, index, axis=0, mode="clip"), arguments)
+        outputs = jax.vmap(fn)(*inputs)
+        rows = jax.tree.map(lambda x, new: x.at[index].set(new, mode="drop"), rows, outputs)
+        return left.at[index].set(False, mode="drop"), rows
+
+    return jax.lax.while_loop(lambda carry: jnp.any(carry[0]), put, (mask, rows))[1]
+
+
+def _select_rows(
+    fn: Callable[..., Any], arguments: tuple[Any, ...], mask: jax.Array, rows: Any
+) -> Any:
+    """Return what ``replace_rows`` does, from ``fn`` of all rows."""
+
+    def select(new: jax.Array, old: jax.Array) -> jax.Array:
+        return jnp.where(mask.reshape(-1, *(1,) * (old.ndim - 1)), new, old)
+
+    return jax.tree.map(select, jax.vmap(fn)(*arguments), rows)
+
+
+def _has_open_loop(jaxpr: Any) -> bool:
+    """Return whether a program has a loop that goes on until its data says otherwise."""
+    for eqn in jaxpr.eqns:
+        parts = [
+            getattr(part, "jaxpr", part) for part in jax.tree.leaves(list(eqn.params.values()))
+        ]
+        inner = (part for part in parts if hasattr(part, "eqns"))
+        if eqn.primitive.name == "while" or any(map(_has_open_loop, inner)):
+            return True
+    return False

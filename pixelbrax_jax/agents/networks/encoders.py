@@ -1,0 +1,216 @@
+"""Networks that turn pixels into features, of layers that are fast and deterministic."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+
+from pixelbrax_jax._platform.lowering import by_platform
+
+_GREY = 0.5
+"""Taken from pixels in [0, 1] by the encoders that are not published ones. A gradient has the same
+sign for all weights of a filter that sees positive numbers only, and large steps then leave most
+filters at zero for ever, under videos all of them."""
+
+Pads = tuple[tuple[int, int], tuple[int, int]]
+
+
+def convolve(x: jax.Array, kernel: jax.Array, stride: int, pads: Pads) -> jax.Array:
+    """Return cross-correlation of (B, H, W, C) with (h, w, C, D), padded by zeros.
+
+    XLA's own convolution on a CPU, and its derivatives above all, reach a fraction of the speed of
+    matrix products within ``lax.scan``. There it is written as products.
+    """
+
+    def products(x: jax.Array, kernel: jax.Array) -> jax.Array:
+        return _as_products(x, kernel, stride, pads)
+
+    def native(x: jax.Array, kernel: jax.Array) -> jax.Array:
+        return jax.lax.conv_general_dilated(
+            x, kernel, (stride, stride), pads, dimension_numbers=("NHWC", "HWIO", "NHWC")
+        )
+
+    result: jax.Array = by_platform(x, kernel, cpu=products, default=native)
+    return result
+
+
+def _as_products(x: jax.Array, kernel: jax.Array, stride: int, pads: Pads) -> jax.Array:
+    """Return the convolution as a sum of matrix products.
+
+    The image is cut into blocks of stride x stride pixels, whose channels are put side by side:
+    over blocks the stride is 1, and each place of the kernel adds one product.
+    """
+    batch, height, width, channels = x.shape
+    (top, bottom), (left, right) = pads
+    rows = (top + height + bottom - kernel.shape[0]) // stride + 1
+    columns = (left + width + right - kernel.shape[1]) // stride + 1
+    # Blocks of a kernel, and of the image as far as the last place of the kernel reaches.
+    tall, wide = (-(-side // stride) for side in kernel.shape[:2])
+    down, across = rows + tall - 1, columns + wide - 1
+    borders = (
+        (0, 0, 0),
+        (top, down * stride - top - height, 0),
+        (left, across * stride - left - width, 0),
+        (0, 0, 0),
+    )
+    x = jax.lax.pad(x, jnp.zeros((), x.dtype), borders)
+    x = x.reshape(batch, down, stride, across, stride, channels).transpose(0, 1, 3, 2, 4, 5)
+    x = x.reshape(batch, down, across, -1)
+    missing = ((0, tall * stride - kernel.shape[0]), (0, wide * stride - kernel.shape[1]))
+    kernel = jnp.pad(kernel, (*missing, (0, 0), (0, 0)))
+    kernel = kernel.reshape(tall, stride, wide, stride, channels, -1).transpose(0, 2, 1, 3, 4, 5)
+    kernel = kernel.reshape(tall, wide, x.shape[-1], -1)
+    result = jnp.zeros((), x.dtype)
+    for i in range(tall):
+        for j in range(wide):
+            result += x[:, i : i + rows, j : j + columns] @ kernel[i, j]
+    return result
+
+
+class Conv(nn.Module):
+    """A convolution with a bias, of channels-last images; as ``flax.linen.Conv``."""
+
+    features: int
+    size: int
+    stride: int = 1
+    padding: str = "VALID"
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """Map (B, H, W, C) float32 to (B, H', W', features)."""
+        shape = (self.size, self.size, x.shape[-1], self.features)
+        kernel = self.param("kernel", nn.initializers.lecun_normal(), shape)
+        bias = self.param("bias", nn.initializers.zeros, (self.features,))
+        rows, columns = jax.lax.padtype_to_pads(
+            x.shape[1:3], shape[:2], (self.stride, self.stride), self.padding
+        )
+        return convolve(x, kernel, self.stride, (rows, columns)) + bias
+
+
+def max_pool(x: jax.Array) -> jax.Array:
+    """Return the maximum over windows of 3 x 3 with stride 2, padded as ``SAME``.
+
+    The windows are nine strided slices. ``nn.max_pool`` gives the same numbers, but its gradient
+    is XLA's select-and-scatter, which is slow and on a GPU not deterministic.
+    """
+    height, width = x.shape[1:3]
+    pads = jax.lax.padtype_to_pads((height, width), (3, 3), (2, 2), "SAME")
+    x = jnp.pad(x, ((0, 0), *pads, (0, 0)), constant_values=-jnp.inf)
+    rows, columns = -(-height // 2), -(-width // 2)
+    windows = [
+        x[:, i : i + 2 * rows - 1 : 2, j : j + 2 * columns - 1 : 2]
+        for i in range(3)
+        for j in range(3)
+    ]
+    pooled = windows[0]
+    for window in windows[1:]:
+        pooled = jnp.maximum(pooled, window)
+    return pooled
+
+
+def dense(size: int, gain: float = math.sqrt(2.0), name: str | None = None) -> nn.Dense:
+    """Return a layer with orthogonal weights, which may be sampled under ``jax.vmap`` too.
+
+    They are Q of a QR decomposition. On a CPU that of a batch waits for threads which others of
+    its kind may hold while they wait as well: where cores are few, jaxlib 0.10 then stands still
+    for ever. Here a batch is drawn one by one.
+    """
+    initializer = nn.initializers.orthogonal(gain)
+
+    def orthogonal(key: jax.Array, shape: tuple[int, ...], dtype: Any = jnp.float32) -> jax.Array:
+        one_by_one = jax.custom_batching.sequential_vmap(lambda key: initializer(key, shape, dtype))
+        matrix: jax.Array = one_by_one(key)
+        return matrix
+
+    return nn.Dense(size, kernel_init=orthogonal, name=name)
+
+
+class Impala(nn.Module):
+    """The residual network of IMPALA (Espeholt et al., arXiv 1802.01561), 15 convolutions."""
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """Map (B, H, W, C) float32 to (B, 256) features."""
+        for channels in (16, 32, 32):
+            x = max_pool(Conv(channels, 3, padding="SAME")(x))
+            for _ in range(2):
+                skip = x
+                x = Conv(channels, 3, padding="SAME")(nn.relu(x))
+                x = Conv(channels, 3, padding="SAME")(nn.relu(x))
+                x = x + skip
+        return nn.relu(dense(256)(_flat(nn.relu(x))))
+
+
+class Nature(nn.Module):
+    """The network of DQN (Mnih et al., Nature 518, 2015)."""
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """Map (B, H, W, C) float32 to (B, 512) features."""
+        for channels, size, stride in ((32, 8, 4), (64, 4, 2), (64, 3, 1)):
+            x = nn.relu(Conv(channels, size, stride)(x))
+        return nn.relu(dense(512)(_flat(x)))
+
+
+class DrQ(nn.Module):
+    """The network of DrQ (Kostrikov et al., arXiv 2004.13649)."""
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """Map (B, H, W, C) float32 to (B, 50) features."""
+        for stride in (2, 1, 1, 1):
+            x = nn.relu(Conv(32, 3, stride)(x))
+        return jnp.tanh(nn.LayerNorm()(dense(50)(_flat(x))))
+
+
+class Small(nn.Module):
+    """Three convolutions for small images and slow processors."""
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """Map (B, H, W, C) float32 to (B, 128) features."""
+        x = x - _GREY
+        for channels, size, stride in ((16, 4, 2), (32, 4, 2), (32, 3, 1)):
+            x = nn.relu(Conv(channels, size, stride)(x))
+        return nn.relu(dense(128)(_flat(x)))
+
+
+class Patch(nn.Module):
+    """Three convolutions, the first over patches that do not overlap: little work for each pixel.
+
+    Vision transformers begin with such a layer (Dosovitskiy et al., arXiv 2010.11929).
+    """
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """Map (B, H, W, C) float32 to (B, 256) features."""
+        x = x - _GREY
+        for channels, size, stride in ((32, 4, 4), (32, 2, 2), (32, 3, 1)):
+            x = nn.relu(Conv(channels, size, stride)(x))
+        return nn.relu(dense(256)(_flat(x)))
+
+
+ENCODERS: dict[str, Callable[[], nn.Module]] = {
+    "impala": Impala,
+    "nature": Nature,
+    "drq": DrQ,
+    "small": Small,
+    "patch": Patch,
+}
+
+SMALLEST = {"impala": 1, "nature": 36, "drq": 15, "small": 18, "patch": 24}
+"""Height and width, in pixels, that an encoder needs at least."""
+
+
+def scaled(pixels: jax.Array) -> jax.Array:
+    """Return uint8 pixels as encoders take them: float32 in [0, 1]."""
+    return pixels.astype(jnp.float32) / 255.0
+
+
+def _flat(x: jax.Array) -> jax.Array:
+    return x.reshape(x.shape[0], -1)

@@ -1,0 +1,281 @@
+"""What on-policy algorithms share: a rollout, and passes over it in minibatches."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from pixelbrax_jax.agents.algorithm import Algorithm
+from pixelbrax_jax.agents.config import TrainConfig
+from pixelbrax_jax.agents.networks.actor_critic import Actor, ActorCritic, Critic
+from pixelbrax_jax.agents.on_policy.config import OnPolicyConfig
+from pixelbrax_jax.agents.on_policy.losses import Batch, RewardScaler, gae, mean, normalized
+from pixelbrax_jax.agents.optimizer import Optimizer
+from pixelbrax_jax.agents.rollout import Rollout, at_times, collect, observations, split_obs
+from pixelbrax_jax.agents.train_state import (
+    Metrics,
+    Networks,
+    TrainState,
+    action_key,
+    as_declared,
+    env_key,
+    network_key,
+    without_envs,
+)
+from pixelbrax_jax.flags import under_default_flags
+from pixelbrax_jax.types import EnvParams
+
+Loss = Callable[[Networks, Batch, jax.Array], tuple[jax.Array, Metrics]]
+"""Of networks, a batch and a key: the loss, and scalars to log."""
+
+
+class OnPolicyState(TrainState):
+    """Where an on-policy algorithm stands.
+
+    Attributes:
+        aux_opt_state: of the optimiser of the auxiliary phase; None where there is none.
+        scaler: statistics of rewards.
+        buffer: what the auxiliary phase will learn from; None where there is none.
+    """
+
+    aux_opt_state: Networks | None = without_envs()
+    scaler: RewardScaler = as_declared()
+    buffer: Any = as_declared()
+
+
+class Decision(NamedTuple):
+    """What learning needs of an action: itself, its log-probability, and the value it was at."""
+
+    unclipped_action: jax.Array
+    log_prob: jax.Array
+    value: jax.Array
+
+
+class Experience(NamedTuple):
+    """A rollout whose ``choice`` is a ``Decision``, and its advantages and returns, (T, N)."""
+
+    rollout: Rollout
+    advantage: jax.Array
+    returns: jax.Array
+
+
+@dataclass(frozen=True)
+class OnPolicy(Algorithm):
+    """An algorithm that learns from each rollout with the policy that played it.
+
+    A subclass has ``agent``, its networks, and ``learn``.
+    """
+
+    config: OnPolicyConfig
+    config_class: ClassVar[type[TrainConfig]] = OnPolicyConfig
+
+    @property
+    @abstractmethod
+    def agent(self) -> ActorCritic:
+        """Its networks."""
+
+    @abstractmethod
+    def learn(self, state: OnPolicyState, experience: Experience) -> tuple[OnPolicyState, Metrics]:
+        """Learn from the rollout of iteration ``state.iteration``, after which ``state`` is."""
+
+    def make_agent(self, *, shared: bool, has_value: bool, detach: bool = False) -> ActorCritic:
+        """Return networks as the settings say.
+
+        Args:
+            shared: whether the critic is the actor's value head.
+            has_value: whether the actor has a value head.
+            detach: whether a shared value leaves the encoder alone.
+        """
+        config = self.config
+        action_size = self.envs.env.action_size
+        actor = Actor(config.encoder, action_size, config.policy, config.initial_std, has_value)
+        critic = None if shared else Critic(config.encoder, sees_state=config.state_critic)
+        return ActorCritic(actor, critic, detach)
+
+    def init_networks(self, key: jax.Array) -> Networks:
+        """Sample initial parameters, by name of the network."""
+        return self.agent.init(key, *split_obs(self.envs.env.obs_spec))
+
+    @under_default_flags
+    def init(self, key: jax.Array, env_params: EnvParams) -> OnPolicyState:
+        """As ``Algorithm.init``."""
+        networks = self.init_networks(network_key(key))
+        env_state, _ = self.envs.reset(env_key(key), env_params)
+        return OnPolicyState(
+            networks=networks,
+            opt_state=Optimizer(self.config).init(networks),
+            env_state=env_state,
+            key=key,
+            iteration=jnp.uint32(0),
+            aux_opt_state=None,
+            scaler=RewardScaler.start(self.config.num_envs),
+            buffer=None,
+        )
+
+    @under_default_flags
+    def iterate(self, state: OnPolicyState, env_params: EnvParams) -> tuple[OnPolicyState, Metrics]:
+        """Play a rollout and learn from it."""
+        state, experience, metrics = self.gather(state, env_params)
+        state, learn_metrics = self.learn(state, experience)
+        rate = Optimizer(self.config).learning_rate(state.iteration)
+        state = state.replace(iteration=state.iteration + 1)
+        return state, metrics | learn_metrics | {"learning_rate": rate}
+
+    @under_default_flags
+    def act(self, networks: Networks, pixels: jax.Array, key: jax.Array | None = None) -> jax.Array:
+        """As ``Algorithm.act``, with mean actions where there is no key."""
+        return self.agent.act(networks, pixels, key)
+
+    def gather(
+        self, state: OnPolicyState, env_params: EnvParams
+    ) -> tuple[OnPolicyState, Experience, Metrics]:
+        """Play a rollout, and return the state after it, the experience and its metrics."""
+        config = self.config
+
+        def choose(pixels: jax.Array, seen: jax.Array | None, key: jax.Array) -> Any:
+            policy, value = self.agent(state.networks, pixels, seen)
+            unclipped = policy.sample(key)
+            decision = Decision(unclipped, policy.log_prob(unclipped), value)
+            return policy.action(unclipped), decision
+
+        env_state, rollout = collect(
+            self.envs,
+            state.env_state,
+            env_params,
+            choose,
+            action_key(state),
+            config.num_steps,
+            config.random_shift,
+        )
+        scaler, reward = state.scaler, rollout.reward
+        if config.normalize_reward:
+            scaler, reward = scaler(reward, rollout.done, rollout.valid, config.gamma)
+        advantage, returns = gae(
+            reward,
+            rollout.choice.value,
+            rollout.last_choice.value,
+            rollout.terminated,
+            rollout.truncated,
+            config.gamma,
+            config.gae_lambda,
+        )
+        weight = rollout.valid.astype(jnp.float32)
+        metrics = rollout.episode_metrics() | _metrics(rollout.choice, advantage, returns, weight)
+        metrics["reward/scale"] = scaler.scale if config.normalize_reward else jnp.float32(1.0)
+        if config.normalize_advantage == "batch":
+            advantage = normalized(advantage, weight)
+        state = state.replace(env_state=env_state, scaler=scaler)
+        return state, Experience(rollout, advantage, returns), metrics
+
+    def batch_at(self, experience: Experience, times: jax.Array) -> Batch:
+        """Return the samples of some times, (B, N) int32."""
+        rollout, advantage, returns = experience
+        pixels = observations(rollout.frames, times, self.config.random_shift)
+        weight = rollout.valid.astype(jnp.float32)
+        rows = (rollout.frames.state, *rollout.choice, advantage, returns, weight)
+        return Batch(pixels, *jax.tree.map(lambda rows: at_times(rows, times), rows))
+
+    def update(
+        self,
+        state: OnPolicyState,
+        loss: Loss,
+        experience: Experience,
+        num_epochs: int,
+        key: jax.Array,
+        *,
+        learners: Collection[str] | None = None,
+        target_kl: float | None = None,
+    ) -> tuple[OnPolicyState, Metrics]:
+        """Pass over a rollout in minibatches, with a step of the optimiser for each.
+
+        Args:
+            state: with the parameters.
+            loss: of networks, a batch and a key.
+            experience: the rollout.
+            num_epochs: number of passes.
+            key: of these passes alone.
+            learners: names of the networks that learn; None takes all that have an optimiser.
+            target_kl: approximate KL divergence beyond which no further minibatch is used.
+
+        Returns:
+            The state, and the mean of each metric over all minibatches that were used.
+        """
+        config, optimizer = self.config, Optimizer(self.config)
+
+        def step(
+            carry: tuple[Networks, Networks, jax.Array], inputs: tuple[jax.Array, jax.Array]
+        ) -> tuple[Any, tuple[Metrics, jax.Array]]:
+            networks, opt_state, stopped = carry
+            times, key = inputs
+            batch = self.batch_at(experience, times)
+            gradients, metrics = jax.grad(loss, has_aux=True)(networks, batch, key)
+            # A gradient of 0 would not do: Adam goes on for a while in the direction it had.
+            gradients = {name: gradients[name] for name in opt_state}
+            new, new_opt_state, norms = optimizer.step(
+                networks, opt_state, gradients, state.iteration
+            )
+            metrics |= {f"grad_norm/{name}": norm for name, norm in norms.items()}
+            if target_kl is None:
+                return (new, new_opt_state, stopped), (metrics, jnp.float32(1.0))
+            # This minibatch is still used: its divergence is known only now.
+            used = jnp.where(stopped, 0.0, 1.0)
+            keep = jax.tree.map(
+                lambda old, new: jnp.where(stopped, old, new),
+                (networks, opt_state),
+                (new, new_opt_state),
+            )
+            return (*keep, stopped | (metrics["policy/approx_kl"] > target_kl)), (metrics, used)
+
+        def epoch(carry: Any, key: jax.Array) -> tuple[Any, Any]:
+            parts = config.num_minibatches
+            order = minibatch_times(
+                jax.random.fold_in(key, 0), config.num_steps, config.num_envs, parts
+            )
+            keys = jax.random.split(jax.random.fold_in(key, 1), parts)
+            return jax.lax.scan(step, carry, (order, keys))
+
+        networks = {name: state.networks[name] for name in state.opt_state}
+        opt_state = {name: state.opt_state[name] for name in learners or state.opt_state}
+        carry = (networks, opt_state, jnp.bool_(False))
+        keys = jax.random.split(key, num_epochs)
+        (networks, opt_state, _), (metrics, used) = jax.lax.scan(epoch, carry, keys)
+        metrics = {name: jnp.sum(x * used) / jnp.sum(used) for name, x in metrics.items()}
+        state = state.replace(
+            networks=state.networks | networks, opt_state=state.opt_state | opt_state
+        )
+        return state, metrics
+
+
+def minibatch_times(key: jax.Array, num_steps: int, num_envs: int, parts: int) -> jax.Array:
+    """Return a random partition of T steps into M minibatches, (M, T / M, N) int32.
+
+    Every minibatch has equally many steps of each environment. So a minibatch is cut along the
+    environments alike, on however many devices they live.
+    """
+    keys = jax.vmap(lambda i: jax.random.fold_in(key, i))(jnp.arange(num_envs))
+    order = jax.vmap(lambda key: jax.random.permutation(key, num_steps), out_axes=1)(keys)
+    return order.reshape(parts, num_steps // parts, num_envs)
+
+
+def _metrics(
+    decision: Decision, advantage: jax.Array, returns: jax.Array, weight: jax.Array
+) -> Metrics:
+    center = returns - mean(returns, weight)
+    unexplained = returns - decision.value
+    unexplained -= mean(unexplained, weight)
+    variance = mean(center**2, weight)
+    saturated = jnp.mean(jnp.abs(decision.unclipped_action) >= 1.0, -1)
+    spread = advantage - mean(advantage, weight)
+    return {
+        "advantage/mean": mean(advantage, weight),
+        "advantage/std": jnp.sqrt(mean(spread**2, weight)),
+        "return/mean": mean(returns, weight),
+        "return/std": jnp.sqrt(variance),
+        "value/explained_variance": 1.0 - mean(unexplained**2, weight) / (variance + 1e-8),
+        "policy/saturation": mean(saturated, weight),
+    }

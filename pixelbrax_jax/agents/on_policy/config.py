@@ -1,0 +1,73 @@
+"""Settings that every on-policy algorithm has."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+from pixelbrax_jax.agents.config import TrainConfig, check_count, check_divides, check_positive
+from pixelbrax_jax.agents.networks.actor_critic import LOG_STD_RANGE, POLICIES
+from pixelbrax_jax.validation import check_choice, check_fraction, check_positive_int
+
+ADVANTAGE_NORMS = ("batch", "minibatch", "none")
+
+
+@dataclass(frozen=True)
+class OnPolicyConfig(TrainConfig):
+    """Settings of rollouts, of the policy, and of PPO's objective."""
+
+    memory_settings: ClassVar[tuple[str, ...]] = ("num_envs", "num_steps")
+
+    num_steps: int = 64
+    """Steps T of each environment in one rollout."""
+    random_shift: int = 0
+    """Pixels by which images are shifted at most, one random shift for each rollout."""
+    policy: str = "gaussian"
+    """``gaussian``, ``tanh_gaussian`` or ``deacrep``."""
+    initial_std: float = 1.0
+    """Standard deviation of a new policy, unless it is ``deacrep``."""
+
+    gae_lambda: float = 0.95
+    """Lambda of generalised advantage estimation."""
+    num_minibatches: int = 8
+    """Minibatches of an epoch; each has T / num_minibatches steps of every environment."""
+    clip_coef: float = 0.2
+    """Epsilon of PPO's clipped ratio."""
+    ent_coef: float = 0.001
+    """Weight of the entropy bonus."""
+    normalize_advantage: str = "batch"
+    """Over what advantages get mean 0 and deviation 1: ``batch``, ``minibatch`` or ``none``."""
+    normalize_reward: bool = True
+    """Whether rewards are divided by the deviation of discounted returns."""
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        super().__post_init__()
+        check_positive_int("num_steps", self.num_steps)
+        check_positive_int("num_minibatches", self.num_minibatches)
+        check_divides("num_steps", self.num_steps, "num_minibatches", self.num_minibatches)
+        check_choice("policy", self.policy, POLICIES)
+        check_choice("normalize_advantage", self.normalize_advantage, ADVANTAGE_NORMS)
+        check_fraction("gae_lambda", self.gae_lambda)
+        check_fraction("clip_coef", self.clip_coef)
+        check_positive("initial_std", self.initial_std)
+        check_positive("ent_coef", self.ent_coef, or_zero=True)
+        check_count("random_shift", self.random_shift)
+        low, high = (math.exp(x) for x in LOG_STD_RANGE)
+        if not low < self.initial_std < high:
+            raise ValueError(
+                f"initial_std must be between {low:.4f} and {high:.2f}, where standard deviations "
+                f"are kept, got {self.initial_std}."
+            )
+
+    @property
+    def steps_per_iteration(self) -> int:
+        """Control steps of one rollout, over all environments."""
+        return self.num_envs * self.num_steps * self.env.action_repeat
+
+    @property
+    def bytes_per_iteration(self) -> int:
+        """Bytes of the frames of one rollout, over all environments."""
+        frames = self.num_envs * (self.num_steps + self.env.frame_stack - 1)
+        return frames * self.env.height * self.env.width * 3

@@ -1,0 +1,213 @@
+"""Playing in the environments, and storing what was seen in little memory.
+
+A rollout keeps every frame once. The stack of K frames that the agent saw is put together
+again by index when it is needed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from pixelbrax_jax.agents.train_state import Metrics, along_envs
+from pixelbrax_jax.types import EnvParams, EnvState, Timestep
+
+Choose = Callable[[jax.Array, jax.Array | None, jax.Array], tuple[jax.Array, Any]]
+"""``choose(pixels, state, key) -> (action, choice)``: actions of N observations, and any tree of
+arrays (N, ...) that learning needs of the choice."""
+
+
+class Environments(Protocol):
+    """What agents need: N environments in mode ``"next_step"``, hashable; equal ones are alike."""
+
+    @property
+    def env(self) -> Any:
+        """The ``PixelEnv``."""
+
+    @property
+    def num_envs(self) -> int:
+        """N."""
+
+    @property
+    def autoreset_mode(self) -> str:
+        """``"next_step"``."""
+
+    def reset(self, key: jax.Array, params: EnvParams) -> tuple[EnvState, Timestep]:
+        """As ``VectorPixelEnv.reset``."""
+
+    def step(
+        self, state: EnvState, action: jax.Array, params: EnvParams
+    ) -> tuple[EnvState, Timestep]:
+        """As ``VectorPixelEnv.step``."""
+
+    def obs(self, state: EnvState) -> Any:
+        """As ``VectorPixelEnv.obs``."""
+
+
+class Frames(struct.PyTreeNode):
+    """Observations of T steps of N environments.
+
+    Attributes:
+        pixels: (K - 1 + T, N, H, W, 3) uint8, single frames; the first K - 1 are from before.
+        age: (T, N) int32, frames of its episode that are older than the observation's newest
+            one, at most K - 1.
+        shift: (N, 2) int32, pixels down and right by which observations are shifted.
+        state: (T, N, S) float32, the simulator's state; None unless a critic sees it.
+    """
+
+    pixels: jax.Array = along_envs(1)
+    age: jax.Array = along_envs(1)
+    shift: jax.Array = along_envs(0)
+    state: jax.Array | None = along_envs(1)
+
+
+class Rollout(struct.PyTreeNode):
+    """T steps of N environments.
+
+    Attributes:
+        frames: what was seen.
+        choice: what ``choose`` returned beside the actions, (T, N, ...).
+        last_choice: the same for the observation after the last step, (N, ...).
+        reward: (T, N) float32.
+        terminated: (T, N) bool.
+        truncated: (T, N) bool.
+        valid: (T, N) bool. False where the step began an episode and the action was ignored;
+            such a step teaches nothing.
+        episode_return: (T, N) float32, sum of rewards of the episode so far.
+        episode_length: (T, N) int32, control steps of the episode so far.
+    """
+
+    frames: Frames
+    choice: Any
+    last_choice: Any
+    reward: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    valid: jax.Array
+    episode_return: jax.Array
+    episode_length: jax.Array
+
+    @property
+    def done(self) -> jax.Array:
+        """(T, N) bool, an episode ended."""
+        return self.terminated | self.truncated
+
+    def episode_metrics(self) -> Metrics:
+        """Return what runs log of episodes: sums, which add up over iterations without loss."""
+        done = self.done
+        return {
+            "episode/count": jnp.sum(done, dtype=jnp.int32),
+            "episode/return_sum": jnp.sum(jnp.where(done, self.episode_return, 0.0)),
+            "episode/length_sum": jnp.sum(jnp.where(done, self.episode_length, 0)),
+        }
+
+
+def collect(
+    envs: Environments,
+    env_state: EnvState,
+    env_params: EnvParams,
+    choose: Choose,
+    key: jax.Array,
+    num_steps: int,
+    random_shift: int = 0,
+) -> tuple[EnvState, Rollout]:
+    """Play ``num_steps`` steps, and return where the environments are then and what happened.
+
+    Args:
+        envs: the environments.
+        env_state: where they are.
+        env_params: of the environments.
+        choose: chooses actions.
+        key: of this rollout alone.
+        num_steps: T.
+        random_shift: pixels by which observations are shifted at most.
+    """
+    num_envs = envs.num_envs
+    shift_key = jax.random.fold_in(key, num_steps + 1)
+    shift = jax.random.randint(shift_key, (num_envs, 2), -random_shift, random_shift + 1)
+    first, _ = split_obs(envs.obs(env_state))
+    stack = first.shape[-1] // 3
+    before = jnp.moveaxis(first.reshape(*first.shape[:-1], stack, 3), -2, 0)[:-1]
+
+    def choose_at(env_state: EnvState, number: Any) -> tuple[Any, ...]:
+        pixels, state = split_obs(envs.obs(env_state))
+        seen = shifted(pixels, shift, random_shift)
+        return pixels, state, *choose(seen, state, jax.random.fold_in(key, number))
+
+    def step(carry: tuple[EnvState, jax.Array], number: jax.Array) -> tuple[Any, Any]:
+        env_state, age = carry
+        pixels, state, action, choice = choose_at(env_state, number)
+        begins = env_state.done
+        env_state, timestep = envs.step(env_state, action, env_params)
+        outcome = (
+            timestep.reward,
+            timestep.terminated,
+            timestep.truncated,
+            ~begins,
+            timestep.info["episode_return"],
+            timestep.info["episode_length"],
+        )
+        kept = (pixels[..., -3:], age, state)
+        age = jnp.where(begins, 0, jnp.minimum(age + 1, stack - 1))
+        return (env_state, age), (kept, choice, outcome)
+
+    # The stack that is there already needs no frames of before to be left out: an episode that
+    # has just begun repeats its first frame in it.
+    start = (env_state, jnp.full(num_envs, stack - 1))
+    (env_state, _), (kept, choice, outcome) = jax.lax.scan(step, start, jnp.arange(num_steps))
+    newest, age, state = kept
+    *_, last_choice = choose_at(env_state, num_steps)
+    frames = Frames(pixels=jnp.concatenate([before, newest]), age=age, shift=shift, state=state)
+    return env_state, Rollout(frames, choice, last_choice, *outcome)
+
+
+def observations(frames: Frames, times: jax.Array, random_shift: int = 0) -> jax.Array:
+    """Return the pixels that the agent saw at (B, N) int32 times, as it saw them.
+
+    Returns:
+        (N B, H, W, 3 K) uint8, one environment after the other, oldest frame first.
+    """
+    stack = frames.pixels.shape[0] - frames.age.shape[0] + 1
+    age = jnp.take_along_axis(frames.age, times, axis=0)
+    back = jnp.minimum(jnp.arange(stack - 1, -1, -1), age[..., None])
+    index = times[..., None] + stack - 1 - back
+    picked = jax.vmap(lambda pixels, index: pixels[index], in_axes=1)(frames.pixels, index)
+    stacked = jnp.moveaxis(picked, 2, -2)
+    stacked = stacked.reshape(*stacked.shape[:-2], 3 * stack)
+    if random_shift:
+        of_times = jax.vmap(shifted, in_axes=(1, None, None), out_axes=1)
+        stacked = of_times(stacked, frames.shift, random_shift)
+    return stacked.reshape(-1, *stacked.shape[2:])
+
+
+def at_times(rows: jax.Array, times: jax.Array) -> jax.Array:
+    """Map (T, N, ...) rows and (B, N) int32 times to (N B, ...), one environment after the other.
+
+    What is spread over devices along environments then stays where it is.
+    """
+    picked = jax.vmap(lambda rows, index: rows[index], in_axes=1)(rows, times)
+    return picked.reshape(-1, *rows.shape[2:])
+
+
+def split_obs(obs: Any) -> tuple[Any, Any]:
+    """Return pixels and state of an observation, or of its spec; None for a state not there."""
+    if isinstance(obs, dict):
+        return obs.get("pixels"), obs.get("state")
+    return obs, None
+
+
+def shifted(pixels: jax.Array, shift: jax.Array, at_most: int) -> jax.Array:
+    """Shift (N, H, W, C) images by (N, 2) int32 pixels down and right, and repeat their edges.
+
+    As Yarats et al., arXiv 2004.13649. ``at_most`` bounds the shifts; it is static.
+    """
+    if not at_most:
+        return pixels
+    height, width = pixels.shape[1:3]
+    rows = jnp.clip(jnp.arange(height)[None] - shift[:, :1], 0, height - 1)
+    columns = jnp.clip(jnp.arange(width)[None] - shift[:, 1:], 0, width - 1)
+    return jax.vmap(lambda image, r, c: image[r][:, c])(pixels, rows, columns)

@@ -1,0 +1,204 @@
+"""Options -> pixel environment and its parameters."""
+
+from __future__ import annotations
+
+import inspect
+import os
+from dataclasses import fields, replace
+from functools import lru_cache
+from typing import Any
+from weakref import WeakValueDictionary
+
+import jax
+import numpy as np
+
+from pixelbrax_jax import registry
+from pixelbrax_jax.config import PROGRAM_OPTIONS, EnvConfig, env_config
+from pixelbrax_jax.distractors.clips import ClipBank, load_clips, warn_procedural
+from pixelbrax_jax.distractors.presets import resolve
+from pixelbrax_jax.distractors.video import Video
+from pixelbrax_jax.envs.pixel_env import PixelEnv
+from pixelbrax_jax.extras import install_extra
+from pixelbrax_jax.flags import default_flags
+from pixelbrax_jax.physics.base import Physics
+from pixelbrax_jax.scene.cameras import choose_rig, rig_from_corner, seen_from, with_sides
+from pixelbrax_jax.scene.look import make_look
+from pixelbrax_jax.types import CameraRig, Clips, EnvParams, Look
+
+
+@default_flags()
+def make(task: str | EnvConfig, **options: Any) -> tuple[PixelEnv, EnvParams]:
+    """Make a pixel environment and its parameters.
+
+    Environments made of equal options are equal, and share compiled programs. Those that differ
+    in nothing but camera, look, time limit or clips are equal too: these are parameters.
+
+    Args:
+        task: one of ``list_envs()``; or ``"module:name"``, a task that importing the module
+            registers; or an ``EnvConfig``, of which ``options`` are changed.
+        **options: the fields of ``EnvConfig``, which says what they are.
+
+    Returns:
+        The environment and its parameters.
+
+    Raises:
+        ValueError: a name is unknown, a number out of range, or an option for other tasks alone;
+            the message says what is allowed.
+        TypeError: there is no such option; the message lists them and names the nearest one.
+        ImportError: the task is of the DM Control Suite, and dm_control is not installed; the
+            message has the line that installs it. Or the module of a task cannot be imported.
+        FileNotFoundError: clips are missing.
+        MemoryError: the clips would take too much memory.
+        RuntimeError: JAX has no device to compute on.
+    """
+    config = env_config(task, options)
+    config = replace(config, task=registry.find_task(config.task))
+    _check_device()
+    physics = registry.make_physics(config.task, **config.suite_options())
+    program = {name: getattr(config, name) for name in PROGRAM_OPTIONS}
+    program["distractors"] = resolve(config.distractors, config.task)
+    env = PixelEnv(physics, **program)
+    rig = _rig(config, physics)
+    if not rig.link < len(physics.link_names):
+        raise ValueError(
+            f"the camera follows link {rig.link}, but task {config.task!r} has only "
+            f"{len(physics.link_names)} links: {', '.join(physics.link_names)}."
+        )
+    params = EnvParams(
+        geoms=seen_from(physics.geoms, rig),
+        rig=rig,
+        look=_look(config, physics),
+        episode_length=np.int32(config.episode_length),
+    )
+    # Here, so that no program has to: JAX may be told to refuse that (`jax.transfer_guard`).
+    return env, jax.device_put(params).replace(clips=_clips(config, env))
+
+
+# What help() and editors show.
+make.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
+    [
+        inspect.Parameter("task", inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation="str"),
+        *(
+            inspect.Parameter(
+                field.name,
+                inspect.Parameter.KEYWORD_ONLY,
+                default=field.default,
+                annotation=field.type,
+            )
+            for field in fields(EnvConfig)
+            if field.name != "task"
+        ),
+    ]
+)
+
+
+@default_flags()
+def named_rigs(task: str) -> dict[str, CameraRig]:
+    """Return the viewpoints of a task by name, which ``camera=`` takes.
+
+    Args:
+        task: as ``make`` takes it.
+
+    Returns:
+        ``default``, ``side`` (seen along +y), ``front`` (along -x), ``top`` (from above, +y up in
+        the image); ``original`` where the paper has the task; of the DM Control Suite and of tasks
+        of your own the model's cameras that keep their orientation, also in place of others of
+        that name.
+
+    Raises:
+        ValueError: the task is unknown.
+        ImportError: as in ``make``.
+    """
+    name = registry.find_task(env_config(task, {}).task)
+    return _rigs(name, registry.make_physics(name))
+
+
+def _rigs(task: str, physics: Physics) -> dict[str, CameraRig]:
+    camera = registry.registered_camera(task)
+    if camera is not None:
+        default = choose_rig(task, camera, {})
+    else:
+        default = physics.rigs.get("default") or _corner_rig(physics)
+    return with_sides({**physics.rigs, "default": default})
+
+
+@lru_cache(maxsize=16)
+def _corner_rig(physics: Physics) -> CameraRig:
+    state = physics.reset(jax.random.key(0))
+    xpos, xquat = np.asarray(state.xpos), np.asarray(state.xquat)
+    return rig_from_corner(physics.geoms, xpos, xquat, physics.followed_link)
+
+
+def _rig(config: EnvConfig, physics: Physics) -> CameraRig:
+    rigs = _rigs(config.task, physics)
+    unfit, camera = physics.unfit_cameras, config.camera
+    if isinstance(camera, str) and camera in unfit and camera not in rigs:
+        raise ValueError(
+            f"camera {camera!r} of task {config.task!r} cannot be a viewpoint: {unfit[camera]}, "
+            "and a viewpoint is a perspective that keeps its direction. Allowed: "
+            f"{', '.join(sorted(rigs))}, a CameraRig or a Camera."
+        )
+    return choose_rig(config.task, camera, rigs)
+
+
+def _look(config: EnvConfig, physics: Physics) -> Look:
+    look = config.look
+    if physics.look is not None and look in ("default", "dmc"):
+        look = physics.look
+    return make_look(look, shadows=config.shadows)
+
+
+def _check_device() -> None:
+    """Start JAX, whose own error may be without a word.
+
+    Raises:
+        RuntimeError: it finds no device; the message names what was asked for, and has the fix.
+    """
+    try:
+        jax.devices()
+    except (RuntimeError, AssertionError) as error:
+        asked = os.environ.get("JAX_PLATFORMS")
+        raise RuntimeError(
+            "JAX finds no device to compute on"
+            + (f" with JAX_PLATFORMS={asked}; unset it" if asked else "; run pixelbrax doctor")
+            + f", or {install_extra('cuda12', 'cuda13')}"
+            + (f" ({error})." if str(error) else ".")
+        ) from error
+
+
+def _clips(config: EnvConfig, env: PixelEnv) -> Clips | None:
+    """Return the clips on the device, None where nothing plays any."""
+    clips, split = config.clips, config.split
+    videos = [link for link in env.chain.links if isinstance(link, Video)]
+    if clips is not None and not videos and env.obs_mode != "state":
+        raise ValueError("clips are given, but no video is: add 'video' to the distractors.")
+    if split != "train" and not config.distractors:
+        raise ValueError(
+            f"split={split!r} is given, but no distractor is: add one that has splits, such as "
+            "'video', to the distractors."
+        )
+    if not videos:
+        return None
+    if isinstance(clips, ClipBank):
+        if split not in ("train", clips.split):
+            raise ValueError(f"split={split!r}, but the clips are of split {clips.split!r}.")
+        return _on_device(clips)
+    if clips is None:
+        warn_procedural()
+        clips = "procedural"
+    bank = load_clips(
+        clips, split, height=env.height, width=env.width, num_clips=videos[0].num_clips
+    )
+    return _on_device(bank)
+
+
+# Weakly, so that clips leave the device with the last environment that shows them.
+_resident: WeakValueDictionary[str, Clips] = WeakValueDictionary()
+
+
+def _on_device(bank: ClipBank) -> Clips:
+    """Return the clips on the device, where equal ones are once."""
+    clips = _resident.get(bank.digest)
+    if clips is None:
+        clips = _resident[bank.digest] = bank.to_device()
+    return clips

@@ -1,0 +1,101 @@
+"""The physics of Brax's tasks."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pixelbrax_jax.physics.base import Kinematics
+from pixelbrax_jax.physics.brax.engine import BraxPhysics
+from pixelbrax_jax.physics.brax.tasks import REWARD_PRESETS, TASKS, BraxTask, Viewpoint
+from pixelbrax_jax.physics.divergence import Recipe
+from pixelbrax_jax.physics.mujoco_compatibility import (
+    import_silenced,
+    load_onto_own_device,
+    loading_silenced,
+)
+from pixelbrax_jax.types import CameraRig
+from pixelbrax_jax.validation import check_choice
+
+with import_silenced():
+    from brax import envs
+    from mujoco.mjx._src import io as mjx_io
+
+
+def distance_swum(before: Kinematics, after: Kinematics, action: jax.Array) -> jax.Array:
+    """Return the distance of the swimmer's root from the origin, minus a control cost."""
+    del before
+    return jnp.linalg.norm(after.q[:2]) - 1e-9 * jnp.sum(action**2)
+
+
+_PAPER_REWARDS = {"distance_swum": distance_swum}
+
+
+def make_physics(
+    task: str, *, backend: str | None = None, reward_preset: str = "brax"
+) -> BraxPhysics:
+    """Make the physics of one of Brax's tasks: equal objects for equal arguments.
+
+    Args:
+        task: a name in ``brax.tasks.TASKS``.
+        backend: a backend that the task supports; None for its default.
+        reward_preset: ``"brax"`` for the rewards of the installed Brax, or ``"paper"`` for
+            those of arXiv 2502.00021 where they differ: walker2d weighs forward speed ten
+            times, the swimmer earns its distance from the origin, and humanoid,
+            humanoidstandup, inverted_pendulum and pusher take actions unscaled. Dynamics are
+            the installed Brax's with either.
+
+    Raises:
+        ValueError: an option is unknown; the message lists what is allowed.
+    """
+    row = TASKS[task]
+    check_choice("reward_preset", reward_preset, REWARD_PRESETS)
+    backend = row.default_backend if backend is None else backend
+    check_choice(f"backend of task {task!r}", backend, row.backends)
+    return _load(task, backend, reward_preset)
+
+
+# Loading a model takes a second. One that is dropped and loaded again equals the first.
+@lru_cache(maxsize=16)
+def _load(task: str, backend: str, reward_preset: str) -> BraxPhysics:
+    row, paper = TASKS[task], reward_preset == "paper"
+    return BraxPhysics(
+        load_brax_env(task, backend, **(row.paper_options if paper else {})),
+        colors=row.colors,
+        drawn_radius=row.drawn_radius,
+        rigs=rigs_of(row),
+        unscale_actions=paper and row.paper_unscaled,
+        reward=_PAPER_REWARDS[row.paper_reward] if paper and row.paper_reward else None,
+        identity=Recipe(_load, (task, backend, reward_preset)),
+    )
+
+
+def rigs_of(task: BraxTask) -> dict[str, CameraRig]:
+    """Return a task's viewpoints by name: ``default``, and ``original`` where the paper has it."""
+    views = {"default": task.camera, "original": task.original_camera}
+    return {name: _rig(view) for name, view in views.items() if view is not None}
+
+
+def _rig(view: Viewpoint) -> CameraRig:
+    def f32(numbers: Any) -> Any:
+        return np.asarray(numbers, np.float32)
+
+    return CameraRig(
+        link=view.link,
+        track=f32((1.0, 1.0, 0.0) if view.link >= 0 else (0.0, 0.0, 0.0)),
+        eye=f32(view.eye),
+        target=f32(view.target),
+        up=f32(view.up),
+        fovy=f32(view.fovy),
+    )
+
+
+def load_brax_env(name: str, backend: str, **options: Any) -> envs.Env:
+    """Load one of Brax's environments by its name, bare, without its known warnings."""
+    load_onto_own_device(mjx_io)
+    with loading_silenced():
+        return envs.get_environment(name, backend=backend, **options)

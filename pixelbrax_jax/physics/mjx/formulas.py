@@ -1,0 +1,223 @@
+"""What a task of the DM Control Suite consists of, and what its formulas are made of."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from pixelbrax_jax.physics.mjx.dynamics import Dynamics
+from pixelbrax_jax.physics.opengl import mujoco
+
+
+class Start(struct.PyTreeNode):
+    """An initial state; the fields are those of ``MjxState``, and None is rest or no target."""
+
+    qpos: jax.Array
+    qvel: jax.Array | None = None
+    target: jax.Array | None = None
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """What observations and rewards read of one environment's state, by the names of the model.
+
+    Positions, velocities and their sensors belong to the present joint positions and velocities;
+    sensors of forces and accelerations to the last step, before it moved anything. These are the
+    values that DM Control reads, after ``mj_step2`` and ``mj_step1``. Places are metres in the
+    world frame, rotations are matrices with the axes as columns, or unit quaternions (w, x, y, z).
+
+    Attributes:
+        model: the compiled model.
+        data: ``mujoco.mjx.Data`` of the state.
+        target: this episode's target, as in ``MjxState``.
+    """
+
+    model: mujoco.MjModel
+    data: Any
+    target: jax.Array
+
+    @property
+    def qpos(self) -> jax.Array:
+        """(Q,) float32, joint positions: metres, radians."""
+        return self.data.qpos
+
+    @property
+    def qvel(self) -> jax.Array:
+        """(V,) float32, joint velocities, per second."""
+        return self.data.qvel
+
+    @property
+    def act(self) -> jax.Array:
+        """Activations of actuators that have a state."""
+        return self.data.act
+
+    @property
+    def ctrl(self) -> jax.Array:
+        """(A,) float32, the controls of the last step; 0 after a reset."""
+        return self.data.ctrl
+
+    def joint_pos(self, *names: str) -> jax.Array:
+        """Return the positions of hinges and sliders."""
+        return self.qpos[np.array([self.model.joint(name).qposadr[0] for name in names])]
+
+    def joint_vel(self, *names: str) -> jax.Array:
+        """Return the velocities of hinges and sliders."""
+        return self.qvel[np.array([self.model.joint(name).dofadr[0] for name in names])]
+
+    def sensor(self, *names: str) -> jax.Array:
+        """Return the readings of sensors, one after the other."""
+        rows: list[int] = []
+        for name in names:
+            sensor = self.model.sensor(name)
+            rows.extend(range(sensor.adr[0], sensor.adr[0] + sensor.dim[0]))
+        return self.data.sensordata[np.array(rows)]
+
+    def sensors_of(self, *kinds: mujoco.mjtSensor) -> jax.Array:
+        """Return the readings of all sensors of some kinds, in the model's order."""
+        wanted = {int(kind) for kind in kinds}
+        rows = [i for i, kind in enumerate(self.model.sensor_type) if int(kind) in wanted]
+        return self.sensor(*(self.model.sensor(i).name for i in rows))
+
+    def xpos(self, body: str) -> jax.Array:
+        """Return (3,), the origin of a body."""
+        return self.data.xpos[self.model.body(body).id]
+
+    def xipos(self, body: str) -> jax.Array:
+        """Return (3,), the centre of mass of a body."""
+        return self.data.xipos[self.model.body(body).id]
+
+    def xmat(self, body: str) -> jax.Array:
+        """Return (3, 3), the rotation of a body."""
+        return self.data.xmat[self.model.body(body).id]
+
+    def xquat(self, body: str) -> jax.Array:
+        """Return (4,), the rotation of a body."""
+        return self.data.xquat[self.model.body(body).id]
+
+    def xmats(self) -> jax.Array:
+        """Return (L, 3, 3), the rotations of all bodies but the world."""
+        return self.data.xmat[1:]
+
+    def geom_pos(self, name: str) -> jax.Array:
+        """Return (3,), the centre of a geom."""
+        return self.data.geom_xpos[self.model.geom(name).id]
+
+    def geom_mat(self, name: str) -> jax.Array:
+        """Return (3, 3), the rotation of a geom."""
+        return self.data.geom_xmat[self.model.geom(name).id]
+
+    def site_pos(self, name: str) -> jax.Array:
+        """Return (3,), the centre of a site."""
+        return self.data.site_xpos[self.model.site(name).id]
+
+
+def joined(*parts: jax.Array | float) -> jax.Array:
+    """Return arrays and scalars one after the other, flattened."""
+    return jnp.concatenate([jnp.ravel(jnp.asarray(part)) for part in parts])
+
+
+def tolerance(
+    x: jax.Array,
+    bounds: tuple[float, float] = (0.0, 0.0),
+    margin: float = 0.0,
+    sigmoid: str = "gaussian",
+    value_at_margin: float = 0.1,
+) -> jax.Array:
+    """Return 1 within bounds, and less the farther outside.
+
+    The formulas are those of section 4.3 of arXiv 1801.00690 and of
+    ``dm_control.utils.rewards.tolerance``; of its sigmoids those that the suite's tasks use.
+
+    Args:
+        x: the quantity, of any shape.
+        bounds: lower and upper bound, inclusive; may be infinite.
+        margin: distance from the bounds at which the result is ``value_at_margin``; with 0 the
+            result is 0 outside.
+        sigmoid: how the result falls: ``gaussian``, ``long_tail``, ``linear`` or ``quadratic``.
+        value_at_margin: the result at that distance; in [0, 1) for ``linear`` and ``quadratic``,
+            in (0, 1) for the others, which reach 0 nowhere.
+    """
+    lower, upper = bounds
+    inside = (x >= lower) & (x <= upper)
+    if margin == 0:
+        return jnp.where(inside, 1.0, 0.0)
+    # Nothing is above an infinite bound, and the distance to it would be infinite.
+    distance = lower - x if upper == math.inf else jnp.where(x < lower, lower - x, x - upper)
+    return jnp.where(inside, 1.0, _SIGMOIDS[sigmoid](distance / margin, value_at_margin))
+
+
+def rising(x: jax.Array, bound: float, margin: float, value_at_margin: float = 0.0) -> jax.Array:
+    """Return 1 from a bound on, and linearly less below it; see ``tolerance``."""
+    return tolerance(x, (bound, math.inf), margin, "linear", value_at_margin)
+
+
+def _gaussian(x: jax.Array, value_at_1: float) -> jax.Array:
+    return jnp.exp(-0.5 * (x * math.sqrt(-2 * math.log(value_at_1))) ** 2)
+
+
+def _long_tail(x: jax.Array, value_at_1: float) -> jax.Array:
+    return 1 / ((x * math.sqrt(1 / value_at_1 - 1)) ** 2 + 1)
+
+
+def _linear(x: jax.Array, value_at_1: float) -> jax.Array:
+    scaled = x * (1 - value_at_1)
+    return jnp.where(jnp.abs(scaled) < 1, 1 - scaled, 0.0)
+
+
+def _quadratic(x: jax.Array, value_at_1: float) -> jax.Array:
+    scaled = x * math.sqrt(1 - value_at_1)
+    return jnp.where(jnp.abs(scaled) < 1, 1 - scaled**2, 0.0)
+
+
+_SIGMOIDS = {
+    "gaussian": _gaussian,
+    "linear": _linear,
+    "long_tail": _long_tail,
+    "quadratic": _quadratic,
+}
+
+
+def _unchanged(model: mujoco.MjModel) -> None:
+    del model
+
+
+@dataclass(frozen=True, eq=False)
+class Formulas:
+    """How a task's episodes begin, what is observed and rewarded, and what is special about it.
+
+    Attributes:
+        start: samples an initial state from a key.
+        observe: returns the observation, in DM Control's order.
+        reward: returns the reward, in [0, 1].
+        substeps: physics steps per control step.
+        edit: changes the compiled model as DM Control's task does.
+        options: arguments of the model's generator.
+        camera: index of the model's camera that is the task's own.
+        movable: names of the geoms, sites and lights that ``Start.target`` moves.
+        target_body: name of the body, fixed to the world, that it moves; empty for none.
+        reads_forces: whether observations have sensors of forces or accelerations.
+        starts_with_forces: whether these read something else than 0 in an initial state.
+        out_of_reach: names of the geoms that nothing ever touches, in any pose.
+        batch_last: whether a CPU computes a batch faster with the environments as last axis.
+    """
+
+    start: Callable[[Dynamics, jax.Array], Start]
+    observe: Callable[[Snapshot], jax.Array]
+    reward: Callable[[Snapshot], jax.Array]
+    substeps: int = 1
+    edit: Callable[[mujoco.MjModel], None] = _unchanged
+    options: Mapping[str, Any] = field(default_factory=dict)
+    camera: int = 0
+    movable: tuple[str, ...] = ()
+    target_body: str = ""
+    reads_forces: bool = False
+    starts_with_forces: bool = False
+    out_of_reach: tuple[str, ...] = ()
+    batch_last: bool = True

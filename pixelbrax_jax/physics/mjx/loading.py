@@ -1,0 +1,43 @@
+"""The physics of the DM Control Suite's tasks."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from importlib import import_module
+
+from pixelbrax_jax.physics.divergence import Recipe
+from pixelbrax_jax.physics.mjx.engine import MjxPhysics
+from pixelbrax_jax.physics.mjx.formulas import Formulas
+from pixelbrax_jax.physics.mjx.models import load_model
+from pixelbrax_jax.physics.mjx.tasks import TASKS
+
+
+def make_physics(task: str) -> MjxPhysics:
+    """Make the physics of a task of the DM Control Suite.
+
+    Args:
+        task: a name in ``mjx.tasks.TASKS``.
+
+    Returns:
+        The physics: equal ones for a task, and the same one as long as few others are asked for.
+
+    Raises:
+        ImportError: dm_control is not installed; the message has the line that installs it.
+    """
+    return _load(task)
+
+
+def formulas_of(task: str) -> Formulas:
+    """Return the model, initial states, observation and reward of a task."""
+    row = TASKS[task]
+    module = import_module(f"pixelbrax_jax.physics.mjx.domains.{row.domain}")
+    formulas: Formulas = module.TASKS[row.task]
+    return formulas
+
+
+# Loading a model takes a second. One that is dropped and loaded again equals the first.
+@lru_cache(maxsize=16)
+def _load(task: str) -> MjxPhysics:
+    formulas = formulas_of(task)
+    model = load_model(TASKS[task].domain, **formulas.options)
+    return MjxPhysics(formulas, model, identity=Recipe(_load, (task,)))

@@ -1,0 +1,38 @@
+"""What there is to know about a task before its physics is loaded."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import TypeVar
+
+Color = tuple[float, float, float]
+"""Red, green, blue in [0, 1]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """One row of a suite's table.
+
+    Attributes:
+        name: what ``make`` calls it.
+        gymnasium_id: what Gymnasium calls it.
+        summary: one sentence: the goal, and what ends an episode before the time limit.
+    """
+
+    name: str
+    gymnasium_id: str
+    summary: str
+
+    def other_names(self) -> tuple[str, ...]:
+        """Return what other libraries call the task, for the message about an unknown one."""
+        return (self.gymnasium_id,)
+
+
+_Task = TypeVar("_Task", bound=Task)
+
+
+def by_name(rows: Iterable[_Task]) -> Mapping[str, _Task]:
+    """Return rows by the names of their tasks."""
+    return MappingProxyType({row.name: row for row in rows})

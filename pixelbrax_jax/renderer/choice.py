@@ -1,0 +1,238 @@
+"""Whether NVIDIA GPUs draw by the kernel of `kernel.py`: it must be there, and draw what it should.
+
+The kernel is checked once in a process: where an environment is made or an image drawn for the
+first time, on the host, by programs of its own that are no part of any other.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from importlib.util import find_spec
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pixelbrax_jax import spatial
+from pixelbrax_jax._platform.lowering import default_platform
+from pixelbrax_jax.flags import default_flags
+from pixelbrax_jax.renderer import fused
+from pixelbrax_jax.types import Camera, Frame, GeomKind, Geoms, Lamp, Look, Scene
+
+_CAPABILITY = 8.0
+"""Least compute capability for which XLA compiles such kernels: Ampere's."""
+
+_HEIGHT, _WIDTH = 24, 40
+
+_COLOR = 1.0 / 255.0
+"""Difference of colors that rounding may make."""
+
+_DEPTH = 1e-4
+"""The same of depths, relative."""
+
+
+@dataclass(frozen=True)
+class KernelCheck:
+    """Whether the kernel draws what the plain ray-caster draws.
+
+    Attributes:
+        passed: whether it does.
+        text: what was compared, or what differed, in a sentence without its period.
+    """
+
+    passed: bool
+    text: str
+
+
+def auto_renderer() -> tuple[str, str]:
+    """Return the renderer that ``"auto"`` stands for on JAX's default device, and why."""
+    if default_platform() != "gpu":
+        return "fused", f"JAX computes on a {default_platform()}, and the kernel is for NVIDIA GPUs"
+    why = why_no_kernel()
+    if why is not None:
+        return "fused", f"not by one kernel: {why}"
+    return "pallas", f"by one kernel, on {jax.devices()[0].device_kind}; {kernel_check().text}"
+
+
+def why_no_kernel() -> str | None:
+    """Return why ``"auto"`` draws without the kernel on CUDA; None if it draws with it.
+
+    Starts a device. If it is an NVIDIA GPU, the first call in a process checks the kernel there,
+    and warns if it does not pass. Without a GPU nothing can be checked: a program that is compiled
+    for one has the kernel.
+    """
+    why = why_unsupported()
+    if why is None and default_platform() == "gpu":
+        check = kernel_check()
+        return None if check.passed else check.text
+    return why
+
+
+def why_unsupported() -> str | None:
+    """Return why programs for CUDA cannot have the kernel; None if they can.
+
+    What JAX computes on need not be a GPU: where its plugin for CUDA is installed, programs may be
+    compiled for one ahead of time. jax 0.12.0.1 must then be told which, and 0.10.2 need not; see
+    `docs/renderer.md`.
+    """
+    platform = default_platform()
+    # Without a plugin nothing is imported or traced that only a GPU needs.
+    if platform != "gpu" and not _has_plugin():
+        return f"JAX computes on a {platform}, and the kernel is for NVIDIA GPUs"
+    if platform == "gpu" and "rocm" in _driver(jax.devices()[0]).lower():
+        return "JAX computes on ROCm, and the kernel is for NVIDIA GPUs"
+    try:
+        from jax.experimental.pallas import triton
+
+        # jax 0.12.0.1 tells of an abstract or a real card; 0.10.2 has no such function.
+        info = triton.get_gpu_info() if hasattr(triton, "get_gpu_info") else None
+    except ImportError:
+        return f"jax {jax.__version__} has no Pallas for Triton"
+    except ValueError as error:
+        return f"Pallas does not know the card: {error}"
+    if info is not None:
+        return _why_too_old("the card", info.compute_capability / 10)
+    if platform != "gpu":
+        return None
+    card = jax.devices()[0]
+    capability = str(getattr(card, "compute_capability", ""))
+    try:
+        return _why_too_old(card.device_kind, float(capability))
+    except ValueError:
+        return f"the compute capability of {card.device_kind} is unknown: {capability!r}"
+
+
+def why_not_here() -> str | None:
+    """Return why JAX's default device cannot run the kernel, checked or not; None if it can."""
+    why = why_unsupported()
+    if why is None and default_platform() != "gpu":
+        return f"JAX computes on a {default_platform()}"
+    return why
+
+
+@cache
+def kernel_check() -> KernelCheck:
+    """Return what the check of the kernel found on JAX's default device, a GPU.
+
+    The first call in a process draws, and warns if the kernel does not pass.
+    """
+    from pixelbrax_jax.renderer import kernel
+
+    check = compare(kernel.render)
+    if not check.passed:
+        card = jax.devices()[0]
+        warnings.warn(
+            f"PixelBrax's kernel for NVIDIA GPUs is not used, for {check.text} ({card.device_kind},"
+            f" jax {jax.__version__}, {' '.join(_driver(card).split())}). Images are drawn by "
+            "renderer='fused', which is right and slower. Please report this line with what "
+            "`pixelbrax doctor` says; renderer='fused' silences it.",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+    return check
+
+
+def compare(draw: Callable[[Scene, int, int], Frame]) -> KernelCheck:
+    """Compare a renderer with the plain ray-caster, on two small images of every kind of geom.
+
+    Args:
+        draw: the renderer; of a scene, a height and a width.
+    """
+
+    def plain(scene: Scene, height: int, width: int) -> Frame:
+        return fused.render(scene, height, width, 0, height)
+
+    def images(draw: Callable[[Scene, int, int], Frame]) -> Frame:
+        frames = jax.jit(jax.vmap(lambda scene: draw(scene, _HEIGHT, _WIDTH)))(scenes)
+        return jax.tree.map(np.asarray, frames)
+
+    # Computed now, also where another program is being traced.
+    with default_flags(), jax.disable_jit(False), jax.ensure_compile_time_eval():
+        scenes = jax.jit(jax.vmap(_scene))(np.array([[0.5, -4.0, 2.0], [-2.0, -3.5, 1.5]]))
+        wanted = images(plain)
+        try:
+            found = images(draw)
+        except Exception as error:  # of a compiler or a driver, whatever it is
+            lines = str(error).splitlines() or [""]
+            return KernelCheck(False, f"it fails with {type(error).__name__}: {lines[0]}")
+    colors = np.abs([getattr(found, c) - getattr(wanted, c) for c in "rgb"]).max(0)
+    depths = np.abs(found.depth / wanted.depth - 1.0)
+    right = (found.seg == wanted.seg) & (found.ground == wanted.ground)
+    # NaN is wrong, too.
+    right &= (colors <= _COLOR) & (depths <= _DEPTH)
+    if right.all():
+        return KernelCheck(True, f"it draws {right.size} pixels as the plain ray-caster does")
+    return KernelCheck(
+        False,
+        f"{(~right).sum()} of {right.size} pixels differ from the plain ray-caster's, colors by up "
+        f"to {255.0 * colors.max():.0f} of 255, depth by up to {100.0 * depths.max():.2g} %",
+    )
+
+
+def _scene(eye: jax.Array) -> Scene:
+    """Return one of each kind of geom on the ground, in light with shadows, seen from ``eye``."""
+    kinds = tuple(GeomKind)
+    angles = jnp.linspace(0.3, 1.2, len(kinds))
+    axes = jnp.array([[0.0, 0.0, 0.0]] + [[0.6, 0.0, 0.8]] * (len(kinds) - 1))
+    quat = jnp.concatenate([jnp.cos(angles)[:, None], jnp.sin(angles)[:, None] * axes], axis=1)
+    x = jnp.linspace(-1.8, 1.5, len(kinds))
+    pos = jnp.stack([x, 0.3 * jnp.cos(3.0 * x), jnp.full(len(kinds), 0.6)], axis=1)
+    target, up = jnp.array([0.0, 0.0, 0.5]), jnp.array([0.0, 0.0, 1.0])
+    geoms = Geoms(
+        kind=kinds,
+        link=(-1,) * len(kinds),
+        material=tuple(range(len(kinds))),
+        name=tuple(kind.name for kind in kinds),
+        size=jnp.tile(jnp.array([0.3, 0.4, 0.25]), (len(kinds), 1)),
+        pos=pos,
+        quat=quat,
+        rgb=jnp.linspace(0.1, 0.9, 3 * len(kinds)).reshape(-1, 3),
+    )
+    lamp = Lamp(
+        link=-1,
+        exponent=2,
+        pos=jnp.array([2.0, -2.0, 3.0]),
+        axis=spatial.unit(jnp.array([-0.6, 0.6, -0.9])),
+        cos_cutoff=jnp.float32(0.5),
+        diffuse=jnp.float32(0.3),
+        highlight=jnp.float32(0.2),
+    )
+    look = Look(
+        ground="checker",
+        shadows=True,
+        shininess=8,
+        light=jnp.array([-0.5, -0.8, 2.0]),
+        ambient=jnp.float32(0.3),
+        diffuse=jnp.float32(0.5),
+        specular=jnp.float32(0.1),
+        highlight=jnp.float32(0.2),
+        sky=jnp.array([[0.8, 0.8, 0.9], [0.2, 0.4, 0.8]]),
+        ground_rgb=jnp.array([[0.3, 0.4, 0.5], [0.6, 0.6, 0.5]]),
+        ground_pitch=jnp.float32(1.0),
+        lamps=(lamp,),
+    )
+    return Scene(
+        geoms=geoms,
+        pos=pos.at[0].set(0.0),
+        xmat=jax.vmap(spatial.quat_to_mat)(spatial.quat_normalize(quat)).at[0].set(jnp.eye(3)),
+        camera=Camera(pos=eye, xmat=spatial.look_at(eye, target, up), fovy=jnp.float32(45.0)),
+        look=look,
+    )
+
+
+def _why_too_old(card: str, capability: float) -> str | None:
+    if capability >= _CAPABILITY:
+        return None
+    return f"{card} has compute capability {capability}, and the kernel needs {_CAPABILITY}"
+
+
+def _driver(device: jax.Device) -> str:
+    return getattr(device.client, "platform_version", "")
+
+
+@cache
+def _has_plugin() -> bool:
+    return any(map(find_spec, ("jax_cuda12_plugin", "jax_cuda13_plugin")))

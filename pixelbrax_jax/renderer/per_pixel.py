@@ -1,0 +1,160 @@
+"""Changes of an image that are made pixel by pixel, recognised by their program.
+
+A kernel makes such a change as it draws a pixel. Whatever the change computes that does not depend
+on the frame, as a random offset or an image to mix in, is computed before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend import core
+
+from pixelbrax_jax._platform.rules import bind, row_aval
+from pixelbrax_jax.types import Frame
+
+_ELEMENTWISE_NAMES = """
+abs add and ceil clamp convert_element_type cos copy copy_p div eq exp exp2 floor ge gt integer_pow
+is_finite le log log1p logistic lt max min mul ne neg not or pow rsqrt select_n shift_left
+shift_right_arithmetic shift_right_logical sign sin sqrt square stop_gradient sub tanh xor
+"""
+"""Primitives of JAX that a kernel has, too."""
+
+_ELEMENTWISE = frozenset(_ELEMENTWISE_NAMES.split())
+
+_DTYPES = ("float32", "int32", "uint32", "bool")
+
+
+class _Pixel(NamedTuple):
+    """What a change knows of each pixel, by its place: the frame's planes, then all results."""
+
+    place: int
+
+
+class _Given(NamedTuple):
+    """Something that is computed before: ``inputs[group][place]``, or a constant."""
+
+    group: str
+    place: Any
+
+
+class _NotPerPixelError(Exception):
+    """A pixel of the result depends on other pixels."""
+
+
+@dataclass
+class PerPixel:
+    """A change of an image, pixel by pixel.
+
+    Attributes:
+        shape: (H, W).
+        numbers: () arrays that all pixels need.
+        images: (H, W) arrays of which a pixel needs the same pixel.
+    """
+
+    shape: tuple[int, ...]
+    num_planes: int
+    numbers: list[jax.Array] = field(default_factory=list)
+    images: list[jax.Array] = field(default_factory=list)
+    _steps: list[tuple[core.JaxprEqn, list[_Pixel | _Given]]] = field(default_factory=list)
+    # By the id of an array, with the array, so that no other one gets that id.
+    _scalars: dict[int, tuple[Any, Any]] = field(default_factory=dict)
+    _equations: dict[int, tuple[Any, core.JaxprEqn, list[Any]]] = field(default_factory=dict)
+    _found: dict[int, tuple[Any, _Pixel | _Given]] = field(default_factory=dict)
+
+    def apply(self, frame: Frame, numbers: Sequence[Any], images: Sequence[Any]) -> jax.Array:
+        """Return the result for some pixels of a frame, given the same pixels of the images."""
+        known, given = jax.tree.leaves(frame), {"number": numbers, "image": images}
+
+        def value(x: _Pixel | _Given) -> Any:
+            if isinstance(x, _Pixel):
+                return known[x.place]
+            return x.place if x.group == "constant" else given[x.group][x.place]
+
+        for eqn, operands in self._steps:
+            known += bind(eqn, *(jnp.broadcast_to(value(x), frame.r.shape) for x in operands))
+        return known[-1]
+
+    def read(self, closed: core.ClosedJaxpr, operands: Sequence[Any]) -> list[Any]:
+        """Take in a program: compute what does not depend on pixels, and note down the rest."""
+        known = dict(zip(closed.jaxpr.constvars, closed.consts, strict=True))
+        known |= dict(zip(closed.jaxpr.invars, operands, strict=True))
+
+        def value(atom: core.Var | core.Literal) -> Any:
+            if isinstance(atom, core.Literal):
+                return np.asarray(atom.val, row_aval(atom).dtype)[()]
+            return known[atom]
+
+        for eqn in closed.jaxpr.eqns:
+            with eqn.ctx.manager:
+                results = self._read_equation(eqn, list(map(value, eqn.invars)))
+            known.update(zip(eqn.outvars, results, strict=True))
+        return list(map(value, closed.jaxpr.outvars))
+
+    def _read_equation(self, eqn: core.JaxprEqn, operands: list[Any]) -> list[Any]:
+        if eqn.primitive.name == "jit":
+            return self.read(eqn.params["jaxpr"], operands)
+        if any(isinstance(x, _Pixel) for x in operands):
+            return [self._add(eqn, operands)]
+        results = bind(eqn, *operands)
+        if eqn.primitive.name == "broadcast_in_dim" and jnp.ndim(operands[0]) == 0:
+            self._scalars[id(results[0])] = (results[0], operands[0])
+        elif self._is_elementwise(eqn):
+            # Of an image, as its red: the kernel computes it if it is needed there.
+            self._equations[id(results[0])] = (results[0], eqn, operands)
+        return results
+
+    def _is_elementwise(self, eqn: core.JaxprEqn) -> bool:
+        aval = row_aval(eqn.outvars[0])
+        fits = aval.shape == self.shape and aval.dtype.name in _DTYPES
+        return eqn.primitive.name in _ELEMENTWISE and fits
+
+    def _add(self, eqn: core.JaxprEqn, operands: Sequence[Any]) -> _Pixel:
+        if not self._is_elementwise(eqn):
+            raise _NotPerPixelError
+        self._steps.append((eqn, list(map(self._operand, operands))))
+        return _Pixel(self.num_planes + len(self._steps) - 1)
+
+    def _operand(self, x: Any) -> _Pixel | _Given:
+        if isinstance(x, _Pixel):
+            return x
+        _, x = self._scalars.get(id(x), (x, x))
+        if not isinstance(x, jax.Array) and jnp.ndim(x) == 0:
+            return _Given("constant", x)
+        if id(x) not in self._found:
+            self._found[id(x)] = (x, self._find(x))
+        return self._found[id(x)][1]
+
+    def _find(self, x: Any) -> _Pixel | _Given:
+        if id(x) in self._equations:
+            with suppress(_NotPerPixelError):  # then the image itself may be read
+                return self._add(*self._equations[id(x)][1:])
+        if x.shape not in ((), self.shape) or x.dtype.name not in _DTYPES[:-1]:
+            raise _NotPerPixelError
+        group, array = ("image", self.images) if x.shape else ("number", self.numbers)
+        array.append(x)
+        return _Given(group, len(array) - 1)
+
+
+def per_pixel(change: Callable[[Frame], jax.Array], frame: Frame) -> PerPixel | None:
+    """Return a change of a frame into an array of its size; None if it is not made pixel by pixel.
+
+    Args:
+        change: of a frame.
+        frame: shapes and dtypes of the frame's planes.
+    """
+    closed = jax.make_jaxpr(change)(frame)
+    planes = [_Pixel(place) for place in range(len(closed.jaxpr.invars))]
+    found = PerPixel(frame.r.shape, len(planes))
+    try:
+        (result,) = found.read(closed, planes)
+    except _NotPerPixelError:
+        return None
+    last = len(planes) + len(found._steps) - 1
+    return found if found._steps and result == _Pixel(last) else None

@@ -1,0 +1,81 @@
+"""Rows that are computed in chunks are those that are computed together, and by ``jax.vmap``."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import pixelbrax_jax as pb
+from pixelbrax_jax._platform import batches
+from pixelbrax_jax._platform.batches import chunk_size, map_runs, step_rows
+from tests.envs.toy import PARAMS, Ball
+
+
+@pytest.mark.parametrize(
+    ("num_rows", "size"),
+    [(1, 1), (100, 100), (128, 128), (130, 65), (256, 128), (257, 257), (1000, 125), (8192, 128)],
+)
+def test_a_chunk_is_the_largest_divisor_within_bounds(num_rows, size):
+    assert chunk_size(num_rows) == size
+
+
+def step(state, row, shared):
+    """Rows of two arrays, one of them empty, as some engines carry."""
+    x = jnp.tanh(state["x"] @ shared + row)
+    return {"x": x, "empty": state["empty"]}, x.sum()
+
+
+@pytest.mark.parametrize("last", [True, False])
+@pytest.mark.parametrize("num_rows", [1, 6, 7])
+def test_chunks_give_what_the_whole_gives(num_rows, last, monkeypatch):
+    keys = jax.random.split(jax.random.key(num_rows), 3)
+    state = {"x": jax.random.normal(keys[0], (num_rows, 3)), "empty": jnp.zeros((num_rows, 0))}
+    row, shared = jax.random.normal(keys[1], (num_rows, 3)), jax.random.normal(keys[2], (3, 3))
+    expected = jax.jit(jax.vmap(step, in_axes=(0, 0, None)))(state, row, shared)
+    for largest in (128, 4, 3, 1):
+        monkeypatch.setattr(batches, "_CHUNK", largest)
+        actual = jax.jit(partial(step_rows, step, last=last))(state, row, shared)
+        for a, b in zip(jax.tree.leaves(actual), jax.tree.leaves(expected), strict=True):
+            assert a.shape == b.shape
+            np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)
+
+
+def test_physics_say_which_axis_a_batch_is(monkeypatch):
+    """An engine that is faster with the environments as first axis is computed by `jax.vmap`."""
+
+    def fail(*args, **kwargs):
+        raise AssertionError("the batch is the last axis")
+
+    class BallByFirstAxis(Ball):
+        batch_last = False
+
+    monkeypatch.setattr(batches, "batch_last", fail)
+    for physics in (BallByFirstAxis(), Ball()):
+        envs = pb.VectorPixelEnv(pb.PixelEnv(physics, obs_mode="state", frame_stack=9), 3)
+        state, _ = jax.eval_shape(envs.reset, jax.random.key(0), PARAMS)
+        if physics.__class__ is BallByFirstAxis:
+            jax.eval_shape(envs.step, state, jnp.zeros((3, 1)), PARAMS)
+        else:
+            with pytest.raises(AssertionError, match="last axis"):
+                jax.eval_shape(envs.step, state, jnp.zeros((3, 1)), PARAMS)
+
+
+@pytest.mark.parametrize(("platform", "loops"), [("cpu", 1), ("cuda", 0)])
+def test_only_a_cpu_has_a_loop_over_chunks(platform, loops):
+    states, rows = jnp.zeros((256, 3)), jnp.zeros((256, 3))
+
+    def put(states, rows):
+        moved, sums = step_rows(step, {"x": states, "empty": states[:, :0]}, rows, jnp.eye(3))
+        return moved["x"], sums
+
+    text = jax.jit(put).trace(states, rows).lower(lowering_platforms=(platform,)).as_text()
+    assert text.count("stablehlo.while") == loops
+
+
+def test_runs_are_mapped_one_after_the_other_on_a_cpu():
+    runs = jnp.arange(6.0).reshape(3, 2)
+    np.testing.assert_array_equal(map_runs(lambda run: run * 2.0, runs), runs * 2.0)

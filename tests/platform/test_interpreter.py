@@ -1,0 +1,248 @@
+"""Programs computed with the batch as last axis are those of ``jax.vmap``."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.sharding import AxisType
+from jax.sharding import PartitionSpec as P
+
+from pixelbrax_jax._platform import interpreter as module
+from pixelbrax_jax._platform.interpreter import batch_last
+from pixelbrax_jax._platform.lowering import by_platform
+from tests.platform.equations import equations
+
+TABLE = jnp.arange(12.0).reshape(4, 3)
+
+
+@jax.custom_jvp
+def doubled(x):
+    return 2 * x
+
+
+@doubled.defjvp
+def _(primals, tangents):
+    return doubled(*primals), 7 * tangents[0]
+
+
+def late(x):
+    """A loop whose second carry meets the batch in its second turn only, and a counter."""
+
+    def turn(i, carry):
+        a, b, _ = carry
+        return x[i % 3] + a, a, b
+
+    return jax.lax.fori_loop(0, 4, turn, (jnp.float32(0), jnp.float32(1), jnp.float32(2)))
+
+
+def until_nine(x):
+    return jax.lax.while_loop(lambda y: y[0] < 9, lambda y: y + 1.5, x)
+
+
+def until_even(x):
+    """A loop with constants of a row, a counter that all rows share, and rows that end apart."""
+    return jax.lax.while_loop(
+        lambda c: (c[0] < 7) & (c[1] < x[0] + 2),
+        lambda c: (c[0] + 1, c[1] + jnp.abs(x[1]), c[2] * TABLE[0] + x),
+        (jnp.int32(0), x[2], TABLE[1]),
+    )
+
+
+def as_often_for_all(x):
+    """A loop that ends for all rows at once, with a carry that stays the same for all."""
+    return jax.lax.while_loop(
+        lambda c: c[0] < 3, lambda c: (c[0] + 1, c[1] + x, 2 * c[2]), (0, x, TABLE[1])
+    )
+
+
+def nested(x):
+    def outer(carry, row):
+        return jax.lax.scan(lambda c, y: (c + y * carry, c * y), carry, row)
+
+    return jax.lax.scan(outer, x[0], jnp.stack([x, TABLE[0], 2 * x]), reverse=True)
+
+
+FUNCTIONS = {
+    "elementwise": lambda x: jnp.sin(x) * 2 + jnp.where(x > 0, x, TABLE[0]) ** 3,
+    "a scalar chooses": lambda x: jnp.where(x[0] > 0, x, TABLE[1]),
+    "clamp": lambda x: jax.lax.clamp(0.1, x, 0.5),
+    "casts": lambda x: (x * 10).astype(jnp.int32) % 3,
+    "broadcast": lambda x: x[:, None] + x[None] + TABLE[0][:, None],
+    "reshape": lambda x: jnp.outer(x, x).reshape(-1)[::2],
+    "reshape in another order": lambda x: jnp.outer(x, TABLE[1]).reshape(-1, order="F"),
+    "transpose": lambda x: jnp.outer(x, TABLE[2]).T,
+    "slices": lambda x: (x[1:], x[::-1], x[0:3:2], jnp.split(x, 3)),
+    "pad": lambda x: jnp.pad(x, (1, 2), constant_values=4.0),
+    "pad with a row's own": lambda x: jax.lax.pad(x, x[0], ((1, 0, 1),)),
+    "concatenate": lambda x: jnp.concatenate([x, TABLE[0], jnp.zeros(1)]),
+    "stack": lambda x: (jnp.stack([x, TABLE[0]]), jnp.stack([TABLE[0], x], axis=-1)),
+    "tile": lambda x: jnp.tile(jnp.outer(x, x), (2, 3)),
+    "take the same": lambda x: jnp.outer(x, x)[jnp.array([2, 0, 0])],
+    "take one's own": lambda x: TABLE[jnp.argmax(x)],
+    "dynamic slice": lambda x: jax.lax.dynamic_slice(x, (jnp.int32(1),), (2,)),
+    "dynamic slice before the start": lambda x: jax.lax.dynamic_slice(x, (jnp.int32(-5),), (1,)),
+    "dynamic slices in a loop": lambda x: jax.lax.map(lambda i: x[i], jnp.arange(-5, 5)),
+    "dynamic slice of a scalar": lambda x: jax.lax.dynamic_slice(x[0], (), ()),
+    "dynamic slice of one's own": lambda x: jax.lax.dynamic_slice(x, (jnp.argmax(x),), (2,)),
+    "take beyond the end": lambda x: (
+        jnp.take(x, jnp.array([1, 7]), mode="clip"),
+        x.at[jnp.array([1, 7])].get(mode="fill", fill_value=3),
+    ),
+    "add at the same": lambda x: jax.ops.segment_sum(jnp.outer(x, x), jnp.array([1, 0, 1]), 4),
+    "add at the same, to all the same": lambda x: TABLE.at[jnp.array([1, 3])].add(x),
+    "add at one's own": lambda x: TABLE.at[jnp.argmax(x)].add(x),
+    "set": lambda x: (x.at[1].set(5.0), TABLE.at[2].set(x), TABLE.at[jnp.array([1, 1])].max(x)),
+    "reductions": lambda x: (x.sum(), x.max(), jnp.argmin(x), jnp.cumsum(x), jnp.all(x > 0)),
+    "matrix and vector": lambda x: jnp.outer(x, x) @ x,
+    "matrix and the same": lambda x: TABLE @ x,
+    "the same and matrix": lambda x: x @ TABLE.T,
+    "batches of matrices": lambda x: jax.vmap(jnp.dot)(jnp.outer(x, x), TABLE[:3]),
+    "many axes": lambda x: jnp.einsum("ijk,kj->i", TABLE[:, :, None] * x, jnp.outer(x, x)),
+    "nothing to sum": lambda x: jnp.einsum("i,j->ij", x, x),
+    "integers": lambda x: x.astype(jnp.int32) @ jnp.arange(3),
+    "booleans": lambda x: jnp.dot(x > 0, TABLE[0] > 0),
+    "short integers": lambda x: jnp.dot(
+        x.astype(jnp.int8), jnp.full(3, 100, jnp.int8), preferred_element_type=jnp.int32
+    ),
+    "short floats": lambda x: x.astype(jnp.bfloat16) @ x.astype(jnp.bfloat16),
+    "long sums": lambda x: jnp.tile(x, 20) @ jnp.ones((60, 2)),
+    "sort": jnp.sort,
+    "calls": lambda x: jax.jit(lambda y: jax.jit(jnp.tanh)(y) + 1)(x),
+    "own derivative": doubled,
+    "late in a loop": late,
+    "loops within": nested,
+    "a loop that ends by itself": until_nine,
+    "rows that end apart": until_even,
+    "a loop that ends for all": as_often_for_all,
+    "a loop in a loop that ends": lambda x: jax.lax.while_loop(
+        lambda y: y.sum() < 20, lambda y: until_nine(y) + 1, x
+    ),
+    "a loop that ends in a loop": lambda x: jax.lax.scan(
+        lambda c, y: (c + until_nine(y)[1], c), jnp.float32(0), jnp.outer(x, x)
+    ),
+    "branches": lambda x: jax.lax.cond(x[0] > 0, jnp.sin, jnp.cos, x),
+    "branches with loops": lambda x: jax.lax.cond(x[0] > 0, late, lambda y: (y[2], x[1], 1.0), x),
+    "three branches": lambda x: jax.lax.switch(
+        jnp.argmax(x) * 2 - 1, [jnp.sin, lambda y: TABLE[0], jnp.outer(x, x).__matmul__], x
+    ),
+    "a form for CPUs": lambda x: by_platform(x[0], x, cpu=jnp.multiply, default=jnp.subtract),
+    "a form for CPUs in a loop": lambda x: jax.lax.scan(
+        lambda c, y: (c + 1.0, by_platform(c, cpu=jnp.sin, default=jnp.cos)), jnp.float32(0), x
+    ),
+    "a form for CPUs of nothing": lambda x: x + by_platform(cpu=lambda: 1.0, default=lambda: 2.0),
+    "the same branch": lambda x: jax.lax.switch(jnp.int32(1), [jnp.sin, jnp.cos], x),
+    "draws": lambda x: jax.random.normal(jax.random.fold_in(jax.random.key(0), x[0] > 0), 2),
+    "no use of it": lambda x: (TABLE, jnp.float32(3)),
+    "as it is": lambda x: x,
+    "nothing": lambda x: x[:0] @ jnp.zeros((0, 2)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+@pytest.mark.parametrize("size", [1, 3, 5, 16])
+def test_results_are_those_of_vmap(name, size):
+    x = jax.random.normal(jax.random.key(size), (size, 3))
+    expected = jax.vmap(FUNCTIONS[name])(x)
+    actual = batch_last(FUNCTIONS[name], (0,))(x)
+    for a, b in zip(jax.tree.leaves(actual), jax.tree.leaves(expected), strict=True):
+        assert a.shape == b.shape
+        assert a.dtype == b.dtype
+        np.testing.assert_allclose(a, b, rtol=2e-5, atol=1e-6)
+
+
+def test_arguments_may_be_trees_keys_and_the_same_for_all():
+    def fn(row, shift):
+        key, extra = row["key"], row["none"]
+        assert extra is None
+        return {"key": jax.random.split(key)[0], "sum": row["x"] + shift["y"]}
+
+    row = {
+        "key": jax.random.split(jax.random.key(1), 6),
+        "none": None,
+        "x": jnp.arange(6.0),
+    }
+    shift = {"y": jnp.float32(2)}
+    actual = batch_last(fn, (0, None))(row, shift)
+    expected = jax.vmap(fn, in_axes=(0, None))(row, shift)
+    assert jax.tree.structure(actual) == jax.tree.structure(expected)
+    assert jnp.array_equal(actual["key"], expected["key"])
+    np.testing.assert_array_equal(actual["sum"], expected["sum"])
+
+
+def test_numbers_of_rows_must_agree():
+    fn = batch_last(lambda x, y: x + y, (0, 0))
+    with pytest.raises(ValueError, match=r"same number of rows, got \[2, 3\]"):
+        fn(jnp.ones(3), jnp.ones(2))
+    assert batch_last(lambda _, y: y + 1, (0, 0))(None, jnp.ones(0)).shape == (0,)
+
+
+def test_a_shard_map_that_tracks_what_varies():
+    mesh = jax.make_mesh((1,), ("i",), axis_types=(AxisType.Auto,))
+    double = batch_last(lambda x: x * 2.0, (0,))
+    sharded = jax.shard_map(double, mesh=mesh, in_specs=P("i"), out_specs=P("i"))
+    np.testing.assert_array_equal(jax.jit(sharded)(jnp.ones(5)), jnp.full(5, 2.0))
+
+
+def test_equations_keep_their_contexts():
+    def draw(x):
+        with jax.threefry_partitionable(False):
+            return jax.random.normal(jax.random.key(0), (4,)) + x
+
+    actual = batch_last(draw, (0,))(jnp.zeros(2))
+    np.testing.assert_array_equal(actual, jax.vmap(draw)(jnp.zeros(2)))
+
+
+@pytest.mark.parametrize("function", ["_scan_sizes", "bind", "_reshape_wrongly"])
+def test_what_is_not_known_is_computed_by_vmap(monkeypatch, function):
+    """As if a release of JAX had other parameters, or shapes that no rule foresaw."""
+    if function == "_reshape_wrongly":
+        monkeypatch.setitem(module.RULES, "reshape", lambda eqn, inputs, size: [inputs[0].value])
+    else:
+        monkeypatch.setattr(module, function, lambda *_: {}["num_carry"])
+    monkeypatch.setattr(module, "_warned", [])
+
+    def fn(x):
+        return nested(x)[1].reshape(-1), jax.jit(jnp.sin)(x)
+
+    x = jax.random.normal(jax.random.key(0), (5, 3))
+    with pytest.warns(RuntimeWarning, match=r"jax .* has programs .* computed by jax\.vmap"):
+        actual = jax.jit(batch_last(fn, (0,)))(x)
+    for a, b in zip(actual, jax.jit(jax.vmap(fn))(x), strict=True):
+        np.testing.assert_array_equal(a, b)
+    # One warning is enough; warnings are errors here.
+    batch_last(fn, (0,))(x)
+
+
+def test_mistakes_of_the_function_itself_are_not_hidden():
+    with pytest.raises(ZeroDivisionError):
+        batch_last(lambda x: x * (1 // 0), (0,))(jnp.ones(5))
+
+
+@pytest.mark.parametrize("size", [4, 5])
+def test_derivatives_are_those_of_vmap(size):
+    def loss(form, x):
+        return jnp.sum(form(lambda y: doubled(y) @ jnp.stack([y, TABLE[1], y * y]))(x))
+
+    x = jnp.linspace(-1, 1, 3 * size).reshape(size, 3)
+    actual = jax.grad(lambda x: loss(lambda fn: batch_last(fn, (0,)), x))(x)
+    np.testing.assert_allclose(actual, jax.grad(lambda x: loss(jax.vmap, x))(x), rtol=1e-5)
+
+
+@pytest.mark.parametrize("join", [jnp.stack, jnp.concatenate])
+def test_joined_arrays_are_behind_a_barrier(join):
+    jaxpr = jax.make_jaxpr(batch_last(lambda x: join([x, jnp.sin(x)]), (0,)))(jnp.ones((5, 3)))
+    held = {id(eqn.invars[0]) for eqn in equations(jaxpr.jaxpr) if "barrier" in eqn.primitive.name}
+    names = ("concatenate", "stack")
+    joined = [eqn for eqn in equations(jaxpr.jaxpr) if eqn.primitive.name in names]
+    assert joined
+    assert {id(eqn.outvars[0]) for eqn in joined} == held
+
+
+@pytest.mark.parametrize("size", [4, 5])
+def test_products_of_few_rows_are_sums_over_an_axis(size):
+    jaxpr = jax.make_jaxpr(batch_last(jnp.dot, (0, 0)))(jnp.ones((size, 3)), jnp.ones((size, 3)))
+    names = [eqn.primitive.name for eqn in equations(jaxpr.jaxpr)]
+    assert "dot_general" not in names
+    assert ("reduce_sum" in names) == (size == 4)
