@@ -283,15 +283,6 @@ def test_gymnasiums_tools_know_our_spaces():
         jax.tree.map(assert_array_equal, read_from_shared_memory(one, memory, 3), obs)
 
 
-def test_attributes_of_the_environments_as_gymnasiums_own_vectors_have_them():
-    envs = make_vec(**PICTURES)
-    envs.reset(seed=0)
-    assert_array_equal(envs.call("render"), envs.render())
-    assert envs.get_attr("render_mode") == ("rgb_array",) * 3
-    envs.set_attr("difficulty", [1, 2, 3])
-    assert envs.get_attr("difficulty") == (1, 2, 3)
-
-
 def test_workers_that_are_spawned_hand_out_the_same():
     envs = gymnasium.vector.AsyncVectorEnv([make] * 3, context="spawn")
     plain, steps = play(make_vec(), MANY), play(envs, MANY)

@@ -42,15 +42,21 @@ class Adapter:
         self.env = env
 
     @property
+    def snapshot(self) -> Any:
+        """What is kept between two calls."""
+        return getattr(self.env, "unwrapped", self.env)._stateful._snapshot
+
+    @property
     def ended(self) -> np.ndarray:
         """Where an episode has ended and no other one has begun."""
-        return np.atleast_1d(np.asarray(self.env.unwrapped._stateful._snapshot.ended))
+        return np.atleast_1d(np.asarray(self.snapshot.ended))
 
     def held(self) -> bytes:
         """The state that the environment holds, and what the adapter keeps beside it."""
-        snapshot = self.env.unwrapped._stateful._snapshot
-        begun = self.env._begun[1] if hasattr(self.env, "_begun") else b""
-        return b"".join(np.asarray(x).tobytes() for x in (*snapshot.packed, snapshot.ended, begun))
+        snapshot = self.snapshot
+        begun = self.env._begun[1] if isinstance(self, TorchRL) else ()
+        kept = (*snapshot.packed, snapshot.ended, begun)
+        return b"".join(np.asarray(array).tobytes() for array in kept)
 
     def reset(self, seed: int = 0) -> Any:
         """Reset all; return what the environment does."""
@@ -104,8 +110,9 @@ class Vector(Adapter):
             elif self.mode == "same_step" and (results[1] or results[2]):
                 assert length == 0
                 length = int(infos["final_info"]["episode_length"][i])
-                events += [Event(i, False, row_of(infos["final_obs"][i], ...), *results, length)]
-                events += [firsts[i]]
+                last = infos["final_obs"]
+                last = row_of(last, i) if isinstance(last, dict) else last[i]
+                events += [Event(i, False, last, *results, length), firsts[i]]
             else:
                 events.append(Event(i, False, row_of(obs, i), *results, length))
         return events, returned
@@ -180,4 +187,9 @@ ADAPTERS = {
 
 def as_bytes(returned: Any) -> Any:
     """The bits of all that a call returned."""
-    return jax.tree.map(lambda x: None if x is None else np.asarray(x).tobytes(), returned)
+
+    def bits(leaf: Any) -> Any:
+        array = np.asarray(leaf)
+        return as_bytes(list(array)) if array.dtype == object else array.tobytes()
+
+    return jax.tree.map(bits, returned)

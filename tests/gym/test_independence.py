@@ -33,8 +33,7 @@ def test_writing_to_results_changes_nothing_later(name):
         returned = dirty.call()[1]
         assert as_bytes(returned) == as_bytes(clean.call()[1])
     spoil(returned)
-    # A reset of all at any time, be the episodes at their end or not.
-    assert as_bytes(dirty.env.reset()) == as_bytes(clean.env.reset())
+    assert as_bytes(dirty.reset(seed=7)) == as_bytes(clean.reset(seed=7))
 
 
 @pytest.mark.parametrize("name", sorted(set(ADAPTERS) - {"single"}))

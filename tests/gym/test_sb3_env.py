@@ -6,7 +6,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium import error
-from stable_baselines3 import PPO, SAC
+from stable_baselines3 import PPO
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.preprocessing import is_image_space_channels_first
@@ -208,26 +208,6 @@ def test_ppo_takes_channels_first(make_sb3):
     model = PPO("CnnPolicy", env, n_steps=4, batch_size=12, n_epochs=1, policy_kwargs=SMALL_NET)
     assert model.get_env() is env
     model.learn(12)
-
-
-def test_ppo_takes_both(make_sb3):
-    kwargs = {"net_arch": [8]}
-    env = make_sb3(obs_mode="both", **LARGE)
-    PPO("MultiInputPolicy", env, n_steps=4, batch_size=12, n_epochs=1, policy_kwargs=kwargs).learn(
-        12
-    )
-
-
-def test_sac_learns(make_sb3):
-    SAC(
-        "CnnPolicy",
-        make_sb3(**LARGE),
-        buffer_size=100,
-        learning_starts=6,
-        batch_size=4,
-        train_freq=2,
-        policy_kwargs=SMALL_NET,
-    ).learn(18)
 
 
 def test_float64_actions_are_rounded(make_sb3):

@@ -102,15 +102,23 @@ def test_devices_must_agree():
         dlpack.actions_to_jax(torch.zeros(1, device="meta"), jax.devices("cpu")[0])
 
 
-def test_missing_torch_names_the_cure(monkeypatch):
+@pytest.mark.parametrize(
+    ("package", "module", "extra"),
+    [
+        ("torch", "pixelbrax_gym.interop.dlpack", "torch"),
+        ("torchrl", "pixelbrax_gym.torchrl.env", "torchrl"),
+        ("stable_baselines3", "pixelbrax_gym.sb3.vec_env", "sb3"),
+    ],
+)
+def test_a_missing_package_is_named_with_the_cure(monkeypatch, package, module, extra):
     real = builtins.__import__
 
-    def without_torch(name, *args, **kwargs):
-        if name == "torch":
+    def without(name, *args, **kwargs):
+        if name.partition(".")[0] == package:
             raise ImportError(name)
         return real(name, *args, **kwargs)
 
-    monkeypatch.setattr(builtins, "__import__", without_torch)
-    monkeypatch.delitem(sys.modules, "pixelbrax_gym.interop.dlpack", raising=False)
-    with pytest.raises(ImportError, match=r'pip install "pixelbrax\[torch\]"'):
-        importlib.import_module("pixelbrax_gym.interop.dlpack")
+    monkeypatch.setattr(builtins, "__import__", without)
+    monkeypatch.delitem(sys.modules, module, raising=False)
+    with pytest.raises(ImportError, match=rf'pip install "pixelbrax\[{extra}\]"'):
+        importlib.import_module(module)

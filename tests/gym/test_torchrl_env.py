@@ -495,22 +495,3 @@ def test_pixel_spec_behaves_as_unbounded():
         assert spec.to(torch.float32).dtype == torch.float32
     assert type(ours.to(torch.float32)) is PixelSpec
     assert "PixelSpec" in repr(ours)
-
-
-@pytest.mark.parametrize("package", ["torch", "torchrl"])
-def test_missing_torchrl_names_the_cure(monkeypatch, package):
-    import builtins
-    import importlib
-    import sys
-
-    real = builtins.__import__
-
-    def without(name, *args, **kwargs):
-        if name.partition(".")[0] == package:
-            raise ImportError(name)
-        return real(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", without)
-    monkeypatch.delitem(sys.modules, "pixelbrax_gym.torchrl.env", raising=False)
-    with pytest.raises(ImportError, match=r'pip install "pixelbrax\[torch(rl)?\]"'):
-        importlib.import_module("pixelbrax_gym.torchrl.env")
