@@ -10,10 +10,9 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 
-from pixelbrax_jax.agents.config import TrainConfig, make_env
+from pixelbrax_jax.agents.config import TrainConfig
 from pixelbrax_jax.agents.rollout import Environments, split_obs
 from pixelbrax_jax.agents.train_state import Metrics, Networks, TrainState
-from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.types import EnvParams
 
@@ -27,8 +26,6 @@ class Algorithm(ABC):
     Attributes:
         config: its settings, of ``config_class``.
         envs: the environments it plays in.
-        name: what it is called.
-        config_class: the class of its settings.
         acting: names of the networks that ``act`` needs, which evaluation and export take.
 
     Raises:
@@ -48,37 +45,25 @@ class Algorithm(ABC):
 
     @abstractmethod
     def init(self, key: jax.Array, env_params: EnvParams) -> TrainState:
-        """Return the state before the first iteration.
-
-        Args:
-            key: typed PRNG key of the run.
-            env_params: of the environments.
-        """
+        """Return the state before the first iteration of the run with a typed PRNG key."""
 
     @abstractmethod
     def iterate(self, state: Any, env_params: EnvParams) -> tuple[TrainState, Metrics]:
         """Play ``config.steps_per_iteration`` control steps and learn.
 
-        Args:
-            state: where training stands, of the class that ``init`` returns.
-            env_params: of the environments.
-
         Returns:
-            The state, its ``iteration`` greater by 1, and scalars, among them those of
-            ``Rollout.episode_metrics``.
+            The state, of the class that ``init`` returns, its ``iteration`` greater by 1; and
+            scalars, among them those of ``Rollout.episode_metrics``.
         """
 
     @abstractmethod
     def act(self, networks: Networks, pixels: jax.Array, key: jax.Array | None = None) -> jax.Array:
-        """Return actions.
+        """Return (N, A) float32 actions for (N, H, W, 3 K) uint8 pixels.
 
         Args:
             networks: parameters; those of ``acting`` are enough.
-            pixels: (N, H, W, 3 K) uint8.
+            pixels: what is seen.
             key: for sampled actions; None returns the best ones.
-
-        Returns:
-            (N, A) float32.
         """
 
     @property
@@ -91,30 +76,8 @@ class Algorithm(ABC):
         raise NotImplementedError(f"{self.name} has no auxiliary phase.")
 
 
-def environments(
-    config: TrainConfig, envs: Environments | None, env_params: EnvParams | None
-) -> tuple[Environments, EnvParams]:
-    """Return the given environments and their parameters, or those that ``config`` names.
-
-    Raises:
-        ValueError: one of the two is given without the other.
-    """
-    if envs is not None and env_params is not None:
-        return envs, env_params
-    if envs is not None or env_params is not None:
-        missing = "envs" if envs is None else "env_params"
-        raise ValueError(f"envs and env_params belong together, got no {missing}.")
-    env, env_params = make_env(config)
-    return VectorPixelEnv(env, config.num_envs), env_params
-
-
 def check_environments(config: TrainConfig, envs: Environments) -> None:
-    """Reject environments that are not what the settings say.
-
-    Raises:
-        ValueError: naming the setting and both values.
-        TypeError: they cannot be hashed, which programs are shared by.
-    """
+    """Reject environments that are not what the settings say, or cannot be hashed."""
     try:
         hash(envs)
     except TypeError as error:
@@ -150,18 +113,7 @@ def check_environments(config: TrainConfig, envs: Environments) -> None:
 def train_function(
     algorithm: Algorithm, env_params: EnvParams
 ) -> Callable[[jax.Array], tuple[TrainState, Metrics]]:
-    """Return a whole run as a pure function of a key.
-
-    The function may be jitted, and mapped over keys by ``jax.vmap``.
-
-    Args:
-        algorithm: with its settings.
-        env_params: of the environments.
-
-    Returns:
-        ``train(key) -> (state, metrics)``; metrics have a leading axis of iterations, those of the
-        auxiliary phase one of phases.
-    """
+    """Return a whole run of an algorithm as a pure function, as ``make_train`` does."""
     iterations, every = algorithm.config.num_iterations, algorithm.auxiliary_every
 
     def several(state: TrainState, number: int) -> tuple[TrainState, Metrics]:

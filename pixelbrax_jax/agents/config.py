@@ -24,7 +24,11 @@ from pixelbrax_jax.validation import (
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Settings that every algorithm has."""
+    """Settings that every algorithm has.
+
+    Raises:
+        ValueError: a setting is out of range; the message says what is allowed.
+    """
 
     env: EnvConfig = EnvConfig()  # noqa: RUF009 (it is frozen)
     """Options of the environment; camera, look, clips and distractors as names."""
@@ -56,11 +60,7 @@ class TrainConfig:
     """Bytes, in 10^9, that stored frames may take; none asks the device."""
 
     def __post_init__(self) -> None:
-        """Check the settings.
-
-        Raises:
-            ValueError: a setting is out of range; the message says what is allowed.
-        """
+        """Check the settings."""
         _check_env(self.env)
         for name in ("total_steps", "num_envs"):
             check_positive_int(name, getattr(self, name))
@@ -95,10 +95,7 @@ class TrainConfig:
         return 0
 
     def replace(self, **settings: Any) -> Self:
-        """Return these settings with others, those of the environment among them by their names.
-
-        Args:
-            **settings: as ``num_envs=64`` and ``height=64``, which is that of ``env``.
+        """Return these settings with others; ``height=64`` and the like are those of ``env``.
 
         Raises:
             TypeError: a name is unknown; the message lists those there are.
@@ -129,12 +126,7 @@ def _check_env(env: EnvConfig) -> None:
 
 
 def make_env(config: TrainConfig, **changes: Any) -> tuple[PixelEnv, EnvParams]:
-    """Make the environment that a configuration names, and its parameters.
-
-    Args:
-        config: of any algorithm.
-        **changes: fields of ``EnvConfig`` that shall be others.
-    """
+    """Make the environment that settings name, with ``changes`` of ``EnvConfig``."""
     obs_mode = "both" if config.state_critic else "pixels"
     return make(config.env, **({"obs_mode": obs_mode} | changes))
 

@@ -14,11 +14,8 @@ class Optimizer:
     """Steps along the gradients of several networks, by the settings of ``config``."""
 
     def __init__(self, config: TrainConfig) -> None:
-        self._max_norm = config.max_grad_norm
+        self._config = config
         self._adam = optax.scale_by_adam(eps=config.adam_eps)
-        self._rate = optax.constant_schedule(config.learning_rate)
-        if config.anneal:
-            self._rate = optax.linear_schedule(config.learning_rate, 0.0, config.num_iterations)
 
     def init(self, networks: Networks) -> Networks:
         """Return the optimiser's state of the named networks."""
@@ -26,7 +23,11 @@ class Optimizer:
 
     def learning_rate(self, iteration: jax.Array) -> jax.Array:
         """Return () float32, the step size in an iteration, a () uint32."""
-        return jnp.float32(self._rate(iteration))
+        rate = jnp.float32(self._config.learning_rate)
+        if self._config.anneal:
+            # Rounding may make the fraction negative, which optax.linear_schedule lets pass.
+            rate *= jnp.maximum(0.0, 1.0 - iteration / self._config.num_iterations)
+        return rate
 
     def step(
         self, networks: Networks, opt_state: Networks, gradients: Networks, iteration: jax.Array
@@ -40,9 +41,9 @@ class Optimizer:
         rate = self.learning_rate(iteration)
         for name, gradient in gradients.items():
             norm = norms[name] = optax.tree.norm(gradient)
-            if self._max_norm:
+            if self._config.max_grad_norm:
                 # As PyTorch clips; optax.clip_by_global_norm has no 1e-6.
-                scale = jnp.minimum(1.0, self._max_norm / (norm + 1e-6))
+                scale = jnp.minimum(1.0, self._config.max_grad_norm / (norm + 1e-6))
                 gradient = jax.tree.map(lambda g, scale=scale: g * scale, gradient)
             updates, opt_state[name] = self._adam.update(gradient, opt_state[name])
             networks[name] = jax.tree.map(lambda p, u: p - rate * u, networks[name], updates)

@@ -6,13 +6,14 @@ from collections.abc import Callable
 
 import jax
 
-from pixelbrax_jax.agents.algorithm import Algorithm, environments, train_function
-from pixelbrax_jax.agents.config import TrainConfig
+from pixelbrax_jax.agents.algorithm import Algorithm, train_function
+from pixelbrax_jax.agents.config import TrainConfig, make_env
 from pixelbrax_jax.agents.on_policy.dcpg import DCPG
 from pixelbrax_jax.agents.on_policy.ppg import PPG
 from pixelbrax_jax.agents.on_policy.ppo import PPO
 from pixelbrax_jax.agents.rollout import Environments
 from pixelbrax_jax.agents.train_state import Metrics, TrainState
+from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.types import EnvParams
 
 ALGORITHMS: dict[str, type[Algorithm]] = {kind.name: kind for kind in (PPO, PPG, DCPG)}
@@ -21,10 +22,6 @@ ALGORITHMS: dict[str, type[Algorithm]] = {kind.name: kind for kind in (PPO, PPG,
 
 def make_algorithm(config: TrainConfig, envs: Environments) -> Algorithm:
     """Return the algorithm that settings are of.
-
-    Args:
-        config: settings.
-        envs: environments of your own.
 
     Raises:
         TypeError: no algorithm has such settings.
@@ -56,5 +53,10 @@ def make_train(
         TypeError: no algorithm has such settings.
         ValueError: one of the two is given without the other.
     """
-    envs, env_params = environments(config, envs, env_params)
+    if envs is None and env_params is None:
+        env, env_params = make_env(config)
+        envs = VectorPixelEnv(env, config.num_envs)
+    if envs is None or env_params is None:
+        missing = "envs" if envs is None else "env_params"
+        raise ValueError(f"envs and env_params belong together, got no {missing}.")
     return train_function(make_algorithm(config, envs), env_params)

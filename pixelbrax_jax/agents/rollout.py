@@ -115,7 +115,7 @@ def collect(
     num_steps: int,
     random_shift: int = 0,
 ) -> tuple[EnvState, Rollout]:
-    """Play ``num_steps`` steps.
+    """Play ``num_steps`` steps, and return where the environments are then and what happened.
 
     Args:
         envs: the environments.
@@ -125,17 +125,10 @@ def collect(
         key: of this rollout alone.
         num_steps: T.
         random_shift: pixels by which observations are shifted at most.
-
-    Returns:
-        Where the environments are then, and what happened.
     """
     num_envs = envs.num_envs
-    shift = jax.random.randint(
-        jax.random.fold_in(key, num_steps + 1),
-        (num_envs, 2),
-        -random_shift,
-        random_shift + 1,
-    )
+    shift_key = jax.random.fold_in(key, num_steps + 1)
+    shift = jax.random.randint(shift_key, (num_envs, 2), -random_shift, random_shift + 1)
     first, _ = split_obs(envs.obs(env_state))
     stack = first.shape[-1] // 3
     before = jnp.moveaxis(first.reshape(*first.shape[:-1], stack, 3), -2, 0)[:-1]
@@ -173,12 +166,7 @@ def collect(
 
 
 def observations(frames: Frames, times: jax.Array, random_shift: int = 0) -> jax.Array:
-    """Return the pixels that the agent saw at some times, as it saw them.
-
-    Args:
-        frames: of T steps of N environments.
-        times: (B, N) int32, steps of each environment.
-        random_shift: pixels by which observations were shifted at most.
+    """Return the pixels that the agent saw at (B, N) int32 times, as it saw them.
 
     Returns:
         (N B, H, W, 3 K) uint8, one environment after the other, oldest frame first.
@@ -213,15 +201,9 @@ def split_obs(obs: Any) -> tuple[Any, Any]:
 
 
 def shifted(pixels: jax.Array, shift: jax.Array, at_most: int) -> jax.Array:
-    """Shift images, and repeat their edges (Yarats et al., arXiv 2004.13649).
+    """Shift (N, H, W, C) images by (N, 2) int32 pixels down and right, and repeat their edges.
 
-    Args:
-        pixels: (N, H, W, C).
-        shift: (N, 2) int32, pixels down and right.
-        at_most: bound of the shifts, static.
-
-    Returns:
-        (N, H, W, C).
+    As Yarats et al., arXiv 2004.13649. ``at_most`` bounds the shifts; it is static.
     """
     if not at_most:
         return pixels

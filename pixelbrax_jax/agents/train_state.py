@@ -29,25 +29,18 @@ _ENVS, _NETWORKS, _ACTIONS, _UPDATES, _AUXILIARY = range(5)
 def along_envs(axis: int, *, kept: bool = True) -> Any:
     """Declare a field whose arrays have the environments along ``axis``.
 
-    Args:
-        axis: of the environments.
-        kept: whether checkpoints have it; if not, a resumed run begins with that of ``init``.
+    Checkpoints leave out what is not ``kept``; a resumed run begins with that of ``init``.
     """
     return struct.field(metadata={_ENV_AXIS: axis, _KEPT: kept})
 
 
 def without_envs(*, kept: bool = True) -> Any:
-    """Declare a field that belongs to no environment; ``kept`` as for `along_envs`."""
+    """Declare a field that belongs to no environment."""
     return struct.field(metadata={_ENV_AXIS: _NONE, _KEPT: kept})
 
 
 def as_declared(leading_axes: int = 0, *, kept: bool = True) -> Any:
-    """Declare a field whose own class declares its fields; ``kept`` as for `along_envs`.
-
-    Args:
-        leading_axes: axes that its arrays have before those that the class speaks of.
-        kept: whether checkpoints have it.
-    """
+    """Declare a field whose own class declares its fields, but for ``leading_axes`` more."""
     return struct.field(metadata={_ENV_AXIS: ("class", leading_axes), _KEPT: kept})
 
 
@@ -76,13 +69,7 @@ State = TypeVar("State", bound=TrainState)
 
 
 def env_axes(tree: Any) -> Any:
-    """Return where the environments are in each leaf of a dataclass.
-
-    Args:
-        tree: a dataclass of declared fields, or its ``jax.eval_shape``. A field may be None.
-
-    Returns:
-        The same tree; in place of a leaf its axis of environments, or -1 if it has none.
+    """Return a dataclass of declared fields with each leaf's axis of environments, or -1.
 
     Raises:
         TypeError: a field is not declared, or is none of the class that shall declare it.

@@ -13,9 +13,10 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.extend import core
 
-from pixelbrax_jax._platform.rules import bind
+from pixelbrax_jax._platform.rules import bind, row_aval
 from pixelbrax_jax.types import Frame
 
 _ELEMENTWISE_NAMES = """
@@ -86,10 +87,13 @@ class PerPixel:
         known |= dict(zip(closed.jaxpr.invars, operands, strict=True))
 
         def value(atom: core.Var | core.Literal) -> Any:
-            return atom.val if isinstance(atom, core.Literal) else known[atom]
+            if isinstance(atom, core.Literal):
+                return np.asarray(atom.val, row_aval(atom).dtype)[()]
+            return known[atom]
 
         for eqn in closed.jaxpr.eqns:
-            results = self._read_equation(eqn, list(map(value, eqn.invars)))
+            with eqn.ctx.manager:
+                results = self._read_equation(eqn, list(map(value, eqn.invars)))
             known.update(zip(eqn.outvars, results, strict=True))
         return list(map(value, closed.jaxpr.outvars))
 
@@ -107,7 +111,7 @@ class PerPixel:
         return results
 
     def _is_elementwise(self, eqn: core.JaxprEqn) -> bool:
-        aval: Any = eqn.outvars[0].aval
+        aval = row_aval(eqn.outvars[0])
         fits = aval.shape == self.shape and aval.dtype.name in _DTYPES
         return eqn.primitive.name in _ELEMENTWISE and fits
 

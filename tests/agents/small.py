@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -11,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pixelbrax_jax import EnvParams, PixelEnv, VectorPixelEnv
+from pixelbrax_jax.agents import DCPG, PPG, PPO
 from pixelbrax_jax.agents.algorithm import Algorithm
 from pixelbrax_jax.agents.train_state import TrainState
 from pixelbrax_jax.config import EnvConfig
@@ -41,28 +43,23 @@ def ball_envs() -> VectorPixelEnv:
     return VectorPixelEnv(PixelEnv(Ball(), **OPTIONS), SMALL["num_envs"])
 
 
-@partial(jax.jit, static_argnums=0)
-def _iterate(algorithm: Algorithm, state: TrainState) -> Any:
-    return algorithm.iterate(state, PARAMS)
-
-
-@partial(jax.jit, static_argnums=0)
-def _auxiliary(algorithm: Algorithm, state: TrainState) -> Any:
-    return algorithm.auxiliary(state)
-
-
+@dataclass(frozen=True)
 class Agent:
     """An algorithm, the parts of which are compiled once for equal ones."""
 
-    def __init__(self, algorithm: Algorithm) -> None:
-        self.algorithm = algorithm
-        self.config = algorithm.config
+    algorithm: Algorithm
 
-    def iterate(self, state: TrainState) -> tuple[TrainState, dict[str, Any]]:
-        return _iterate(self.algorithm, state)
+    @property
+    def config(self) -> Any:
+        return self.algorithm.config
 
-    def auxiliary(self, state: TrainState) -> tuple[TrainState, dict[str, Any]]:
-        return _auxiliary(self.algorithm, state)
+    @partial(jax.jit, static_argnums=0)
+    def iterate(self, state: TrainState) -> Any:
+        return self.algorithm.iterate(state, PARAMS)
+
+    @partial(jax.jit, static_argnums=0)
+    def auxiliary(self, state: TrainState) -> Any:
+        return self.algorithm.auxiliary(state)
 
     def init(self, seed: int = 0) -> TrainState:
         return self.algorithm.init(jax.random.key(seed), PARAMS)
@@ -81,6 +78,21 @@ class Agent:
     def without_steps(self, state: TrainState) -> TrainState:
         """``state`` after the last iteration: annealed, the step size is 0 from there on."""
         return state.replace(iteration=jnp.uint32(self.config.num_iterations))
+
+
+def small_agent(kind: type[Algorithm], **settings: Any) -> Agent:
+    """An agent of ``SMALL`` and, if it has such phases, ``PHASIC``, with other settings."""
+    phasic = PHASIC if "aux_epochs" in kind.config_class.__dataclass_fields__ else {}
+    return Agent(kind(kind.config_class(**SMALL | phasic | settings), ball_envs()))
+
+
+AGENTS = {
+    "ppo": small_agent(PPO, update_epochs=1, vf_coef=1.0),
+    "ppg": small_agent(PPG),
+    "dcpg": small_agent(DCPG),
+    # With everything there is: a critic of its own, an averaged actor, and a dynamics head.
+    "decoupled": small_agent(DCPG, decoupled=True, dynamics_coef=1.0),
+}
 
 
 def with_iterate(

@@ -8,39 +8,21 @@ import numpy as np
 import pytest
 
 from pixelbrax_jax.agents.algorithm import train_function
-from pixelbrax_jax.agents.on_policy.dcpg import DCPG, DCPGConfig
 from pixelbrax_jax.agents.on_policy.losses import value_loss
-from pixelbrax_jax.agents.on_policy.ppg import PPG, PPGConfig
-from pixelbrax_jax.agents.on_policy.ppo import PPO, PPOConfig
-from tests.agents.small import PARAMS, PHASIC, SMALL, Agent, assert_close, ball_envs, same
+from pixelbrax_jax.agents.on_policy.ppg import PPG
+from pixelbrax_jax.agents.on_policy.ppo import PPO
+from tests.agents.small import AGENTS, PARAMS, PHASIC, SMALL, assert_close, same, small_agent
 
 ITERATIONS = 3
 """Of a run: an auxiliary phase comes after the second one."""
 
 
-@pytest.fixture(scope="module")
-def envs():
-    return ball_envs()
+PPO_AGENT, PPG_AGENT = AGENTS["ppo"], AGENTS["ppg"]
 
 
-@pytest.fixture(scope="module")
-def ppo(envs):
-    return Agent(PPO(PPOConfig(**SMALL, update_epochs=1, vf_coef=1.0), envs))
-
-
-@pytest.fixture(scope="module")
-def ppg(envs):
-    return Agent(PPG(PPGConfig(**SMALL, **PHASIC, vf_coef=1.0), envs))
-
-
-@pytest.fixture(scope="module")
-def dcpg(envs):
-    return Agent(DCPG(DCPGConfig(**SMALL, **PHASIC), envs))
-
-
-@pytest.fixture(params=["ppo", "ppg", "dcpg"])
+@pytest.fixture(params=AGENTS)
 def agent(request):
-    return request.getfixturevalue(request.param)
+    return AGENTS[request.param]
 
 
 def test_the_same_key_gives_the_same_run_and_another_another(agent):
@@ -84,9 +66,8 @@ def test_the_step_size_of_a_run_falls_along_a_line(agent):
     np.testing.assert_allclose(rates, expected, rtol=1e-5)
 
 
-def test_ppg_without_auxiliary_phases_is_ppo(ppo, ppg, envs):
-    config = PPGConfig(**SMALL | PHASIC | {"aux_epochs": 0}, vf_coef=1.0)
-    assert PPG(config, envs).auxiliary_every == 0
+def test_ppg_without_auxiliary_phases_is_ppo():
+    assert small_agent(PPG, aux_epochs=0).algorithm.auxiliary_every == 0
 
     def shared(networks):
         """All but the value head, which PPO's actor does not have."""
@@ -95,38 +76,37 @@ def test_ppg_without_auxiliary_phases_is_ppo(ppo, ppg, envs):
             "critic": networks["critic"],
         }
 
-    one, other = ppo.init(), ppg.init()
+    one, other = PPO_AGENT.init(), PPG_AGENT.init()
     assert same(shared(one.networks), shared(other.networks))
     for _ in range(ITERATIONS):
-        one, facts = ppo.iterate(one)
-        other, more_facts = ppg.iterate(other)
+        one, facts = PPO_AGENT.iterate(one)
+        other, more_facts = PPG_AGENT.iterate(other)
         assert same(shared(one.networks), shared(other.networks))
         assert same(facts, more_facts)
     assert same(one.env_state, other.env_state)
     assert same(one.scaler, other.scaler)
 
 
-def test_ppg_s_actor_keeps_its_value_head_until_the_auxiliary_phase(ppg):
-    state = ppg.init()
+def test_ppg_s_actor_keeps_its_value_head_until_the_auxiliary_phase():
+    state = PPG_AGENT.init()
     head = state.networks["actor"]["params"]["value"]
     for _ in range(2):
-        state, _ = ppg.iterate(state)
+        state, _ = PPG_AGENT.iterate(state)
         assert same(state.networks["actor"]["params"]["value"], head)
-    state, _ = ppg.auxiliary(state)
+    state, _ = PPG_AGENT.auxiliary(state)
     learned = state.networks["actor"]["params"]["value"]
     assert not same(learned, head)
     # The policy's Adam has never had a gradient of that head, and does not move it now.
-    state, _ = ppg.iterate(state)
+    state, _ = PPG_AGENT.iterate(state)
     assert same(state.networks["actor"]["params"]["value"], learned)
 
 
-def test_ppg_s_passes_of_the_value_alone_leave_the_policy_alone(ppg, envs):
-    config = PPGConfig(**SMALL, **PHASIC, vf_coef=1.0, value_epochs=3)
-    longer = Agent(PPG(config, envs))
-    state = ppg.init()
+def test_ppg_s_passes_of_the_value_alone_leave_the_policy_alone():
+    longer = small_agent(PPG, value_epochs=3)
+    state = PPG_AGENT.init()
     # Adam's moments are not 0 then, so that it would move what has a gradient of 0.
-    state, _ = ppg.iterate(state)
-    one, _ = ppg.iterate(state)
+    state, _ = PPG_AGENT.iterate(state)
+    one, _ = PPG_AGENT.iterate(state)
     three, _ = longer.iterate(state)
     assert_close(one.networks["actor"], three.networks["actor"], rtol=1e-4, atol=1e-6)
     assert_close(one.opt_state["actor"], three.opt_state["actor"], rtol=1e-3, atol=1e-6)
@@ -135,9 +115,8 @@ def test_ppg_s_passes_of_the_value_alone_leave_the_policy_alone(ppg, envs):
     assert counts == {"actor": 2 + 2, "critic": 2 + 6}
 
 
-def test_an_update_stops_once_the_policy_has_moved_too_far(envs):
-    config = PPOConfig(**SMALL | {"learning_rate": 0.03}, update_epochs=3, target_kl=1e-4)
-    agent = Agent(PPO(config, envs))
+def test_an_update_stops_once_the_policy_has_moved_too_far():
+    agent = small_agent(PPO, learning_rate=0.03, update_epochs=3, target_kl=1e-4)
     state, facts = agent.iterate(agent.init())
     # The first of 6 minibatches sees the policy that played; the second one sees that it has
     # moved, and is the last one that is used.
@@ -148,53 +127,45 @@ def test_an_update_stops_once_the_policy_has_moved_too_far(envs):
     assert {int(moments.count) for moments in still.opt_state.values()} == {2 + 6}
 
 
-@pytest.fixture(scope="module")
-def pixels():
-    return jax.random.randint(jax.random.key(0), (6, 18, 18, 6), 0, 256).astype(jnp.uint8)
-
-
-def value_gradient(envs, pixels, layout):
+def moved_by_value(layout: str) -> set[str]:
     """Which layers of which networks a value loss moves, with a layout of PPG."""
-    algorithm = PPG(PPGConfig(**SMALL, **PHASIC, layout=layout), envs)
-    agent, networks = algorithm.agent, algorithm.init_networks(jax.random.key(0))
+    algorithm = small_agent(PPG, layout=layout).algorithm
+    pixels = jax.random.randint(jax.random.key(0), (6, 18, 18, 6), 0, 256).astype(jnp.uint8)
 
     @jax.jit
     @jax.grad
     def gradient(networks):
-        _, value = agent(networks, pixels, None)
+        _, value = algorithm.agent(networks, pixels, None)
         return value_loss(value, jnp.ones(6), jnp.ones(6))
 
     return {
-        (name, layer): any(bool(jnp.any(x != 0)) for x in jax.tree.leaves(slopes))
-        for name, params in gradient(networks).items()
+        f"{name} {layer}"
+        for name, params in gradient(algorithm.init_networks(jax.random.key(0))).items()
         for layer, slopes in params["params"].items()
+        if any(bool(jnp.any(x != 0)) for x in jax.tree.leaves(slopes))
     }
 
 
-def test_a_separate_value_leaves_the_actor_alone(envs, pixels):
-    moves = value_gradient(envs, pixels, "dual")
-    assert {name for (name, _), moved in moves.items() if moved} == {"critic"}
+@pytest.mark.parametrize(
+    ("layout", "moved"),
+    [
+        ("dual", {"critic Small_0", "critic value"}),
+        ("detach", {"actor value"}),
+        ("shared", {"actor Small_0", "actor value"}),
+    ],
+)
+def test_a_value_moves_what_the_layout_lets_it(layout, moved):
+    assert moved_by_value(layout) == moved
 
 
-def test_a_detached_value_moves_its_head_alone(envs, pixels):
-    moves = value_gradient(envs, pixels, "detach")
-    assert {layer for (_, layer), moved in moves.items() if moved} == {"value"}
-
-
-def test_a_shared_value_moves_the_encoder_and_no_policy_head(envs, pixels):
-    moves = value_gradient(envs, pixels, "shared")
-    assert {layer for (_, layer), moved in moves.items() if moved} == {"Small_0", "value"}
-    assert {layer for (_, layer), moved in moves.items() if not moved} == {"mean", "log_std"}
-
-
-def test_a_run_is_its_iterations_and_runs_may_be_mapped_over_keys(ppg):
+def test_a_run_is_its_iterations_and_runs_may_be_mapped_over_keys():
     keys = jax.vmap(jax.random.key)(jnp.arange(2))
-    train = train_function(ppg.algorithm, PARAMS)
+    train = train_function(PPG_AGENT.algorithm, PARAMS)
     states, metrics = jax.jit(jax.vmap(train))(keys)
-    number = ppg.config.num_iterations
+    number = PPG_AGENT.config.num_iterations
     assert number % PHASIC["num_policy_phases"], "the last phase is no whole one"
     for seed in range(2):
-        state, facts = ppg.run(ppg.init(seed), number)
+        state, facts = PPG_AGENT.run(PPG_AGENT.init(seed), number)
         one = jax.tree.map(lambda x, seed=seed: x[seed], states)
         assert int(one.iteration) == int(state.iteration) == number
         # Another batch of the same sums is rounded differently, and that adds up.

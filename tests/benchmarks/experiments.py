@@ -28,7 +28,7 @@ from pathlib import Path
 
 import pixelbrax_jax
 from pixelbrax_gym.bench.machine import describe_cpu
-from pixelbrax_gym.cli._train import parse
+from pixelbrax_gym.cli.train import read_first, settings
 from pixelbrax_jax.agents.config import TrainConfig
 from pixelbrax_jax.agents.on_policy.presets import TASK_SETTINGS, preset
 from pixelbrax_jax.agents.registry import ALGORITHMS
@@ -201,7 +201,7 @@ def run(arguments: list[str], folder: Path, until: float) -> int:
 def config_of(arguments: list[str]) -> TrainConfig:
     """The settings that a command gives."""
     _, algorithm, *line = arguments
-    return parse(algorithm, line)[1]
+    return settings(algorithm, *read_first(line))[0]
 
 
 def is_made(path: Path, arguments: list[str]) -> bool:

@@ -61,26 +61,6 @@ def test_nothing_exported_is_part_of_the_state(make_vector, mode):
         assert not pointers(outputs) & pointers(stateful._snapshot.packed)
 
 
-@pytest.mark.parametrize("mode", ["next_step", "same_step", "disabled"])
-def test_writing_to_tensors_changes_nothing_later(make_vector, mode):
-    options = {"obs_mode": "both", "autoreset_mode": mode, "output": "torch"}
-    clean, dirty = make_vector(**options), make_vector(**options)
-
-    def spoil(tree):
-        jax.tree.map(lambda x: x.fill_(1), tree)
-
-    clean.reset(seed=0)
-    spoil(dirty.reset(seed=0))
-    for _ in range(5):
-        expected = clean.step(ACTIONS)
-        actual = dirty.step(ACTIONS)
-        jax.tree.map(lambda x, y: np.testing.assert_array_equal(x, y), actual, expected)
-        spoil(actual)
-    mask = {"reset_mask": np.array([False, True, True])}
-    expected, actual = clean.reset(options=mask), dirty.reset(options=mask)
-    jax.tree.map(lambda x, y: np.testing.assert_array_equal(x, y), actual, expected)
-
-
 def test_a_kept_tensor_outlives_later_steps(make_vector):
     env = make_vector(output="torch")
     kept, _ = env.reset(seed=0)

@@ -50,10 +50,7 @@ class Normal(struct.PyTreeNode):
         """Return (...) differential entropy of the action, in nats.
 
         Exact without squashing; with it the mean of ``log(1 - tanh^2 u)`` is estimated from one
-        draw.
-
-        Args:
-            key: for that draw.
+        draw with the key.
         """
         entropy = (jnp.log(self.std) + 0.5 * (1.0 + _LOG_2PI)).sum(-1)
         if self.squash:

@@ -57,13 +57,7 @@ class Decision(NamedTuple):
 
 
 class Experience(NamedTuple):
-    """A rollout of T steps of N environments, and what follows from it.
-
-    Attributes:
-        rollout: what happened; its ``choice`` is a ``Decision``.
-        advantage: (T, N) float32, normalised over the batch if the settings say so.
-        returns: (T, N) float32.
-    """
+    """A rollout whose ``choice`` is a ``Decision``, and its advantages and returns, (T, N)."""
 
     rollout: Rollout
     advantage: jax.Array
@@ -98,13 +92,8 @@ class OnPolicy(Algorithm):
             detach: whether a shared value leaves the encoder alone.
         """
         config = self.config
-        actor = Actor(
-            config.encoder,
-            self.envs.env.action_size,
-            config.policy,
-            config.initial_std,
-            has_value=has_value,
-        )
+        action_size = self.envs.env.action_size
+        actor = Actor(config.encoder, action_size, config.policy, config.initial_std, has_value)
         critic = None if shared else Critic(config.encoder, sees_state=config.state_critic)
         return ActorCritic(actor, critic, detach)
 
@@ -186,17 +175,10 @@ class OnPolicy(Algorithm):
     def batch_at(self, experience: Experience, times: jax.Array) -> Batch:
         """Return the samples of some times, (B, N) int32."""
         rollout, advantage, returns = experience
-        frames, decision = rollout.frames, rollout.choice
-        return Batch(
-            pixels=observations(frames, times, self.config.random_shift),
-            state=None if frames.state is None else at_times(frames.state, times),
-            unclipped_action=at_times(decision.unclipped_action, times),
-            log_prob=at_times(decision.log_prob, times),
-            value=at_times(decision.value, times),
-            advantage=at_times(advantage, times),
-            returns=at_times(returns, times),
-            weight=at_times(rollout.valid, times).astype(jnp.float32),
-        )
+        pixels = observations(rollout.frames, times, self.config.random_shift)
+        weight = rollout.valid.astype(jnp.float32)
+        rows = (rollout.frames.state, *rollout.choice, advantage, returns, weight)
+        return Batch(pixels, *jax.tree.map(lambda rows: at_times(rows, times), rows))
 
     def update(
         self,
@@ -270,19 +252,10 @@ class OnPolicy(Algorithm):
 
 
 def minibatch_times(key: jax.Array, num_steps: int, num_envs: int, parts: int) -> jax.Array:
-    """Return a random partition of a rollout into minibatches.
+    """Return a random partition of T steps into M minibatches, (M, T / M, N) int32.
 
     Every minibatch has equally many steps of each environment. So a minibatch is cut along the
     environments alike, on however many devices they live.
-
-    Args:
-        key: of this epoch alone.
-        num_steps: T.
-        num_envs: N.
-        parts: number of minibatches M, a divisor of T.
-
-    Returns:
-        (M, T / M, N) int32.
     """
     keys = jax.vmap(lambda i: jax.random.fold_in(key, i))(jnp.arange(num_envs))
     order = jax.vmap(lambda key: jax.random.permutation(key, num_steps), out_axes=1)(keys)

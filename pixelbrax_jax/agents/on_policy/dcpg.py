@@ -156,16 +156,7 @@ def dynamics_loss(params: Networks, features: jax.Array, chunk: Chunk, key: jax.
     With features z, action a and features z' one step later, and a logistic loss l:
     ``l(f(z, a, z'), 1) + l(f(z, a~, z'), 0) / 2 + l(f(z, a, z~'), 0)``, with the weights of the
     authors' code. Here a~ and z~' are those of another sample. Pairs that an episode's end parts
-    are left out.
-
-    Args:
-        params: of ``Dynamics``.
-        features: (N C, F) float32 of the chunk.
-        chunk: C steps of N environments.
-        key: for the exchange.
-
-    Returns:
-        () float32.
+    are left out. ``features`` are those of the chunk, (N C, F); the key is for the exchange.
     """
 
     def in_time(rows: jax.Array) -> jax.Array:

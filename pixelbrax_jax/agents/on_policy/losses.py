@@ -29,18 +29,10 @@ def gae(
     truncation. ``o_{t+1}`` is the observation that the step returned, also of the step that ended
     the episode: a time limit does not make the future worthless.
 
-    Args:
-        reward: (T, N) float32.
-        value: (T, N) float32, V(o_t).
-        last_value: (N,) float32, V(o_T).
-        terminated: (T, N) bool.
-        truncated: (T, N) bool.
-        gamma: discount.
-        gae_lambda: lambda.
-
     Returns:
-        Advantages and returns ``A_t + V(o_t)``, (T, N) float32 each. At a step that only begins
-        an episode both are without meaning.
+        Advantages and returns ``A_t + V(o_t)``, (T, N) float32 each, of arrays (T, N) and the
+        (N,) value of the last observation. At a step that only begins an episode both are without
+        meaning.
     """
     following = jnp.concatenate([value[1:], last_value[None]])
     delta = reward + gamma * jnp.where(terminated, 0.0, following) - value
@@ -88,17 +80,7 @@ class RewardScaler(struct.PyTreeNode):
     def __call__(
         self, reward: jax.Array, done: jax.Array, valid: jax.Array, gamma: float
     ) -> tuple[RewardScaler, jax.Array]:
-        """Learn from a rollout, then scale it.
-
-        Args:
-            reward: (T, N) float32.
-            done: (T, N) bool, the step ended an episode.
-            valid: (T, N) bool, the step did not merely begin one.
-            gamma: discount.
-
-        Returns:
-            The scaler that has seen the rollout, and its rewards, scaled.
-        """
+        """Return the scaler that has seen a rollout, (T, N) each, and its rewards, scaled."""
 
         def forwards(before: jax.Array, now: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
             reward, done = now
@@ -164,13 +146,7 @@ def policy_loss(
     """Return PPO's clipped objective and the entropy bonus (Schulman et al., arXiv 1707.06347).
 
     ``- mean min(rho A, clip(rho, 1 - eps, 1 + eps) A) - c_H H`` with the ratio
-    ``rho = exp(log pi(a) - log pi_old(a))``.
-
-    Args:
-        policy: today's, of the batch's observations.
-        batch: the samples.
-        config: settings.
-        key: for entropies that are estimated.
+    ``rho = exp(log pi(a) - log pi_old(a))``. The key is for entropies that are estimated.
     """
     advantage = batch.advantage
     if config.normalize_advantage == "minibatch":

@@ -167,11 +167,7 @@ class Phasic(OnPolicy):
 
     @under_default_flags
     def auxiliary(self, state: OnPolicyState) -> tuple[OnPolicyState, Metrics]:
-        """Pass over a full buffer with an optimiser of its own.
-
-        Returns:
-            The state, and the mean of each metric over all minibatches.
-        """
+        """Pass over a full buffer with an optimiser of its own; metrics are means over steps."""
         config, optimizer, key = self.config, Optimizer(self.config), auxiliary_key(state)
         num_minibatches = config.aux_minibatches
         # The step size of the rollout before: after the last one, that of the next would be 0.
@@ -213,15 +209,9 @@ class Phasic(OnPolicy):
     def loss_with_kept_policy(
         self, networks: Networks, chunk: Chunk, critic_coef: float
     ) -> tuple[ActorOutput, jax.Array, Metrics]:
-        """Return the loss by which values learn from the buffer while the policy stays.
+        """Return the actor's output, a loss by which values learn while the policy stays, metrics.
 
-        Args:
-            networks: parameters.
-            chunk: samples of the buffer.
-            critic_coef: weight of the loss of the critic of its own, if there is one.
-
-        Returns:
-            The actor's output, () float32, and metrics.
+        ``critic_coef`` is the weight of the loss of a critic of its own.
         """
         output = self.agent.actor(networks["actor"], chunk.pixels)
         error = value_loss(output.value, chunk.returns, chunk.weight)
@@ -262,15 +252,10 @@ class Phasic(OnPolicy):
             state=None,
         )
         times = jnp.broadcast_to(jnp.arange(num_steps)[:, None], (num_steps, config.num_envs))
-        return Chunk(
-            pixels=observations(seen, times, config.random_shift),
-            state=None if frames.state is None else flat(frames.state),
-            unclipped_action=flat(buffer.unclipped_action),
-            returns=flat(buffer.returns),
-            weight=flat(buffer.valid).astype(jnp.float32),
-            policy=policy,
-            num_steps=num_steps,
-        )
+        rows = (frames.state, buffer.unclipped_action, buffer.returns, buffer.valid)
+        state, action, returns, valid = jax.tree.map(flat, rows)
+        pixels = observations(seen, times, config.random_shift)
+        return Chunk(pixels, state, action, returns, valid.astype(jnp.float32), policy, num_steps)
 
 
 def _entry(experience: Experience) -> Buffer:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import ClassVar
 
 import jax
+import jax.numpy as jnp
 
 from pixelbrax_jax.agents.config import TrainConfig, check_positive
 from pixelbrax_jax.agents.networks.actor_critic import ActorCritic
@@ -72,42 +73,34 @@ class PPG(Phasic):
         """Learn as PPO does (the policy phase), and remember the rollout."""
         config, agent, key = self.config, self.agent, update_key(state)
 
-        def improve_policy(
-            networks: Networks, batch: Batch, key: jax.Array
+        def loss(
+            of_policy: bool, of_value: bool, networks: Networks, batch: Batch, key: jax.Array
         ) -> tuple[jax.Array, Metrics]:
-            policy, _ = agent(networks, batch.pixels, batch.state)
-            return policy_loss(policy, batch, config, key)
-
-        def improve_value(
-            networks: Networks, batch: Batch, key: jax.Array
-        ) -> tuple[jax.Array, Metrics]:
-            del key
-            _, value = agent(networks, batch.pixels, batch.state)
-            error = value_loss(value, batch.returns, batch.weight)
-            return config.vf_coef * error, {"loss/value": error}
-
-        def improve_both(
-            networks: Networks, batch: Batch, key: jax.Array
-        ) -> tuple[jax.Array, Metrics]:
-            loss, metrics = improve_policy(networks, batch, key)
-            error, value_metrics = improve_value(networks, batch, key)
-            return loss + error, metrics | value_metrics
+            policy, value = agent(networks, batch.pixels, batch.state)
+            total, metrics = jnp.float32(0.0), {}
+            if of_policy:
+                total, metrics = policy_loss(policy, batch, config, key)
+            if of_value:
+                error = value_loss(value, batch.returns, batch.weight)
+                total += config.vf_coef * error
+                metrics["loss/value"] = error
+            return total, metrics
 
         # Passes that both make are made together, then those that one makes alone.
         shared_epochs = min(config.policy_epochs, config.value_epochs)
         value_network = "critic" if config.layout == "dual" else "actor"
         plan = (
-            (improve_both, shared_epochs, tuple(state.networks)),
-            (improve_policy, config.policy_epochs - shared_epochs, ("actor",)),
-            (improve_value, config.value_epochs - shared_epochs, (value_network,)),
+            (partial(loss, True, True), shared_epochs, tuple(state.networks)),
+            (partial(loss, True, False), config.policy_epochs - shared_epochs, ("actor",)),
+            (partial(loss, False, True), config.value_epochs - shared_epochs, (value_network,)),
         )
         metrics: Metrics = {}
-        for part, (loss, num_epochs, learners) in enumerate(plan):
+        for part, (part_loss, num_epochs, learners) in enumerate(plan):
             if num_epochs:
                 # Far from the numbers of passes, by which keys are split.
                 part_key = key if part == 0 else jax.random.fold_in(key, 2**31 + part)
                 state, part_metrics = self.update(
-                    state, loss, experience, num_epochs, part_key, learners=learners
+                    state, part_loss, experience, num_epochs, part_key, learners=learners
                 )
                 metrics |= part_metrics
         return self.remember(state, experience), metrics
