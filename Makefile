@@ -67,9 +67,9 @@ test-gpu: $(VENV)/.installed-dev ## run the tests that need an NVIDIA GPU, on a 
 
 bench-gpu: $(VENV)/.installed-dev ## measure on an NVIDIA GPU; JSON, tables and plot in runs/gpu
 	$(PIP) "jax[$(CUDA)]"
-	$(RUN) -m pixelbrax_gym.cli bench --full --output-dir runs/gpu $(ARGS)
+	$(RUN) -m tests.benchmarks.run --only renderer adapters distractors environments --output-dir runs/gpu $(ARGS)
 	XLA_FLAGS="--xla_gpu_enable_command_buffer=-WHILE" \
-		$(RUN) -m pixelbrax_gym.cli bench --full --only environments --output-dir runs/gpu/host-loops $(ARGS)
+		$(RUN) -m tests.benchmarks.run --only environments --output-dir runs/gpu/host-loops $(ARGS)
 
 test-programs: $(VENV)/.installed-dev .venv-newest/.installed ## compile for an H100 and a TPU that need not be here
 	$(RUN) -m pytest -m gpu_program tests/test_gpu_program.py $(ARGS)

@@ -34,6 +34,8 @@ _LAZY = {
     "check_vector_env": "pixelbrax_gym.gymnasium.check",
 }
 
+_ENV = "pixelbrax_gym.gymnasium.env:GymnasiumEnv"
+
 
 def register(task: str, id: str | None = None) -> str:  # noqa: A002  # Gymnasium's name for it
     """Make a task available to ``gymnasium.make`` and ``gymnasium.make_vec``.
@@ -46,7 +48,7 @@ def register(task: str, id: str | None = None) -> str:  # noqa: A002  # Gymnasiu
         The id.
 
     Raises:
-        ValueError: there is no such task, or the id is taken.
+        ValueError: there is no such task, or the id stands for something else.
     """
     from pixelbrax_jax.registry import list_envs
     from pixelbrax_jax.validation import check_choice
@@ -56,9 +58,11 @@ def register(task: str, id: str | None = None) -> str:  # noqa: A002  # Gymnasiu
         name = "".join(part[:1].upper() + part[1:] for part in task.split("_"))
         id = f"PixelBrax/{name}-v0"  # noqa: A001
         id = TASKS[task].gymnasium_id if task in TASKS else id  # noqa: A001
-    if id in gym.registry:
+    known = gym.registry.get(id)
+    if known is None:
+        _register(task, id)
+    elif (known.entry_point, known.kwargs) != (_ENV, {"task": task}):
         raise ValueError(f"Gymnasium id {id!r} is registered already; choose another.")
-    _register(task, id)
     return id
 
 
@@ -67,7 +71,7 @@ def _register(task: str, name: str) -> None:
     # TimeLimit on top would count calls of step(), which are fewer under action repeat.
     gym.register(
         id=name,
-        entry_point="pixelbrax_gym.gymnasium.env:GymnasiumEnv",
+        entry_point=_ENV,
         vector_entry_point="pixelbrax_gym.gymnasium.vector_env:GymnasiumVectorEnv",
         kwargs={"task": task},
     )

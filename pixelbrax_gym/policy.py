@@ -27,10 +27,7 @@ class TorchPolicy:
     """
 
     def __init__(self, path: str | Path) -> None:
-        """Load the file.
-
-        Args:
-            path: of the file that ``pixelbrax train`` wrote.
+        """Load the file that ``pixelbrax train`` wrote.
 
         Raises:
             FileNotFoundError: there is no such file.

@@ -1,21 +1,58 @@
-"""The compiled programs behind an environment that keeps its state."""
+"""The compiled programs behind an environment that keeps its state, and how it is kept."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from functools import cache
-from typing import Any
+from functools import lru_cache
+from itertools import accumulate
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pixelbrax_gym.packing import Packed, pack, unpack
 from pixelbrax_jax import PixelEnv, VectorPixelEnv, compilation
 from pixelbrax_jax.types import EnvParams, EnvState, Timestep
 
+_FEW = 32
+"""Environments up to which it is faster to put the parts of a state together than to pass them."""
+
+_MANY_PROGRAMS = 64
+"""Sets of options whose programs are kept when no environment has them any more."""
+
 Array = jax.Array | np.ndarray
-Stepped = tuple[Packed, dict[str, Any]]
+
+
+class Packed(NamedTuple):
+    """An ``EnvState`` as arrays.
+
+    The arguments and results of a compiled program cost a fixed time each. With the 40 or so parts
+    of a state, one environment spends a tenth of its step on them.
+
+    Attributes:
+        frames: (N, H, W, 3K) uint8, as in the state.
+        rest: of few environments one array, (W,) uint32, the bits of all else, one part after the
+            other; of many the parts, keys as what ``jax.random.key_data`` makes of them.
+    """
+
+    frames: jax.Array
+    rest: tuple[jax.Array, ...]
+
+
+class Stepped(NamedTuple):
+    """What a program returns.
+
+    Attributes:
+        packed: the states.
+        ended: () or (N,) bool, whether a step has ended the episode.
+        outputs: arrays that may be handed out. ``obs``, ``reward``, ``terminated``,
+            ``truncated`` and ``info`` are those of a ``Timestep``. Of many environments there are
+            also ``done``, (N,) bool, and ``reported``, (N,) bool, which environments ``info``
+            is about.
+    """
+
+    packed: Packed
+    ended: jax.Array
+    outputs: dict[str, Any]
 
 
 def _env(programs: Programs) -> PixelEnv:
@@ -55,10 +92,8 @@ class Programs:
     def reset(self, seeds: Array, params: EnvParams, offsets: Array | None) -> Stepped:
         """Reset all environments to episode 0 of their (N,) uint32 seeds.
 
-        Args:
-            seeds: as above.
-            params: of all.
-            offsets: (N,) int32, new ``time_limit_offset`` of all; None keeps what a reset makes.
+        ``offsets``, (N,) int32, are new ``time_limit_offset`` of all; None keeps what a reset
+        makes.
         """
         state, timestep = self.vector.reset(jax.vmap(jax.random.key)(seeds), params)
         return self._stepped(_with_offsets(state, offsets), timestep)
@@ -95,9 +130,9 @@ class Programs:
         del spare
         state = self._state(packed, params)
         stepped, timestep = self._step(state, action, params)
-        state = self._where(mask, stepped, state)
-        packed, outputs = self._stepped(state, timestep.replace(obs=self.vector.obs(state)))
-        return packed, outputs | {"done": outputs["done"] & mask}
+        state = _where(mask, stepped, state)
+        packed, ended, outputs = self._stepped(state, timestep.replace(obs=self.vector.obs(state)))
+        return Stepped(packed, ended & mask, outputs | {"done": outputs["done"] & mask})
 
     @compilation.jit(_env, static_argnums=0)
     def state(self, packed: Packed, params: EnvParams) -> EnvState:
@@ -117,7 +152,7 @@ class Programs:
         self, packed: Packed, mask: Array, state: EnvState, params: EnvParams
     ) -> Stepped:
         """Go on from given states where (N,) ``mask``; the others stay as they are."""
-        return self._started(self._where(mask, state, self._state(packed, params)), params)
+        return self._started(_where(mask, state, self._state(packed, params)), params)
 
     @compilation.jit(_env, static_argnums=(0, 3, 4))
     def images(self, packed: Packed, params: EnvParams, height: int, width: int) -> jax.Array:
@@ -126,27 +161,44 @@ class Programs:
         images: jax.Array = jax.vmap(lambda row: env.image(row, params, height, width))(state)
         return images
 
-    def state_spec(self, params: EnvParams) -> EnvState:
-        """Return shapes and dtypes of what ``state`` returns and ``start`` takes."""
-        spec: EnvState = self._spec(params)
-        if not self.single:
-            return spec
-        return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), spec)
+    def check_state(self, state: Any, params: EnvParams) -> None:
+        """Reject what ``start`` cannot take; the message names the first difference."""
+        if not isinstance(state, EnvState):
+            raise TypeError(
+                f"a state must be an EnvState, as get_state() returns, got {type(state).__name__}."
+            )
+        wanted: Any = jax.tree_util.tree_flatten_with_path(self._spec(params))
+        given: Any = jax.tree.flatten(state)
+        if given[1] != wanted[1]:
+            raise ValueError(
+                f"the state has other parts than those of this environment, {len(given[0])} arrays "
+                f"and not {len(wanted[0])}, or others: take it from an environment of the same "
+                "task, physics backend, distractors and obs_mode."
+            )
+        for value, (path, spec) in zip(given[0], wanted[0], strict=True):
+            shape, dtype = np.shape(value), getattr(value, "dtype", type(value).__name__)
+            expected = spec.shape[1:] if self.single else spec.shape
+            if (shape, dtype) != (expected, spec.dtype):
+                raise ValueError(
+                    f"state{jax.tree_util.keystr(path)} must be {spec.dtype} of shape {expected}, "
+                    f"got {dtype} of shape {shape}."
+                )
 
-    def _spec(self, params: EnvParams) -> Any:
+    def _spec(self, params: EnvParams) -> EnvState:
+        """Return shapes and dtypes of the states, with their leading axis."""
         leaves, tree = jax.tree.flatten(params)
         key = tree, tuple((np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
         if key not in self._specs:
-            self._specs[key] = self._make_spec(params)
+            seeds = jax.ShapeDtypeStruct((self.vector.num_envs,), np.uint32)
+            keys = jax.eval_shape(jax.vmap(jax.random.key), seeds)
+            self._specs[key] = jax.eval_shape(self.vector.reset, keys, params)[0]
         return self._specs[key]
-
-    def _make_spec(self, params: EnvParams) -> Any:
-        seeds = jax.ShapeDtypeStruct((self.vector.num_envs,), np.uint32)
-        keys = jax.eval_shape(jax.vmap(jax.random.key), seeds)
-        return jax.eval_shape(self.vector.reset, keys, params)[0]
 
     def _state(self, packed: Packed, params: EnvParams) -> EnvState:
         return unpack(packed, self._spec(params))
+
+    def _step(self, state: EnvState, action: Array, params: EnvParams) -> tuple[EnvState, Timestep]:
+        return self.vector.step(state, action[None] if self.single else action, params)
 
     def _started(self, state: EnvState, params: EnvParams) -> Stepped:
         rewards = jnp.zeros(self.vector.num_envs)
@@ -156,48 +208,59 @@ class Programs:
     def _stepped(
         self, state: EnvState, timestep: Timestep, reported: Array | None = None
     ) -> Stepped:
-        """Pack states, and return them and outputs; infos are about (N,) ``reported``."""
-        reported = jnp.ones(self.vector.num_envs, bool) if reported is None else reported
-        return pack(state), self._outputs(timestep, reported)
-
-    @staticmethod
-    def _where(mask: Array, state: EnvState, otherwise: EnvState) -> EnvState:
-        def choose(new: jax.Array, old: jax.Array) -> jax.Array:
-            return jnp.where(mask.reshape(mask.shape + (1,) * (new.ndim - 1)), new, old)
-
-        chosen: EnvState = jax.tree.map(choose, state, otherwise)
-        return chosen
-
-    def _step(self, state: EnvState, action: Array, params: EnvParams) -> tuple[EnvState, Timestep]:
-        return self.vector.step(state, action[None] if self.single else action, params)
-
-    def _outputs(self, timestep: Timestep, reported: Array) -> dict[str, Any]:
-        done = timestep.terminated | timestep.truncated
+        ended = timestep.terminated | timestep.truncated
         outputs = {
             "obs": timestep.obs,
             "reward": timestep.reward,
             "terminated": timestep.terminated,
             "truncated": timestep.truncated,
-            "done": done,
             "info": timestep.info,
         }
         if self.single:
-            return jax.tree.map(lambda x: x[0], outputs)
-        info = dict(timestep.info)
-        ended: dict[str, Any] = {
-            name: info.pop(name) for name in ("final_obs", "final_info") if name in info
-        }
-        info = _with_masks(info, reported)
-        if ended:
-            ended["final_info"] = _with_masks(ended["final_info"], done)
-            info |= _with_masks(ended, done)
-        return outputs | {"info": info}
+            return Stepped(pack(state), ended[0], jax.tree.map(lambda x: x[0], outputs))
+        if reported is None:
+            reported = jnp.ones(self.vector.num_envs, bool)
+        return Stepped(pack(state), ended, outputs | {"done": ended, "reported": reported})
 
 
-@cache
+@lru_cache(_MANY_PROGRAMS)
 def programs_of(vector: VectorPixelEnv, single: bool) -> Programs:
     """Return the programs of environments, the same object for equal ones."""
     return Programs(vector, single)
+
+
+def pack(state: EnvState) -> Packed:
+    """Return a state, with a leading axis N, as arrays."""
+    parts = jax.tree.leaves(state.replace(frames=None))
+    if len(state.frames) > _FEW:
+        return Packed(state.frames, tuple(map(_data, parts)))
+    # Without a barrier, what computes the parts is compiled into the loop that writes them.
+    parts = jax.lax.optimization_barrier(parts)
+    return Packed(state.frames, (jnp.concatenate([_words(part) for part in parts]),))
+
+
+def unpack(packed: Packed, like: EnvState) -> EnvState:
+    """Return the state that ``pack`` was given, to the bit; ``like`` has its shapes and types."""
+    parts, tree = jax.tree.flatten(like.replace(frames=None))
+    if like.frames.shape[0] > _FEW:
+        restored = list(map(_from_data, packed.rest, parts))
+    else:
+        sizes = [jax.eval_shape(_words, part).size for part in parts]
+        (words,) = packed.rest
+        restored = [
+            _from_words(words[end - size : end], part)
+            for part, size, end in zip(parts, sizes, accumulate(sizes), strict=True)
+        ]
+    state: EnvState = jax.tree.unflatten(tree, restored)
+    return state.replace(frames=packed.frames)
+
+
+def _where(mask: Array, state: EnvState, otherwise: EnvState) -> EnvState:
+    def choose(new: jax.Array, old: jax.Array) -> jax.Array:
+        return jnp.where(mask.reshape(mask.shape + (1,) * (new.ndim - 1)), new, old)
+
+    chosen: EnvState = jax.tree.map(choose, state, otherwise)
+    return chosen
 
 
 def _with_offsets(state: EnvState, offsets: Array | None) -> EnvState:
@@ -206,6 +269,40 @@ def _with_offsets(state: EnvState, offsets: Array | None) -> EnvState:
     return state.replace(sim=state.sim.replace(time_limit_offset=offsets))
 
 
-def _with_masks(info: Mapping[str, Any], mask: Array) -> dict[str, Any]:
-    """Add a mask ``_key`` for each ``key``, which says what environments it is about."""
-    return {**info, **{f"_{name}": mask for name in info}}
+def _is_key(part: Any) -> bool:
+    return jnp.issubdtype(part.dtype, jax.dtypes.prng_key)
+
+
+def _data(part: jax.Array) -> jax.Array:
+    return jax.random.key_data(part) if _is_key(part) else part
+
+
+def _from_data(data: jax.Array, like: Any) -> jax.Array:
+    if not _is_key(like):
+        return data
+    return jax.random.wrap_key_data(data, impl=jax.random.key_impl(jnp.empty((), like.dtype)))
+
+
+def _words(part: jax.Array) -> jax.Array:
+    """Return the bits of an array, (W,) uint32; of a narrow type, one number a word."""
+    part = _data(part)
+    if part.dtype == bool:
+        part = part.astype(jnp.uint8)
+    bits = part.dtype.itemsize * 8
+    if bits < 32:
+        part = jax.lax.bitcast_convert_type(part, f"uint{bits}").astype(jnp.uint32)
+    return jax.lax.bitcast_convert_type(part, jnp.uint32).ravel()
+
+
+def _from_words(words: jax.Array, like: Any) -> jax.Array:
+    """Return what ``_words`` was given, of the shape and type of ``like``."""
+    if _is_key(like):
+        data = jax.eval_shape(jax.random.key_data, like)
+        return _from_data(words.reshape(data.shape), like)
+    if like.dtype == bool:
+        return words.reshape(like.shape).astype(bool)
+    bits = like.dtype.itemsize * 8
+    if bits < 32:
+        words = words.astype(f"uint{bits}")
+    shape = (*like.shape, bits // 32) if bits > 32 else like.shape
+    return jax.lax.bitcast_convert_type(words.reshape(shape), like.dtype)

@@ -34,14 +34,7 @@ class SubEnv:
         observation_space: gymnasium.Space,
         action_space: gymnasium.Space,
     ) -> None:
-        """Make the stand-in.
-
-        Args:
-            owner: the environment of all, whose ``get_images`` returns N images.
-            index: which one this is.
-            observation_space: of one environment.
-            action_space: of one environment.
-        """
+        """Make the stand-in of environment ``index``; ``owner.get_images`` returns N images."""
         self.owner, self.index, self.render_mode = owner, index, owner.render_mode
         self.observation_space, self.action_space = observation_space, action_space
 
@@ -68,13 +61,7 @@ class SubEnv:
     def set_wrapper_attr(self, name: str, value: Any, *, force: bool = True) -> bool:
         """Set the attribute of that name, as Gymnasium's environments do.
 
-        Args:
-            name: of the attribute.
-            value: of the attribute.
-            force: whether one that is not there yet is made.
-
-        Returns:
-            Whether it was set.
+        Without ``force`` only one that is there already; returns whether it was set.
         """
         if not force and not hasattr(self, name):
             return False
@@ -87,14 +74,7 @@ class SubEnv:
 
 
 def call_sub_envs(sub_envs: Sequence[SubEnv], name: str, *args: Any, **kwargs: Any) -> list[Any]:
-    """Return an attribute of each sub-environment, or what it returns if it can be called.
-
-    Args:
-        sub_envs: of one environment.
-        name: of the attribute or method.
-        *args: of the method.
-        **kwargs: of the method.
-    """
+    """Return an attribute of each sub-environment, or what it returns if it can be called."""
     if name == "render" and sub_envs:
         # Drawn once for all, not once for each.
         images = sub_envs[0].owner.get_images()

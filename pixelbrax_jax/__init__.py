@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from pixelbrax_jax.envs.making import named_rigs as named_rigs
     from pixelbrax_jax.envs.pixel_env import PixelEnv as PixelEnv
     from pixelbrax_jax.envs.sharded import ShardedVectorEnv as ShardedVectorEnv
-    from pixelbrax_jax.envs.vector import AUTORESET_MODES as AUTORESET_MODES
     from pixelbrax_jax.envs.vector import VectorPixelEnv as VectorPixelEnv
     from pixelbrax_jax.physics.base import Physics as Physics
     from pixelbrax_jax.physics.brax.engine import BraxPhysics as BraxPhysics
@@ -26,22 +25,16 @@ if TYPE_CHECKING:
     from pixelbrax_jax.policy import load_policy as load_policy
     from pixelbrax_jax.registry import list_envs as list_envs
     from pixelbrax_jax.registry import register as register
-    from pixelbrax_jax.renderer.base import render as render
     from pixelbrax_jax.scene.cameras import make_rig as make_rig
     from pixelbrax_jax.scene.look import make_look as make_look
-    from pixelbrax_jax.scene.place import place as place
     from pixelbrax_jax.types import Camera as Camera
     from pixelbrax_jax.types import CameraRig as CameraRig
-    from pixelbrax_jax.types import Clips as Clips
     from pixelbrax_jax.types import EnvParams as EnvParams
     from pixelbrax_jax.types import EnvState as EnvState
-    from pixelbrax_jax.types import Frame as Frame
     from pixelbrax_jax.types import GeomKind as GeomKind
     from pixelbrax_jax.types import Geoms as Geoms
     from pixelbrax_jax.types import Look as Look
     from pixelbrax_jax.types import PhysicsState as PhysicsState
-    from pixelbrax_jax.types import Scene as Scene
-    from pixelbrax_jax.types import SimState as SimState
     from pixelbrax_jax.types import Timestep as Timestep
 
 # Loaded when they are first asked for: who wants the list of tasks need not wait for JAX.
@@ -54,20 +47,15 @@ _PUBLIC = {
     "envs.making": "make named_rigs",
     "envs.pixel_env": "PixelEnv",
     "envs.sharded": "ShardedVectorEnv",
-    "envs.vector": "AUTORESET_MODES VectorPixelEnv",
+    "envs.vector": "VectorPixelEnv",
     "physics.base": "Physics",
     "physics.brax.engine": "BraxPhysics",
     "physics.brax.mjcf": "mjcf_physics",
     "policy": "list_pretrained load_policy",
     "registry": "list_envs register",
-    "renderer.base": "render",
     "scene.cameras": "make_rig",
     "scene.look": "make_look",
-    "scene.place": "place",
-    "types": (
-        "Camera CameraRig Clips EnvParams EnvState Frame GeomKind Geoms Look PhysicsState Scene "
-        "SimState Timestep"
-    ),
+    "types": "Camera CameraRig EnvParams EnvState GeomKind Geoms Look PhysicsState Timestep",
 }
 _LAZY = {
     name: f"pixelbrax_jax.{module}" for module, names in _PUBLIC.items() for name in names.split()

@@ -87,7 +87,7 @@ _SUITE_OPTIONS = fields(BraxOptions)
 
 
 @dataclass(frozen=True)
-class EnvConfig(ProgramConfig, BraxOptions):
+class EnvConfig(BraxOptions, ProgramConfig):
     """All options of an environment; ``pixelbrax_jax.make(task, **options)`` takes them.
 
     Raises:
@@ -115,7 +115,7 @@ class EnvConfig(ProgramConfig, BraxOptions):
 
     def __post_init__(self) -> None:
         """Check the options, and store them as Python's own types."""
-        super().__post_init__()
+        ProgramConfig.__post_init__(self)
         for name in ("task", "split", *(option.name for option in _SUITE_OPTIONS)):
             self._static(name)
         BraxOptions.__post_init__(self)

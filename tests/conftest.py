@@ -32,6 +32,8 @@ import pytest
 
 MAX_MAPS = 45_000
 """Memory maps of this process beyond which compiled programs are forgotten."""
+MAX_BYTES = 5 * 10**9
+"""Memory of this process beyond which they are forgotten, too."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -50,12 +52,16 @@ def pytest_runtest_teardown() -> None:
     Every program maps memory of its own, and a process may have some 65,000 maps on Linux
     (vm.max_map_count). The compiler crashes beyond them.
     """
-    if number_of_maps() > MAX_MAPS:
+    maps, taken = memory_of_this_process()
+    if maps > MAX_MAPS or taken > MAX_BYTES:
         jax.clear_caches()
         gc.collect()
 
 
-def number_of_maps() -> int:
-    """Memory maps of this process; 0 where the system does not tell."""
-    maps = Path("/proc/self/maps")
-    return maps.read_bytes().count(b"\n") if maps.exists() else 0
+def memory_of_this_process() -> tuple[int, int]:
+    """Memory maps and resident bytes; 0 where the system does not tell."""
+    process = Path("/proc/self")
+    if not (process / "maps").exists():
+        return 0, 0
+    pages = int((process / "statm").read_text().split()[1])
+    return (process / "maps").read_bytes().count(b"\n"), pages * os.sysconf("SC_PAGE_SIZE")

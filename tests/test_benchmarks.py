@@ -213,8 +213,6 @@ def test_what_is_misspelt_or_left_empty_is_refused(workers, capsys):
     with pytest.raises(SystemExit):
         pixelbrax(["bench", "--task", "antt"])
     assert "antt" in capsys.readouterr().err
-    assert pixelbrax(["bench", "--only", "distractors"]) == 2
-    assert "--full" in capsys.readouterr().err
     assert pixelbrax(["bench", "--task", "humanoid"]) == 1
     assert "no case fits" in capsys.readouterr().err
 
@@ -345,7 +343,7 @@ def test_a_real_case_runs_in_a_process_of_its_own():
     ],
 )
 def test_more_real_cases_run(measure, options):
-    ours = measure in ("throughput.scan", "adapters.compare", "distractors.compare")
+    ours = measure in ("throughput.scan", "adapters.compare")
     package = "pixelbrax_gym.bench" if ours else "tests.benchmarks"
     kind = all_cases.DevicesCase if "num_devices" in options else Case
     outcome = runner.measure(kind("adapters", measure, options, package), 900.0)
@@ -373,10 +371,8 @@ def test_the_command_measures_this_machine_and_shows_the_page(workers, tmp_path,
     count = len(asked)
     assert pixelbrax(["bench", "--output-dir", str(tmp_path)]) == 0
     assert len(asked) == count
-    assert (
-        pixelbrax(["bench", "--full", "--only", "distractors", "--output-dir", str(tmp_path)]) == 0
-    )
-    assert len(asked) == count + len(list(cases.distractors()))
+    assert pixelbrax(["bench", "--full", "--only", "adapters", "--output-dir", str(tmp_path)]) == 0
+    assert len(asked) == count + len(list(cases.adapters()))
 
 
 def test_without_matplotlib_the_command_says_how_to_get_a_plot(

@@ -81,8 +81,9 @@ def test_a_video_needs_an_extra(monkeypatch, tmp_path):
             write_frames(tmp_path / name, [], 20)
 
 
-@pytest.mark.parametrize("command", ["record", "evaluate"])
+@pytest.mark.parametrize("command", ["train", "evaluate", "record"])
 def test_trained_agents_need_an_extra(monkeypatch, capsys, command):
-    monkeypatch.setitem(sys.modules, "pixelbrax_jax.agents.runner.trained", None)
-    assert cli.main([command, "nowhere"]) == 1
+    for module in ("train", "trained"):
+        monkeypatch.setitem(sys.modules, f"pixelbrax_jax.agents.runner.{module}", None)
+    assert cli.main([command, "ppo"]) == 1
     assert '"pixelbrax[train]"' in capsys.readouterr().err

@@ -23,16 +23,8 @@ Run = Callable[[], Any]
 def compare(task: str, num_envs: int, seconds: float = SECONDS) -> list[dict[str, Any]]:
     """Measure steps per second of every adapter that is installed, and of the JAX environment.
 
-    All get the same actions and play the same episodes.
-
-    Args:
-        task: the task.
-        num_envs: environments of each.
-        seconds: about how long all take altogether, compilation apart.
-
-    Returns:
-        One entry for each; ``ratio`` is to a Python loop over the compiled step with the same
-        autoreset mode that waits for each step, as an adapter does.
+    All get the same actions and play the same episodes. ``ratio`` is to a Python loop over the
+    compiled step with the same autoreset mode that waits for each step, as an adapter does.
     """
     env, params = pb.make(task)
     shape = (max(8, min(100, 512 // num_envs)), num_envs, env.action_size)

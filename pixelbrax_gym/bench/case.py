@@ -21,17 +21,12 @@ class AbsentError(Exception):
 
 @dataclass(frozen=True)
 class Case:
-    """One measurement, made in a process of its own.
-
-    Attributes:
-        group: the part of the benchmark that it belongs to.
-        measure: ``module.function`` of a package.
-        arguments: of that function.
-        package: the package.
-    """
+    """One measurement, made in a process of its own."""
 
     group: str
+    """The part of the benchmark that it belongs to."""
     measure: str
+    """``module.function`` of the package."""
     arguments: Mapping[str, Any] = field(default_factory=dict)
     package: str = "pixelbrax_gym.bench"
 
@@ -58,13 +53,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Group:
-    """A part of the benchmark.
-
-    Attributes:
-        cases: what is measured.
-        table: the outcomes in Markdown.
-        note: what it shows and what it does not.
-    """
+    """A part of the benchmark: its cases, their outcomes in Markdown, and what these show."""
 
     cases: Callable[[], Iterator[Case]]
     table: Callable[[list[Row]], str]

@@ -65,12 +65,6 @@ def adapters() -> Iterator[Case]:
         yield Case("adapters", "adapters.compare", {"task": task, "num_envs": num_envs})
 
 
-def distractors() -> Iterator[Case]:
-    """Pixels with each distractor."""
-    for task, num_envs in (("ant", 256), ("ant", 1024), *((task, 1000) for task in TASKS)):
-        yield Case("distractors", "distractors.compare", {"task": task, "num_envs": num_envs})
-
-
 RENDERER_NOTE = "From link poses to packed pixels, without physics."
 ADAPTERS_NOTE = (
     "The ratio is that to the JAX loop with the same autoreset mode, which waits for each step: "
@@ -90,13 +84,6 @@ FULL = {
     "renderer": Group(renderers, tables.renderer, RENDERER_NOTE),
     "adapters": Group(
         adapters, tables.interleaved("num_envs", "autoreset_mode", "adapter"), ADAPTERS_NOTE
-    ),
-    "distractors": Group(
-        distractors,
-        tables.interleaved("num_envs", "distractors"),
-        "With a bank of 60 clips of 70 frames. Ratios are to the speed without: medians over "
-        "rounds, in which all take a turn of 1 to 100 steps in one process, with bootstrap "
-        "intervals of 95 %.",
     ),
     "environments": Group(environments, tables.environments, ENVIRONMENTS_NOTE),
 }

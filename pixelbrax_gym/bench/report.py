@@ -32,13 +32,7 @@ def write(file: Path, groups: Mapping[str, Group]) -> None:
 
 
 def page(kept: Mapping[str, Row], groups: Mapping[str, Group], picture: str | None) -> str:
-    """Return the page, in Markdown.
-
-    Args:
-        kept: what a file of results holds.
-        groups: parts of the page.
-        picture: name of the plot's file.
-    """
+    """Return the page of a file's results, in Markdown, with the plot of that name."""
     rows = _rows(kept, groups)
     used = {row["machine"] for row in rows}
     parts = [
@@ -60,14 +54,7 @@ def page(kept: Mapping[str, Row], groups: Mapping[str, Group], picture: str | No
 
 
 def plot(rows: list[Row], path: Path) -> bool:
-    """Draw steps per second over the number of environments, a panel for each task.
-
-    Returns:
-        Whether there was anything to draw.
-
-    Raises:
-        ImportError: matplotlib is not installed.
-    """
+    """Draw steps per second over the number of environments, and return if there are any."""
     chosen = [row for row in succeeded(rows) if row["group"] == "environments"]
     tasks = list(dict.fromkeys(row["arguments"]["task"] for row in chosen))
     if not tasks:

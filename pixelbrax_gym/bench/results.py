@@ -14,10 +14,6 @@ from pixelbrax_gym.bench.case import Case
 class Results:
     """What has been measured, in a JSON file that is written after every case.
 
-    Args:
-        file: where it is kept; what is there stays.
-        machine: what the figures are measured on.
-
     Raises:
         ValueError: the file is of another kind.
     """

@@ -42,19 +42,12 @@ def measure_all(
 
     A run that is cut short loses nothing, and the next one goes on where it stopped.
 
-    Args:
-        cases: what to measure.
-        groups: parts of the page, which shows what else the file holds of them.
-        output_dir: folder of the files.
-        again: measure anew what is known.
-        timeout: seconds of one case at most.
-
     Returns:
         The JSON file, and whether a case failed for another reason than memory or something
         absent.
 
     Raises:
-        KeyboardInterrupt: after Ctrl-C, and with its number after another signal to stop.
+        KeyboardInterrupt: after a signal to stop, with its number.
     """
     # A process must not outlive this one and disturb the next one's measurements.
     before = {number: signal.signal(number, _interrupt) for number in stop_signals()}

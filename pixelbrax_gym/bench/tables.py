@@ -127,11 +127,7 @@ def _peak_bytes(row: Row | None) -> float | None:
 
 
 def interleaved(*columns: str) -> Callable[[list[Row]], str]:
-    """Return what draws the table of a comparison of interleaved runs.
-
-    Args:
-        columns: what tells its lines apart, by their names in the case's arguments or values.
-    """
+    """Return what draws a comparison, whose lines differ in these arguments or values."""
 
     def draw(rows: list[Row]) -> str:
         lines = [

@@ -31,15 +31,7 @@ def compiled(
 
 
 def rate(run: Callable[[int], Any], least_calls: int = 1) -> dict[str, float]:
-    """Measure calls per second.
-
-    Args:
-        run: does so many calls and returns something to wait for.
-        least_calls: of a repetition.
-
-    Returns:
-        Median, slowest and fastest repetition, and the calls of each.
-    """
+    """Measure calls per second of what does so many calls and returns something to wait for."""
     calls = least_calls
     _seconds(run, calls)
     while (seconds := _seconds(run, calls)) < REPETITION_SECONDS:
@@ -66,11 +58,7 @@ def take_interleaved(
     """Measure the seconds of each runner's runs, one in each of 5 to 300 rounds.
 
     When the machine slows down it does so for all, so that ratios hold where speeds do not. Each
-    round has an order of its own.
-
-    Args:
-        runners: each runs, and waits for what it has done.
-        seconds: about how long all runs take altogether.
+    round has an order of its own. All runs take about ``seconds`` altogether.
     """
     for run in runners.values():
         run()

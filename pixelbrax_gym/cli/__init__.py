@@ -23,11 +23,9 @@ from pixelbrax_jax.extras import install_extra
 
 Options = TypeVar("Options")
 
-ERRORS = (ValueError, OSError, ImportError, MemoryError)
-"""What a command reports in one line; anything else is a defect, with a traceback."""
 
-USAGE = 2
-"""Exit status for a command line that is wrong."""
+class CommandError(Exception):
+    """What a command reports in one line, of an error that has another type."""
 
 
 class UsageError(Exception):
@@ -56,7 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         meant = f" Did you mean {near[0]!r}?" if near else ""
         told = f"unknown command {first!r}.{meant}" if first else "name a command."
         sys.stderr.write(f"pixelbrax: {told}\n\n{_help()}")
-        return USAGE
+        return 2
     _find_modules_here()
     try:
         with _warnings_of(first):
@@ -65,14 +63,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return 128 + signal.SIGINT
     except UsageError as error:
-        sys.stderr.write(f"pixelbrax {first}: {error}\n")
-        return USAGE
-    except ERRORS as error:
-        sys.stderr.write(f"pixelbrax {first}: {error}\n")
+        say(first, error)
+        return 2
+    # Anything else is a defect, with a traceback.
+    except (CommandError, ValueError, OSError, ImportError, MemoryError) as error:
+        say(first, error)
         return 1
     finally:
         for stream in filter(None, (sys.stdout, sys.stderr)):
             _flush(stream)
+
+
+def say(command: str, message: object) -> None:
+    """Write a line to stderr, if anybody is left to read it."""
+    with suppress(OSError, ValueError):
+        sys.stderr.write(f"pixelbrax {command}: {message}\n")
 
 
 def commands() -> list[str]:
@@ -133,8 +138,7 @@ def _warnings_of(command: str) -> Iterator[None]:
     """Write warnings in one line, without the line of source that raises them."""
 
     def show(message: Warning | str, *_: Any, **__: Any) -> None:
-        with suppress(OSError, ValueError):
-            sys.stderr.write(f"pixelbrax {command}: {message}\n")
+        say(command, message)
 
     with warnings.catch_warnings():
         if not sys.warnoptions:

@@ -13,7 +13,7 @@ from typing import Literal
 
 from pixelbrax_gym.bench.case import Case, Group
 from pixelbrax_gym.bench.cases import FULL, QUICK
-from pixelbrax_gym.cli import UsageError, parse
+from pixelbrax_gym.cli import CommandError, parse
 from pixelbrax_jax.extras import install_extra
 from pixelbrax_jax.stop_signals import signal_name
 
@@ -27,10 +27,10 @@ class Options:
     """
 
     full: bool = False
-    """More tasks, batches and repetitions, and distractors; hours on a CPU."""
+    """More tasks, batches and looks; hours on a CPU."""
     output_dir: Path = Path("runs/bench")
     """Where results are kept."""
-    only: tuple[Literal["renderer", "environments", "adapters", "distractors"], ...] = ()
+    only: tuple[Literal["renderer", "environments", "adapters"], ...] = ()
     """Parts to measure; all by default."""
     task: tuple[
         Literal["inverted_pendulum", "halfcheetah", "walker2d", "ant", "humanoid"], ...
@@ -50,8 +50,6 @@ def run(arguments: Sequence[str]) -> int:
     """Run the command."""
     options = parse("bench", Options, arguments)
     groups = FULL if options.full else QUICK
-    if lacking := [name for name in options.only if name not in groups]:
-        raise UsageError(f"--only {' '.join(lacking)} is measured by --full alone; add it")
     if options.full:
         options = replace(options, output_dir=options.output_dir / "full")
     return measure_groups(options, groups, options.only or list(groups))
@@ -60,12 +58,7 @@ def run(arguments: Sequence[str]) -> int:
 def measure_groups(options: Options, groups: Mapping[str, Group], chosen: Sequence[str]) -> int:
     """Measure the chosen groups as the options say, and tell where the results are.
 
-    Returns:
-        The exit status: 1 if a case failed for another reason than memory or something absent,
-        128 plus its number after a signal to stop, which loses nothing.
-
-    Raises:
-        ValueError: no case is left.
+    The exit status is 1 if a case failed for another reason than memory or something absent.
     """
     from pixelbrax_gym.bench.runner import measure_all
 
@@ -86,7 +79,7 @@ def measure_groups(options: Options, groups: Mapping[str, Group], chosen: Sequen
         )
         return int(128 + number)
     except (RuntimeError, SubprocessError) as error:
-        raise ValueError(str(error)) from error
+        raise CommandError(str(error)) from error
     page, picture = file.with_suffix(".md"), file.with_suffix(".png")
     if groups is QUICK:
         sys.stdout.write(f"\n{page.read_text('utf-8')}\n")

@@ -6,11 +6,12 @@ import json
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from pixelbrax_gym.cli import needs_extra, parse
+from pixelbrax_gym.cli import CommandError, needs_extra, parse, say
 
 if TYPE_CHECKING:
     from pixelbrax_jax.agents.runner.trained import Trained
@@ -60,7 +61,7 @@ def run(arguments: Sequence[str]) -> int:
         episodes=options.episodes,
         splits=options.split,
         clips=options.clips,
-        report=lambda line: sys.stderr.write(f"{line}\n"),
+        report=partial(say, "evaluate"),
     ):
         sys.stdout.write(json.dumps(row) + "\n")
         sys.stdout.flush()
@@ -71,7 +72,8 @@ def load(options: AgentOptions) -> Trained:
     """Return the agent that options choose.
 
     Raises:
-        ValueError: there is none, or options do not go together.
+        CommandError: there is no such checkpoint.
+        ValueError: options do not go together, or are out of range.
     """
     with needs_extra("train"):
         from pixelbrax_jax.agents.runner.checkpoint import CheckpointError
@@ -85,4 +87,4 @@ def load(options: AgentOptions) -> Trained:
             run=options.run_index,
         )
     except CheckpointError as error:
-        raise ValueError(str(error)) from error
+        raise CommandError(str(error)) from error

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from tyro.conf import Positional, arg
 
-from pixelbrax_gym.cli import parse
+from pixelbrax_gym.cli import CommandError, parse, say
 from pixelbrax_jax.extras import install_extra
 from pixelbrax_jax.validation import check_positive_int
 
@@ -24,6 +24,7 @@ ENV_OPTIONS = ("backend", "camera", "look", "shadows", "distractors", "clips", "
 """Options of an environment that the command takes; one that is not given stays as it is."""
 
 Act = Callable[[np.ndarray], np.ndarray]
+"""Gives an (A,) float32 action for an (H, W, 3 K) uint8 observation."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,7 @@ def run(arguments: Sequence[str]) -> int:
     try:
         env, act = _make(options)
     except TypeError as error:
-        raise ValueError(str(error)) from error
+        raise CommandError(str(error)) from error
     lacking = "" if options.gif else _why_no_window()
     # Of a task module:name, not all systems have files so called.
     name = options.task.rpartition(":")[2]
@@ -78,8 +79,8 @@ def run(arguments: Sequence[str]) -> int:
     if written and None in map(find_spec, ("imageio_ffmpeg", "PIL")):
         raise ImportError(f"{lacking}; {NO_WRITER}" if lacking else NO_WRITER)
     if lacking:
-        sys.stderr.write(f"pixelbrax play: {lacking}; writing {written} in its place\n")
-    sys.stderr.write("pixelbrax play: compiling, which may take two minutes\n")
+        say("play", f"{lacking}; writing {written} in its place")
+    say("play", "compiling, which may take two minutes")
     shown = images(env, act, options.seed, options.size if options.observation else None)
     fps = env.metadata["render_fps"]
     if written is None:
@@ -91,17 +92,10 @@ def run(arguments: Sequence[str]) -> int:
 
 
 def images(env: GymnasiumEnv, act: Act, seed: int, observed: int | None) -> Iterator[np.ndarray]:
-    """Play for ever, episode after episode.
+    """Play for ever, and yield (H, W, 3) uint8 images.
 
-    Args:
-        env: with ``render_mode="rgb_array"``.
-        act: gives an (A,) float32 action for an (H, W, 3 K) uint8 observation.
-        seed: of the first episode.
-        observed: None yields what ``render`` draws; a number the newest frame of the observation,
-            enlarged by a whole factor to about so many pixels.
-
-    Yields:
-        (H, W, 3) uint8 images.
+    They are what ``render`` draws; or, ``observed``, the newest frame of the observation, enlarged
+    by a whole factor to about so many pixels.
     """
     obs, _ = env.reset(seed=seed)
     while True:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 
-from pixelbrax_gym.cli import parse
+from pixelbrax_gym.cli import parse, say
 from pixelbrax_jax.extras import install_extra
 from pixelbrax_jax.tasks import TASKS
 
@@ -24,7 +24,5 @@ def run(arguments: Sequence[str]) -> int:
     for name, row in TASKS.items():
         sys.stdout.write(f"{name:{width}}  {row.gymnasium_id}: {row.summary}\n")
     if find_spec("dm_control") is None:
-        sys.stderr.write(
-            f"pixelbrax tasks: those named dmc need dm_control: {install_extra('dmc')}\n"
-        )
+        say("tasks", f"those named dmc need dm_control: {install_extra('dmc')}")
     return 0

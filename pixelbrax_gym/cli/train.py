@@ -2,13 +2,193 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
+from dataclasses import dataclass, make_dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_type_hints
 
-from pixelbrax_gym.cli import needs_extra
+import tyro
+from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
+
+from pixelbrax_gym.cli import CommandError, UsageError, needs_extra, say
+from pixelbrax_jax.validation import check_choice, check_positive_int
+
+if TYPE_CHECKING:
+    from pixelbrax_jax.agents.config import TrainConfig
+    from pixelbrax_jax.agents.runner.settings import RunConfig
+
+
+@dataclass(frozen=True)
+class Launch:
+    """How a run is started."""
+
+    preset: str = "default"
+    """Named settings, as cpu; they change the defaults of all others."""
+    cpu_devices: int | None = None
+    """Emulated devices that the environments are spread over, one a core, on a machine without an
+    accelerator."""
+    coordinator: str | None = None
+    """HOST:PORT of process 0, of several processes."""
+    num_processes: int | None = None
+    """How many there are."""
+    process_id: int | None = None
+    """Which of them this is, from 0."""
+
+    def start(self) -> None:
+        """Make devices and processes known to JAX.
+
+        Raises:
+            UsageError: options do not go together.
+            ValueError: devices cannot be emulated.
+        """
+        import jax
+
+        if self.cpu_devices is not None:
+            check_positive_int("--cpu-devices", self.cpu_devices)
+            try:
+                jax.config.update("jax_num_cpu_devices", self.cpu_devices)
+            except RuntimeError as error:
+                raise ValueError(
+                    f"--cpu-devices {self.cpu_devices} comes too late: JAX is at work in this "
+                    "process."
+                ) from error
+        spread = (self.coordinator, self.num_processes, self.process_id)
+        if None not in spread:
+            jax.distributed.initialize(*spread)
+        elif any(given is not None for given in spread):
+            raise UsageError("--coordinator, --num-processes and --process-id belong together")
+
+
+@dataclass(frozen=True)
+class _First:
+    """What decides the defaults of all other options."""
+
+    preset: str = "default"
+    task: str | None = None
+
+
+def _first(arguments: Sequence[str]) -> _First:
+    first, _ = tyro.cli(_First, args=arguments, return_unknown_args=True, add_help=False)
+    return first
 
 
 def run(arguments: Sequence[str]) -> int:
     """Run the command."""
     with needs_extra("train"):
-        from pixelbrax_gym.cli._train import train
-    return train(list(arguments))
+        from pixelbrax_jax.agents.on_policy.presets import PRESETS
+        from pixelbrax_jax.agents.registry import ALGORITHMS
+        from pixelbrax_jax.agents.runner.checkpoint import CheckpointError, latest_steps
+        from pixelbrax_jax.agents.runner.train import TrainingDivergedError, train
+    import jax
+
+    names = ",".join(ALGORITHMS)
+    if not arguments or arguments[0] in ("-h", "--help"):
+        sys.stdout.write(
+            f"usage: pixelbrax train {{{names}}} [--preset {{{','.join(PRESETS)}}}] [options]\n\n"
+            "All options: pixelbrax train ppo --help\n"
+        )
+        return 0
+    algorithm, *rest = arguments
+    if algorithm.startswith("-"):
+        raise UsageError(
+            f"name an algorithm first, as in 'pixelbrax train ppo {algorithm} ...'; there are "
+            f"{', '.join(ALGORITHMS)}"
+        )
+    try:
+        check_choice("algorithm", algorithm, ALGORITHMS)
+        check_choice("preset", _first(rest).preset, PRESETS)
+    except ValueError as error:
+        raise UsageError(str(error)) from error
+    launch, config, options = parse(algorithm, rest)
+    launch.start()
+    try:
+        outcome = train(config, options, _report)
+    except (CheckpointError, TrainingDivergedError, jax.errors.JaxRuntimeError) as error:
+        raise CommandError(str(error)) from error
+    except KeyboardInterrupt:
+        kept = "there is no checkpoint"
+        if (latest := latest_steps(Path(options.output_dir) / "checkpoints")) is not None:
+            kept = f"go on from the checkpoint of {latest} steps with --resume latest"
+        say("train", f"stopped at once; {kept}")
+        raise
+    return 128 + outcome.signal if outcome.interrupted else 0
+
+
+def _report(line: str) -> None:
+    """Write a line of a run above the bar."""
+    import jax
+    from tqdm import tqdm
+
+    if jax.process_index() == 0:
+        tqdm.write(line, file=sys.stderr)
+
+
+def parse(algorithm: str, arguments: Sequence[str]) -> tuple[Launch, TrainConfig, RunConfig]:
+    """Return how to start, settings of an algorithm and of the run.
+
+    Args:
+        algorithm: its name.
+        arguments: options, as ``--preset cpu --num-envs 64``.
+
+    Raises:
+        ValueError: a setting is out of range.
+        SystemExit: an option is unknown.
+    """
+    from pixelbrax_jax.agents.on_policy.presets import PRESETS, preset
+    from pixelbrax_jax.agents.runner.settings import RunConfig
+
+    # Defaults are those of a preset, which may be those of a task.
+    first = _first(arguments)
+    parts: dict[str, Any] = {
+        "launch": Launch(first.preset),
+        "config": preset(algorithm, first.preset, first.task),
+        "options": RunConfig(output_dir=f"runs/{algorithm}"),
+    }
+    # One flat list of options for all.
+    flat: Any = tyro.conf.OmitArgPrefixes
+    command: Any = make_dataclass(
+        "Train", [(part, flat[type(value)]) for part, value in parts.items()]
+    )
+    with _names_for_objects():
+        parsed = tyro.cli(
+            command,
+            prog=f"pixelbrax train {algorithm}",
+            description=f"Trains {algorithm.upper()} from pixels; presets: {', '.join(PRESETS)}.",
+            default=command(**parts),
+            args=arguments,
+        )
+    return parsed.launch, parsed.config, parsed.options
+
+
+def _names_for_objects() -> ConstructorRegistry:
+    """Return a context in which options that may be objects in Python are names."""
+    from pixelbrax_jax.config import EnvConfig
+
+    types, registry = get_type_hints(EnvConfig), ConstructorRegistry()
+
+    @registry.primitive_rule
+    def one_name(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+        if info.type not in [types[name] for name in ("camera", "look", "clips")]:
+            return None
+        return PrimitiveConstructorSpec(
+            nargs=1,
+            metavar="FOLDER" if info.type == types["clips"] else "NAME",
+            instance_from_str=lambda args: args[0],
+            is_instance=lambda value: value is None or isinstance(value, str),
+            str_from_instance=lambda value: [str(value)],
+        )
+
+    @registry.primitive_rule
+    def several_names(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+        if info.type != types["distractors"]:
+            return None
+        return PrimitiveConstructorSpec(
+            nargs="*",
+            metavar="[NAME ...]",
+            instance_from_str=tuple,
+            is_instance=lambda value: isinstance(value, tuple),
+            str_from_instance=list,
+        )
+
+    return registry

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
 from typing import Any
 
+import jax
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
@@ -53,35 +53,30 @@ def check_vector_env(env: VectorEnv, *, seed: int = 0, num_steps: int = 200) -> 
     Raises:
         VectorEnvError: naming the rule that is broken.
     """
-    _Check(env, seed).run(num_steps)
+    check = _Check(env, seed)
+    check.determinism()
+    check.rollout(num_steps)
+    check.render()
+    if check.mode is AutoresetMode.DISABLED and check.num_envs > 1:
+        check.reset_of_others()
+    for rule, changed in check.changed.items():
+        _require(changed, rule)
+    check.close()
 
 
 class _Check:
+    """An environment under test; its attributes and spaces are checked at once."""
+
     def __init__(self, env: VectorEnv, seed: int) -> None:
-        self.env, self.seed = env, seed
-        # Whether each kind of reset has ever shown something else than the state before it.
-        self.changed: dict[str, bool] = {}
-
-    def run(self, num_steps: int) -> None:
-        self.check_attributes()
-        self.check_determinism()
-        self.check_rollout(num_steps)
-        self.check_render()
-        if self.mode is AutoresetMode.DISABLED:
-            self.check_reset_mask()
-        for rule, changed in self.changed.items():
-            _require(changed, rule)
-        self.check_close()
-
-    def check_attributes(self) -> None:
-        env = self.env
         _require(isinstance(env, VectorEnv), "the environment must be a gymnasium VectorEnv")
         num_envs: Any = getattr(env, "num_envs", None)
         _require(
             isinstance(num_envs, (int, np.integer)) and bool(num_envs >= 1),
             f"num_envs must be a positive integer, is {num_envs!r}",
         )
-        self.num_envs = int(num_envs)
+        self.env, self.seed, self.num_envs = env, seed, int(num_envs)
+        # Whether each kind of reset has ever shown something else than the state before it.
+        self.changed: dict[str, bool] = {}
         for kind in ("observation", "action"):
             single: Any = getattr(env, f"single_{kind}_space", None)
             batched: Any = getattr(env, f"{kind}_space", None)
@@ -104,75 +99,89 @@ class _Check:
             f"the attribute autoreset_mode ({attribute}) must agree with the metadata ({mode})",
         )
 
-    def check_determinism(self) -> None:
+    def determinism(self) -> None:
         first, again = self.replay(self.seed), self.replay(self.seed)
         _require(_equal(first, again), "the same seed and actions must give the same results")
         if _equal(first[0], self.replay(self.seed + self.num_envs)[0]):
             _warn("two different seeds give the same first observation")
 
+    def reset_of_others(self) -> None:
+        """Check that only masked rows are reset: the others go on as if nothing had happened."""
+        mask = np.arange(self.num_envs) == 0
+        undisturbed, disturbed = self.replay(self.seed), self.replay(self.seed, mask)
+        for one, other in zip(undisturbed, disturbed, strict=False):
+            _require(
+                _equal(*(jax.tree.map(lambda x: x[1:], tree) for tree in (one, other))),
+                "reset(options={'reset_mask': mask}) must leave the other environments alone",
+            )
+
     def replay(self, seed: int, reset_mask: np.ndarray | None = None) -> list[Any]:
-        """Copy what a short run returns; with a mask, reset some after its first step."""
+        """Return copies of a short run; with a mask, some are reset after its first step."""
         self.env.action_space.seed(self.seed)
-        obs, infos = self.env.reset(seed=seed)
-        self.check_obs(obs, "reset")
-        self.check_infos(infos, "reset")
-        results = [_host_copy(obs)]
+        results = [_copy(self.check_reset(self.env.reset(seed=seed)))]
         for index in range(_REPLAYED_STEPS):
             returned = self.env.step(self.env.action_space.sample())
             ended = self.check_step(returned)
-            results.append(_host_copy(returned[:4]))
+            results.append(_copy(returned[:4]))
             if ended.any():
                 break
             if index == 0 and reset_mask is not None:
                 self.reset_some(reset_mask, returned[0])
         return results
 
-    def check_rollout(self, num_steps: int) -> None:
+    def rollout(self, num_steps: int) -> None:
         self.env.action_space.seed(self.seed)
-        obs, _ = self.env.reset(seed=self.seed)
-        returned, ended, any_ended = [obs], np.zeros(self.num_envs, bool), False
+        latest: tuple[Any, ...] = self.env.reset(seed=self.seed)[:1]
+        ended, any_ended = np.zeros(self.num_envs, bool), False
         for _ in range(num_steps):
-            kept = _host_copy(returned)
-            returned_next = self.env.step(self.env.action_space.sample())
+            kept = _copy(latest)
+            returned = self.env.step(self.env.action_space.sample())
             _require(
-                _equal(kept, _host_copy(returned)),
-                "what a call returned must not be overwritten by a later one",
+                _equal(kept, latest), "what a call returned must not be overwritten by a later one"
             )
-            done = self.check_step(returned_next)
+            done = self.check_step(returned)
             if self.mode is AutoresetMode.NEXT_STEP and ended.any():
-                self.check_first_step(returned_next, ended)
+                rule = "in mode NEXT_STEP, the step after the end of an episode must return"
+                reward, terminated, truncated = map(np.asarray, returned[1:4])
+                _require(not reward[ended].any(), f"{rule} reward 0")
+                _require(not (terminated | truncated)[ended].any(), f"{rule} both flags False")
             if self.mode is AutoresetMode.SAME_STEP:
-                self.check_final(returned_next[0], returned_next[4], done)
+                self.check_final(returned[0], returned[4], done)
             if self.mode is AutoresetMode.DISABLED and done.any():
-                self.reset_some(done, returned_next[0])
+                self.reset_some(done, returned[0])
             any_ended |= bool(done.any())
-            returned, ended = list(returned_next[:4]), done
+            latest, ended = returned[:4], done
         if not any_ended:
             _warn(f"no episode ended within {num_steps} steps: autoreset was not checked")
+
+    def check_reset(self, returned: Any) -> Any:
+        obs, infos = returned
+        _check_in_space(self.env.observation_space, obs, "the observation of reset()")
+        self.check_infos(infos, "reset")
+        return obs
 
     def check_step(self, returned: Any) -> np.ndarray:
         _require(
             isinstance(returned, tuple) and len(returned) == 5,
             "step() must return observations, rewards, terminated, truncated and infos",
         )
-        obs, reward, *flags, infos = returned
-        self.check_obs(obs, "step")
-        rewards = _host(reward)
+        _check_in_space(self.env.observation_space, returned[0], "the observation of step()")
+        rewards, *flags = map(np.asarray, returned[1:4])
         _require(
             rewards.shape == (self.num_envs,) and rewards.dtype.kind == "f",
             f"rewards must be floats of shape ({self.num_envs},), are {_describe(rewards)}",
         )
         _require(bool(np.isfinite(rewards).all()), "rewards must be finite")
-        for name, flag in zip(("terminated", "truncated"), map(_host, flags), strict=True):
-            _require(
-                flag.shape == (self.num_envs,) and flag.dtype == np.bool_,
-                f"{name} must be bools of shape ({self.num_envs},), is {_describe(flag)}",
-            )
-        self.check_infos(infos, "step")
-        return _host(flags[0]) | _host(flags[1])
+        for name, flag in zip(("terminated", "truncated"), flags, strict=True):
+            self.check_bools(name, flag)
+        self.check_infos(returned[4], "step")
+        return flags[0] | flags[1]
 
-    def check_obs(self, obs: Any, where: str) -> None:
-        _check_in_space(self.env.observation_space, obs, f"the observation of {where}()")
+    def check_bools(self, name: str, flags: np.ndarray) -> None:
+        _require(
+            flags.shape == (self.num_envs,) and flags.dtype == np.bool_,
+            f"{name} must be bools of shape ({self.num_envs},), is {_describe(flags)}",
+        )
 
     def check_infos(self, infos: Any, where: str) -> None:
         _require(isinstance(infos, dict), f"the infos of {where}() must be a dict")
@@ -180,77 +189,48 @@ class _Check:
             if name.startswith("_") and name[1:] in infos:
                 continue
             _require(f"_{name}" in infos, f"infos[{name!r}] must have a mask infos['_{name}']")
-            mask = _host(infos[f"_{name}"])
-            _require(
-                mask.shape == (self.num_envs,) and mask.dtype == np.bool_,
-                f"infos['_{name}'] must be bools of shape ({self.num_envs},), is {_describe(mask)}",
-            )
+            self.check_bools(f"infos['_{name}']", np.asarray(infos[f"_{name}"]))
             if name == "final_info":
                 self.check_infos(value, where)
                 continue
-            for leaf in _leaves(value):
-                _require(
-                    np.shape(leaf)[:1] == (self.num_envs,),
-                    f"infos[{name!r}] must have {self.num_envs} entries",
-                )
-
-    def check_first_step(self, returned: Any, ended: np.ndarray) -> None:
-        _, reward, terminated, truncated, _ = returned
-        rule = "in mode NEXT_STEP, the step after the end of an episode must return"
-        _require(not _host(reward)[ended].any(), f"{rule} reward 0")
-        _require(
-            not (_host(terminated) | _host(truncated))[ended].any(), f"{rule} both flags False"
-        )
+            _require(
+                all(np.shape(leaf)[:1] == (self.num_envs,) for leaf in jax.tree.leaves(value)),
+                f"infos[{name!r}] must have {self.num_envs} entries",
+            )
 
     def check_final(self, obs: Any, infos: dict[str, Any], done: np.ndarray) -> None:
         for name in ("final_obs", "final_info"):
-            mask = _host(infos[f"_{name}"]) if name in infos else np.zeros_like(done)
+            mask = np.asarray(infos[f"_{name}"]) if name in infos else np.zeros_like(done)
             _require(
                 np.array_equal(mask, done),
                 f"in mode SAME_STEP, infos must have {name!r} exactly where an episode ended",
             )
         rule = "in mode SAME_STEP, the observation at the end of an episode must be the next one's"
         for i in np.flatnonzero(done):
-            final = _row(infos["final_obs"], i)
+            final, first = (jax.tree.map(lambda x, i=i: x[i], x) for x in (infos["final_obs"], obs))
             _check_in_space(self.env.single_observation_space, final, f"infos['final_obs'][{i}]")
-            differs = not _equal(_host_copy(final), _host_copy(_row(obs, i)))
-            self.changed[rule] = self.changed.get(rule, False) or differs
+            self.changed[rule] = self.changed.get(rule, False) or not _equal(final, first)
 
     def reset_some(self, mask: np.ndarray, before: Any) -> None:
-        """Reset where ``mask`` and checks that only that happened; ``before`` is the last obs."""
+        """Reset where ``mask``, and check that only that happened; ``before`` is the last obs."""
         rule = "reset(options={'reset_mask': mask}) must"
-        kept, options, mask_given = _host_copy(before), {"reset_mask": mask.copy()}, mask.copy()
-        given = options["reset_mask"]
-        obs, infos = self.env.reset(options=options)
+        kept, given = _copy(before), mask.copy()
+        options = {"reset_mask": given}
+        returned = self.env.reset(options=options)
         if options.get("reset_mask") is not given:
             _warn("reset() changed the caller's options; wrappers then see no reset_mask")
-        _require(np.array_equal(given, mask_given), f"{rule} not write to the mask")
-        self.check_obs(obs, "reset")
-        self.check_infos(infos, "reset")
-        for old, new in zip(_leaves(kept), _leaves(_host_copy(obs)), strict=True):
-            _require(
-                np.array_equal(old[~mask], new[~mask]),
-                f"{rule} return the observations of the other environments as they were",
-            )
-            reset = f"{rule} reset the masked environments"
-            differs = not np.array_equal(old[mask], new[mask])
-            self.changed[reset] = self.changed.get(reset, False) or differs
+        _require(np.array_equal(given, mask), f"{rule} not write to the mask")
+        obs = _copy(self.check_reset(returned))
+        old, new = (jax.tree.map(lambda x: x[~mask], tree) for tree in (kept, obs))
+        _require(
+            _equal(old, new),
+            f"{rule} return the observations of the other environments as they were",
+        )
+        old, new = (jax.tree.map(lambda x: x[mask], tree) for tree in (kept, obs))
+        reset = f"{rule} reset the masked environments"
+        self.changed[reset] = self.changed.get(reset, False) or not _equal(old, new)
 
-    def check_reset_mask(self) -> None:
-        """Check that only masked rows are reset: the others go on as if nothing had happened."""
-        if self.num_envs == 1:
-            return
-        mask = np.zeros(self.num_envs, bool)
-        mask[0] = True
-        undisturbed, disturbed = self.replay(self.seed), self.replay(self.seed, mask)
-        for one, other in zip(undisturbed, disturbed, strict=False):
-            for left, right in zip(_leaves(one), _leaves(other), strict=True):
-                _require(
-                    np.array_equal(left[1:], right[1:]),
-                    "reset(options={'reset_mask': mask}) must leave the other environments alone",
-                )
-
-    def check_render(self) -> None:
+    def render(self) -> None:
         if self.env.render_mode is None:
             return
         images: Any = self.env.render()
@@ -271,7 +251,7 @@ class _Check:
         fps: Any = self.env.metadata.get("render_fps")
         _require(bool(fps) and fps > 0, f"metadata['render_fps'] must be positive, is {fps!r}")
 
-    def check_close(self) -> None:
+    def close(self) -> None:
         try:
             self.env.close()
             self.env.close()
@@ -289,38 +269,14 @@ def _warn(message: str) -> None:
     warnings.warn(message + ".", VectorEnvWarning, stacklevel=2)
 
 
-def _host(array: Any) -> np.ndarray:
-    return np.asarray(array)
-
-
-def _leaves(value: Any) -> Iterator[Any]:
-    if isinstance(value, dict):
-        for name in sorted(value):
-            yield from _leaves(value[name])
-    elif isinstance(value, (tuple, list)):
-        for part in value:
-            yield from _leaves(part)
-    else:
-        yield value
-
-
-def _host_copy(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {name: _host_copy(part) for name, part in value.items()}
-    if isinstance(value, (tuple, list)):
-        return [_host_copy(part) for part in value]
-    return np.array(_host(value))
+def _copy(tree: Any) -> Any:
+    """Return copies in the host's memory."""
+    return jax.tree.map(lambda x: np.array(np.asarray(x)), tree)
 
 
 def _equal(one: Any, other: Any) -> bool:
-    left, right = list(_leaves(one)), list(_leaves(other))
+    left, right = jax.tree.leaves(one), jax.tree.leaves(other)
     return len(left) == len(right) and all(map(np.array_equal, left, right))
-
-
-def _row(batch: Any, index: Any) -> Any:
-    if isinstance(batch, dict):
-        return {name: _row(part, index) for name, part in batch.items()}
-    return batch[index]
 
 
 def _describe(array: np.ndarray) -> str:
@@ -328,27 +284,25 @@ def _describe(array: np.ndarray) -> str:
 
 
 def _is_batch(single: spaces.Space, batched: spaces.Space, num_envs: int) -> bool:
-    if isinstance(single, spaces.Box):
-        # Compared by parts: a batched Box of many pixel environments takes gigabytes to build.
-        return (
-            isinstance(batched, spaces.Box)
-            and batched.shape == (num_envs, *single.shape)
-            and batched.dtype == single.dtype
-            and all(
-                np.array_equal(low, single.low) and np.array_equal(high, single.high)
-                for low, high in (
-                    (batched.low[0], batched.high[0]),
-                    (batched.low[-1], batched.high[-1]),
-                )
-            )
-        )
     if isinstance(single, spaces.Dict):
         return (
             isinstance(batched, spaces.Dict)
             and set(single.spaces) == set(batched.spaces)
             and all(_is_batch(single[name], batched[name], num_envs) for name in single.spaces)
         )
-    return batch_space(single, num_envs) == batched
+    if not isinstance(single, spaces.Box):
+        return batch_space(single, num_envs) == batched
+    # Compared by parts: a batched Box of many pixel environments takes gigabytes to build.
+    return (
+        isinstance(batched, spaces.Box)
+        and batched.shape == (num_envs, *single.shape)
+        and batched.dtype == single.dtype
+        and all(
+            np.array_equal(batched.low[i], single.low)
+            and np.array_equal(batched.high[i], single.high)
+            for i in (0, -1)
+        )
+    )
 
 
 def _check_in_space(space: spaces.Space, value: Any, what: str) -> None:
@@ -357,22 +311,21 @@ def _check_in_space(space: spaces.Space, value: Any, what: str) -> None:
             isinstance(value, dict) and set(value) == set(space.spaces),
             f"{what} must be a dict of {', '.join(space.spaces)}",
         )
-        for name, part in space.spaces.items():
+        parts: dict[Any, spaces.Space] = space.spaces
+    elif isinstance(space, spaces.Tuple):
+        size = len(space.spaces)
+        _require(
+            isinstance(value, tuple) and len(value) == size, f"{what} must be a tuple of {size}"
+        )
+        parts = dict(enumerate(space.spaces))
+    if isinstance(space, (spaces.Dict, spaces.Tuple)):
+        for name, part in parts.items():
             _check_in_space(part, value[name], f"{what}, entry {name!r},")
         return
-    if isinstance(space, spaces.Tuple):
-        _require(
-            isinstance(value, tuple) and len(value) == len(space.spaces),
-            f"{what} must be a tuple of {len(space.spaces)}",
-        )
-        for index, part in enumerate(space.spaces):
-            _check_in_space(part, value[index], f"{what}, entry {index},")
-        return
     if isinstance(space, spaces.Box):
-        array = _host(value)
+        value = np.asarray(value)
         _require(
-            array.shape == space.shape and array.dtype == space.dtype,
-            f"{what} must be {space.dtype} of shape {space.shape}, is {_describe(array)}",
+            value.shape == space.shape and value.dtype == space.dtype,
+            f"{what} must be {space.dtype} of shape {space.shape}, is {_describe(value)}",
         )
-        value = array
     _require(value in space, f"{what} must lie in {space}")

@@ -2,29 +2,26 @@
 
 from __future__ import annotations
 
+import sys
+from types import FrameType
 from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.envs.registration import EnvSpec
+from gymnasium.wrappers import TimeLimit
 
+from pixelbrax_gym.gymnasium.base import StatefulAdapter
 from pixelbrax_gym.gymnasium.spaces import action_space, observation_space
-from pixelbrax_gym.gymnasium.specs import complete_spec, time_limit_around
 from pixelbrax_gym.gymnasium.window import Window
 from pixelbrax_gym.interop.export import exporter, to_numpy
-from pixelbrax_gym.reset_options import check_reset_options
-from pixelbrax_gym.seeds import check_seed, check_unseeded
+from pixelbrax_gym.resets import check_seed, read_options
 from pixelbrax_gym.stateful import StatefulEnv
-from pixelbrax_jax.memory import check_fits
-from pixelbrax_jax.types import EnvState
-from pixelbrax_jax.validation import check_choice, check_positive_int
+from pixelbrax_jax.validation import check_choice
 
 RENDER_MODES = ("human", "rgb_array")
 
-_OWN_OPTIONS = ("output", "render_mode", "render_height", "render_width", "max_episode_steps")
 
-
-class GymnasiumEnv(gymnasium.Env):
+class GymnasiumEnv(StatefulAdapter, gymnasium.Env):
     """A Brax task seen through a camera.
 
     Seeded with s it is bitwise environment 0 of a ``GymnasiumVectorEnv`` that is seeded with s,
@@ -83,19 +80,18 @@ class GymnasiumEnv(gymnasium.Env):
             check_choice("render_mode", render_mode, RENDER_MODES)
         self._export = exporter(output)
         self._stateful = StatefulEnv(
+            GymnasiumEnv,
             task,
             options,
             single=True,
             max_episode_steps=max_episode_steps,
-            also_allowed=_OWN_OPTIONS,
+            render_size=(render_height, render_width),
         )
         env = self._stateful.env
         self.observation_space = observation_space(env.obs_spec)
         self.action_space = action_space(env.action_size)
         self.render_mode = render_mode
         self.metadata = {**type(self).metadata, "render_fps": self._stateful.fps}
-        self._render_size = check_render_size(render_height, render_width)
-        self._spec: EnvSpec | None = None
         self._window: Window | None = None
         if render_mode == "human":
             self._window = Window(f"PixelBrax {task}", self._stateful.fps)
@@ -120,43 +116,14 @@ class GymnasiumEnv(gymnasium.Env):
                 environment; or there are other options.
             RuntimeError: this process is a fork that cannot run JAX.
         """
-        check_reset_options(options, ("state",))
+        given = read_options(options, seed)
         self._take_time_limit()
-        if options:
-            check_unseeded(seed)
-            outputs = self._stateful.set_state(options["state"])
-        else:
+        if not given:
             seed = None if seed is None else check_seed(seed)
-            super().reset(seed=seed)
-            outputs = self._stateful.reset(seed, self.np_random)
+            gymnasium.Env.reset(self, seed=seed)
+        outputs = self._stateful.reset(seed, self.np_random, **given)
         self._show()
         return self._export(outputs["obs"]), _plain(outputs["info"])
-
-    def get_state(self) -> EnvState:
-        """Return the present state.
-
-        Returns:
-            An ``EnvState`` of arrays that nothing writes to, with all that decides how the episode
-            and the later ones go on, but for a ``TimeLimit`` around the environment. It can be
-            pickled, and ``reset(options={"state": state})`` goes on from it to the bit.
-
-        Raises:
-            ResetNeeded: before the first reset, or after ``close``.
-        """
-        return self._stateful.get_state()
-
-    def set_state(self, state: EnvState) -> None:
-        """Go on from a given state, as ``reset(options={"state": state})`` does.
-
-        Args:
-            state: what ``get_state`` returned here or of another environment of the same options,
-                or ``PixelEnv.reset`` or ``step`` did.
-
-        Raises:
-            TypeError: it is no ``EnvState``.
-            ValueError: it is of another environment; the message names the first difference.
-        """
-        self._stateful.set_state(state)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Act for ``action_repeat`` control steps.
@@ -210,18 +177,9 @@ class GymnasiumEnv(gymnasium.Env):
             self._window.close()
         self._stateful.forget()
 
-    @property
-    def spec(self) -> EnvSpec | None:
-        """What Gymnasium knows of the environment, with its time limit in calls of ``step``."""
-        return self._spec
-
-    @spec.setter
-    def spec(self, spec: EnvSpec | None) -> None:
-        self._spec = complete_spec(spec, self._stateful, self._stateful.is_limited)
-
     def _take_time_limit(self) -> None:
         """Let a ``TimeLimit`` around this environment have its way, unless a limit was given."""
-        calls = None if self._stateful.is_limited else time_limit_around(self)
+        calls = None if self._stateful.is_limited else _time_limit_around(self)
         if calls is not None and calls > self._stateful.max_episode_steps:
             self._stateful.set_time_limit(calls * self._stateful.env.action_repeat)
             if self._spec is not None:
@@ -232,20 +190,26 @@ class GymnasiumEnv(gymnasium.Env):
             self._window.show(self._picture())
 
     def _picture(self) -> np.ndarray:
-        image: np.ndarray = to_numpy(self._stateful.render(*self._render_size))[0]
+        image: np.ndarray = to_numpy(self._stateful.render())[0]
         return image
 
 
-def check_render_size(height: Any, width: Any) -> tuple[int, int]:
-    """Return the size of an image that ``render()`` draws.
+def _time_limit_around(env: gymnasium.Env) -> int | None:
+    """Return the least limit of the ``TimeLimit`` wrappers through which ``env`` is reset.
 
-    Raises:
-        ValueError: it is not a pair of integers of at least 1.
-        MemoryError: an image would not fit into this machine's memory.
+    ``gymnasium.make`` tells its ``max_episode_steps`` to such a wrapper alone, so that an
+    environment with a limit of its own cannot know otherwise that a longer one was asked for.
     """
-    size = check_positive_int("render_height", height), check_positive_int("render_width", width)
-    check_fits(f"render_height={height}, render_width={width}", 3 * size[0] * size[1])
-    return size
+    limits: list[int] = []
+    frame: FrameType | None = sys._getframe(1)
+    while frame is not None:
+        # Of no other frame: to look at its variables may keep them alive.
+        if frame.f_code is TimeLimit.reset.__code__:
+            wrapper = frame.f_locals["self"]
+            if wrapper.unwrapped is env:
+                limits.append(wrapper._max_episode_steps)
+        frame = frame.f_back
+    return min(limits, default=None)
 
 
 def _plain(info: dict[str, Any]) -> dict[str, Any]:

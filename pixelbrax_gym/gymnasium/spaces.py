@@ -22,14 +22,7 @@ class BroadcastBox(gymnasium.spaces.Box):
     """
 
     def __init__(self, low: float, high: float, shape: tuple[int, ...], dtype: Any) -> None:
-        """Make the space.
-
-        Args:
-            low: bound of every entry.
-            high: bound of every entry.
-            shape: of a sample.
-            dtype: of a sample.
-        """
+        """Make the space; each bound is that of every entry."""
         super().__init__(low, high, (1,), dtype)
         self._shape = tuple(shape)
         self.low_repr, self.high_repr = str(self.low[0]), str(self.high[0])
@@ -68,14 +61,9 @@ iterate.register(BroadcastBox, iterate.dispatch(gymnasium.spaces.Box))
 
 
 def observation_space(spec: Any, num_envs: int | None = None) -> gymnasium.Space:
-    """Return the space of an observation.
+    """Return the space of an observation, batched if ``num_envs`` is given.
 
-    Args:
-        spec: ``PixelEnv.obs_spec``: a ``jax.ShapeDtypeStruct`` or a dict of them.
-        num_envs: of the batch; None for a single environment.
-
-    Returns:
-        uint8 boxes in [0, 255] for pixels, unbounded float32 boxes for state, a ``Dict`` for both.
+    uint8 boxes in [0, 255] for pixels, unbounded float32 boxes for state, a ``Dict`` for both.
     """
     if isinstance(spec, dict):
         return gymnasium.spaces.Dict(

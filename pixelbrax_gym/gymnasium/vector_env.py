@@ -3,39 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import gymnasium
 import jax
 import numpy as np
-from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 
-from pixelbrax_gym.gymnasium.env import check_render_size
+from pixelbrax_gym.gymnasium.base import StatefulAdapter
 from pixelbrax_gym.gymnasium.spaces import action_space, observation_space
-from pixelbrax_gym.gymnasium.specs import complete_spec
 from pixelbrax_gym.interop.export import exporter, to_numpy
-from pixelbrax_gym.reset_options import check_reset_options, reset_mask
-from pixelbrax_gym.seeds import check_seed, check_unseeded
+from pixelbrax_gym.resets import check_seed, read_options
 from pixelbrax_gym.stateful import StatefulEnv
 from pixelbrax_gym.sub_env import SubEnv, call_sub_envs
-from pixelbrax_jax import AUTORESET_MODES
-from pixelbrax_jax.types import EnvState
 from pixelbrax_jax.validation import check_choice
 
-_OWN_OPTIONS = (
-    "num_envs",
-    "autoreset_mode",
-    "output",
-    "render_mode",
-    "render_height",
-    "render_width",
-    "max_episode_steps",
-)
 
-
-class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
+class GymnasiumVectorEnv(StatefulAdapter, gymnasium.vector.VectorEnv):
     """``num_envs`` copies of a Brax task seen through a camera, stepped together.
 
     Environment i seeded with s is the same whatever ``num_envs`` is and whoever its neighbors.
@@ -126,12 +111,13 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         self.autoreset_mode = as_autoreset_mode(autoreset_mode)
         self._output, self._export = output, exporter(output)
         self._stateful = StatefulEnv(
+            GymnasiumVectorEnv,
             task,
             options,
             num_envs=num_envs,
             autoreset_mode=self.autoreset_mode.name.lower(),
             max_episode_steps=max_episode_steps,
-            also_allowed=_OWN_OPTIONS,
+            render_size=(render_height, render_width),
         )
         env = self._stateful.env
         self.num_envs = self._stateful.num_envs
@@ -145,8 +131,6 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
             "render_fps": self._stateful.fps,
             "autoreset_mode": self.autoreset_mode,
         }
-        self._render_size = check_render_size(render_height, render_width)
-        self._spec: EnvSpec | None = None
 
     def reset(
         self,
@@ -177,42 +161,13 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
             ClosedEnvironmentError: after ``close``.
             RuntimeError: this process is a fork that cannot run JAX.
         """
-        check_reset_options(options, ("reset_mask", "state"))
-        mask = reset_mask(options, self.num_envs)
-        if options and "state" in options:
-            check_unseeded(seed)
-            outputs = self._stateful.set_state(options["state"], mask)
-            return self._export(outputs["obs"]), self._infos(outputs)
-        # One seed for all also seeds the generator that Gymnasium's wrappers draw from.
-        super().reset(seed=None if seed is None or np.ndim(seed) else check_seed(seed))
-        outputs = self._stateful.reset(seed, self.np_random, mask)
+        given = read_options(options, seed, self.num_envs)
+        if "state" not in given:
+            # One seed for all also seeds the generator that Gymnasium's wrappers draw from.
+            first = None if seed is None or np.ndim(seed) else check_seed(seed)
+            gymnasium.vector.VectorEnv.reset(self, seed=first)
+        outputs = self._stateful.reset(seed, self.np_random, **given)
         return self._export(outputs["obs"]), self._infos(outputs)
-
-    def get_state(self) -> EnvState:
-        """Return the present states of all environments.
-
-        Returns:
-            An ``EnvState`` with a leading axis N, of arrays that nothing writes to. It can be
-            pickled, and ``reset(options={"state": state})`` goes on from it to the bit.
-
-        Raises:
-            ResetNeeded: before the first reset.
-            ClosedEnvironmentError: after ``close``.
-        """
-        return self._stateful.get_state()
-
-    def set_state(self, state: EnvState) -> None:
-        """Go on from given states, as ``reset(options={"state": state})`` does.
-
-        Args:
-            state: what ``get_state`` returned here or of other environments of the same options.
-
-        Raises:
-            TypeError: it is no ``EnvState``.
-            ValueError: it is of other environments; the message names the first difference.
-            ClosedEnvironmentError: after ``close``.
-        """
-        self._stateful.set_state(state)
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Step all environments.
@@ -253,28 +208,14 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         """
         if self.render_mode is None:
             return None
-        return tuple(to_numpy(self._stateful.render(*self._render_size)))
+        return tuple(to_numpy(self._stateful.render()))
 
     def get_images(self) -> list[np.ndarray | None]:
-        """Draw the present states.
-
-        Returns:
-            N arrays (render_height, render_width, 3) of uint8; None without a render mode.
-
-        Raises:
-            ResetNeeded: before the first reset.
-            ClosedEnvironmentError: after ``close``.
-        """
+        """Return what ``render`` does as a list, N times None without a render mode."""
         return list(self.render() or [None] * self.num_envs)
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """Return what a method of each environment returns, or the attribute of that name.
-
-        Args:
-            name: of the method or attribute, such as ``"render"``.
-            *args: of the method.
-            **kwargs: of the method.
-        """
+        """Return what a method of each environment returns, or the attribute of that name."""
         return tuple(call_sub_envs(self._sub_envs, name, *args, **kwargs))
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
@@ -297,15 +238,6 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         for sub_env, value in zip(self._sub_envs, each, strict=True):
             sub_env.set_wrapper_attr(name, value)
 
-    @property
-    def spec(self) -> EnvSpec | None:
-        """What Gymnasium knows of the environments, with their time limit in calls of ``step``."""
-        return self._spec
-
-    @spec.setter
-    def spec(self, spec: EnvSpec | None) -> None:
-        self._spec = complete_spec(spec, self._stateful, limited=True)
-
     def close_extras(self, **kwargs: Any) -> None:
         """Forget the states."""
         del kwargs
@@ -319,41 +251,41 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         return [SubEnv(self, i, *spaces) for i in range(self.num_envs)]
 
     def _infos(self, outputs: Mapping[str, Any]) -> dict[str, Any]:
-        if self._output != "numpy":
-            return self._export(outputs["info"])
-        infos = dict(outputs["info"])
-        final_obs = infos.pop("final_obs", None)
-        final_info = infos.pop("final_info", None)
-        infos.pop("_final_obs", None), infos.pop("_final_info", None)
-        infos = jax.tree.map(np.array, infos)
-        done = np.array(outputs["done"])
-        if final_obs is None or not done.any():
+        info, is_numpy = dict(outputs["info"]), self._output == "numpy"
+        final_obs, final_info = info.pop("final_obs", None), info.pop("final_info", None)
+        # Copies take less time than views of a few numbers.
+        numbers = partial(jax.tree.map, np.array) if is_numpy else self._export
+        infos = _with_masks(numbers(info), numbers(outputs["reported"]))
+        if final_obs is None:
             return infos
-        final_obs = self._export(final_obs)
-        rows = np.full(self.num_envs, None, dtype=object)
-        for i in np.flatnonzero(done):
-            # A copy: a view would keep the frames of all environments alive.
-            rows[i] = jax.tree.map(lambda x, i=i: x[i].copy(), final_obs)
-        # Zero where no episode ended, as in Gymnasium's own vector environments.
-        final_info = jax.tree.map(np.array, final_info)
-        for value in final_info.values():
-            value[~done] = 0
-        infos |= {"final_obs": rows, "final_info": final_info}
-        return infos | {"_final_obs": done, "_final_info": done.copy()}
+        done = numbers(outputs["done"])
+        if is_numpy and not done.any():
+            return infos
+        final_obs, final_info = self._export(final_obs), numbers(final_info)
+        if is_numpy:
+            rows = np.full(self.num_envs, None, dtype=object)
+            for i in np.flatnonzero(done):
+                # A copy: a view would keep the frames of all environments alive.
+                rows[i] = jax.tree.map(lambda x, i=i: x[i].copy(), final_obs)
+            # Zero where no episode ended, as in Gymnasium's own vector environments.
+            for value in final_info.values():
+                value[~done] = 0
+            final_obs = rows
+        ended = {"final_obs": final_obs, "final_info": _with_masks(final_info, done)}
+        return infos | _with_masks(ended, done)
+
+
+def _with_masks(infos: dict[str, Any], mask: Any) -> dict[str, Any]:
+    """Add a mask ``_key`` for each ``key``, which says what environments it is about."""
+    return infos | {f"_{name}": mask for name in infos}
 
 
 def as_autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:
-    """Return Gymnasium's name of an autoreset mode.
-
-    Args:
-        mode: ours, Gymnasium's, or the value of Gymnasium's.
-
-    Raises:
-        ValueError: there is no such mode; the message lists them.
-    """
+    """Return Gymnasium's name of an autoreset mode: ours, Gymnasium's, or the value of that."""
     if isinstance(mode, AutoresetMode):
         return mode
     by_value = {known.value: known for known in AutoresetMode}
     if isinstance(mode, str) and mode in by_value:
         return by_value[mode]
-    return AutoresetMode[check_choice("autoreset_mode", mode, AUTORESET_MODES).upper()]
+    modes = [known.name.lower() for known in AutoresetMode]
+    return AutoresetMode[check_choice("autoreset_mode", mode, modes).upper()]

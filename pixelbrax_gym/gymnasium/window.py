@@ -16,15 +16,7 @@ class Window:
     """Shows images on the screen, no faster than a given rate."""
 
     def __init__(self, title: str, fps: int) -> None:
-        """Open nothing yet.
-
-        Args:
-            title: of the window.
-            fps: images per second.
-
-        Raises:
-            ImportError: pygame is not installed, with the fix.
-        """
+        """Open nothing yet; an ImportError has the fix if pygame is not installed."""
         try:
             import pygame
         except ImportError as error:
@@ -42,14 +34,7 @@ class Window:
         return Window, (self._title, self._fps)
 
     def show(self, image: np.ndarray) -> None:
-        """Show an image.
-
-        Args:
-            image: (H, W, 3) uint8.
-
-        Raises:
-            OSError: no window can be opened; with the reason and the fix.
-        """
+        """Show an image, (H, W, 3) uint8; an OSError has the reason if no window can be opened."""
         pygame = self._pygame
         if self._screen is None:
             try:

@@ -22,29 +22,16 @@ def to_torch(tree: Any) -> Any:
     A tensor and its array share memory, which torch may write to: hand over only arrays that
     nobody reads again. Waits for a CPU array to be computed; on a GPU, torch's current stream
     waits and the host does not.
-
-    Args:
-        tree: a pytree of JAX arrays, each on one device.
-
-    Returns:
-        The same tree of tensors, of the same shapes and dtypes.
     """
     # The arrays themselves, not capsules of them: only so do the two agree on a stream.
     return jax.tree.map(torch.utils.dlpack.from_dlpack, tree)
 
 
 def actions_to_jax(tensor: torch.Tensor, device: jax.Device) -> np.ndarray | jax.Array:
-    """Return a tensor of actions as something that a jitted function takes.
+    """Return a tensor of actions as float32 that a jitted function takes.
 
     It is copied: JAX computes in the background, and would otherwise read the caller's memory
-    after the caller has filled it with the next actions.
-
-    Args:
-        tensor: floating point, any shape, on the environment's device.
-        device: the environment's device.
-
-    Returns:
-        float32, same shape: a NumPy array for a CPU tensor, else an array on ``device``.
+    after the caller has filled it with the next actions. A CPU tensor becomes a NumPy array.
 
     Raises:
         TypeError: the tensor is not floating point, or sparse.
@@ -67,14 +54,7 @@ def actions_to_jax(tensor: torch.Tensor, device: jax.Device) -> np.ndarray | jax
 
 
 def as_device(device: torch.device | str) -> torch.device:
-    """Return a torch device that is there.
-
-    Args:
-        device: a torch device or its name.
-
-    Raises:
-        ValueError: there is no such device; the message names the argument.
-    """
+    """Return a torch device; a ValueError, naming the argument, if it is not there."""
     try:
         place = torch.device(device)
         torch.empty(0, device=place)
@@ -86,11 +66,7 @@ def as_device(device: torch.device | str) -> torch.device:
 
 
 def torch_device(device: jax.Device) -> torch.device:
-    """Return the torch name of a JAX device.
-
-    Raises:
-        ValueError: torch has none, e.g. of a TPU.
-    """
+    """Return the torch name of a JAX device; a ValueError if torch has none."""
     if device.platform == "cpu":
         return torch.device("cpu")
     if device.platform in ("gpu", "cuda", "rocm"):
@@ -99,11 +75,7 @@ def torch_device(device: jax.Device) -> torch.device:
 
 
 def default_torch_device() -> torch.device:
-    """Return the torch name of the device on which JAX computes by default.
-
-    Raises:
-        ValueError: torch has none, e.g. of a TPU.
-    """
+    """Return the torch name of the device on which JAX computes by default."""
     # A small array has it, whatever the device was chosen by.
     (device,) = jax.device_put(np.float32(0)).devices()
     return torch_device(device)

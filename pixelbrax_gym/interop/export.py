@@ -8,26 +8,16 @@ from typing import Any
 import jax
 import numpy as np
 
-from pixelbrax_jax.flags import is_guarded
 from pixelbrax_jax.validation import check_choice
 
 OUTPUTS = ("jax", "numpy", "torch")
 
 
 def exporter(output: str) -> Callable[[Any], Any]:
-    """Return how to hand out a tree of JAX arrays.
+    """Return how to hand out a tree of JAX arrays that nobody reads again.
 
-    Args:
-        output: ``"numpy"`` for arrays that may be written to, ``"torch"`` for tensors on the
-            environment's device, both without a copy where the device is the CPU; ``"jax"`` for
-            the arrays. Hand over only arrays that nobody reads again.
-
-    Returns:
-        A function of a tree.
-
-    Raises:
-        ValueError: another name.
-        ImportError: torch is not installed, with the fix.
+    ``"numpy"`` gives arrays that may be written to, without a copy where they are on a CPU;
+    ``"torch"`` gives tensors on the environment's device, ``"jax"`` the arrays.
     """
     check_choice("output", output, OUTPUTS)
     if output == "torch":
@@ -41,26 +31,8 @@ def to_numpy(tree: Any) -> Any:
     """Return every array of a tree as a NumPy array that may be written to.
 
     Without a copy where the array is on a CPU: hand over only arrays that nobody reads again.
-
-    Args:
-        tree: a pytree of JAX arrays, each on one device.
-
-    Returns:
-        The same tree of NumPy arrays, of the same shapes and dtypes.
     """
     return jax.tree.map(_writable, tree)
-
-
-def read_under_guard(outputs: dict[str, Any]) -> None:
-    """Read all but observations explicitly where ``jax.transfer_guard`` watches what is read.
-
-    JAX keeps what it has read, so that ``float(x)`` and ``np.asarray(x)`` transfer nothing then.
-
-    Args:
-        outputs: of a ``StatefulEnv``.
-    """
-    if is_guarded("device_to_host"):
-        jax.device_get({name: x for name, x in outputs.items() if name != "obs"})
 
 
 class _Memory:

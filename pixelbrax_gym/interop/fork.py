@@ -40,10 +40,6 @@ def is_forked() -> bool:
 
 
 def check_not_forked() -> None:
-    """Stop a forked worker before it hangs.
-
-    Raises:
-        RuntimeError: JAX cannot run in this process, with the fix.
-    """
+    """Stop a forked worker before it hangs, by a RuntimeError with the fix."""
     if _Process.forked:
         raise RuntimeError(_FIX)

@@ -18,34 +18,19 @@ except ImportError as missing:
         f"Stable-Baselines3 is not installed; try: {install_extra('sb3')}"
     ) from missing
 
-from pixelbrax_gym.gymnasium.env import check_render_size
 from pixelbrax_gym.gymnasium.spaces import action_space, channels_first_space, observation_space
 from pixelbrax_gym.interop.export import to_numpy
-from pixelbrax_gym.reset_options import check_reset_options
-from pixelbrax_gym.seeds import SEEDS, spread_seeds
+from pixelbrax_gym.resets import SEEDS, spread_seeds
 from pixelbrax_gym.stateful import StatefulEnv
 from pixelbrax_gym.sub_env import SubEnv, call_sub_envs
 from pixelbrax_jax import PixelEnv
 from pixelbrax_jax.validation import check_bool, check_choice
-
-_OWN_OPTIONS = (
-    "num_envs",
-    "render_mode",
-    "render_height",
-    "render_width",
-    "channels_first",
-    "stagger",
-    "max_episode_steps",
-)
 
 
 def check_channels(env: PixelEnv, channels_first: bool) -> None:
     """Reject images of which Stable-Baselines3 would read another axis as channels.
 
     It takes the shortest axis for them, the first of several.
-
-    Raises:
-        ValueError: it would; the message names the options.
     """
     channels = 3 * env.frame_stack
     shortest = min(env.height, env.width)
@@ -125,15 +110,15 @@ class SB3VecEnv(VecEnv):
         self._channels_first = check_bool("channels_first", channels_first)
         stagger = check_bool("stagger", stagger)
         self._stateful = StatefulEnv(
+            SB3VecEnv,
             task,
             options,
             num_envs=num_envs,
             autoreset_mode="same_step",
             max_episode_steps=max_episode_steps,
-            also_allowed=_OWN_OPTIONS,
+            render_size=(render_height, render_width),
         )
         env, num_envs = self._stateful.env, self._stateful.num_envs
-        self._render_size = check_render_size(render_height, render_width)
         space = observation_space(env.obs_spec)
         space = channels_first_space(space) if channels_first else space
         check_channels(env, channels_first)
@@ -162,25 +147,20 @@ class SB3VecEnv(VecEnv):
         given = self._options
         # What is refused must not be refused again at the next reset.
         self._reset_options()
-        for options in given:
-            check_reset_options(options)
+        for options in filter(None, given):
+            raise ValueError(
+                f"reset() takes no options, got {', '.join(map(repr, options))}; seed() gives a "
+                "seed, everything else is given when the environment is made."
+            )
         outputs = self._stateful.reset(self._seeds, time_limit_offsets=self._time_limit_offsets)
         self._reset_seeds()
         self.reset_infos = [{} for _ in range(self.num_envs)]
         return self._observations(outputs["obs"])
 
     def seed(self, seed: int | None = None) -> Sequence[int]:
-        """Let environment i draw from ``seed + i`` from the next reset on.
+        """Let environment i draw from ``seed + i`` from the next reset on; returns the N seeds.
 
-        Args:
-            seed: an integer; beyond 2**32 - 1 they go on at 0. NumPy's global generator
-                draws one for None.
-
-        Returns:
-            The N seeds.
-
-        Raises:
-            TypeError: it is not an integer.
+        Beyond 2**32 - 1 they go on at 0. NumPy's global generator draws one for None.
         """
         if seed is None:
             seed = int(np.random.randint(SEEDS, dtype=np.uint64))  # noqa: NPY002  # as SB3 does
@@ -215,11 +195,7 @@ class SB3VecEnv(VecEnv):
 
     def _describe_ends(self, infos: list[dict[str, Any]], rows: np.ndarray, info: Any) -> None:
         last = self._observations(info["final_obs"])
-        final = {
-            name: np.array(value)
-            for name, value in info["final_info"].items()
-            if not name.startswith("_")
-        }
+        final = {name: np.array(value) for name, value in info["final_info"].items()}
         for i in rows:
             # A copy: a view would keep the frames of all environments alive.
             infos[i]["terminal_observation"] = jax.tree.map(lambda x, i=i: x[i].copy(), last)
@@ -229,18 +205,10 @@ class SB3VecEnv(VecEnv):
             }
 
     def get_images(self) -> list[np.ndarray | None]:
-        """Draw the present states.
-
-        Returns:
-            N arrays (render_height, render_width, 3) of uint8; None without a render mode.
-
-        Raises:
-            ResetNeeded: before the first reset.
-            ClosedEnvironmentError: after ``close``.
-        """
+        """Return N images (render_height, render_width, 3) uint8; None without a render mode."""
         if self.render_mode is None:
             return [None] * self.num_envs
-        return list(to_numpy(self._stateful.render(*self._render_size)))
+        return list(to_numpy(self._stateful.render()))
 
     def close(self) -> None:
         """Forget the states."""

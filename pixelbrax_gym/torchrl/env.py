@@ -17,16 +17,13 @@ try:
 except ImportError as missing:
     raise ImportError(f"TorchRL is not installed; try: {install_extra('torchrl')}") from missing
 
-from pixelbrax_gym.gymnasium.env import check_render_size
 from pixelbrax_gym.interop.actions import name_rows
 from pixelbrax_gym.interop.dlpack import as_device, default_torch_device, to_torch
 from pixelbrax_gym.interop.fork import check_not_forked
-from pixelbrax_gym.reset_options import as_mask
-from pixelbrax_gym.seeds import SEEDS, spread_seeds
+from pixelbrax_gym.programs import Stepped
+from pixelbrax_gym.resets import SEEDS, as_mask, spread_seeds
 from pixelbrax_gym.stateful import StatefulEnv
 from pixelbrax_gym.torchrl.specs import action_spec, done_spec, observation_spec
-
-_OWN_OPTIONS = ("num_envs", "device", "render_height", "render_width")
 
 
 class TorchRLEnv(EnvBase):
@@ -89,11 +86,12 @@ class TorchRLEnv(EnvBase):
         """
         check_not_forked()
         stateful = StatefulEnv(
+            TorchRLEnv,
             task,
             options,
             num_envs=num_envs,
             autoreset_mode="same_step",
-            also_allowed=_OWN_OPTIONS,
+            render_size=(render_height, render_width),
         )
         self._jax_device = default_torch_device()
         device = self._jax_device if device is None else as_device(device)
@@ -101,7 +99,6 @@ class TorchRLEnv(EnvBase):
         self.is_closed = False
         self.infos: dict[str, torch.Tensor] = {}
         self._task, self._stateful, self._num_envs = task, stateful, stateful.num_envs
-        self._render_size = check_render_size(render_height, render_width)
         # Of environments whose next reset shall be to episode 0 of a seed; else None.
         self._seeds: list[int | None] | None = None
         self._is_seeded = False
@@ -134,7 +131,7 @@ class TorchRLEnv(EnvBase):
             to_reset |= np.array([seed is not None for seed in seeds])
         # Handed out once, and so never shared by two who might write to it.
         if to_reset.any() or first_obs is None:
-            outputs = self._stateful.reset(seeds, mask=to_reset, extra_of=lambda _: (None, left))
+            outputs = self._stateful.reset(seeds, mask=to_reset, keep=lambda _: (None, left))
             first_obs = outputs["obs"]
         else:
             self._stateful.replace_extra((None, left))
@@ -190,18 +187,17 @@ class TorchRLEnv(EnvBase):
                 "times in a row, use action_repeat instead."
             )
 
-        def begun(outputs: dict[str, Any]) -> tuple[Any, Any]:
-            # Not `done` itself, which leaves and may be written to.
-            where = outputs["info"]["_final_obs"]
-            return outputs["obs"], where if mask is None else began | np.asarray(outputs["done"])
+        def begun(stepped: Stepped) -> tuple[Any, Any]:
+            where = stepped.ended if mask is None else began | np.asarray(stepped.ended)
+            return stepped.outputs["obs"], where
 
-        outputs = self._stateful.step(action.to(self._jax_device), mask, extra_of=begun)
+        outputs = self._stateful.step(action.to(self._jax_device), mask, keep=begun)
         infos = outputs["info"]
         names = ("reward", "done", "terminated", "truncated")
         exported = to_torch(
             {
                 "obs": infos["final_obs"],
-                "infos": {k: v for k, v in infos["final_info"].items() if k[0] != "_"},
+                "infos": infos["final_info"],
                 **{name: outputs[name] for name in names},
             }
         )
@@ -229,7 +225,7 @@ class TorchRLEnv(EnvBase):
             ResetNeeded: before the first reset.
             ClosedEnvironmentError: after ``close``.
         """
-        return to_torch(self._stateful.render(*self._render_size)).to(self.device)
+        return to_torch(self._stateful.render()).to(self.device)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Forget the states."""

@@ -31,14 +31,7 @@ class PixelSpec(UnboundedDiscrete, metaclass=_Itself):
         dtype: torch.dtype = torch.uint8,
         **kwargs: Any,
     ) -> None:
-        """Make the spec.
-
-        Args:
-            shape: of the pixels, batch axes first.
-            device: where they are; None means the CPU.
-            dtype: uint8, or another one after a transform.
-            **kwargs: ``domain``, ``"discrete"`` or ``"continuous"``.
-        """
+        """Make the spec of uint8, or of another dtype after a transform."""
         kind = "continuous" if dtype.is_floating_point else "discrete"
         TensorSpec.__init__(
             self,
@@ -61,13 +54,7 @@ class PixelSpec(UnboundedDiscrete, metaclass=_Itself):
 
 
 def observation_spec(spec: Any, num_envs: int, device: torch.device) -> Composite:
-    """Return the spec of an observation: pixels under ``"pixels"``, state under ``"observation"``.
-
-    Args:
-        spec: ``PixelEnv.obs_spec``: a ``jax.ShapeDtypeStruct`` or a dict of them.
-        num_envs: N, the leading axis.
-        device: where observations are.
-    """
+    """Return the spec of an observation, with entries ``"pixels"`` and ``"observation"``."""
     parts = spec if isinstance(spec, dict) else {"any": spec}
     specs: dict[str, TensorSpec] = {}
     for part in parts.values():

@@ -70,10 +70,8 @@ def find(folder: Path, split: str) -> tuple[list[Source], str]:
     Where there is one split, and its name is not that of a test, ``"train"`` stands for it too.
     Subfolders that may not be read are left out, and a warning names them.
 
-    Args:
-        folder: where to look; the folder ``DAVIS``, the one above it, and its ``JPEGImages`` and
-            ``JPEGImages/480p`` have the same clips.
-        split: of which clips.
+    The folder ``DAVIS``, the one above it, and its ``JPEGImages`` and ``JPEGImages/480p`` have the
+    same clips.
 
     Returns:
         The clips, in the order of the split file, else by name; and the split that they are,
@@ -203,10 +201,7 @@ def _clips(folder: Path, closed: dict[Path, None]) -> list[Path]:
 def _if_open(
     look: Callable[[Path], list[Path]], folder: Path, closed: dict[Path, None]
 ) -> list[Path]:
-    """Return what is in a folder; nothing, and the folder in ``closed``, if it may not be read.
-
-    The root of a disk has such folders, as ``lost+found``.
-    """
+    """Return what is in a folder; nothing, and the folder in ``closed``, if it may not be read."""
     try:
         return look(folder)
     except PermissionError:

@@ -33,7 +33,7 @@ def read_clip(
     Images are turned as their EXIF orientation says, videos as their display matrix does. 16 bits
     become 8, floats in [0, 1] become 0 to 255, and what is transparent lies on black.
 
-    ``check_count`` is called with the number of a video's frames so far, and may raise.
+    ``check_count`` is called with the number of frames so far, and may raise.
 
     Returns:
         (H, W, 3) uint8 each, and what the file lacks, to be said after its name; empty if it lacks
@@ -46,6 +46,7 @@ def read_clip(
         ImportError: Pillow or imageio-ffmpeg is missing, with the fix.
     """
     if not source.is_video:
+        check_count(len(source.files))
         with ThreadPoolExecutor() as pool:  # Pillow decodes and scales without Python's lock
             return list(pool.map(lambda file: _picture(file, height, width), source.files)), ""
     frames: list[np.ndarray] = []

@@ -50,7 +50,7 @@ def draw(scene: Scene, height: int, width: int, change: Callable[[Frame], jax.Ar
 
     A change that is made pixel by pixel is part of the kernel.
     """
-    plane = jax.ShapeDtypeStruct((height, width), jnp.float32)
+    plane: Any = jax.ShapeDtypeStruct((height, width), jnp.float32)
     seg, ground = plane.update(dtype=jnp.int32), plane.update(dtype=bool)
     by_pixel = per_pixel(change, Frame(plane, plane, plane, plane, seg, ground))
     if by_pixel is None:
@@ -156,9 +156,10 @@ def _call(
     inputs, inputs_tree = jax.tree.flatten((view, list(numbers), first_row))
     inputs = [jax.lax.stop_gradient(jnp.asarray(x)) for x in inputs]
     packed = [x.ndim <= 1 and x.dtype == jnp.float32 for x in inputs]
-    few, arrays = _parted(inputs, packed)
+    few = [x for x, is_packed in zip(inputs, packed, strict=True) if is_packed]
+    others = [x for x, is_packed in zip(inputs, packed, strict=True) if not is_packed]
     # In one array, or XLA would compute them in launches of their own.
-    arrays = [jnp.concatenate([x.ravel() for x in few]), *arrays]
+    arrays = [jnp.concatenate([x.ravel() for x in few]), *others]
     num_pixels = num_rows * width
 
     def kernel(*refs: Any) -> None:
@@ -196,12 +197,6 @@ def _call(
         name="pixelbrax_draw",
     )(*arrays, *[jax.lax.stop_gradient(image).reshape(num_pixels) for image in images])
     return [output.reshape(num_rows, width) for output in outputs]
-
-
-def _parted(items: Sequence[Any], flags: Sequence[bool]) -> tuple[list[Any], list[Any]]:
-    """Return the items with a flag, and those without."""
-    pairs = list(zip(items, flags, strict=True))
-    return [x for x, flag in pairs if flag], [x for x, flag in pairs if not flag]
 
 
 def _unpacked(ref: Any, arrays: Sequence[jax.Array]) -> Iterator[Any]:

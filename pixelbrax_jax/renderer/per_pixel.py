@@ -13,9 +13,10 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.extend import core
 
-from pixelbrax_jax._platform.rules import bind
+from pixelbrax_jax._platform.rules import bind, row_aval
 from pixelbrax_jax.types import Frame
 
 _ELEMENTWISE_NAMES = """
@@ -86,10 +87,13 @@ class PerPixel:
         known |= dict(zip(closed.jaxpr.invars, operands, strict=True))
 
         def value(atom: core.Var | core.Literal) -> Any:
-            return atom.val if isinstance(atom, core.Literal) else known[atom]
+            if isinstance(atom, core.Literal):
+                return np.asarray(atom.val, row_aval(atom).dtype)[()]
+            return known[atom]
 
         for eqn in closed.jaxpr.eqns:
-            results = self._read_equation(eqn, list(map(value, eqn.invars)))
+            with eqn.ctx.manager:
+                results = self._read_equation(eqn, list(map(value, eqn.invars)))
             known.update(zip(eqn.outvars, results, strict=True))
         return list(map(value, closed.jaxpr.outvars))
 
@@ -98,7 +102,12 @@ class PerPixel:
             return self.read(eqn.params["jaxpr"], operands)
         if any(isinstance(x, _Pixel) for x in operands):
             return [self._add(eqn, operands)]
-        results = bind(eqn, *operands)
+        if operands and all(isinstance(x, np.generic) for x in operands):
+            with jax.ensure_compile_time_eval():
+                results = bind(eqn, *operands)
+            results = [np.asarray(x)[()] for x in results]
+        else:
+            results = bind(eqn, *operands)
         if eqn.primitive.name == "broadcast_in_dim" and jnp.ndim(operands[0]) == 0:
             self._scalars[id(results[0])] = (results[0], operands[0])
         elif self._is_elementwise(eqn):
@@ -107,7 +116,7 @@ class PerPixel:
         return results
 
     def _is_elementwise(self, eqn: core.JaxprEqn) -> bool:
-        aval: Any = eqn.outvars[0].aval
+        aval = row_aval(eqn.outvars[0])
         fits = aval.shape == self.shape and aval.dtype.name in _DTYPES
         return eqn.primitive.name in _ELEMENTWISE and fits
 
@@ -121,7 +130,7 @@ class PerPixel:
         if isinstance(x, _Pixel):
             return x
         _, x = self._scalars.get(id(x), (x, x))
-        if not isinstance(x, jax.Array) and jnp.ndim(x) == 0:
+        if isinstance(x, np.generic):
             return _Given("constant", x)
         if id(x) not in self._found:
             self._found[id(x)] = (x, self._find(x))
@@ -131,10 +140,10 @@ class PerPixel:
         if id(x) in self._equations:
             with suppress(_NotPerPixelError):  # then the image itself may be read
                 return self._add(*self._equations[id(x)][1:])
-        if x.shape not in ((), self.shape) or x.dtype.name not in _DTYPES[:-1]:
+        if x.dtype.name not in _DTYPES[:-1]:
             raise _NotPerPixelError
         group, array = ("image", self.images) if x.shape else ("number", self.numbers)
-        array.append(x)
+        array.append(jnp.broadcast_to(x, self.shape) if x.shape else x)
         return _Given(group, len(array) - 1)
 
 

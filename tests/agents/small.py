@@ -33,6 +33,8 @@ SMALL: dict[str, Any] = {
     "learning_rate": 3e-3,
     "anneal": True,
 }
+ABOUT: dict[str, Any] = {"algorithm": "ppg", "config": {}}
+"""What is stored with the checkpoints of no run in particular."""
 PHASIC = {"num_policy_phases": 2, "aux_minibatches": 4, "aux_epochs": 2}
 
 

@@ -17,7 +17,7 @@ import pytest
 
 from pixelbrax_jax.agents.runner.checkpoint import latest_steps
 from pixelbrax_jax.agents.runner.metrics import read_metrics
-from tests.agents.test_processes import PER_ITERATION, ROOT, command, leaves
+from tests.agents.test_processes import PER_ITERATION, ROOT, assert_equal, command, leaves
 
 slow = pytest.mark.slow
 pytestmark = pytest.mark.timeout(600)
@@ -65,10 +65,7 @@ def assert_goes_on(folder: Path, whole: dict[str, np.ndarray]) -> None:
     assert steps is not None
     assert 0 < steps < STEPS
     assert f"from the checkpoint of {steps} steps" in finish(folder, "--resume latest")
-    ours = leaves(folder, STEPS)
-    assert ours.keys() == whole.keys()
-    for name, leaf in ours.items():
-        np.testing.assert_array_equal(leaf, whole[name], err_msg=name)
+    assert_equal(leaves(folder, STEPS), whole)
 
 
 class Terminal:
@@ -109,8 +106,8 @@ class Terminal:
         os.close(self._keys)
 
 
-def stopped_by_ctrl_c(tmp_path: Path) -> Path:
-    """The folder of a run whose lines ``tee`` reads, both stopped by one Ctrl-C."""
+@pytest.mark.parametrize("goes_on", [False, pytest.param(True, marks=slow)])
+def test_ctrl_c_reaches_the_reader_of_the_lines_too(tmp_path, request, goes_on):
     run, status = tmp_path / "run", tmp_path / "status"
     line = shlex.join(command("ppo", run, OPTIONS)).replace("--no-progress", "--progress")
     # Bash itself survives to write the status; the signal kills tee.
@@ -122,18 +119,9 @@ def stopped_by_ctrl_c(tmp_path: Path) -> Path:
     terminal.close()
     assert status.read_text() == "130\n"
     assert "compiling" in (tmp_path / "log").read_text()
-    return run
-
-
-def test_ctrl_c_reaches_the_reader_of_the_lines_too(tmp_path):
-    steps = latest_steps(stopped_by_ctrl_c(tmp_path) / "checkpoints")
-    assert steps is not None
-    assert 0 < steps < STEPS
-
-
-@slow
-def test_stopped_by_ctrl_c_with_a_pipe_it_goes_on(whole, tmp_path):
-    assert_goes_on(stopped_by_ctrl_c(tmp_path), whole)
+    assert 0 < latest_steps(run / "checkpoints") < STEPS
+    if goes_on:
+        assert_goes_on(run, request.getfixturevalue("whole"))
 
 
 @slow
@@ -147,41 +135,36 @@ def test_the_terminal_is_closed(whole, tmp_path):
 
 
 @slow
-def test_nohup_stays_in_force(whole, tmp_path):
-    line = shlex.join(command("ppo", tmp_path, OPTIONS))
-    process = subprocess.Popen(["bash", "-c", f"trap '' HUP; exec {line}"], cwd=ROOT)
-    until(lambda: under_way(tmp_path))
-    process.send_signal(signal.SIGHUP)
-    assert process.wait(200) == 0
-    for name, leaf in leaves(tmp_path, STEPS).items():
-        np.testing.assert_array_equal(leaf, whole[name], err_msg=name)
+def test_nohup_stays_in_force_and_nobody_need_read_the_lines(whole, tmp_path):
+    line = shlex.join(command("ppo", tmp_path, f"{OPTIONS} --progress"))
+    line = line.replace("--no-progress ", "")
+    with Path("/dev/full").open("w") as full:
+        ignoring = ["bash", "-c", f"trap '' HUP; exec {line}"]
+        process = subprocess.Popen(ignoring, cwd=ROOT, stderr=full)
+        until(lambda: under_way(tmp_path))
+        process.send_signal(signal.SIGHUP)
+        assert process.wait(200) == 0
+    assert_equal(leaves(tmp_path, STEPS), whole)
 
 
 @slow
-def test_a_scheduler_sends_several_signals(whole, tmp_path):
+@pytest.mark.parametrize(
+    "names",
+    [["SIGUSR1"], ["SIGUSR2"], ["SIGXCPU"], ["SIGTERM", "SIGHUP", "SIGINT", "SIGTERM"]],
+    ids=lambda names: "-".join(names),
+)
+def test_what_a_scheduler_sends_stops_a_run_once(whole, tmp_path, names):
     process = start(tmp_path, stderr=subprocess.PIPE)
     until(lambda: under_way(tmp_path))
-    for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT, signal.SIGTERM):
-        process.send_signal(number)
+    for name in names:
+        process.send_signal(getattr(signal, name))
     told = process.communicate(timeout=60)[1]
     # Python handles those that wait in the order of their numbers.
-    assert process.returncode in {128 + signal.SIGTERM, 128 + signal.SIGHUP}
+    stopped_by = signal.Signals(process.returncode - 128).name
+    assert stopped_by in names[:2]
     assert told.count("stopping within two iterations") == 1
+    assert f"stopped by {stopped_by} after" in told
     assert "go on with --resume latest" in told
-    assert_goes_on(tmp_path, whole)
-
-
-@slow
-@pytest.mark.parametrize("name", ["SIGUSR1", "SIGUSR2", "SIGXCPU"])
-def test_the_warning_of_a_scheduler(whole, tmp_path, name):
-    number = getattr(signal, name)
-    process = start(tmp_path, stderr=subprocess.PIPE)
-    until(lambda: under_way(tmp_path))
-    process.send_signal(number)
-    told = process.communicate(timeout=60)[1]
-    assert process.returncode == 128 + number
-    assert f"{name}: stopping within two iterations" in told
-    assert f"stopped by {name} after" in told
     assert_goes_on(tmp_path, whole)
 
 
@@ -196,15 +179,6 @@ def test_ctrl_c_before_the_first_iteration(tmp_path):
     assert process.returncode == 130
     assert "Traceback" not in told
     assert "before the first iteration; nothing is lost" in told or "no checkpoint" in told
-
-
-@slow
-def test_nothing_reads_the_lines_at_all(whole, tmp_path):
-    with Path("/dev/full").open("w") as full:
-        process = start(tmp_path, "--progress", stderr=full)
-        assert process.wait(200) == 0
-    for name, leaf in leaves(tmp_path, STEPS).items():
-        np.testing.assert_array_equal(leaf, whole[name], err_msg=name)
 
 
 class Disk:

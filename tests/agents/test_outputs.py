@@ -19,12 +19,12 @@ from tensorboardX.record_writer import masked_crc32c
 from pixelbrax_jax import stop_signals
 from pixelbrax_jax.agents.on_policy.ppo import PPO, PPOConfig
 from pixelbrax_jax.agents.runner import metrics, saving, train
-from pixelbrax_jax.agents.runner.checkpoint import CheckpointError, Checkpoints
+from pixelbrax_jax.agents.runner.checkpoint import CheckpointError, latest_steps
 from pixelbrax_jax.agents.runner.metrics import AppendedFile, open_metrics, read_metrics
 from pixelbrax_jax.agents.runner.progress import Bar, Messages
-from pixelbrax_jax.agents.runner.saving import Saver
+from pixelbrax_jax.agents.runner.saving import Checkpoints
 from pixelbrax_jax.agents.runner.train import RunConfig, run
-from tests.agents.small import PARAMS, SMALL, ball_envs, same
+from tests.agents.small import ABOUT, PARAMS, SMALL, ball_envs, same
 
 PER_ITERATION = SMALL["num_envs"] * SMALL["num_steps"]
 
@@ -113,10 +113,8 @@ def test_a_disk_that_stays_full_is_told_at_the_end(tmp_path):
     writer.write(10, {"x": 1.0})
     with files_of_at_most(60):
         writer.write(20, {"x": 1.0})
-        writer.write(30, {"x": 1.0})
         writer.close()
-    assert len(told) == 2
-    assert len(writer.missing()) == 2
+    assert len(told) == len(writer.missing()) == 2
     assert "metrics.jsonl may lack records after 10 steps: File too large" in writer.missing()[0]
 
 
@@ -156,6 +154,14 @@ class BrokenPipe:
 
     def flush(self):
         raise BrokenPipeError(32, "Broken pipe")
+
+
+def test_a_bar_is_shown_on_terminals_unless_asked_for(monkeypatch):
+    yes, no = (SimpleNamespace(isatty=lambda told=told: told) for told in (True, False))
+    for terminal in (yes, no, None):
+        monkeypatch.setattr(sys, "stderr", terminal)
+        assert RunConfig().progress == bool(terminal and terminal.isatty())
+        assert RunConfig(progress=True).progress
 
 
 def test_a_bar_that_cannot_be_drawn_is_told_once(monkeypatch):
@@ -200,60 +206,56 @@ def test_a_policy_that_cannot_be_written_costs_no_checkpoint(tmp_path, monkeypat
     algorithm = PPO(PPOConfig(**SMALL), ball_envs())
     with pytest.raises(OSError, match=r"policy.jax: No space left on device.*160 steps is whole"):
         run(algorithm, PARAMS, RunConfig(str(tmp_path), progress=False))
-    checkpoints = Checkpoints(tmp_path / "checkpoints", {}, "ppo")
-    assert checkpoints.steps() == [5 * PER_ITERATION]
-    checkpoints.close()
+    assert latest_steps(tmp_path / "checkpoints") == 5 * PER_ITERATION
 
 
 def test_a_checkpoint_is_tried_again(tmp_path, monkeypatch):
     free, now, told = [1 << 40], [0.0], []
     monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=free[0]))
     monkeypatch.setattr(saving, "time", SimpleNamespace(monotonic=lambda: now[0]))
-    checkpoints = Checkpoints(tmp_path, {}, "ppo")
+    checkpoints = Checkpoints(tmp_path, ABOUT, minutes=10, report=told.append)
     state = {"x": jnp.arange(3)}
-    saver = Saver(checkpoints, 0, told.append, every=0, minutes=10)
-    assert not saver.is_due_by_clock()
+    assert not checkpoints.is_due_by_clock()
     now[0] = 600
-    assert saver.is_due_by_clock()
-    saver.save(state, 10, None, last=False)
-    saver.look_after(wait=True)
-    assert not saver.is_due_by_clock()
+    assert checkpoints.is_due_by_clock()
+    checkpoints.save(state, 10, None)
+    checkpoints.look_after(wait=True)
+    assert not checkpoints.is_due_by_clock()
     free[0] = 1
     for steps in (20, 30):
-        saver.save(state, steps, None, last=False)
+        checkpoints.save(state, steps, None)
     (line,) = told
     assert "Training goes on" in line
     now[0] = 661
-    assert saver.is_due_by_clock(), "sooner than usual"
+    assert checkpoints.is_due_by_clock(), "sooner than usual"
     free[0] = 1 << 40
-    saver.save(state, 40, None, last=False)
-    saver.look_after(wait=True)
+    checkpoints.save(state, 40, None)
+    checkpoints.look_after(wait=True)
     assert told[1:] == ["the checkpoint of 40 steps is written"]
     free[0] = 1
     with pytest.raises(CheckpointError, match=r"of 50 steps.*is lost; that of 40 steps stays"):
-        saver.save(state, 50, None, last=True)
+        checkpoints.save(state, 50, None, last=True)
     assert checkpoints.steps() == [10, 40]
     checkpoints.close()
 
 
 def test_a_checkpoint_that_fails_while_it_is_written_leaves_the_others(tmp_path, caplog):
     told = []
-    checkpoints = Checkpoints(tmp_path, {}, "ppo", keep=1)
-    saver = Saver(checkpoints, 0, told.append, every=10, minutes=0)
+    checkpoints = Checkpoints(tmp_path, ABOUT, keep=1, every=10, report=told.append)
     state = {"x": jnp.arange(300_000.0) % 7919 * 1.37}
-    saver.save(state, 10, None, last=True)
+    checkpoints.save(state, 10, None, last=True)
     with files_of_at_most(5_000):
-        saver.save(state, 20, None, last=False)
+        checkpoints.save(state, 20, None)
         end = time.monotonic() + 60
         while not told and time.monotonic() < end:
-            saver.look_after()
+            checkpoints.look_after()
             time.sleep(0.01)
     assert "File too large" in told[0]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["10"], "and nothing half written"
-    assert saver.latest() == 10
+    assert checkpoints.latest() == 10
     assert not [record for record in caplog.records if record.exc_info], "no traceback"
-    assert not saver.is_due_after(29)
-    saver.save(state, 30, None, last=True)
+    assert not checkpoints.is_due_after(29)
+    checkpoints.save(state, 30, None, last=True)
     assert checkpoints.steps() == [30]
     checkpoints.close()
 
@@ -287,28 +289,22 @@ NUMBERS = [
 
 
 @pytest.mark.parametrize("number", NUMBERS)
-def test_what_schedulers_send_is_a_request_to_stop(number):
-    lines, before = [], signal.getsignal(number)
+def test_what_schedulers_send_is_a_request_to_stop_unless_the_program_uses_it(number):
+    lines, got, before = [], [], signal.getsignal(number)
     with stop_signals.stop_requests(lines.append) as request:
         os.kill(os.getpid(), number)
         assert request.signal == number
     assert lines[0].startswith(f"{number.name}: stopping within two iterations, with a checkpoint")
     assert signal.getsignal(number) is before
-
-
-@pytest.mark.parametrize("number", NUMBERS[1:])
-def test_signals_that_the_program_uses_stay_its_own(number):
-    """Launchers requeue a job on them, and ``nohup`` ignores one."""
-    got = []
-    before = signal.signal(number, lambda number, _: got.append(number))
+    if number == signal.SIGTERM:
+        return
+    # Launchers requeue a job on the others, and ``nohup`` ignores one.
     try:
-        with stop_signals.stop_requests(got.append) as request:
-            os.kill(os.getpid(), number)
-            assert (request.signal, got) == (0, [number])
-        signal.signal(number, signal.SIG_IGN)
-        with stop_signals.stop_requests(got.append) as request:
-            os.kill(os.getpid(), number)
-            assert (request.signal, got) == (0, [number])
+        for handler in (lambda number, _: got.append(number), signal.SIG_IGN):
+            signal.signal(number, handler)
+            with stop_signals.stop_requests(lines.append) as request:
+                os.kill(os.getpid(), number)
+                assert (request.signal, got) == (0, [number])
     finally:
         signal.signal(number, before)
 

@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pixelbrax_jax.agents.runner.checkpoint import Checkpoints
+from pixelbrax_jax.agents.runner.saving import Checkpoints
+from tests.agents.small import ABOUT
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
@@ -56,6 +57,20 @@ def leaves(folder: Path, steps: int) -> dict[str, np.ndarray]:
     return reader.restore(path, args=ocp.args.PyTreeRestore(restore_args=as_numpy))
 
 
+def assert_equal(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> None:
+    assert one.keys() == other.keys()
+    for name, leaf in one.items():
+        np.testing.assert_array_equal(leaf, other[name], err_msg=name)
+
+
+def assert_networks_are_close(one: Path, other: Path, steps: int) -> None:
+    """Those of the checkpoints of two runs, up to rounding."""
+    found, expected = leaves(one, steps), leaves(other, steps)
+    assert found.keys() == expected.keys()
+    for name in (name for name in found if name.startswith("networks.")):
+        np.testing.assert_allclose(found[name], expected[name], 1e-4, 1e-5, err_msg=name)
+
+
 @pytest.mark.parametrize("algorithm", EXTRA)
 def test_a_killed_run_ends_as_one_that_never_was(algorithm, tmp_path):
     """Killed mid rollout, within the buffer, and while a checkpoint is written."""
@@ -83,10 +98,7 @@ def test_a_killed_run_ends_as_one_that_never_was(algorithm, tmp_path):
         process.wait()
     finish(algorithm, killed, f"{options} --resume latest")
     last = iterations * PER_ITERATION
-    ours, theirs = leaves(killed, last), leaves(tmp_path / "whole", last)
-    assert ours.keys() == theirs.keys()
-    for name, leaf in ours.items():
-        np.testing.assert_array_equal(leaf, theirs[name], err_msg=name)
+    assert_equal(leaves(killed, last), leaves(tmp_path / "whole", last))
 
 
 @pytest.mark.parametrize("algorithm", EXTRA)
@@ -94,11 +106,7 @@ def test_four_devices_learn_what_one_learns(algorithm, tmp_path):
     options = f"--total-steps {4 * PER_ITERATION}"
     finish(algorithm, tmp_path / "one", options, **AS_USERS)
     finish(algorithm, tmp_path / "four", options, **FOUR_DEVICES)
-    one, four = (leaves(tmp_path / name, 4 * PER_ITERATION) for name in ("one", "four"))
-    assert one.keys() == four.keys()
-    for name, leaf in one.items():
-        if name.startswith("networks."):
-            np.testing.assert_allclose(four[name], leaf, rtol=1e-4, atol=1e-5, err_msg=name)
+    assert_networks_are_close(tmp_path / "four", tmp_path / "one", 4 * PER_ITERATION)
 
 
 def test_a_run_on_four_devices_goes_on_to_the_bit(tmp_path):
@@ -108,9 +116,8 @@ def test_a_run_on_four_devices_goes_on_to_the_bit(tmp_path):
     finish("ppg", tmp_path / "parts", line, **AS_USERS)
     line = f"--total-steps {5 * PER_ITERATION} --cpu-devices 4 --resume latest"
     finish("ppg", tmp_path / "parts", line, **AS_USERS)
-    ours, theirs = (leaves(tmp_path / name, 5 * PER_ITERATION) for name in ("parts", "whole"))
-    for name, leaf in ours.items():
-        np.testing.assert_array_equal(leaf, theirs[name], err_msg=name)
+    parts, whole = (leaves(tmp_path / name, 5 * PER_ITERATION) for name in ("parts", "whole"))
+    assert_equal(parts, whole)
 
 
 def test_frames_stay_on_their_devices(tmp_path):
@@ -162,10 +169,7 @@ def test_two_processes_learn_what_one_learns(tmp_path):
         for i in range(2)
     ]
     assert [process.wait(300) for process in processes] == [0, 0]
-    one, two = (leaves(tmp_path / name, 3 * PER_ITERATION) for name in ("one", "two"))
-    for name, leaf in one.items():
-        if name.startswith("networks."):
-            np.testing.assert_allclose(two[name], leaf, rtol=1e-4, atol=1e-5, err_msg=name)
+    assert_networks_are_close(tmp_path / "two", tmp_path / "one", 3 * PER_ITERATION)
 
 
 def test_all_checkpoints_of_a_killed_run_are_whole(tmp_path):
@@ -178,9 +182,8 @@ def test_all_checkpoints_of_a_killed_run_are_whole(tmp_path):
         time.sleep(0.05)
     process.send_signal(signal.SIGKILL)
     process.wait()
-    checkpoints = Checkpoints(tmp_path / "checkpoints", {}, "ppo")
-    known = checkpoints.steps()
+    checkpoints = Checkpoints(tmp_path / "checkpoints", ABOUT)
     checkpoints.close()
-    assert known
-    for steps in known:
+    assert checkpoints.steps()
+    for steps in checkpoints.steps():
         assert "networks.actor.params.mean.kernel" in leaves(tmp_path, steps)

@@ -11,8 +11,9 @@ import pytest
 from pixelbrax_jax.agents.on_policy.ppg import PPGConfig
 from pixelbrax_jax.agents.on_policy.ppo import PPO, PPOConfig
 from pixelbrax_jax.agents.runner import settings
-from pixelbrax_jax.agents.runner.checkpoint import CheckpointError, Checkpoints, read_about
+from pixelbrax_jax.agents.runner.checkpoint import CheckpointError, read_about
 from pixelbrax_jax.agents.runner.programs import Runs
+from pixelbrax_jax.agents.runner.saving import Checkpoints
 from pixelbrax_jax.agents.runner.train import RunConfig, run
 from pixelbrax_jax.agents.runner.trained import load_config
 from tests.agents.small import OPTIONS, PARAMS, SMALL, ball_envs, same
@@ -47,12 +48,9 @@ def change(folder: Path, *, without: tuple[str, ...] = (), **changes) -> None:
 
 
 def restore(folder: Path, algorithm: PPO, name: str = "ppo"):
-    checkpoints = Checkpoints(
-        folder / "checkpoints",
-        settings.settings_of(algorithm, RunConfig()),
-        name,
-        former=settings.former_settings(type(algorithm.config)),
-    )
+    about = settings.describe_run(algorithm, RunConfig()) | {"algorithm": name}
+    former = settings.former_settings(type(algorithm.config))
+    checkpoints = Checkpoints(folder / "checkpoints", about, former=former)
     try:
         return checkpoints.restore(Runs(algorithm).template(PARAMS))
     finally:

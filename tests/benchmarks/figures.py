@@ -7,7 +7,9 @@ python -m tests.benchmarks.figures --plots    plots, too
 from __future__ import annotations
 
 import ast
+import importlib
 import inspect
+import itertools
 import json
 import sys
 from dataclasses import fields
@@ -43,11 +45,10 @@ def options() -> str:
     """Every option of an environment, with its default and its documentation."""
     about = {}
     for kind in pb.EnvConfig.__mro__[:-1]:
-        (body,) = ast.parse(inspect.getsource(kind)).body
-        assert isinstance(body, ast.ClassDef)
-        for field, text in zip(body.body, body.body[1:], strict=False):
+        lines = ast.parse(inspect.getsource(kind)).body[0].body
+        for field, text in itertools.pairwise(lines):
             if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
-                about[field.target.id] = ast.literal_eval(text.value)  # type: ignore[union-attr]
+                about[field.target.id] = ast.literal_eval(text.value)
     lines = [
         [
             f"`{field.name}`",
@@ -58,6 +59,21 @@ def options() -> str:
         if field.name != "task"
     ]
     return table(("option", "default", "meaning"), lines)
+
+
+def public(package: str, *more: str) -> Figures:
+    """What is importable from a package, for ``mkdocstrings``, by the package's name."""
+
+    def directives() -> str:
+        root = importlib.import_module(package)
+        named = {name: getattr(root, name) for name in sorted({*root.__all__, *more})}
+        return "".join(
+            f"\n::: {getattr(value, '__module__', package)}.{name}\n"
+            for name, value in named.items()
+            if not inspect.ismodule(value) and (root is pb or getattr(pb, name, None) is not value)
+        )
+
+    return {package.replace(".", "-").replace("_", "-"): directives}
 
 
 PAGES: dict[str, Figures] = {
@@ -72,6 +88,12 @@ PAGES: dict[str, Figures] = {
     "docs/dmc.md": dmc_page.FIGURES,
     "docs/tasks.md": {"tasks": brax_tasks},
     "docs/options.md": {"options": options},
+    "docs/api.md": {
+        **public("pixelbrax_jax"),
+        **public("pixelbrax_jax.distractors"),
+        **public("pixelbrax_jax.agents"),
+        **public("pixelbrax_gym", "SB3VecEnv", "TorchPolicy", "TorchRLEnv"),
+    },
 }
 """Page -> its tables and figures, by name."""
 

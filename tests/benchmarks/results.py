@@ -53,14 +53,7 @@ def clocked(runs: dict[str, dict]) -> dict[str, dict]:
 
 
 def return_at(run: dict, when: float, clock: str = "seconds", window: float = WINDOW) -> float:
-    """Mean return of the episodes that ended within a window before; NaN beyond the run.
-
-    Args:
-        run: what is kept of it.
-        when: on that clock.
-        clock: ``"seconds"`` or ``"steps"``.
-        window: on that clock.
-    """
+    """Mean return of the episodes that ended within a window before, by seconds or steps."""
     times = np.array(run[clock])
     if times[-1] < when:
         return float("nan")

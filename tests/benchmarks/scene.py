@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 
 import pixelbrax_jax as pb
+from pixelbrax_jax.scene.place import place
 
 
 def describe(task: str) -> dict[str, Any]:
@@ -24,7 +25,7 @@ def describe(task: str) -> dict[str, Any]:
     env, params = pb.make(task)
     state, _ = env.reset(jax.random.key(0), params)
     physics = state.sim.physics
-    scene = pb.place(params.geoms, params.rig, params.look, physics.xpos, physics.xquat)
+    scene = place(params.geoms, params.rig, params.look, physics.xpos, physics.xquat)
     quat = np.zeros(4)
     mujoco.mju_mat2Quat(quat, np.asarray(scene.camera.xmat, np.float64).ravel())
     return {

@@ -20,7 +20,9 @@ import mujoco
 import numpy as np
 from PIL import Image, ImageDraw
 
-import pixelbrax_jax as pb
+from pixelbrax_jax.renderer.base import render
+from pixelbrax_jax.scene.place import place
+from pixelbrax_jax.types import Frame
 from tests.renderer import suite_models
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -55,8 +57,8 @@ def pictures(domain: str, task: str, camera: int, movable: tuple[str, ...]) -> d
     scene = own.scene
 
     @jax.jit
-    def draw(xpos: jax.Array, xquat: jax.Array) -> pb.Frame:
-        return pb.render(pb.place(scene.geoms, scene.rig, scene.look, xpos, xquat), SIZE, SIZE)
+    def draw(xpos: jax.Array, xquat: jax.Array) -> Frame:
+        return render(place(scene.geoms, scene.rig, scene.look, xpos, xquat), SIZE, SIZE)
 
     drawn: dict[str, list] = {"theirs": [], "ours": [], "area": []}
     for state in range(STATES):

@@ -248,20 +248,6 @@ def test_environments_of_stable_baselines_hand_out_the_same(kind):
     env.close()
 
 
-def test_attributes_reach_the_members_as_in_a_dummy_vec_env():
-    ours = SB3VecEnv(TASK, NUM_ENVS, **OPTIONS)
-    theirs = DummyVecEnv([lambda: make(**OPTIONS)] * NUM_ENVS)
-    for env in (ours, theirs):
-        env.set_attr("difficulty", 7, indices=1)
-        assert env.get_attr("difficulty", indices=1) == [7]
-        assert env.has_attr("render_mode")
-        assert not env.has_attr("no_such_thing")
-        assert env.env_method("has_wrapper_attr", "difficulty") == [False, True]
-        env.env_method("set_wrapper_attr", "difficulty", 3, indices=[0])
-        assert env.get_attr("difficulty") == [3, 7]
-        assert env.env_method("get_wrapper_attr", "difficulty") == [3, 7]
-
-
 def test_the_remaining_wrappers_hand_on_what_they_get():
     env = SB3VecEnv(TASK, NUM_ENVS, obs_mode="both", **OPTIONS)
     bare = SB3VecEnv(TASK, NUM_ENVS, obs_mode="both", **OPTIONS)

@@ -16,6 +16,8 @@ from PIL import Image
 
 import pixelbrax_jax as pb
 from pixelbrax_jax.physics.model_scene import COM_LINK
+from pixelbrax_jax.renderer.base import render
+from pixelbrax_jax.scene.place import place
 from pixelbrax_jax.tasks import BRAX_TASKS, DMC_TASKS
 
 FOLDER = Path(__file__).parent
@@ -48,7 +50,7 @@ def draw(task: str) -> np.ndarray:
 
     @jax.jit
     def image(rig: pb.CameraRig, look: pb.Look) -> jax.Array:
-        frame = pb.render(pb.place(params.geoms, rig, look, xpos, xquat), size, size)
+        frame = render(place(params.geoms, rig, look, xpos, xquat), size, size)
         return jax.numpy.stack([frame.r, frame.g, frame.b], axis=-1)
 
     rows = [np.concatenate([image(rig, look) for rig in rigs], axis=1) for look in looks]

@@ -25,58 +25,43 @@ def toy_ball():
     assert pixelbrax_gym.register(TASK) == ID
 
 
-@pytest.fixture
-def make_single():
-    made = []
+def maker(build):
+    """A fixture: a function that makes environments, which are closed after the test."""
 
-    def make(**options):
-        made.append(pixelbrax_gym.GymnasiumEnv(TASK, **(SIZE | options)))
-        return made[-1]
+    @pytest.fixture
+    def make():
+        made = []
 
-    yield make
-    for env in made:
-        env.close()
+        def one(*args, **options):
+            made.append(build(*args, **options))
+            return made[-1]
 
+        yield one
+        for env in made:
+            env.close()
 
-@pytest.fixture
-def make_vector():
-    made = []
-
-    def make(num_envs=3, **options):
-        made.append(gymnasium.make_vec(ID, num_envs=num_envs, **(SIZE | options)))
-        return made[-1]
-
-    yield make
-    for env in made:
-        env.close()
+    return make
 
 
-@pytest.fixture
-def make_torchrl():
-    made = []
-
-    def make(num_envs=3, seed=0, **options):
-        options = SIZE | {"episode_length": 20} | options
-        made.append(pixelbrax_gym.TorchRLEnv(TASK, num_envs, **options))
-        if seed is not None:
-            made[-1].set_seed(seed)
-        return made[-1]
-
-    yield make
-    for env in made:
-        env.close()
+def seeded(env, seed):
+    if seed is not None:
+        (env.set_seed if hasattr(env, "set_seed") else env.seed)(seed)
+    return env
 
 
-@pytest.fixture
-def make_sb3():
-    made = []
+def torchrl(num_envs=3, seed=0, **options):
+    options = SIZE | {"episode_length": 20} | options
+    return seeded(pixelbrax_gym.TorchRLEnv(TASK, num_envs, **options), seed)
 
-    def make(num_envs=3, seed=0, **options):
-        options = SIZE | {"episode_length": 20} | options
-        made.append(pixelbrax_gym.SB3VecEnv(TASK, num_envs, **options))
-        made[-1].seed(seed)
-        return made[-1]
 
-    yield make
-    for env in made:
-        env.close()
+def sb3(num_envs=3, seed=0, **options):
+    options = SIZE | {"episode_length": 20} | options
+    return seeded(pixelbrax_gym.SB3VecEnv(TASK, num_envs, **options), seed)
+
+
+def vector(num_envs=3, **options):
+    return gymnasium.make_vec(ID, num_envs=num_envs, **(SIZE | options))
+
+
+make_single = maker(lambda **options: pixelbrax_gym.GymnasiumEnv(TASK, **(SIZE | options)))
+make_vector, make_torchrl, make_sb3 = maker(vector), maker(torchrl), maker(sb3)

@@ -9,10 +9,9 @@ import pytest
 import torch
 from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 
-from pixelbrax_gym import GymnasiumEnv, GymnasiumVectorEnv
+from pixelbrax_gym import GymnasiumEnv, GymnasiumVectorEnv, SB3VecEnv, TorchRLEnv
+from tests.gym.adapters import ACTIONS, ADAPTERS
 from tests.gym.conftest import ID, TASK
-
-ACTIONS = np.array([[-0.2], [0.9], [1.0]], np.float32)
 
 
 @pytest.mark.parametrize("kind", [GymnasiumEnv, GymnasiumVectorEnv])
@@ -65,6 +64,34 @@ def test_options(kind, options, message):
 def test_names_of_options(kind, options, message):
     with pytest.raises(TypeError, match=message):
         kind(TASK, **options)
+
+
+@pytest.mark.parametrize("kind", [SB3VecEnv, TorchRLEnv])
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"heigth": 12}, TypeError, "unexpected keyword argument 'heigth'.*Did you mean 'height'"),
+        ({"num_env": 12}, TypeError, "unexpected keyword .*num_envs.* Did you mean 'num_envs'"),
+        ({"num_envs": 0}, ValueError, "a positive integer, got 0"),
+        ({"render_height": 0}, ValueError, "render_height must be a positive integer"),
+    ],
+)
+def test_options_of_other_frameworks(kind, options, error, message):
+    with pytest.raises(error, match=message):
+        kind(TASK, **options)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"render_mode": "human"}, ValueError, "rgb_array"),
+        ({"channels_first": "yes"}, TypeError, "channels_first must be True or False, got 'yes'"),
+        ({"stagger": 2}, TypeError, "stagger must be True or False, got 2"),
+    ],
+)
+def test_options_of_stable_baselines(options, error, message):
+    with pytest.raises(error, match=message):
+        SB3VecEnv(TASK, **options)
 
 
 def test_task():
@@ -143,6 +170,27 @@ def test_actions_leave_the_environment_usable(make_vector, action, error, messag
     with pytest.raises(error, match=message):
         env.step(action)
     np.testing.assert_array_equal(env.step(ACTIONS)[0], other.step(ACTIONS)[0])
+
+
+@pytest.mark.parametrize("name", ["sb3", "torchrl"])
+@pytest.mark.parametrize(
+    ("actions", "error", "message"),
+    [
+        (
+            np.zeros((3, 2), np.float32),
+            ValueError,
+            r"action must have shape \(3, 1\), got \(3, 2\)",
+        ),
+        (np.zeros((3, 1), np.int64), TypeError, "floating point.*int64"),
+        (np.full((3, 1), np.nan, np.float32), ValueError, "environment 0, 1, 2 contains NaN"),
+    ],
+)
+def test_actions_of_other_frameworks(name, actions, error, message):
+    adapter = ADAPTERS[name]()
+    adapter.reset()
+    with pytest.raises(error, match=message):
+        adapter.call(actions)
+    assert [event.obs["state"][1] for event in adapter.call()[0]] == [1.0] * 3
 
 
 @pytest.mark.parametrize(

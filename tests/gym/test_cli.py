@@ -12,7 +12,7 @@ import pytest
 
 from pixelbrax_gym import cli
 
-COMMANDS = ("bench", "clips", "doctor", "evaluate", "play", "record", "tasks", "train")
+COMMANDS = cli.commands()
 
 
 @pytest.fixture
@@ -27,18 +27,19 @@ def command(monkeypatch):
 def test_every_command_is_listed(capsys):
     assert cli.main(["--help"]) == 0
     listed = [line.split()[0] for line in capsys.readouterr().out.splitlines() if line[:2] == "  "]
-    assert listed == cli.commands() == list(COMMANDS)
+    assert listed == COMMANDS
+    assert {"doctor", "play", "train"} <= set(COMMANDS)
 
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_has_help_and_refuses_what_it_does_not_know(name, capsys):
-    if name != "train":  # which asks for an algorithm first
-        with pytest.raises(SystemExit) as end:
-            cli.main([name, "--help"])
-        assert end.value.code == 0
-        assert f"usage: pixelbrax {name}" in capsys.readouterr().out
+    first = {"play": ["ant"], "clips": ["procedural"], "train": ["ppo"]}.get(name, [])
     with pytest.raises(SystemExit) as end:
-        cli.main([name, *(["ant"] if name in ("play", "clips") else []), "--no-such-option"])
+        cli.main([name, *first, "--help"])
+    assert end.value.code == 0
+    assert f"usage: pixelbrax {name}" in capsys.readouterr().out
+    with pytest.raises(SystemExit) as end:
+        cli.main([name, *first, "--no-such-option"])
     assert end.value.code == 2
     assert "--no-such-option" in capsys.readouterr().err
 

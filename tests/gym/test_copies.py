@@ -6,6 +6,7 @@ import copy
 import pickle
 import subprocess
 import sys
+from functools import partial
 
 import cloudpickle
 import gymnasium
@@ -14,136 +15,91 @@ import numpy as np
 import pytest
 import torch
 
-import pixelbrax_gym
 import pixelbrax_jax
 from pixelbrax_jax.envs.sharded import make_env_mesh
-from tests.gym.conftest import ID, SIZE, TASK
+from tests.gym.adapters import ADAPTERS, Single, Vector, as_bytes
 
 COPIES = {
     "pickle": lambda env: pickle.loads(pickle.dumps(env)),
     "cloudpickle": lambda env: cloudpickle.loads(cloudpickle.dumps(env)),
     "deepcopy": copy.deepcopy,
 }
-OPTIONS = SIZE | {"obs_mode": "both", "distractors": "color"}
-
-
-def single(**options):
-    env = gymnasium.make(ID, **(OPTIONS | options))
-    env.reset(seed=3)
-    return env
-
-
-def vector(**options):
-    env = gymnasium.make_vec(ID, num_envs=3, **(OPTIONS | options))
-    env.reset(seed=3)
-    return env
-
-
-def sb3():
-    env = pixelbrax_gym.SB3VecEnv(TASK, 3, **OPTIONS)
-    env.seed(3)
-    env.reset()
-    return env
-
-
-def torchrl():
-    env = pixelbrax_gym.TorchRLEnv(TASK, 3, **OPTIONS)
-    env.set_seed(3)
-    env.reset()
-    return env
-
-
-ENVS = {
-    "single": single,
-    "window": lambda: single(render_mode="human", render_height=8, render_width=8),
-    "numpy": vector,
-    "torch": lambda: vector(output="torch", autoreset_mode="same_step"),
-    "jax": lambda: vector(output="jax", autoreset_mode="disabled"),
-    "sb3": sb3,
-    "torchrl": torchrl,
+DISTRACTED = {"distractors": "color", "episode_length": 6}
+ENVS = {name: partial(make, **DISTRACTED) for name, make in ADAPTERS.items()} | {
+    "window": lambda: Single(render_mode="human", render_height=8, render_width=8, **DISTRACTED)
 }
 
 
-def some_steps(env, count):
-    """Everything that an environment returns in some steps and resets."""
-    seen = []
-    for i in range(count):
-        if isinstance(env, gymnasium.Env):
-            seen.append(env.step(np.full(1, 0.1 * i, np.float32)))
-            if seen[-1][2] or seen[-1][3]:
-                seen.append(env.reset())
-        elif isinstance(env, pixelbrax_gym.TorchRLEnv):
-            began = torch.tensor(env._begun[1])[:, None]
-            if began.any():
-                tensors = env.reset(env.full_done_spec.zero().set("_reset", began))
-            else:
-                tensors = env.step(
-                    env.full_done_spec.zero().set("action", torch.full((3, 1), 0.1 * i))
-                )["next"]
-            seen.append({name: tensors[name] for name in ("pixels", "observation", "done")})
-        else:
-            done = env._stateful._snapshot.done
-            if env._stateful._must_reset and np.any(done):
-                seen.append(env.reset(options={"reset_mask": np.asarray(done)}))
-            seen.append(env.step(np.full((3, 1), 0.1 * i, np.float32)))
-    as_array = lambda x: x.numpy() if isinstance(x, torch.Tensor) else np.asarray(x)  # noqa: E731
-    return jax.tree.map(lambda x: as_array(x).tobytes(), seen)
+def some_calls(adapter, count):
+    """The bits of everything that an environment returns in some steps and resets."""
+    return [as_bytes(adapter.call()[1]) for _ in range(count)]
+
+
+def started(name):
+    adapter = ENVS[name]()
+    adapter.reset(seed=3)
+    return adapter
+
+
+def copied(adapter, how=copy.deepcopy):
+    other = copy.copy(adapter)
+    other.env = how(adapter.env)
+    return other
 
 
 @pytest.mark.parametrize("how", COPIES)
 @pytest.mark.parametrize("name", ENVS)
 def test_a_copy_goes_on_as_the_original_does(name, how):
-    env = ENVS[name]()
-    some_steps(env, 3)
-    other = COPIES[how](env)
+    adapter = started(name)
+    some_calls(adapter, 3)
+    other = copied(adapter, COPIES[how])
     # The one that goes on first must not change the other.
-    expected = some_steps(env, 9)
-    assert some_steps(other, 9) == expected
-    env.close(), other.close()
+    expected = some_calls(adapter, 9)
+    assert some_calls(other, 9) == expected
+    adapter.env.close(), other.env.close()
 
 
 def test_a_copy_before_the_first_reset():
-    env = gymnasium.make_vec(ID, num_envs=3, **OPTIONS)
-    other = pickle.loads(pickle.dumps(env))
-    obs, wanted = other.reset(seed=1)[0], env.reset(seed=1)[0]
-    jax.tree.map(np.testing.assert_array_equal, obs, wanted)
+    adapter = ENVS["numpy"]()
+    other = copied(adapter, COPIES["pickle"])
+    assert as_bytes(other.reset(seed=1)) == as_bytes(adapter.reset(seed=1))
 
 
 def test_a_deep_copy_shares_what_nothing_writes_to():
-    env = vector()
-    other = copy.deepcopy(env)
-    assert other._stateful.params is env._stateful.params
-    assert other._stateful._programs is env._stateful._programs
-    assert other._stateful._snapshot.packed is env._stateful._snapshot.packed
+    adapter = started("numpy")
+    other = copied(adapter)
+    one, two = adapter.env._stateful, other.env._stateful
+    assert two.params is one.params
+    assert two._programs is one._programs
+    assert two._snapshot.packed is one._snapshot.packed
     # Both are the next to write, and neither into what the other reads.
-    frames = env._stateful._snapshot.packed.frames
-    some_steps(env, 4), some_steps(other, 4)
+    frames = one._snapshot.packed.frames
+    some_calls(adapter, 4), some_calls(other, 4)
     assert not frames.is_deleted()
 
 
 def test_a_deep_copy_is_not_reached_by_what_torch_writes():
-    env, clean = torchrl(), torchrl()
-    while not env._begun[1].any():
-        some_steps(env, 1), some_steps(clean, 1)
-    twin = copy.deepcopy(env)
-    began = torch.tensor(env._begun[1])[:, None]
-    first = [e.reset(e.full_done_spec.zero().set("_reset", began)) for e in (clean, env)]
-    first[1]["pixels"].zero_()
-    after = twin.reset(twin.full_done_spec.zero().set("_reset", began))
-    assert torch.equal(after["pixels"], first[0]["pixels"])
+    adapter, clean = started("torchrl"), started("torchrl")
+    while not adapter.ended.any():
+        adapter.call(), clean.call()
+    twin = copied(adapter)
+    (_, wanted), (_, spoiled) = clean.call(), adapter.call()
+    spoiled["pixels"].zero_()
+    _, after = twin.call()
+    assert torch.equal(after["pixels"], wanted["pixels"])
     assert after["pixels"].any()
 
 
 def test_clips_are_on_the_device_once_and_after_a_pickle_too():
-    options = {"height": 12, "width": 12, "distractors": "video", "clips": "procedural"}
-    envs = [gymnasium.make_vec(ID, num_envs=3, **options) for _ in range(2)]
-    packed = [env._stateful.params.clips.packed for env in envs]
+    options = {"distractors": "video", "clips": "procedural"}
+    adapters = [Vector(**options) for _ in range(2)]
+    packed = [adapter.env._stateful.params.clips.packed for adapter in adapters]
     assert packed[0].unsafe_buffer_pointer() == packed[1].unsafe_buffer_pointer()
-    envs[0].reset(seed=0)
-    restored = pickle.loads(pickle.dumps(envs[0]))
-    expected = some_steps(envs[0], 3)
-    assert some_steps(restored, 3) == expected
-    assert all(isinstance(x, jax.Array) for x in jax.tree.leaves(restored._stateful.params))
+    adapters[0].reset(seed=0)
+    restored = copied(adapters[0], COPIES["pickle"])
+    expected = some_calls(adapters[0], 3)
+    assert some_calls(restored, 3) == expected
+    assert all(isinstance(x, jax.Array) for x in jax.tree.leaves(restored.env._stateful.params))
 
 
 @pytest.mark.parametrize("task", ["inverted_pendulum", "dmc_cartpole_swingup"])

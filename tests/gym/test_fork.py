@@ -1,4 +1,4 @@
-"""Forked workers say what is wrong; spawned ones work."""
+"""Forked workers say what is wrong; `tests/clients` has spawned ones, which work."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import os
 
 import gymnasium
 import jax
-import numpy as np
 import pytest
 
 from tests.gym.conftest import ID, SIZE
@@ -49,20 +48,3 @@ def test_forked_workers_do_not_touch_clips():
     os.waitpid(pid, 0)
     assert os.read(child, 10_000).decode().startswith("PixelBrax was forked")
     os.close(child), os.close(parent)
-
-
-@pytest.mark.slow
-def test_spawned_workers_work():
-    def make():
-        import gymnasium
-
-        return gymnasium.make(
-            "pixelbrax_gym:PixelBrax/InvertedPendulum-v0", height=8, width=8, obs_mode="state"
-        )
-
-    env = gymnasium.vector.AsyncVectorEnv([make] * 2, context="spawn")
-    together = gymnasium.make_vec(
-        "PixelBrax/InvertedPendulum-v0", num_envs=2, height=8, width=8, obs_mode="state"
-    )
-    np.testing.assert_array_equal(env.reset(seed=0)[0], together.reset(seed=0)[0])
-    env.close()

@@ -7,93 +7,23 @@ import signal
 import sys
 import time
 
-import gymnasium
-import numpy as np
 import pytest
-import torch
 
 import pixelbrax_gym
 from pixelbrax_jax import compilation
-from tests.gym.conftest import ID, SIZE, TASK
+from tests.gym.adapters import ADAPTERS
+from tests.gym.conftest import TASK
 
 # JAX calls Python from within, e.g. in callbacks of weak references: what is raised there is lost.
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 
 SIGNALS = 60
 """Of each adapter."""
-OPTIONS = SIZE | {"episode_length": 7}
 PACKAGE = pixelbrax_gym.__path__[0]
 
 
 class InterruptedStepError(KeyboardInterrupt):
     """Raised by the handler of a timer's signal."""
-
-
-def single():
-    env = gymnasium.make(ID, **OPTIONS)
-
-    def step():
-        if env.unwrapped._stateful._snapshot.done:
-            env.reset()
-        else:
-            env.step(np.zeros(1, np.float32))
-
-    return env.unwrapped, lambda: env.reset(seed=0), step
-
-
-def vector(output):
-    def make():
-        env = gymnasium.make_vec(ID, num_envs=3, output=output, **OPTIONS)
-        return env, lambda: env.reset(seed=0), lambda: env.step(np.zeros((3, 1), np.float32))
-
-    return make
-
-
-def sb3():
-    env = pixelbrax_gym.SB3VecEnv(TASK, 3, **OPTIONS)
-
-    def reset():
-        env.seed(0)
-        env.reset()
-
-    return env, reset, lambda: env.step(np.zeros((3, 1), np.float32))
-
-
-def torchrl():
-    env = pixelbrax_gym.TorchRLEnv(TASK, 3, **OPTIONS)
-    zeros = torch.zeros(3, 1)
-    latest = [None]
-
-    def reset():
-        env.set_seed(0)
-        latest[0] = env.reset()
-
-    def step():
-        began = env._begun[1]
-        if began.any():
-            mask = torch.tensor(began)[:, None]
-            latest[0] = env.reset(latest[0].clone().set("_reset", mask))
-        else:
-            latest[0] = env.step(latest[0].clone().set("action", zeros))["next"]
-
-    return env, reset, step
-
-
-ADAPTERS = {
-    "single": single,
-    "numpy": vector("numpy"),
-    "torch": vector("torch"),
-    "sb3": sb3,
-    "torchrl": torchrl,
-}
-
-
-def held(env):
-    """The state that an adapter holds, and what it keeps beside it."""
-    now = env._stateful._snapshot
-    begun = env._begun[1].tobytes() if hasattr(env, "_begun") else b""
-    arrays = (np.asarray(array).tobytes() for array in now.packed)
-    return b"".join(arrays) + np.asarray(now.done).tobytes() + begun
 
 
 @pytest.fixture
@@ -111,37 +41,37 @@ def interrupt():
 
 @pytest.mark.parametrize("name", ADAPTERS)
 def test_a_signal_leaves_the_state_before_or_after_a_step(name, interrupt):
-    env, reset, step = ADAPTERS[name]()
-    reset()
-    states = [held(env)]
+    adapter = ADAPTERS[name](episode_length=7)
+    adapter.reset()
+    states = [adapter.held()]
     # Later steps take the ways of the earlier ones, with everything compiled.
     for _ in range(60):
         start = time.perf_counter()
-        step()
+        adapter.call()
         seconds = time.perf_counter() - start
-        states.append(held(env))
+        states.append(adapter.held())
     places = {state: i for i, state in enumerate(states)}
     assert len(places) == len(states)
     delays, arrived, moved = random.Random(0), 0, 0
     while arrived < SIGNALS:
-        reset()
+        adapter.reset()
         count = 0
         try:
             interrupt(seconds * delays.uniform(0.01, 20.0))
             while count < 50:
-                step()
+                adapter.call()
                 count += 1
             interrupt(0)
             continue
         except InterruptedStepError:
             arrived += 1
-        now = places[held(env)]
+        now = places[adapter.held()]
         # `count` steps have been counted; one more may be done.
         assert now in (count, count + 1)
         moved += now > 0
         for _ in range(3):
-            step()
-        assert held(env) == states[now + 3]
+            adapter.call()
+        assert adapter.held() == states[now + 3]
     assert moved > SIGNALS // 4
 
 
@@ -165,29 +95,28 @@ def raising_at(last):
 @pytest.mark.parametrize("name", ADAPTERS)
 def test_an_exception_at_every_line_leaves_a_usable_environment(name):
     """As a debugger raises one: from its trace function, at each line in turn."""
-    env, reset, step = ADAPTERS[name]()
-    reset()
-    step()
+    adapter = ADAPTERS[name](episode_length=7)
+    adapter.reset()
+    adapter.call()
     lines = 0
     while True:
-        reset()
-        before = held(env)
+        adapter.reset()
+        before = adapter.held()
         former = sys.gettrace()
         try:
             sys.settrace(raising_at(lines))
-            step()
+            adapter.call()
             break
         except InterruptedStepError:
             pass
         finally:
             sys.settrace(former)
-        interrupted = held(env)
-        if interrupted == before:
-            step()
-        after = held(env)
-        reset()
-        step()
-        assert held(env) == after
+        if adapter.held() == before:
+            adapter.call()
+        after = adapter.held()
+        adapter.reset()
+        adapter.call()
+        assert adapter.held() == after
         lines += 1
     assert lines > 5
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pixelbrax_gym.packing import pack, unpack
+from pixelbrax_gym.programs import pack, unpack
 from pixelbrax_jax.types import EnvState, PhysicsState, SimState
 
 

@@ -30,7 +30,6 @@ from pixelbrax_gym.interop.dlpack import torch_device
 from pixelbrax_gym.torchrl import specs as torchrl_specs
 from pixelbrax_gym.torchrl.specs import PixelSpec
 from pixelbrax_jax.tasks import BRAX_TASKS
-from tests.compilations import counted
 from tests.gym.conftest import ID, TASK
 
 RIGHT = np.array([[-0.2], [0.9], [1.0]], np.float32)
@@ -124,24 +123,6 @@ def test_collector_transitions_are_true(make_torchrl):
     assert data["next", "terminated"].any()
     assert data["next", "truncated"].any()
     check_transitions(data)
-
-
-def test_one_end_leaves_the_others_alone(make_torchrl):
-    options = {"obs_mode": "both", "episode_length": 100}
-    env, alone = make_torchrl(**options), make_torchrl(**options)
-    td, expected = env.reset(), alone.reset()
-    ends = 0
-    for _ in range(40):
-        # Environment 1 ends again and again, the others merely live on.
-        action = np.array([[0.1], [1.0], [-0.1]], np.float32)
-        stepped, td = env.step_and_maybe_reset(act(td, action))
-        wanted = alone.step(act(expected, np.array([[0.1], [0.0], [-0.1]], np.float32)))
-        ends += stepped["next", "done"][1].item()
-        for row in (0, 2):
-            for key in ("pixels", "observation", "reward", "done"):
-                assert torch.equal(stepped["next", key][row], wanted["next", key][row])
-        expected = wanted["next"]
-    assert ends >= 2
 
 
 def test_reset_mask_changes_one_row(make_torchrl):
@@ -267,26 +248,6 @@ def test_episodes_that_begin_copy_no_pictures(make_torchrl):
     assert td["observation"][:, 1].tolist() == np.asarray(obs["state"])[:, 1].tolist()
     assert torch.equal(td["pixels"][0], stepped["next", "pixels"][0])
     assert not torch.equal(td["pixels"][1], stepped["next", "pixels"][1])
-
-
-def test_writing_to_tensors_changes_nothing_later(make_torchrl):
-    clean, dirty = make_torchrl(obs_mode="both"), make_torchrl(obs_mode="both")
-    td, expected = dirty.reset(), clean.reset()
-    td["pixels"].fill_(7)
-    for _ in range(25):
-        done, td = dirty.step_and_maybe_reset(act(td))
-        wanted, expected = clean.step_and_maybe_reset(act(expected))
-        for key in ("pixels", "observation", "reward", "done"):
-            assert torch.equal(done["next", key], wanted["next", key])
-        # The last frame, the first of the next episode, and the flags.
-        td = td.copy()
-        flags = {key: td[key].clone() for key in ("done", "terminated", "truncated")}
-        for tensor in done["next"].values():
-            tensor.fill_(1)
-        td.update(flags)
-        td["pixels"].fill_(5)
-    td, expected = dirty.reset(), clean.reset()
-    assert torch.equal(td["pixels"], expected["pixels"])
 
 
 def test_seeds(make_torchrl):
@@ -429,23 +390,6 @@ def test_infos(make_torchrl):
     assert not env.infos["non_finite"].any()
 
 
-@pytest.mark.parametrize(
-    ("action", "error_type", "message"),
-    [
-        (torch.zeros(3, 2), ValueError, r"action must have shape \(3, 1\), got \(3, 2\)"),
-        (torch.zeros(3, 1, dtype=torch.int64), TypeError, "floating point.*int64"),
-        (torch.full((3, 1), torch.nan), ValueError, "environment 0, 1, 2 contains NaN"),
-    ],
-)
-def test_bad_actions(make_torchrl, action, error_type, message):
-    env = make_torchrl(obs_mode="state")
-    td = env.reset()
-    bad = TensorDict({"action": action}, batch_size=[3])
-    with pytest.raises(error_type, match=message):
-        env.step(bad)
-    assert env.step(act(td))["next", "observation"][:, 1].tolist() == [1.0] * 3
-
-
 def test_actions_are_converted(make_torchrl):
     wanted = torch.tensor([[0.25], [-0.5], [1.0]])
     strided = torch.zeros(3, 2)
@@ -528,13 +472,6 @@ def test_torchrls_own_gym_environment_takes_ours():
     assert td["reward"].item() == pytest.approx(sum(step[1] for step in steps))
 
 
-def test_options_are_checked():
-    with pytest.raises(
-        TypeError, match=r"unexpected keyword argument 'heigth'.*Did you mean 'height'"
-    ):
-        pixelbrax_gym.TorchRLEnv(TASK, 2, heigth=12)
-
-
 def test_pixel_specs_have_no_tensors():
     spec = torchrl_specs.observation_spec(
         pixelbrax_jax.make(TASK)[0].obs_spec, 4096, torch.device("cpu")
@@ -558,33 +495,3 @@ def test_pixel_spec_behaves_as_unbounded():
         assert spec.to(torch.float32).dtype == torch.float32
     assert type(ours.to(torch.float32)) is PixelSpec
     assert "PixelSpec" in repr(ours)
-
-
-def test_nothing_is_compiled_twice(make_torchrl):
-    env = make_torchrl()
-    td = env.reset()
-    for _ in range(20):
-        _, td = env.step_and_maybe_reset(env.rand_action(td))
-    with counted() as events:
-        for _ in range(200):
-            _, td = env.step_and_maybe_reset(env.rand_action(td))
-    assert not events
-
-
-@pytest.mark.parametrize("package", ["torch", "torchrl"])
-def test_missing_torchrl_names_the_cure(monkeypatch, package):
-    import builtins
-    import importlib
-    import sys
-
-    real = builtins.__import__
-
-    def without(name, *args, **kwargs):
-        if name.partition(".")[0] == package:
-            raise ImportError(name)
-        return real(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", without)
-    monkeypatch.delitem(sys.modules, "pixelbrax_gym.torchrl.env", raising=False)
-    with pytest.raises(ImportError, match=r'pip install "pixelbrax\[torch(rl)?\]"'):
-        importlib.import_module("pixelbrax_gym.torchrl.env")

@@ -11,7 +11,7 @@ import pytest
 import torch
 from gymnasium.vector import AutoresetMode
 
-from pixelbrax_gym import GymnasiumEnv, GymnasiumVectorEnv, check_vector_env
+from pixelbrax_gym import GymnasiumVectorEnv, check_vector_env
 from pixelbrax_gym.interop.export import to_numpy
 from tests.gym.conftest import SIZE, TASK
 from tests.gym.test_registration import TASKS
@@ -20,64 +20,6 @@ MODES = ("next_step", "same_step", "disabled")
 # Environment 0 goes left and times out, the others reach the end at different times.
 ACTIONS = np.array([[-0.2], [0.9], [1.0]], np.float32)
 LONG = {"episode_length": 17}
-
-
-def as_numpy(tree):
-    return jax.tree.map(np.asarray, tree)
-
-
-def episodes(env, num_steps, seed=0):
-    """Per environment, its episodes: lists of (obs, reward, terminated, truncated, length)."""
-    obs, infos = env.reset(seed=seed)
-    done = np.zeros(3, bool)
-    found = [[[(np.array(obs[i]), 0.0, False, False, 0)]] for i in range(3)]
-    for _ in range(num_steps):
-        if env.autoreset_mode is AutoresetMode.DISABLED and done.any():
-            obs, infos = env.reset(options={"reset_mask": done})
-            for i in np.flatnonzero(done):
-                found[i].append([(np.array(obs[i]), 0.0, False, False, 0)])
-            done = np.zeros(3, bool)
-        ended = done
-        obs, reward, terminated, truncated, infos = env.step(ACTIONS)
-        done = terminated | truncated
-        for i in range(3):
-            flags = (float(reward[i]), bool(terminated[i]), bool(truncated[i]))
-            if env.autoreset_mode is AutoresetMode.NEXT_STEP and ended[i]:
-                assert flags == (0.0, False, False)
-                found[i].append([])
-            same_step = env.autoreset_mode is AutoresetMode.SAME_STEP and done[i]
-            last = infos["final_obs"][i] if same_step else obs[i]
-            length = infos["final_info"] if same_step else infos
-            found[i][-1].append((np.array(last), *flags, int(length["episode_length"][i])))
-            if same_step:
-                assert infos["episode_length"][i] == 0
-                found[i].append([(np.array(obs[i]), 0.0, False, False, 0)])
-    return found
-
-
-def single_episodes(row, num_steps, seed=0, **options):
-    env = GymnasiumEnv(TASK, **(SIZE | LONG | options))
-    found = [[(env.reset(seed=seed + row)[0], 0.0, False, False, 0)]]
-    for _ in range(num_steps):
-        if found[-1][-1][2] or found[-1][-1][3]:
-            found.append([(env.reset()[0], 0.0, False, False, 0)])
-        obs, reward, terminated, truncated, info = env.step(ACTIONS[row])
-        found[-1].append((obs, reward, terminated, truncated, info["episode_length"]))
-    return found
-
-
-@pytest.mark.parametrize("mode", MODES)
-def test_every_mode_goes_through_the_episodes_of_the_single_environment(make_vector, mode):
-    actual = episodes(make_vector(autoreset_mode=mode, **LONG), 40)
-    for row in range(3):
-        expected = single_episodes(row, 40)
-        assert len(actual[row]) >= 2
-        for mine, other in zip(actual[row], expected, strict=False):
-            for step, (left, right) in enumerate(zip(mine, other, strict=False)):
-                # Two programs, whose sums may be rounded in another order.
-                np.testing.assert_allclose(left[0], right[0], atol=1, err_msg=f"{row}, {step}")
-                assert left[1] == pytest.approx(right[1], rel=1e-6, abs=1e-6)
-                assert left[2:] == right[2:]
 
 
 @pytest.mark.parametrize("output", ["numpy", "torch", "jax"])
@@ -178,27 +120,6 @@ def test_dense_final_entries_of_torch(make_vector):
     )
 
 
-@pytest.mark.parametrize("mode", MODES)
-def test_results_may_be_written_to(make_vector, mode):
-    """What a caller does to them shows in no later result."""
-    env, other = (make_vector(obs_mode="both", autoreset_mode=mode) for _ in range(2))
-    obs, infos = env.reset(seed=0)
-    other.reset(seed=0)
-    steps = []
-    for _ in range(5):
-        for array in (*obs.values(), *infos.values()):
-            array[:] = 1
-        obs, *rest, infos = env.step(ACTIONS)
-        expected, *expected_rest, _ = other.step(ACTIONS)
-        for name in obs:
-            np.testing.assert_array_equal(obs[name], expected[name])
-        for array, wanted in zip(rest, expected_rest, strict=True):
-            np.testing.assert_array_equal(array, wanted)
-            array[:] = 1
-        steps.append(obs["pixels"])
-    assert not any(map(np.shares_memory, steps, steps[1:]))
-
-
 def test_observations_outlive_their_environment():
     env = GymnasiumVectorEnv(TASK, 3, **SIZE)
     obs, _ = env.reset(seed=0)
@@ -279,22 +200,6 @@ def test_reset_mask_with_a_seed(make_vector):
     obs, _ = env.reset(seed=0, options={"reset_mask": np.array([False, False, True])})
     np.testing.assert_array_equal(obs[2], first[2])
     assert not np.array_equal(obs[0], first[0])
-
-
-def test_an_ending_leaves_the_others_bitwise_alone(make_vector):
-    # Environment 2 ends in one run and lives on in the other.
-    env, other = make_vector(obs_mode="both", **LONG), make_vector(obs_mode="both", **LONG)
-    lazy = ACTIONS * np.array([[1.0], [0.1], [0.0]], np.float32)
-    busy = ACTIONS * np.array([[1.0], [0.1], [1.0]], np.float32)
-    env.reset(seed=0), other.reset(seed=0)
-    ended = False
-    for _ in range(16):
-        mine, theirs = env.step(busy), other.step(lazy)
-        ended |= bool(mine[2][2])
-        left = jax.tree.map(lambda x: x[:2], mine[:4])
-        right = jax.tree.map(lambda x: x[:2], theirs[:4])
-        jax.tree.map(np.testing.assert_array_equal, left, right)
-    assert ended
 
 
 def test_seeds(make_vector):

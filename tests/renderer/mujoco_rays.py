@@ -5,7 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from pixelbrax_jax import Scene
+from pixelbrax_jax.types import Scene
 
 
 def cast(

@@ -6,8 +6,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from pixelbrax_jax import Camera, Geoms, Look, Scene, make_look
+from pixelbrax_jax import Camera, Geoms, Look, make_look
 from pixelbrax_jax.spatial import look_at
+from pixelbrax_jax.types import Scene
 
 PRIMITIVES_MJCF = """
 <mujoco>

@@ -13,7 +13,8 @@ from brax.io import mjcf
 from etils import epath
 
 import pixelbrax_jax
-from pixelbrax_jax import place, render
+from pixelbrax_jax.renderer.base import render
+from pixelbrax_jax.scene.place import place
 from pixelbrax_jax.tasks import BRAX_TASKS
 from pixelbrax_jax.types import FAR
 from tests.renderer import scenes

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import pytest
 
 import pixelbrax_jax as pb
+from pixelbrax_jax.renderer.base import render
 from tests.renderer.test_lamps import LAMP
 from tests.renderer.test_planes import random_strip
 
@@ -85,7 +86,7 @@ def test_every_shape_and_light_is_in_the_one_fusion(shadows):
     scene = jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * 16), scene)
 
     def packed(scene):
-        frame = pb.render(scene, SIZE, SIZE)
+        frame = render(scene, SIZE, SIZE)
         r, g, b = (jnp.uint32(255 * plane) for plane in (frame.r, frame.g, frame.b))
         return r | g << 8 | b << 16
 

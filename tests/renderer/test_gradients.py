@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pixelbrax_jax import GeomKind, make_look, render
+from pixelbrax_jax import GeomKind, make_look
+from pixelbrax_jax.renderer.base import render
 from tests.renderer import scenes
 from tests.renderer.test_planes import random_strip
 

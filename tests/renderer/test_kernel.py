@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 import pixelbrax_jax as pb
-from pixelbrax_jax import GeomKind, make_look, render
+from pixelbrax_jax import GeomKind, make_look
 from pixelbrax_jax.distractors import Color, Distractor
+from pixelbrax_jax.renderer.base import render
 from pixelbrax_jax.renderer.fused import view_of
 from pixelbrax_jax.renderer.kernel import may_see, window_of
 from pixelbrax_jax.tasks import BRAX_TASKS

@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pixelbrax_jax import GeomKind, make_look, render
+from pixelbrax_jax import GeomKind, make_look
 from pixelbrax_jax.renderer import shading
+from pixelbrax_jax.renderer.base import render
 from pixelbrax_jax.types import FAR
 from tests.renderer import scenes
 

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pixelbrax_jax import GeomKind, Geoms, make_look, render
+from pixelbrax_jax import GeomKind, Geoms, make_look
+from pixelbrax_jax.renderer.base import render
 from pixelbrax_jax.types import FAR, Scene
 from tests.renderer import scenes
 

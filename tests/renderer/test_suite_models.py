@@ -6,7 +6,9 @@ import jax
 import numpy as np
 import pytest
 
-from pixelbrax_jax import make_look, place, render
+from pixelbrax_jax import make_look
+from pixelbrax_jax.renderer.base import render
+from pixelbrax_jax.scene.place import place
 from tests.renderer import suite_models
 from tests.renderer.mujoco_scene import cast
 

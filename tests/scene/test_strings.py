@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pixelbrax_jax import GeomKind, Geoms, make_look, make_rig, place
+from pixelbrax_jax import GeomKind, Geoms, make_look, make_rig
+from pixelbrax_jax.scene.place import place
 from pixelbrax_jax.scene.strings import hang
 from pixelbrax_jax.types import Lamp, String
 

@@ -30,15 +30,9 @@ def mesh_of(algorithm: Algorithm) -> Mesh | None:
 
 
 def state_shardings(mesh: Mesh, template: Any, num_seeds: int = 1) -> Any:
-    """Return a sharding for each leaf of a ``TrainState``.
+    """Return a sharding for each leaf of a ``TrainState``, or of its ``jax.eval_shape``.
 
-    Args:
-        mesh: devices along an axis ``"envs"``.
-        template: the state, or its ``jax.eval_shape``.
-        num_seeds: if more than 1, leaves have a leading axis of that size.
-
-    Raises:
-        TypeError: a field does not say where its environments are.
+    The mesh has an axis ``"envs"``. Of several seeds the leaves have a leading axis.
     """
 
     def sharding(axis: int) -> NamedSharding:
@@ -74,16 +68,7 @@ def highest(*here: int) -> tuple[int, ...]:
 
 
 def check_memory(algorithm: Algorithm, template: TrainState, report: Report) -> None:
-    """Report what will be stored, and reject what would not fit.
-
-    Args:
-        algorithm: with its settings.
-        template: ``jax.eval_shape`` of its state.
-        report: gets the figures.
-
-    Raises:
-        MemoryError: it is more than ``memory_budget_gb``, or than the device has.
-    """
+    """Report what a state like ``template`` takes, or raise a MemoryError if it would not fit."""
     config = algorithm.config
     frames = config.bytes_per_iteration * template.iteration.size
     memories, total = _memories(algorithm), _nbytes(template)

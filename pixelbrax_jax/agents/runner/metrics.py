@@ -26,14 +26,11 @@ _MAX_WAITING = 64 * 2**20
 
 
 def summarize(records: list[Mapping[str, Any]]) -> dict[str, float]:
-    """Return one record of several iterations.
+    """Return one record of several iterations, of which some may have more names than others.
 
-    Episodes count equally, whichever iteration they ended in; all else is the mean over
-    iterations. Without a finished episode there is no return and no length.
-
-    Args:
-        records: metrics of iterations; some may have more names than others. Of several runs
-            they have a leading axis; the summary is over all of them, with each run's return.
+    Episodes count equally, whichever iteration they ended in; all else is the mean. Without a
+    finished episode there is no return and no length. Metrics of several runs have a leading axis,
+    over which the record is too, with each run's return.
     """
     names = {name: None for record in records for name in record}
     values = {
@@ -65,10 +62,9 @@ class AppendedFile:
         self._ended = False
 
     def append(self, block: bytes = b"") -> None:
-        """Write what waits, then a block.
+        """Write what waits, then a block; an OSError if some of it waits still.
 
-        Raises:
-            OSError: some of it waits still, or more than 64 MiB did, behind which the file ends.
+        The file ends where more than 64 MiB would have to wait.
         """
         self._ended = self._ended or len(self._waiting) + len(block) > _MAX_WAITING
         if not self._ended:
@@ -80,11 +76,7 @@ class AppendedFile:
             raise OSError("more waited for room on the disk than is kept in memory")
 
     def close(self) -> None:
-        """Write what waits and close the file.
-
-        Raises:
-            OSError: some of it could not be written.
-        """
+        """Write what waits and close the file, or raise an OSError."""
         try:
             self.append()
         finally:
@@ -93,23 +85,18 @@ class AppendedFile:
 
 @dataclass
 class _Output:
-    """A place that records are written to.
-
-    Attributes:
-        name: as messages have it.
-        write: writes the record of so many steps and seconds, or raises.
-        close: writes what waits, or raises.
-        retries: whether ``write`` keeps what it could not write, and tries again the next time.
-        failure: why records are missing; empty while none is.
-        last: steps of the last record that is there for certain.
-    """
+    """A place that records are written to; both functions may raise."""
 
     name: str
     write: Callable[[int, float, Mapping[str, float]], None]
+    """Takes steps, seconds and the record."""
     close: Callable[[], None]
     retries: bool = True
+    """Whether ``write`` keeps what it could not write, and tries again the next time."""
     failure: str = ""
+    """Why records are missing; empty while none is."""
     last: int = 0
+    """Steps of the last record that is there for certain."""
 
 
 def _lines(path: Path) -> _Output:
@@ -182,18 +169,13 @@ class MetricsWriter:
         outputs: Sequence[_Output] = (),
         seconds: float = 0.0,
     ) -> None:
-        """Start the clock at ``seconds``; ``report`` gets a line about what cannot be written."""
+        """Start the clock at ``seconds``."""
         self._report = report
         self._outputs = outputs
         self._began = time.monotonic() - seconds
 
     def write(self, steps: int, record: Mapping[str, float]) -> None:
-        """Write one record.
-
-        Args:
-            steps: control steps so far, any size.
-            record: numbers by name.
-        """
+        """Write one record, of so many control steps."""
         seconds = time.monotonic() - self._began
         for output in self._outputs:
             if output.failure and not output.retries:
@@ -245,21 +227,10 @@ def open_metrics(
     first_step: int = 0,
     wandb_project: str | None = None,
 ) -> MetricsWriter:
-    """Open ``metrics.jsonl``, TensorBoard's file and, if asked, Weights & Biases.
+    """Open ``metrics.jsonl``, TensorBoard's file and, if asked, Weights & Biases; or raise.
 
-    The settings are written to ``config.json``, for people and scripts; nothing reads it back.
-
-    Args:
-        folder: where the files are.
-        config: settings by name, as JSON has them.
-        report: gets a line about what cannot be written.
-        first_step: control steps at which the run goes on; later records of an earlier attempt are
-            dropped, for they will be written again.
-        wandb_project: project of Weights & Biases; None writes nothing there.
-
-    Raises:
-        ImportError: a project is given, but wandb is not installed.
-        OSError: a file cannot be opened.
+    ``config`` is written to ``config.json`` for people and scripts; nothing reads it back. Records
+    of an earlier attempt beyond ``first_step`` are dropped, for they will be written again.
     """
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "config.json").write_text(json.dumps(config, indent=2) + "\n", "utf-8")

@@ -38,18 +38,18 @@ class Runs:
     algorithm: Algorithm
     num_seeds: int = 1
 
+    @jit(_env, static_argnums=0)
+    def init(self, seed: jax.Array, env_params: EnvParams) -> TrainState:
+        """Return the state before the first iteration; each run has the seed after the last."""
+        return self._spread(self._init(seed, env_params), {})[0]
+
     @under_default_flags
     def _init(self, seed: jax.Array, env_params: EnvParams) -> TrainState:
         if self.num_seeds == 1:
             keys = jax.random.key(seed)
         else:
             keys = jnp.stack([jax.random.key(seed + i) for i in range(self.num_seeds)])
-        return self._spread(self._each(self.algorithm.init, keys, env_params), {})[0]
-
-    @jit(_env, static_argnums=0)
-    def init(self, seed: jax.Array, env_params: EnvParams) -> TrainState:
-        """Return the state before the first iteration; each run has the seed after the last."""
-        return self._init(seed, env_params)
+        return self._each(self.algorithm.init, keys, env_params)
 
     # The state before an iteration is not needed after it: its memory is used again.
 
@@ -65,7 +65,7 @@ class Runs:
 
     def template(self, env_params: EnvParams) -> TrainState:
         """Return shapes, dtypes and, of several devices, shardings of the state."""
-        template = jax.eval_shape(self._init, jnp.uint32(0), env_params)
+        template: TrainState = jax.eval_shape(self._init, jnp.uint32(0), env_params)
         mesh = mesh_of(self.algorithm)
         if mesh is None:
             return template

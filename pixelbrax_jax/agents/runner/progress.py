@@ -23,11 +23,7 @@ def reason(error: BaseException) -> str:
 
 
 class Messages:
-    """Passes lines on for as long as that is possible.
-
-    Attributes:
-        failure: why a line could not be written; empty if all were.
-    """
+    """Passes lines on; ``failure`` tells why one could not be written, and is empty otherwise."""
 
     def __init__(self, report: Report) -> None:
         self._report = report
@@ -42,20 +38,10 @@ class Messages:
 
 
 class Bar:
-    """tqdm's progress bar, or nothing.
-
-    Attributes:
-        failure: why the bar could not be drawn; empty if it could.
-    """
+    """tqdm's progress bar, or nothing; ``failure`` as of `Messages`."""
 
     def __init__(self, shown: bool, total: int, report: Report) -> None:
-        """Draw the bar.
-
-        Args:
-            shown: whether there is one.
-            total: number of iterations.
-            report: gets a line if the bar fails.
-        """
+        """Draw the bar of ``total`` iterations; ``report`` gets a line if that fails."""
         self._report = report
         self.failure = ""
         self._bar = tqdm(disable=True)

@@ -34,16 +34,13 @@ def write_video(
 
     Args:
         agent: who plays, with mean actions.
-        path: of the video; its suffix decides the format.
+        path: of the video, which is returned; its suffix decides the format.
         split: ``"clean"``, ``"train"`` or ``"test"``.
         clips: folder of the clips, in place of that of the training.
         grid: episodes a side.
         size: pixels of one episode, square.
         num_frames: at most.
         seed: of the episodes.
-
-    Returns:
-        The video's path.
 
     Raises:
         NoSplitError: the clips are not those of the split.

@@ -93,10 +93,22 @@ class RunConfig:
             )
 
 
-def settings_of(algorithm: Algorithm, options: RunConfig) -> dict[str, Any]:
-    """Return what decides the result of a run, as JSON has it; a folder of clips from the root."""
+def describe_run(
+    algorithm: Algorithm, options: RunConfig, clips: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Return what decides the result of a run, as JSON has it: algorithm, settings, clips.
+
+    ``clips`` are digests of what is played. Those of made clips are not stored: their name tells
+    them, and they may differ in a pixel from one processor to the next.
+    """
     settings = describe(algorithm.config) | {name: getattr(options, name) for name in OF_RUNS}
-    return settings | {"clips": place_of(settings["clips"])}
+    settings["clips"] = place_of(settings["clips"])
+    made = settings["clips"] in (None, "procedural")
+    return {
+        "algorithm": algorithm.name,
+        "config": settings,
+        "clips": None if made else list(clips) or None,
+    }
 
 
 def former_settings(kind: type[TrainConfig]) -> dict[str, Any]:
@@ -118,13 +130,8 @@ def versions() -> dict[str, str]:
 
 
 def unknown_settings(about: Mapping[str, Any], known: Mapping[str, Any]) -> str:
-    """Return a sentence on stored settings that this release lacks; empty if it has all of them.
-
-    Args:
-        about: what is stored beside a checkpoint.
-        known: all settings of this release.
-    """
-    names = [name for name in about["config"] if name not in known]
+    """Return a sentence on what is stored in ``about`` and not ``known`` here; empty if nothing."""
+    names = [name for name in about["config"] if name not in known and name not in _GONE]
     if not names:
         return ""
     written = about.get("versions", {}).get("pixelbrax", "another release")
@@ -136,11 +143,9 @@ def unknown_settings(about: Mapping[str, Any], known: Mapping[str, Any]) -> str:
 
 
 def differences(about: Mapping[str, Any], own: Mapping[str, Any]) -> list[str]:
-    """Return the settings with which a run may not go on, one line each.
+    """Return the settings with which a stored run may not go on, one line each.
 
-    Args:
-        about: what is stored beside the checkpoint, with all settings.
-        own: the same of the run that shall go on.
+    Both are of ``describe_run``: ``about`` as stored, ``own`` of the run that shall go on.
     """
     old, new = about["config"], own["config"]
     free = {name for name in _FREE if name != "total_steps" or not new.get("anneal")}
@@ -173,15 +178,6 @@ def clip_digests(clips: Clips | None) -> list[str]:
         digest.update(frames.data)
         found.append(digest.hexdigest()[:32])
     return found
-
-
-def stored_clips(config: TrainConfig, digests: Sequence[str]) -> Sequence[str] | None:
-    """Return what is stored of a run's clips; None of those that are made, which their name tells.
-
-    Made ones may differ in a pixel from one processor to the next.
-    """
-    made = config.env.clips is None or config.env.clips == "procedural"
-    return None if made else digests or None
 
 
 def place_of(clips: str | None) -> str | None:

@@ -123,7 +123,8 @@ def _make(config: TrainConfig, **changes: Any) -> tuple[PixelEnv, EnvParams]:
         if _source(config) == "procedural":
             raise
         raise FileNotFoundError(
-            f"{error} If the clips of the run are elsewhere, name their folder with --clips."
+            "the clips of the run are not there; if they are elsewhere, name their folder with "
+            f"--clips: {error}"
         ) from error
 
 

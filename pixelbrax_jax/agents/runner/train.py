@@ -15,7 +15,7 @@ from pixelbrax_jax._platform.lowering import default_platform
 from pixelbrax_jax.agents.algorithm import Algorithm
 from pixelbrax_jax.agents.config import TrainConfig, make_env
 from pixelbrax_jax.agents.registry import make_algorithm
-from pixelbrax_jax.agents.runner.checkpoint import CheckpointError, Checkpoints
+from pixelbrax_jax.agents.runner.checkpoint import CheckpointError
 from pixelbrax_jax.agents.runner.devices import (
     any_process,
     check_memory,
@@ -27,13 +27,12 @@ from pixelbrax_jax.agents.runner.evaluate import Evaluator, Result, together
 from pixelbrax_jax.agents.runner.metrics import MetricsWriter, open_metrics, summarize
 from pixelbrax_jax.agents.runner.programs import Runs
 from pixelbrax_jax.agents.runner.progress import Bar, Messages, Report, reason, silent
-from pixelbrax_jax.agents.runner.saving import Saver
+from pixelbrax_jax.agents.runner.saving import Checkpoints
 from pixelbrax_jax.agents.runner.settings import (
     RunConfig,
     clip_digests,
+    describe_run,
     former_settings,
-    settings_of,
-    stored_clips,
 )
 from pixelbrax_jax.agents.runner.splits import make_splits
 from pixelbrax_jax.agents.runner.trained import save_policy
@@ -133,11 +132,12 @@ def run(
         check_memory(algorithm, template, messages)
         checkpoints = Checkpoints(
             Path(options.output_dir) / "checkpoints",
-            settings_of(algorithm, options),
-            algorithm.name,
+            describe_run(algorithm, options, shown),
             keep=options.keep_checkpoints,
             former=former_settings(type(algorithm.config)),
-            clips=stored_clips(algorithm.config, shown),
+            every=options.checkpoint_every,
+            minutes=options.checkpoint_minutes,
+            report=messages,
         )
         with closing(checkpoints):
             seed = jax.device_put(np.uint32(options.seed))
@@ -162,12 +162,7 @@ def run(
 
 
 def _goes_on(checkpoints: Checkpoints, options: RunConfig, report: Report) -> bool:
-    """Return whether the run goes on from a checkpoint.
-
-    Raises:
-        FileExistsError: there is one of an earlier run.
-        CheckpointError: only some processes see it.
-    """
+    """Return whether the run goes on from a checkpoint, or raise if it may not."""
     found = bool(checkpoints.steps())
     if any_process(found) and any_process(not found):
         raise CheckpointError(
@@ -187,11 +182,7 @@ def _goes_on(checkpoints: Checkpoints, options: RunConfig, report: Report) -> bo
 def _restored(
     checkpoints: Checkpoints, template: TrainState, algorithm: Algorithm, report: Report
 ) -> TrainState:
-    """Return the state of the latest checkpoint.
-
-    Raises:
-        CheckpointError: it is of another run, or behind the end of this one.
-    """
+    """Return the state of the latest checkpoint, or raise if it is not of this run."""
     state = checkpoints.restore(kept(template))
     steps, config = _steps(algorithm, state), algorithm.config
     if steps > config.num_iterations * config.steps_per_iteration:
@@ -233,36 +224,31 @@ class _Run:
     def train(self, state: TrainState) -> Outcome:
         """Train from ``state`` to the end, or until a signal."""
         began = steps = _steps(self.algorithm, state)
-        writer = self.open_writer(steps)
+        self.writer = self.open_writer(steps)
         try:
             shown = self.options.progress and self.is_first
-            bar = Bar(shown, self.config.num_iterations, self.report)
-            with closing(bar):
-                state, steps, stopped_by = self.iterations(state, steps, writer, bar)
+            self.bar = Bar(shown, self.config.num_iterations, self.report)
+            with closing(self.bar):
+                state, steps, stopped_by = self.iterations(state, steps)
             if self.is_first and (not stopped_by or steps > began):
                 self.export(state, steps)
         finally:
-            writer.close()
-            for line in (missing := writer.missing()):
+            self.writer.close()
+            for line in (missing := self.writer.missing()):
                 self.report(line)
         if not stopped_by:
             self.report(f"done after {steps} steps; checkpoints and policy in {self.folder}")
-        failed = {"the progress bar": bar.failure, "messages": self.report.failure}
-        incomplete = [f"{name} could not be shown: {why}" for name, why in failed.items() if why]
-        return Outcome(
-            state,
-            self.record,
-            self.results,
-            bool(stopped_by),
-            stopped_by,
-            (*missing, *incomplete),
-        )
+        failed = {"the progress bar": self.bar.failure, "messages": self.report.failure}
+        hidden = [f"{name} could not be shown: {why}" for name, why in failed.items() if why]
+        incomplete = (*missing, *hidden)
+        interrupted = bool(stopped_by)
+        return Outcome(state, self.record, self.results, interrupted, stopped_by, incomplete)
 
     def open_writer(self, steps: int) -> MetricsWriter:
         """Open the files of records in the first process, or raise in all of them."""
         writer, failure = MetricsWriter(self.report), None
         if self.is_first:
-            settings = settings_of(self.algorithm, self.options)
+            settings = describe_run(self.algorithm, self.options)["config"]
             try:
                 writer = open_metrics(
                     self.folder,
@@ -277,13 +263,11 @@ class _Run:
             raise failure or RuntimeError("process 0 cannot write metrics; it says why.")
         return writer
 
-    def iterations(
-        self, state: TrainState, steps: int, writer: MetricsWriter, bar: Bar
-    ) -> tuple[TrainState, int, int]:
+    def iterations(self, state: TrainState, steps: int) -> tuple[TrainState, int, int]:
         """Return the state at the end or behind a signal, its steps, the signal's number or 0."""
         per_iteration, total = self.config.steps_per_iteration, self.config.num_iterations
         done = steps // per_iteration
-        bar.update(done)
+        self.bar.update(done)
         if done >= total:
             self.report(f"the run has had its {steps} steps")
             return state, steps, 0
@@ -292,33 +276,26 @@ class _Run:
             self.report(f"stopped by {signal_name(stopped_by)} before the first iteration; {left}")
             return state, steps, stopped_by
         self.report("compiling")
-        saver = Saver(
-            self.checkpoints,
-            steps,
-            self.report,
-            every=self.options.checkpoint_every,
-            minutes=self.options.checkpoint_minutes,
-        )
         self.restart_timer(steps)
         for number in range(done + 1, total + 1):
             state, steps = self.iterate(state, number), number * per_iteration
-            bar.update(1)
+            self.bar.update(1)
             # The clock is that of the first process.
-            by_clock = self.is_first and saver.is_due_by_clock()
+            by_clock = self.is_first and self.checkpoints.is_due_by_clock()
             stopped_by, due = highest(self.stop.signal, int(by_clock))
             stopped_by = 0 if number == total else stopped_by
             last = number == total or bool(stopped_by)
             evaluates = is_due(number, self.options.num_evals, total)
-            saves = last or evaluates or bool(due) or saver.is_due_after(steps)
+            saves = last or evaluates or bool(due) or self.checkpoints.is_due_after(steps)
             logs = saves or number % self.options.log_every == 0
             if logs:
-                self.log(steps, writer, bar, saver)
+                self.log(steps)
             if evaluates and not stopped_by:
-                writer.write(steps, self.evaluate(state, steps))
+                self.evaluate(state, steps)
             if saves:
-                saver.save(kept(state), steps, self.score(steps), last=last)
+                self.checkpoints.save(kept(state), steps, self.score(steps), last=last)
             else:
-                saver.look_after()
+                self.checkpoints.look_after()
             if stopped_by:
                 self.report(
                     f"stopped by {signal_name(stopped_by)} after {steps} steps; go on with "
@@ -326,7 +303,7 @@ class _Run:
                 )
                 # Behind the checkpoint: whoever is asked to stop may soon be killed.
                 if evaluates:
-                    writer.write(steps, self.evaluate(state, steps))
+                    self.evaluate(state, steps)
                 break
             if logs:
                 self.restart_timer(steps)
@@ -348,21 +325,21 @@ class _Run:
     def restart_timer(self, steps: int) -> None:
         self.timed_since, self.timed_steps = time.perf_counter(), steps
 
-    def log(self, steps: int, writer: MetricsWriter, bar: Bar, saver: Saver) -> None:
+    def log(self, steps: int) -> None:
         """Write the metrics of the latest iterations, or raise a TrainingDivergedError."""
         if self.pending:
             records = jax.device_get(self.pending)
             self.pending = []
             for record in records:
-                self.check_finite(record, steps, saver)
+                self.check_finite(record, steps)
             self.record = summarize(records)
         if self.options.log_training_metrics:
             seconds = time.perf_counter() - self.timed_since
             self.record["speed/steps_per_second"] = (steps - self.timed_steps) / seconds
-            writer.write(steps, self.record)
-        bar.update(0, self.record)
+            self.writer.write(steps, self.record)
+        self.bar.update(0, self.record)
 
-    def check_finite(self, record: dict[str, Any], steps: int, saver: Saver) -> None:
+    def check_finite(self, record: dict[str, Any], steps: int) -> None:
         wrong = {name: ~np.isfinite(value) for name, value in record.items()}
         wrong = {name: where for name, where in wrong.items() if where.any()}
         if not wrong:
@@ -371,17 +348,17 @@ class _Run:
         if self.options.seeds > 1:
             those = np.flatnonzero(np.any(list(wrong.values()), axis=0))
             seeds = f" of seed {', '.join(str(self.options.seed + int(i)) for i in those)}"
-        saver.look_after(wait=True)
-        latest = saver.latest()
-        kept = "there is none" if latest is None else f"that of {latest} steps is good"
+        self.checkpoints.look_after(wait=True)
+        latest = self.checkpoints.latest()
+        good = "there is none" if latest is None else f"that of {latest} steps is good"
         raise TrainingDivergedError(
             f"not finite within the iterations before step {steps}{seeds}: {', '.join(wrong)}. Of "
-            f"the checkpoints {kept}. Begin anew in another --output-dir; a lower learning_rate or "
+            f"the checkpoints {good}. Begin anew in another --output-dir; a lower learning_rate or "
             "max_grad_norm may help."
         )
 
-    def evaluate(self, state: TrainState, steps: int) -> dict[str, float]:
-        """Evaluate each run in each split, and return what is logged of it."""
+    def evaluate(self, state: TrainState, steps: int) -> None:
+        """Evaluate each run in each split, and log it."""
         record: dict[str, float] = {}
         policies = self.runs.split(jax.device_get(state.networks))
         for split, evaluator in self.evaluators.items():
@@ -393,14 +370,10 @@ class _Run:
                 line += f" +- {result.standard_error:.1f} (standard error)"
             self.report(line)
         self.evaluated_steps = steps
-        return record
+        self.writer.write(steps, record)
 
     def score(self, steps: int) -> float | None:
-        """Return by what the best checkpoint is chosen: one measure for all those of a run.
-
-        It is the return in clean episodes of this moment, and without evaluations that of the
-        latest training episodes.
-        """
+        """Return by what the best checkpoint is chosen: one measure for all those of a run."""
         if self.options.num_evals:
             return self.results["clean"].mean if self.evaluated_steps == steps else None
         return self.record.get("episode/return")

@@ -63,11 +63,7 @@ class Pretrained:
 
     @under_default_flags
     def act(self, networks: Networks, pixels: jax.Array, key: jax.Array | None = None) -> jax.Array:
-        """Return mean actions, (N, A), of (N, H, W, 3 K) pixels.
-
-        Raises:
-            ValueError: there is a key: the policy has no other actions.
-        """
+        """Return mean actions; there are no others, so that a key is a ValueError."""
         del networks
         if key is not None:
             raise ValueError("a pretrained policy has mean actions alone, got a key.")
@@ -95,14 +91,7 @@ class Trained:
 
 
 def load_pretrained(name: str) -> Trained:
-    """Return a policy that comes with the package.
-
-    Args:
-        name: one of ``pixelbrax_jax.policy.list_pretrained()``.
-
-    Raises:
-        ValueError: there is none of that name, or it was made by another version.
-    """
+    """Return a policy that comes with the package, one of ``pixelbrax_jax.list_pretrained()``."""
     about = read_pretrained(name)
     player = Pretrained(load_config(about), load_policy(name))
     return Trained(player, {}, about["steps"], about["config"].get("seed", 0))
@@ -116,12 +105,7 @@ def load_agent(
     best: bool = False,
     run: int = 0,
 ) -> Trained:
-    """Return an agent by `load_trained` from a folder, or by `load_pretrained` by its name.
-
-    Raises:
-        CheckpointError: there is no such checkpoint.
-        ValueError: options do not go together, or are out of range.
-    """
+    """Return an agent from a folder, as `load_trained`, or of a name, as `load_pretrained`."""
     if folder is not None and pretrained is None:
         return load_trained(folder, steps=steps, best=best, run=run)
     if folder is not None or pretrained is None:
@@ -143,8 +127,7 @@ def load_trained(
         run: which of several runs that were trained together, from 0.
 
     Raises:
-        CheckpointError: there is no such checkpoint, or it is of an algorithm that is not known
-            here.
+        CheckpointError: there is no such checkpoint, or its algorithm is unknown here.
         ValueError: an option is out of range.
     """
     checkpoints = Path(folder) / "checkpoints"
@@ -179,15 +162,13 @@ def load_trained(
 
 
 def with_clips(agent: Trained, clips: str | None) -> tuple[TrainConfig, tuple[str, ...] | None]:
-    """Return the settings of an agent with clips of another folder, and those of its training.
+    """Return the settings of an agent, and digests of the clips that its training played.
+
+    Those are None where none are stored and the clips are no longer where they were.
 
     Args:
         agent: who plays.
-        clips: a folder or ``"procedural"``; None keeps those of the training.
-
-    Returns:
-        The settings, and digests of the clips that training played, for ``make_split``. They are
-        None where none are stored and the clips are no longer where they were.
+        clips: a folder or ``"procedural"`` for the settings; None keeps that of the training.
 
     Raises:
         ValueError: clips are given, but no distractor of the run plays any.
@@ -207,11 +188,7 @@ def with_clips(agent: Trained, clips: str | None) -> tuple[TrainConfig, tuple[st
 
 
 def load_config(about: Mapping[str, Any]) -> TrainConfig:
-    """Return the settings that are stored with a checkpoint.
-
-    Raises:
-        CheckpointError: it is of an algorithm that is not known here, or has such settings.
-    """
+    """Return the settings that are stored with a checkpoint, or raise if they are unknown here."""
     if about["algorithm"] not in ALGORITHMS:
         raise CheckpointError(
             f"the checkpoint is of {about['algorithm']!r}, which is none of "
@@ -223,7 +200,7 @@ def load_config(about: Mapping[str, Any]) -> TrainConfig:
     if unknown := unknown_settings(about, former):
         raise CheckpointError(unknown.strip())
     stored = former | about["config"]
-    return kind().replace(**{n: value for n, value in stored.items() if n not in OF_RUNS})
+    return kind().replace(**{name: stored[name] for name in former if name not in OF_RUNS})
 
 
 def save_policy(algorithm: Algorithm, networks: Networks, path: str | Path) -> Path:
@@ -234,11 +211,8 @@ def save_policy(algorithm: Algorithm, networks: Networks, path: str | Path) -> P
 
     Args:
         algorithm: whose ``act`` is stored.
-        networks: parameters.
-        path: of the file.
-
-    Returns:
-        The path.
+        networks: its parameters.
+        path: of the file, which is returned.
     """
     spec = algorithm.envs.env.obs_spec
     spec = spec["pixels"] if isinstance(spec, dict) else spec

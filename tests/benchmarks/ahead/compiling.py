@@ -72,7 +72,7 @@ def _gpu(about: Card, function: Any, arguments: Any) -> dict[str, Any]:
         "kernels": len(found),
         "launches": launches,
         "longest_chain": longest_chain(parsed),
-        "unknown_loops": sum(loop.trips is None for loop in loops(parsed)),
+        "unknown_loops": loops(parsed).count(None),
         "large_kernels": sum(kernel.launches for kernel in large),
         "temporary_bytes": memory.temp_size_in_bytes,
         "output_bytes": memory.output_size_in_bytes,

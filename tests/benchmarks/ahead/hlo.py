@@ -17,16 +17,7 @@ _BITS = re.compile(r"\d+")
 
 @dataclass(frozen=True)
 class Instruction:
-    """One line of a computation.
-
-    Attributes:
-        name: unique in the computation.
-        shape: what it returns, as XLA writes it.
-        op: the operation, such as ``fusion``.
-        operands: names of what it reads.
-        attributes: the rest of the line.
-        is_root: whether the computation returns it.
-    """
+    """One line of a computation, with XLA's text of its shape and its attributes."""
 
     name: str
     shape: str
@@ -64,23 +55,14 @@ Computation = dict[str, Instruction]
 
 @dataclass(frozen=True)
 class Program:
-    """A compiled module.
-
-    Attributes:
-        computations: instructions by name, for each computation.
-        entry: name of the computation that is the program.
-    """
+    """A compiled module, and the name of the computation that is the program."""
 
     computations: dict[str, Computation]
     entry: str
 
 
 def parse(text: str) -> Program:
-    """Read a module in XLA's own notation.
-
-    Raises:
-        ValueError: it has no entry.
-    """
+    """Read a module in XLA's own notation."""
     computations: dict[str, Computation] = {}
     entry, current = "", None
     for line in text.splitlines():
@@ -146,30 +128,12 @@ FREE = frozenset(
 
 @dataclass(frozen=True)
 class Kernel:
-    """A kernel of the program.
-
-    Attributes:
-        name: of the instruction.
-        op: its operation.
-        launches: how often a call of the program launches it; loops of an unknown number of turns
-            count once.
-        read: bytes that a launch reads at least, each once.
-        written: bytes that a launch writes.
-    """
+    """A kernel of the program, with the bytes that a launch reads and writes, each once."""
 
     name: str
-    op: str
-    launches: int
+    launches: int  # of a call of the program; loops of an unknown number of turns count once
     read: int
     written: int
-
-
-@dataclass(frozen=True)
-class Loop:
-    """A loop of the program; ``trips`` is None where only the data tell when it ends."""
-
-    name: str
-    trips: int | None
 
 
 def kernels(program: Program) -> list[Kernel]:
@@ -177,10 +141,10 @@ def kernels(program: Program) -> list[Kernel]:
     return list(_kernels(program, program.entry, 1))
 
 
-def loops(program: Program) -> list[Loop]:
-    """Return the loops of a program."""
+def loops(program: Program) -> list[int | None]:
+    """Turns of the loops of a program; None where only the data tell when one ends."""
     return [
-        Loop(line.name, line.trips)
+        line.trips
         for computation in program.computations.values()
         for line in computation.values()
         if line.op == "while"
@@ -203,7 +167,7 @@ def _kernels(program: Program, name: str, times: int) -> Iterator[Kernel]:
         inner = _inner(line)
         if not inner:
             read, written = _traffic(program, computation, line)
-            yield Kernel(line.name, line.op, times, read, written)
+            yield Kernel(line.name, times, read, written)
         for part in inner:
             yield from _kernels(program, part, times * _turns(line))
 

@@ -52,9 +52,9 @@ def same_state(task: str, count: int) -> dict[str, float]:
     }
 
 
-def control_step(task: str, count: int) -> dict[str, float]:
+def control_step(task: str, count: int, **episodes: int) -> dict[str, float]:
     """Differences after one control step from the same states, likewise."""
-    drawn = oracle.transitions(task, count)
+    drawn = oracle.transitions(task, count, **episodes)
     physics = make_physics(task)
     low, high = physics._control_range
     action = jnp.asarray(2 * (drawn.action - low) / (high - low) - 1, jnp.float32)

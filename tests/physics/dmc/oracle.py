@@ -16,7 +16,6 @@ from pixelbrax_jax.tasks import DMC_TASKS
 os.environ.setdefault("MUJOCO_GL", "disable")
 
 _FIELDS = ("qpos", "qvel", "act", "qacc_warmstart", "ctrl", "sensordata", "xpos")
-_EPISODE = 1000
 
 
 @dataclass(frozen=True)
@@ -77,16 +76,18 @@ def record(env: Any, timestep: Any) -> dict[str, np.ndarray]:
 
 
 @cache
-def transitions(task: str, count: int, *, episodes: int = 4, seed: int = 0) -> Transitions:
+def transitions(
+    task: str, count: int, *, episodes: int = 4, length: int = 1000, seed: int = 0
+) -> Transitions:
     """Take states from episodes of random actions, evenly along them, never the first."""
     env = load(task, seed)
     spec = env.action_spec()
     random = np.random.RandomState(seed + 1)
-    chosen = set(np.linspace(1, _EPISODE - 1, -(-count // episodes)).astype(int).tolist())
+    chosen = set(np.linspace(1, length - 1, -(-count // episodes)).astype(int).tolist())
     before, after, actions = [], [], []
     for _ in range(episodes):
         timestep = env.reset()
-        for number in range(_EPISODE):
+        for number in range(length):
             action = random.uniform(spec.minimum, spec.maximum)
             if number in chosen:
                 before.append(record(env, timestep))

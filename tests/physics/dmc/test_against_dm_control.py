@@ -24,9 +24,9 @@ EACH = [
     for task in DMC_TASKS
 ]
 
-ONE_A_DOMAIN = {row.domain: name for name, row in DMC_TASKS.items()} | {
-    DMC_TASKS[name].domain: name for name in FAST
-}
+COMPARED = {DMC_TASKS[name].domain for name in FAST}
+OF_OTHER_DOMAINS = {row.domain: row.name for row in DMC_TASKS.values()}
+"""Domain -> one of its tasks."""
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -51,9 +51,11 @@ def test_the_same_state_has_the_same_observation_and_reward(task):
     assert errors["links"] < 1e-5
 
 
-@pytest.mark.parametrize("task", ONE_A_DOMAIN.values())
-def test_a_few_control_steps_of_every_domain(task):
-    check_control_step(task, 12)
+@pytest.mark.parametrize(
+    "task", [task for domain, task in OF_OTHER_DOMAINS.items() if domain not in COMPARED]
+)
+def test_a_few_control_steps_of_every_other_domain(task):
+    check_control_step(task, 12, episodes=1, length=120)
 
 
 @pytest.mark.parametrize("task", EACH)
@@ -61,8 +63,8 @@ def test_one_control_step(task):
     check_control_step(task, number_of_states(task))
 
 
-def check_control_step(task, count):
-    errors = measure.control_step(task, count)
+def check_control_step(task, count, **episodes):
+    errors = measure.control_step(task, count, **episodes)
     if task in measure.CAUSES:
         assert errors["rewards_off"] <= errors["velocities_off"] <= 2, errors
     else:
@@ -72,7 +74,7 @@ def check_control_step(task, count):
 
 def test_a_step_is_a_move_and_a_look():
     """What is compared here in two programs is what environments compute in one."""
-    physics = make_physics("dmc_cartpole_swingup")
+    physics = make_physics("dmc_pendulum_swingup")
     keys = jax.random.split(jax.random.key(0), 5)
     state = jax.jit(jax.vmap(physics.reset))(keys)
     action = jnp.linspace(-1, 1, 5)[:, None]

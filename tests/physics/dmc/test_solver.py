@@ -51,12 +51,29 @@ def states(model):
     return qpos, random.normal(size=(NUM_STATES, model.nv))
 
 
+def last(function):
+    return batch_last(function, (0, 0))
+
+
 @pytest.mark.parametrize(
-    "batch", [jax.vmap, lambda f: batch_last(f, (0, 0))], ids=["first", "last"]
-)
-@pytest.mark.parametrize(
-    ("cone", "condim"),
-    [("pyramidal", 1), ("pyramidal", 3), ("elliptic", 3), ("elliptic", 4), ("elliptic", 6)],
+    ("cone", "condim", "batch"),
+    [
+        ("pyramidal", 1, jax.vmap),
+        ("pyramidal", 3, jax.vmap),
+        ("pyramidal", 3, last),
+        ("elliptic", 3, jax.vmap),
+        ("elliptic", 4, last),
+        ("elliptic", 6, jax.vmap),
+        *(
+            pytest.param(cone, condim, batch, marks=pytest.mark.slow)
+            for cone, condim, batch in (
+                ("pyramidal", 1, last),
+                ("elliptic", 3, last),
+                ("elliptic", 4, jax.vmap),
+                ("elliptic", 6, last),
+            )
+        ),
+    ],
 )
 def test_forces_are_those_of_mujoco(cone, condim, batch):
     model = model_of(cone, condim, arms=max(condim, 3))

@@ -1,0 +1,105 @@
+"""What ``reset`` takes: seeds, options and masks."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from pixelbrax_jax.validation import check_choice
+
+SEEDS = 2**32
+"""Number of seeds there are: 0 to one less than this."""
+
+
+def as_seed(seed: Any) -> int:
+    """Return a seed as Python's own integer; a TypeError if it is no integer of any library."""
+    if not isinstance(seed, (bool, np.bool_)):
+        try:
+            return operator.index(seed)
+        except TypeError:
+            pass
+    raise TypeError(f"a seed must be an integer, got {seed!r}.")
+
+
+def check_seed(seed: Any) -> int:
+    """Return a seed as Python's own integer; a ValueError if it is out of range."""
+    seed = as_seed(seed)
+    if not 0 <= seed < SEEDS:
+        raise ValueError(f"seeds must lie in [0, 2**32), got {seed}.")
+    return seed
+
+
+def seeds_of(seed: Any, num_envs: int) -> list[int | None]:
+    """Return a seed for each of N environments.
+
+    s gives environment i the seed s + i; a list, array or tensor has one for each, or None. None
+    gives None to all.
+    """
+    if seed is None:
+        return [None] * num_envs
+    if np.ndim(seed):
+        if len(seed) != num_envs:
+            raise ValueError(f"expected one seed for each of {num_envs}, got {len(seed)}.")
+        return [None if s is None else check_seed(s) for s in seed]
+    first = check_seed(seed)
+    if first + num_envs > SEEDS:
+        raise ValueError(
+            f"seed={first} would give {num_envs} environments the seeds {first} to "
+            f"{first + num_envs - 1}, but seeds must lie in [0, 2**32); give at most "
+            f"{SEEDS - num_envs}."
+        )
+    return [first + i for i in range(num_envs)]
+
+
+def spread_seeds(seed: Any, num_envs: int) -> list[int]:
+    """Return ``seed + i`` for environment i, going on at 0 beyond 2**32 - 1.
+
+    For frameworks that hand seeds of any size from one environment to the next.
+    """
+    first = as_seed(seed)
+    return [(first + i) % SEEDS for i in range(num_envs)]
+
+
+def read_options(options: Any, seed: Any, num_envs: int | None = None) -> dict[str, Any]:
+    """Return ``state`` and ``mask``, as far as Gymnasium's ``options`` of ``reset`` have them.
+
+    Args:
+        options: what the caller gave; never changed.
+        seed: the one that is given beside them.
+        num_envs: N; None for a single environment, which takes no mask.
+    """
+    if options is None:
+        return {}
+    if not isinstance(options, Mapping):
+        raise TypeError(f"options of reset() must be a dict or None, got {options!r}.")
+    allowed = ("state",) if num_envs is None else ("reset_mask", "state")
+    for name in options:
+        check_choice("option of reset()", name, allowed)
+    read = {}
+    if "reset_mask" in options:
+        read["mask"] = as_mask("options['reset_mask']", options["reset_mask"], (num_envs,))
+        if not read["mask"].any():
+            raise ValueError("options['reset_mask'] must have at least one True.")
+    if "state" in options:
+        if seed is not None:
+            raise ValueError(
+                f"reset() takes a seed or options['state'], got both (seed={seed!r}): a state has "
+                "the random numbers of its own episodes; leave one out."
+            )
+        read["state"] = options["state"]
+    return read
+
+
+def as_mask(what: str, given: Any, shape: tuple[int | None, ...]) -> np.ndarray:
+    """Return an array or tensor of bool, on any device, as a NumPy array of that shape."""
+    dtype = str(getattr(given, "dtype", "")).removeprefix("torch.")
+    if dtype != "bool":
+        kind = f"{dtype} array" if dtype else type(given).__name__
+        raise TypeError(f"{what} must be an array or tensor of bool, got {kind}.")
+    mask = np.asarray(given.cpu() if hasattr(given, "cpu") else given)
+    if mask.shape != shape:
+        raise ValueError(f"{what} must have shape {shape}, got {mask.shape}.")
+    return mask

@@ -1,0 +1,69 @@
+"""Environments are reached neither by their neighbors nor by what a caller does to results."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+import torch
+
+from tests.compilations import counted
+from tests.gym.adapters import ADAPTERS, as_bytes
+from tests.gym.test_same_everywhere import DOORS
+
+
+def spoil(returned):
+    """Write to every array that a caller may write to."""
+    for leaf in jax.tree.leaves(returned):
+        if isinstance(leaf, torch.Tensor):
+            leaf.fill_(1)
+        elif isinstance(leaf, np.ndarray) and leaf.dtype == object:
+            spoil(list(leaf))
+        elif isinstance(leaf, np.ndarray):
+            leaf[...] = 1
+
+
+@pytest.mark.parametrize("name", sorted(set(DOORS) - {"jax"}))
+def test_writing_to_results_changes_nothing_later(name):
+    clean, dirty = DOORS[name](), DOORS[name]()
+    returned = dirty.reset()
+    assert as_bytes(returned) == as_bytes(clean.reset())
+    for _ in range(30):
+        spoil(returned)
+        returned = dirty.call()[1]
+        assert as_bytes(returned) == as_bytes(clean.call()[1])
+    spoil(returned)
+    assert as_bytes(dirty.reset(seed=7)) == as_bytes(clean.reset(seed=7))
+
+
+@pytest.mark.parametrize("name", sorted(set(ADAPTERS) - {"single"}))
+def test_one_end_leaves_the_others_alone(name):
+    rows = []
+    # Environment 1 ends again and again in one run and lives on in the other.
+    for push in (1.0, 0.0):
+        adapter = ADAPTERS[name](episode_length=100)
+        events = adapter.first(adapter.reset())
+        for _ in range(45):
+            events += adapter.call(np.array([[0.1], [push], [-0.1]], np.float32))[0]
+        rows.append([[event for event in events if event.row == row] for row in range(3)])
+    busy, lazy = rows
+    assert sum(event.terminated for event in busy[1]) >= 2
+    assert not any(event.terminated for event in lazy[1])
+    for row in (0, 2):
+        shared = min(len(busy[row]), len(lazy[row]))
+        assert shared > 30
+        for one, other in zip(busy[row][:shared], lazy[row][:shared], strict=True):
+            assert as_bytes(one) == as_bytes(other)
+
+
+@pytest.mark.parametrize("name", DOORS)
+def test_nothing_is_compiled_twice(name):
+    adapter = DOORS[name]()
+    adapter.reset()
+    for _ in range(30):
+        adapter.call()
+    with counted() as events:
+        adapter.reset(seed=1)
+        for _ in range(100):
+            adapter.call()
+    assert not events
