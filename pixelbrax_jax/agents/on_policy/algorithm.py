@@ -176,9 +176,9 @@ class OnPolicy(Algorithm):
         """Return the samples of some times, (B, N) int32."""
         rollout, advantage, returns = experience
         pixels = observations(rollout.frames, times, self.config.random_shift)
-        weight = rollout.valid.astype(jnp.float32)
-        rows = (rollout.frames.state, *rollout.choice, advantage, returns, weight)
-        return Batch(pixels, *jax.tree.map(lambda rows: at_times(rows, times), rows))
+        rows = (rollout.frames.state, *rollout.choice, advantage, returns, rollout.valid)
+        *samples, valid = jax.tree.map(lambda rows: at_times(rows, times), rows)
+        return Batch(pixels, *samples, weight=valid.astype(jnp.float32))
 
     def update(
         self,
