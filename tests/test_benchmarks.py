@@ -293,7 +293,7 @@ jax.jit(f)(1.0)
         ("import os, signal; os.kill(os.getpid(), signal.SIGKILL)", "killed", "by the system"),
         ("raise ValueError('wrong')", "failed", "ValueError: wrong"),
         ("import sys; sys.stderr.write('no OpenGL'); sys.exit(3)", "absent", "no OpenGL"),
-        ("print('no result')", "failed", "no result"),
+        ("print('no result')", "failed", "is not a result"),
     ],
     ids=["memory", "JAX's memory", "killed", "error", "absent", "no result"],
 )
