@@ -21,26 +21,26 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Launch:
-    """How a run is started."""
+    """Options that start a run."""
 
     preset: str = "default"
-    """Named settings, as cpu; they change the defaults of all others."""
+    """Named settings, such as cpu; they change the defaults of all other options."""
     cpu_devices: int | None = None
-    """Emulated devices that the environments are spread over, one a core, on a machine without an
-    accelerator."""
+    """Emulates this many devices on a CPU and distributes the environments over them; use one per
+    core."""
     coordinator: str | None = None
-    """HOST:PORT of process 0, of several processes."""
+    """HOST:PORT of process 0 in a run with several processes."""
     num_processes: int | None = None
-    """How many there are."""
+    """Number of processes."""
     process_id: int | None = None
-    """Which of them this is, from 0."""
+    """Index of this process, from 0."""
 
     def start(self) -> None:
-        """Make devices and processes known to JAX.
+        """Configure JAX's devices and processes.
 
         Raises:
-            UsageError: options do not go together.
-            ValueError: devices cannot be emulated.
+            UsageError: options for several processes are incomplete.
+            ValueError: ``cpu_devices`` is not positive, or JAX has already started.
         """
         import jax
 
@@ -50,8 +50,8 @@ class Launch:
                 jax.config.update("jax_num_cpu_devices", self.cpu_devices)
             except RuntimeError as error:
                 raise ValueError(
-                    f"--cpu-devices {self.cpu_devices} comes too late: JAX is at work in this "
-                    "process."
+                    f"--cpu-devices {self.cpu_devices} comes too late: JAX has already started in "
+                    "this process. Start a new one."
                 ) from error
         spread = (self.coordinator, self.num_processes, self.process_id)
         if None not in spread:
@@ -62,7 +62,7 @@ class Launch:
 
 @dataclass(frozen=True)
 class _First:
-    """What decides the defaults of all other options."""
+    """Options that select the defaults of all others."""
 
     preset: str = "default"
     task: str | None = None
@@ -92,8 +92,8 @@ def run(arguments: Sequence[str]) -> int:
     algorithm, *rest = arguments
     if algorithm.startswith("-"):
         raise UsageError(
-            f"name an algorithm first, as in 'pixelbrax train ppo {algorithm} ...'; there are "
-            f"{', '.join(ALGORITHMS)}"
+            f"name an algorithm first, as in 'pixelbrax train ppo {algorithm} ...'; known "
+            f"algorithms: {', '.join(ALGORITHMS)}"
         )
     try:
         check_choice("algorithm", algorithm, ALGORITHMS)
@@ -109,14 +109,14 @@ def run(arguments: Sequence[str]) -> int:
     except KeyboardInterrupt:
         kept = "there is no checkpoint"
         if (latest := latest_steps(Path(options.output_dir) / "checkpoints")) is not None:
-            kept = f"go on from the checkpoint of {latest} steps with --resume latest"
+            kept = f"continue from the checkpoint of {latest} steps with --resume latest"
         say("train", f"stopped at once; {kept}")
         raise
     return 128 + outcome.signal if outcome.interrupted else 0
 
 
 def _report(line: str) -> None:
-    """Write a line of a run above the bar."""
+    """Write a line above the progress bar."""
     import jax
     from tqdm import tqdm
 
@@ -125,11 +125,7 @@ def _report(line: str) -> None:
 
 
 def parse(algorithm: str, arguments: Sequence[str]) -> tuple[Launch, TrainConfig, RunConfig]:
-    """Return how to start, settings of an algorithm and of the run.
-
-    Args:
-        algorithm: its name.
-        arguments: options, as ``--preset cpu --num-envs 64``.
+    """Parse the options of an algorithm, such as ``--preset cpu --num-envs 64``.
 
     Raises:
         ValueError: a setting is out of range.
@@ -162,7 +158,7 @@ def parse(algorithm: str, arguments: Sequence[str]) -> tuple[Launch, TrainConfig
 
 
 def _names_for_objects() -> ConstructorRegistry:
-    """Return a context in which options that may be objects in Python are names."""
+    """Return a context that parses options that may be objects in Python as names."""
     from pixelbrax_jax.config import EnvConfig
 
     types, registry = get_type_hints(EnvConfig), ConstructorRegistry()
