@@ -88,8 +88,8 @@ _YELLOW = (0.941, 0.894, 0.259)
 _VERMILLION = (0.835, 0.369, 0.0)
 _RED = (1.0, 0.0, 0.0)
 
-# Viewpoints of the original renderer (arXiv 2502.00021). It gives a horizontal field of view; at
-# its square images that is the vertical one too.
+# Viewpoints of the original renderer (arXiv 2502.00021). Its field of view is horizontal, which for
+# square images equals the vertical one.
 _ANT = Viewpoint((1.6, -1.6, 3.5), (0.0, 0.0, 0.0), 40.0, link=0)
 _PLANAR = Viewpoint((0.0, -2.1, 0.8), (0.0, 0.0, 0.6), 55.0, link=0)
 _HUMANOID = Viewpoint((1.7, -1.7, 1.5), (0.0, 0.0, 1.1), 50.0, link=0)
@@ -100,8 +100,8 @@ _SWIMMER = Viewpoint((2.4, 2.4, 1.25), (0.0, 0.0, 0.0), 50.0, link=1)
 # The original aims above the lying torso, which then sits at the lower edge.
 _LYING = Viewpoint((2.2, -2.2, 1.7), (0.0, 0.0, 0.55), 50.0, link=0)
 
-# Default backends are those of the paper, which leaves the choice open for ant, humanoid and
-# humanoidstandup and lacks the double pendulum.
+# Default backends are the paper's, which names none for ant, humanoid and humanoidstandup and lacks
+# the double pendulum.
 TASKS = by_name(
     [
         BraxTask(
@@ -111,8 +111,8 @@ TASKS = by_name(
             "spring",
             _ANT,
             _ANT,
-            # Brax's reset noise puts feet below the ground. The positional backend throws such an
-            # ant into the air: a quarter of the episodes ends within four steps.
+            # Brax's reset noise puts feet below the ground, and the positional backend then throws
+            # the ant into the air: a quarter of the episodes ends within four steps.
             backends=("generalized", "mjx", "spring"),
         ),
         BraxTask(
@@ -174,7 +174,7 @@ TASKS = by_name(
             "generalized",
             _PUSHER,
             _PUSHER,
-            # The goal disc has no name in Brax's model, only its place in the list.
+            # The goal disc has no name in Brax's model, so it is capsule/20.
             colors={"object_geom": _SKY_BLUE, "capsule/20": _VERMILLION},
             paper_unscaled=True,
         ),
@@ -196,7 +196,7 @@ TASKS = by_name(
             "generalized",
             _SWIMMER,
             _SWIMMER,
-            # Brax itself refuses the swimmer on other backends.
+            # Brax rejects the swimmer on other backends.
             backends=("generalized",),
             paper_reward="distance_swum",
         ),

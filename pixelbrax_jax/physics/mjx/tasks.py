@@ -30,7 +30,7 @@ def _dmc(domain: str, task: str, summary: str) -> DmcTask:
     return DmcTask(f"dmc_{domain}_{task}", f"PixelBrax/DMC-{camel}-v0", summary, domain, task)
 
 
-# None of them ends before the time limit.
+# All of them last until the time limit.
 TASKS = by_name(
     [
         _dmc("acrobot", "swingup", "Two poles in a row swing up, moved at the elbow."),
