@@ -1,4 +1,4 @@
-"""Names for the distractors of published benchmarks."""
+"""Presets: the distractors of published benchmarks."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ _GROUND_ALPHA = {
     "dmc_walker": 1.0,
     "dmc_cheetah": 1.0,
 }
-"""Of the Distracting Control Suite, which has 0 for reacher, 1 for walker and cheetah; for its own
-tasks by domain."""
+"""The Distracting Control Suite's values (0 for reacher, 1 for walker and cheetah); for other tasks
+by domain."""
 
 _OTHER_GROUND_ALPHA = 0.3
 
@@ -53,22 +53,19 @@ PRESETS = (
 def preset(name: str, task: str) -> tuple[Distractor, ...]:
     """Return the distractors of a benchmark.
 
-    * ``"color"``, ``"video"``, ``"camera"``: each with its defaults.
-    * ``"paper-color"``, ``"paper-video"``: those of the paper, arXiv 2502.00021.
-    * ``"dcs-easy"``, ``"dcs-medium"``, ``"dcs-hard"``, and each with ``"-static"``: color, video
-      and camera of the Distracting Control Suite, arXiv 2101.02722.
-    * ``"color-easy"``, ``"color-hard"``, ``"video-easy"``, ``"video-hard"``: of the DMControl
-      Generalization Benchmark, arXiv 2011.13389; colors are sampled, see ``Color``.
+    * ``"color"``, ``"video"``, ``"camera"``: each with its defaults. * ``"paper-color"``,
+    ``"paper-video"``: those of the paper, arXiv 2502.00021. * ``"dcs-easy"``, ``"dcs-medium"``,
+    ``"dcs-hard"``, and each with ``"-static"``: color, video   and camera of the Distracting
+    Control Suite, arXiv 2101.02722. * ``"color-easy"``, ``"color-hard"``, ``"video-easy"``,
+    ``"video-hard"``: of the DMControl   Generalization Benchmark, arXiv 2011.13389; colors are
+    sampled, see ``Color``.
 
     Args:
         name: one of ``PRESETS``.
         task: the task, which decides how much of the ground a DCS video covers.
 
-    Returns:
-        The distractors.
-
     Raises:
-        ValueError: there is no such preset; the message lists them.
+        ValueError: the preset is unknown; the message lists all presets.
     """
     check_choice("distractor", name, PRESETS)
     if name in _FIXED:
@@ -93,7 +90,7 @@ def preset(name: str, task: str) -> tuple[Distractor, ...]:
 
 
 def _ground_alpha(task: str) -> float:
-    """Return the fraction of the ground that DCS keeps; of DM Control's tasks by their domain."""
+    """Return the fraction of the ground that DCS keeps; for DM Control's tasks by domain."""
     for name, alpha in _GROUND_ALPHA.items():
         if task == name or (name.startswith("dmc_") and task.startswith(f"{name}_")):
             return alpha
@@ -103,10 +100,10 @@ def _ground_alpha(task: str) -> float:
 def as_tuple(
     distractors: str | Distractor | Iterable[str | Distractor] | None,
 ) -> tuple[str | Distractor, ...]:
-    """Return one or several distractors, or their names, as a tuple.
+    """Return distractors or their names as a tuple.
 
     Raises:
-        TypeError: something is neither a name nor a distractor.
+        TypeError: an item is neither a name nor a distractor.
     """
     if distractors is None:
         return ()
@@ -128,11 +125,11 @@ def as_tuple(
 def resolve(
     distractors: str | Distractor | Iterable[str | Distractor] | None, task: str
 ) -> tuple[Distractor, ...]:
-    """Return distractors, those of a preset for the task in place of its name.
+    """Return distractors, with presets for the task in place of their names.
 
     Raises:
         ValueError: a name is unknown.
-        TypeError: something is neither a name nor a distractor.
+        TypeError: an item is neither a name nor a distractor.
     """
     resolved: list[Distractor] = []
     for item in as_tuple(distractors):
