@@ -52,7 +52,6 @@ class ProgramConfig:
     ``plain.to_plain`` may stand for a distractor."""
 
     def __post_init__(self) -> None:
-        """Check the options and convert them to Python's own types."""
         for name in ("height", "width", "frame_stack", "action_repeat"):
             self._store(name, check_positive_int(name, self._static(name)))
         check_choice("obs_mode", self._static("obs_mode"), OBS_MODES)
@@ -110,7 +109,6 @@ class EnvConfig(BraxOptions, ProgramConfig):
     """Split of the clips: ``train``, ``test`` or another one they have; see ``load_clips``."""
 
     def __post_init__(self) -> None:
-        """Check the options and convert them to Python's own types."""
         ProgramConfig.__post_init__(self)
         for name in ("task", "split", *(option.name for option in _SUITE_OPTIONS)):
             self._static(name)

@@ -26,7 +26,7 @@ from tests.gym.conftest import ID, TASK
         ({"obs_mode": "pixel"}, r"Did you mean 'pixels'\?"),
         ({"camera": "nowhere"}, "camera"),
         ({"look": "nice"}, "unknown look"),
-        ({"split": "test"}, "split='test' is given, but no distractor is: add"),
+        ({"split": "test"}, "split='test' is given without a distractor that has splits: add"),
         (
             {"backend": "mjx"},
             "for Brax.s tasks alone, .* choose it where it was registered",

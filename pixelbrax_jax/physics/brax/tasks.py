@@ -31,7 +31,6 @@ class BraxOptions:
     """Rewards of Brax's tasks: ``brax``, or ``paper`` for those of arXiv 2502.00021."""
 
     def __post_init__(self) -> None:
-        """Check the options that do not depend on the task."""
         check_choice("reward_preset", self.reward_preset, REWARD_PRESETS)
 
 
