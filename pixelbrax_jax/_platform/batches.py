@@ -13,7 +13,7 @@ from pixelbrax_jax._platform.interpreter import batch_last
 from pixelbrax_jax._platform.lowering import by_platform, trace_once
 
 _CHUNK = 128
-"""Most rows that a CPU computes together, so that intermediate results stay in its caches."""
+"""Largest number of rows that a CPU computes together, so that intermediate results stay in its caches."""
 
 Step = Callable[..., tuple[Any, jax.Array]]
 

@@ -106,7 +106,9 @@ def test_links_to_the_folder_of_the_images(davis, tmp_path, linked):
 
 def test_images_without_their_lists_are_one_split(davis, tmp_path):
     images = shutil.copytree(davis / "JPEGImages" / "480p", tmp_path / "JPEGImages" / "480p")
-    with pytest.warns(distractors.OnlySplitWarning, match="'train' is split 'all' of .*480p"):
+    with pytest.warns(
+        distractors.OnlySplitWarning, match="'train' selects 'all', the only split of .*480p"
+    ):
         bank = load_clips(images, height=8, width=8)
     assert bank.names == tuple(sorted(LENGTHS | VAL))
     with pytest.raises(ValueError, match=r"no split 'test', only 'all'; .*train and test"):
@@ -436,7 +438,7 @@ def test_command(davis, tmp_path, capsys):
     folder = str(davis / "JPEGImages" / "480p" / "bear" / "..")
     shutil.rmtree(davis / "ImageSets")
     assert cli.main(["clips", folder, "--size", "8"]) == 0
-    assert "pixelbrax clips: split='train' is split 'all' of" in capsys.readouterr().err
+    assert "pixelbrax clips: split='train' selects 'all'" in capsys.readouterr().err
     nowhere = str(tmp_path / "nowhere" / "sheet.png")
     assert cli.main(["clips", str(davis), "--size", "8", "--sheet", nowhere]) == 1
     assert "nowhere" in capsys.readouterr().err
