@@ -85,9 +85,7 @@ _SUITE_OPTIONS = fields(BraxOptions)
 class EnvConfig(BraxOptions, ProgramConfig):
     """All options of an environment; ``pixelbrax_jax.make(task, **options)`` takes them.
 
-    Raises:
-        ValueError: an option is out of range; the message says what is allowed.
-        TypeError: an option has another type, or is an array or tracer.
+    Raises the errors of ``ProgramConfig``.
     """
 
     task: str = "ant"
@@ -138,13 +136,10 @@ ENV_OPTIONS = tuple(field.name for field in fields(EnvConfig))
 def env_config(
     base: str | EnvConfig, options: Mapping[str, Any], also_allowed: Iterable[str] = ()
 ) -> EnvConfig:
-    """Return the options of an environment.
+    """Return the options of ``base``, or the defaults for a task's name, with some changed.
 
-    Args:
-        base: a task, with default options; or options to start from. Fields that a subclass of
-            ``EnvConfig`` adds are ignored.
-        options: the options to change, by name.
-        also_allowed: names of the caller's other options, for the message about an unknown one.
+    Fields that a subclass of ``EnvConfig`` adds are ignored. ``also_allowed`` are the caller's
+    other options, for the message about an unknown one.
 
     Raises:
         TypeError: an option is unknown; the message lists all options and the nearest name.

@@ -38,7 +38,6 @@ def device_memory() -> float:
 
 
 def _main_memory() -> float:
-    """Return the bytes of main memory; infinite if unknown."""
     try:
         return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     except (AttributeError, OSError, ValueError):

@@ -19,8 +19,6 @@ from pixelbrax_jax.validation import check_choice, suggest
 
 @dataclass
 class _OwnTask:
-    """A registered task."""
-
     make_physics: Callable[[], Physics]
     camera: CameraRig | Camera | None
 

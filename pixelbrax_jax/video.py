@@ -74,8 +74,6 @@ def write_frames(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> 
 
 
 class _Gif:
-    """Writer of GIF files, with the interface of ``Encoder``."""
-
     def __init__(self, path: Path, fps: float) -> None:
         from PIL import Image
 

@@ -13,7 +13,8 @@ from pixelbrax_jax._platform.interpreter import batch_last
 from pixelbrax_jax._platform.lowering import by_platform, trace_once
 
 _CHUNK = 128
-"""Largest number of rows that a CPU computes together, so that intermediate results stay in its caches."""
+"""Largest number of rows that a CPU computes together, to keep intermediate results in its
+caches."""
 
 Step = Callable[..., tuple[Any, jax.Array]]
 
@@ -24,17 +25,8 @@ def step_rows(
     """Step every row of a batch, as ``jax.vmap(step, (0, 0, None))(state, rows, shared)``.
 
     A CPU steps the rows in chunks; the results differ from those of ``jax.vmap`` by rounding.
-
-    Args:
-        step: returns a row's next state, with the same tree, and a () float32.
-        state: tree of arrays with a leading axis N.
-        rows: other arguments per row, with a leading axis N.
-        shared: arguments for all rows.
-        last: whether the batch is the last axis of intermediate results on a CPU, see
-            ``batch_last``; else it is the first.
-
-    Returns:
-        The next states and (N,) results.
+    ``step`` returns a row's next state, with the same tree, and a () float32. With ``last`` the
+    batch is the last axis of intermediate results on a CPU, see ``batch_last``.
     """
     step = trace_once(step)
     together = jax.vmap(step, in_axes=(0, 0, None))

@@ -15,12 +15,9 @@ def unpack(packed: jax.Array) -> jax.Array:
 
 
 def push(frames: jax.Array, newest: jax.Array, is_first: jax.Array) -> jax.Array:
-    """Return the frame stack (H, W, 3 K) uint8 after one more frame.
+    """Return the frame stack (H, W, 3 K) uint8 after one more frame, (H, W) uint32 packed pixels.
 
-    Args:
-        frames: (H, W, 3 K) uint8, oldest first.
-        newest: (H, W) uint32 packed pixels.
-        is_first: () bool, whether the stack becomes K copies of ``newest``.
+    With ``is_first``, () bool, it becomes K copies of the frame.
     """
     pushed: jax.Array = by_platform(frames, newest, is_first, cpu=_concatenate, default=_shift)
     return pushed

@@ -1,9 +1,4 @@
-"""``jax.vmap`` with the batch as last axis of intermediate results, which is faster on a CPU.
-
-``jax.vmap`` puts the batch first. Brax computes vectors of three and 3 x 3 matrices, so XLA's
-innermost loops over (N, links, 3) have three iterations and no SIMD, and a matrix product is a call
-per link. Over (links, 3, N) they are loops over environments.
-"""
+"""``jax.vmap`` with the batch as last axis of intermediate results, which is faster on a CPU."""
 
 from __future__ import annotations
 
@@ -26,17 +21,16 @@ _LANES = 16
 def batch_last(fn: Callable[..., Any], in_axes: Sequence[int | None]) -> Callable[..., Any]:
     """Return ``jax.vmap(fn, in_axes)``, computed with the batch as last axis.
 
-    Results differ from those of ``jax.vmap`` by rounding. ``jax.vmap`` computes what has no rule,
-    such as functions with custom derivatives, and everything within a ``jax.shard_map`` that tracks
+    ``jax.vmap`` puts it first, and XLA's innermost loops then run over vectors of three; here they
+    run over environments. Results differ by rounding. ``jax.vmap`` computes what has no rule, such
+    as functions with custom derivatives, and everything within a ``jax.shard_map`` that tracks
     varying values. More than a few rows are padded by copies of the last one, including side
     effects.
 
-    The rules read parameters of JAX's primitives, which are not public. If a release changes them,
-    ``jax.vmap`` computes all of ``fn``, with one RuntimeWarning per process. Side effects, such as
-    those of ``jax.debug.print``, may then happen twice.
+    The rules read private parameters of JAX's primitives. If a release changes them, ``jax.vmap``
+    computes all of ``fn``, with one RuntimeWarning per process and side effects possibly twice.
 
-    An argument's axis is 0 or None; at least one is 0. The function raises ValueError if arguments
-    have different numbers of rows.
+    Raises ValueError if arguments have different numbers of rows. An argument's axis is 0 or None.
     """
 
     def rows_of(*args: Any) -> Any:
@@ -95,12 +89,10 @@ def _row(x: jax.Array) -> jax.ShapeDtypeStruct:
 
 
 def _pad_rows(x: jax.Array, size: int) -> jax.Array:
-    """Pad rows with copies of the last one to length ``size``."""
     return x if len(x) == size else x[jnp.minimum(jnp.arange(size), len(x) - 1)]
 
 
 def _evaluate(closed: core.ClosedJaxpr, operands: Sequence[Operand], size: int) -> list[Operand]:
-    """Evaluate a program equation by equation."""
     known: dict[core.Var, Operand] = {}
 
     def read(atom: core.Var | core.Literal) -> Operand:
@@ -138,7 +130,6 @@ def _apply(eqn: core.JaxprEqn, inputs: list[Operand], size: int) -> list[Operand
 
 
 def _by_vmap(eqn: core.JaxprEqn, inputs: list[Operand]) -> list[Any]:
-    """Compute an equation that has no rule."""
     in_axes = [-1 if x.batched else None for x in inputs]
     rows = jax.vmap(lambda *row: bind(eqn, *row), in_axes=in_axes, out_axes=-1)
     return list(rows(*(x.value for x in inputs)))
@@ -149,10 +140,7 @@ _CALLS = {"jit": "jaxpr", "closed_call": "call_jaxpr"}
 
 
 def _program(eqn: core.JaxprEqn) -> core.ClosedJaxpr | None:
-    """Return the program in an equation, to be inlined; of ``by_platform`` the CPU's form.
-
-    It takes the equation's last operands.
-    """
+    """Return the program in an equation, to be inlined; of ``by_platform`` the CPU's form."""
     if eqn.primitive.name in _CALLS:
         return eqn.params[_CALLS[eqn.primitive.name]]
     for platforms, branch in zip(
@@ -263,7 +251,6 @@ def _spread_where(
 
 
 def _scan_sizes(params: Mapping[str, Any]) -> tuple[int, int]:
-    """Return the numbers of constants and of carries among a scan's operands."""
     if "num_carry" in params:
         return params["num_consts"], params["num_carry"]
     # From jax 0.12 on, operands are in groups.
@@ -272,7 +259,6 @@ def _scan_sizes(params: Mapping[str, Any]) -> tuple[int, int]:
 
 
 def _reach_scan(eqn: core.JaxprEqn, flags: list[bool]) -> list[bool]:
-    """Return which carries and results of a scan are batched."""
     start, num_carry = _scan_sizes(eqn.params)
     stop = start + num_carry
     # A carry that becomes batched may make others batched in the next iteration.

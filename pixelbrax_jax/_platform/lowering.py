@@ -11,17 +11,11 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
 def by_platform(*args: Any, default: Callable[..., Any], **forms: Callable[..., Any]) -> Any:
-    """Return the result of the function for the platform.
+    """Return the result of the function for the platform: one of ``forms``, or ``default``.
 
-    The choice is made when a program is lowered, so a program that is lowered for a GPU has the
-    GPU's form even on a machine without one. All functions are traced, and one is lowered. Trace
-    what they share with ``trace_once`` if tracing is slow.
-
-    Args:
-        *args: trees of arrays, for all functions.
-        default: the function for all other platforms.
-        **forms: functions by platform: ``cpu``, ``cuda``, ``rocm`` or ``tpu``. Their results have
-            the tree, shapes and dtypes of those of ``default``.
+    ``forms`` are functions for ``cpu``, ``cuda``, ``rocm`` or ``tpu``, with results like those of
+    ``default``. The choice is made when a program is lowered, even on a machine without the device.
+    All functions are traced; trace what they share with ``trace_once`` if tracing is slow.
     """
     return jax.lax.platform_dependent(*args, default=default, **forms)
 

@@ -35,17 +35,11 @@ def reset_rows(
 def replace_rows(
     fn: Callable[..., Any], arguments: tuple[Any, ...], mask: jax.Array, rows: Any
 ) -> Any:
-    """Return ``rows`` with ``fn`` of the arguments' rows where ``mask`` is set.
+    """Return ``rows`` with ``fn`` of the arguments' rows where ``mask`` (N,) bool is set.
 
     The work is done in blocks and grows with the number of masked rows, not with N: most steps end
     no episode. The loop carries the remaining rows. With a counter instead, XLA would move what
     blocks have in common, such as physics at the initial pose, out of the loop and into every step.
-
-    Args:
-        fn: maps one row of each argument to one row of ``rows``.
-        arguments: trees of arrays with a leading axis N.
-        mask: (N,) bool.
-        rows: tree of arrays with a leading axis N.
     """
     num_rows = mask.shape[0]
     block = min(_BLOCK, num_rows)
@@ -65,7 +59,6 @@ def replace_rows(
 def _select_rows(
     fn: Callable[..., Any], arguments: tuple[Any, ...], mask: jax.Array, rows: Any
 ) -> Any:
-    """Compute ``replace_rows`` with ``fn`` of all rows."""
 
     def select(new: jax.Array, old: jax.Array) -> jax.Array:
         return jnp.where(mask.reshape(-1, *(1,) * (old.ndim - 1)), new, old)

@@ -11,14 +11,11 @@ from pixelbrax_jax.types import EnvParams, Frame
 
 
 class Distractor:
-    """A change of an environment's image.
+    """A change of an environment's image, written for ONE environment.
 
-    Distractors are written for ONE environment, as frozen dataclasses of plain numbers and strings
-    that decide which program is compiled. All that varies is in the *state*, a pytree that
-    ``reset`` samples for an episode and ``advance`` updates for each frame.
-
-    ``change_params`` acts before the image is rendered, ``change_frame`` after it. Each does
-    nothing unless it is overridden.
+    It is a frozen dataclass of plain numbers and strings, which decide the program. All that varies
+    is in the *state*, a pytree that ``reset`` samples for an episode and ``advance`` updates for
+    each frame. ``change_params`` acts before the image is rendered, ``change_frame`` after it.
 
     Attributes:
         kind: name of the distractor; an environment has at most one of each kind.
@@ -71,21 +68,12 @@ class Distractor:
 
 
 class Chain:
-    """A chain of distractors, at most one of each kind.
-
-    Its state is the tuple of theirs. They are applied in the order camera, video, color, others,
-    independent of the order in which they are given.
-    """
+    """A chain of distractors in the order camera, video, color, others; its state is a tuple."""
 
     _ORDER = ("camera", "video", "color")
 
     def __init__(self, distractors: Iterable[object] = ()) -> None:
-        """Sort and check the distractors.
-
-        Raises:
-            ValueError: two have the same kind or stream.
-            TypeError: one is not a distractor, or cannot be hashed.
-        """
+        """Sort and check the distractors: unique kinds and streams, hashable."""
         links = [_checked(distractor) for distractor in distractors]
         kinds = [distractor.kind for distractor in links]
         for kind in kinds:

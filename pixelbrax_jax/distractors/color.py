@@ -169,7 +169,6 @@ class Color(Distractor):
 
 
 def _plane_material(params: EnvParams) -> int | None:
-    """Return the material of the first plane that is ground."""
     for g, material in enumerate(params.geoms.material):
         if params.geoms.is_ground(g):
             return material

@@ -20,7 +20,7 @@ def check_image(path: str) -> None:
     """Check that an image can be saved under a name, before clips are read.
 
     Raises:
-        ValueError: its suffix is not that of an image; the message lists some that are.
+        ValueError: its suffix is unknown.
         FileNotFoundError: the folder does not exist.
         ImportError: Pillow is missing; the message has the fix.
     """

@@ -62,20 +62,14 @@ class Source:
 
 
 def find(folder: Path, split: str) -> tuple[list[Source], str]:
-    """Return the clips of a split.
+    """Return the clips of a split, and the split's name.
 
-    A folder in DAVIS's layout has the splits ``"train"``, ``"test"`` (DAVIS's validation set),
-    ``"paper-train"`` and ``"paper-test"``. Any other folder has video files, or folders of images,
-    in subfolders named like the splits; without subfolders all are in split ``"all"``. If there is
-    only one split and its name is not that of a test, ``"train"`` also selects it. Unreadable
-    subfolders are skipped with a warning.
-
-    The folder ``DAVIS``, its parent, and its ``JPEGImages`` and ``JPEGImages/480p`` give the same
-    clips.
-
-    Returns:
-        The clips, in the order of the split file, else by name; and the name of their split, which
-        differs from ``split`` if ``"train"`` selected the only one.
+    A folder in DAVIS's layout (or any of its folders) has the splits ``"train"``, ``"test"``
+    (DAVIS's validation set), ``"paper-train"`` and ``"paper-test"``. Any other folder has video
+    files, or folders of images, in subfolders named like the splits; without subfolders all are in
+    split ``"all"``. If there is only one split and its name is not that of a test, ``"train"`` also
+    selects it. Unreadable subfolders are skipped with a warning. Clips are in the order of the
+    split file, else by name.
 
     Raises:
         FileNotFoundError: the folder, a split file or a listed clip is missing; the message has the
@@ -173,7 +167,6 @@ def _plain(folder: Path, split: str) -> tuple[list[Source], str]:
 
 
 def _present(folder: Path, split: str, splits: list[str]) -> str:
-    """Return the selected split."""
     if split not in splits and len(splits) == 1:
         (only,) = splits
         if split == "train" and only.lower() not in _FOR_TESTS:
@@ -186,7 +179,6 @@ def _present(folder: Path, split: str, splits: list[str]) -> str:
 
 
 def _clips(folder: Path, closed: dict[Path, None]) -> list[Path]:
-    """Return the clips of a folder: videos, and folders of images."""
     return [
         entry
         for entry in _entries(folder)

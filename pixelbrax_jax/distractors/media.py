@@ -126,7 +126,6 @@ def _picture(file: Path, height: int, width: int) -> np.ndarray:
 
 
 def _say(file: Path, error: Exception) -> str:
-    """Return why Pillow cannot read a file, and the fix."""
     image_module = pillow()
     if isinstance(error, _UnfitError):
         return str(error)

@@ -100,11 +100,7 @@ def _ground_alpha(task: str) -> float:
 def as_tuple(
     distractors: str | Distractor | Iterable[str | Distractor] | None,
 ) -> tuple[str | Distractor, ...]:
-    """Return distractors or their names as a tuple.
-
-    Raises:
-        TypeError: an item is neither a name nor a distractor.
-    """
+    """Return distractors or names as a tuple; raise TypeError for anything else."""
     if distractors is None:
         return ()
     if not isinstance(distractors, (str, Distractor, Iterable)):
@@ -125,12 +121,7 @@ def as_tuple(
 def resolve(
     distractors: str | Distractor | Iterable[str | Distractor] | None, task: str
 ) -> tuple[Distractor, ...]:
-    """Return distractors, with presets for the task in place of their names.
-
-    Raises:
-        ValueError: a name is unknown.
-        TypeError: an item is neither a name nor a distractor.
-    """
+    """Return distractors, with presets for the task in place of names; errors as in ``preset``."""
     resolved: list[Distractor] = []
     for item in as_tuple(distractors):
         resolved += preset(item, task) if isinstance(item, str) else [item]

@@ -1,8 +1,4 @@
-"""Procedural clips, for use without video files.
-
-They use only additions, multiplications, divisions, square roots and floors in float64, which IEEE
-754 defines to the bit, so the clips are the same on every machine.
-"""
+"""Procedural clips, the same on every machine: IEEE 754 defines all operations to the bit."""
 
 from __future__ import annotations
 
@@ -42,10 +38,7 @@ def clip(name: str, height: int, width: int) -> np.ndarray:
 
 
 class _SplitMix64:
-    """Random numbers from a seed by SplitMix64 (Steele, Lea and Flood, OOPSLA 2014).
-
-    NumPy may change the streams of its generators between releases.
-    """
+    """SplitMix64 (Steele, Lea and Flood, OOPSLA 2014); NumPy may change its generators' streams."""
 
     def __init__(self, seed: int) -> None:
         self._state = np.uint64(seed)
@@ -80,7 +73,6 @@ def _smooth(t: np.ndarray) -> np.ndarray:
 
 
 def _wave(phase: np.ndarray) -> np.ndarray:
-    """Return a smooth wave of period 1 between 0 and 1."""
     fraction = phase - np.floor(phase)
     return _smooth(np.abs(2.0 * fraction - 1.0))
 
@@ -117,7 +109,6 @@ def _value_noise(lattice: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarra
 
 
 def _gratings(x: np.ndarray, y: np.ndarray, random: _SplitMix64) -> list[np.ndarray]:
-    """Return two crossed gratings."""
     waves = []
     for _ in range(2):
         along = (random.integer(-4, 4), random.integer(1, 4))
@@ -134,7 +125,6 @@ def _gratings(x: np.ndarray, y: np.ndarray, random: _SplitMix64) -> list[np.ndar
 
 
 def _blobs(x: np.ndarray, y: np.ndarray, random: _SplitMix64) -> list[np.ndarray]:
-    """Return soft discs on closed paths."""
     number = 7
     centers, radii = random.uniform((number, 2)), 0.08 + 0.17 * random.uniform((number,))
     reach, phases = 0.3 * random.uniform((number, 2)), random.uniform((number, 2))

@@ -53,11 +53,7 @@ class BraxEnv(Env):
     """
 
     def __init__(self, env: PixelEnv, params: EnvParams) -> None:
-        """Wrap ``env``, which is not modified; compile nothing.
-
-        Raises:
-            TypeError: ``env`` is not a ``PixelEnv``.
-        """
+        """Wrap ``env``, which is not modified; raise TypeError if it is not a ``PixelEnv``."""
         if not isinstance(env, PixelEnv):
             raise TypeError(f"env must be a PixelEnv, got {type(env).__name__}.")
         _patch_trainers()
@@ -80,11 +76,7 @@ class BraxEnv(Env):
         return State(pipeline_state=state, **self._fields(timestep))
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Step the environment and render one frame.
-
-        Args:
-            state: result of ``reset`` or ``step``, wrapped or not.
-            action: (A,) float, clipped to [-1, 1].
+        """Step with an action (A,) float, clipped to [-1, 1], and render one frame.
 
         Returns:
             The next state. ``done`` is 1 if the task ended; ``metrics["non_finite"]`` is 1 if it
@@ -103,10 +95,9 @@ class BraxEnv(Env):
     def observation(self, obs: Any) -> Any:
         """Return an observation of one or many pixel environments in Brax's form.
 
-        Returns:
-            The array itself with ``obs_mode="state"``. Otherwise a dictionary with the image, (...,
-            H, W, 3K) float32 in [0, 1], as ``"pixels/view_0"``, and with ``"both"`` the (..., S)
-            float32 state as ``"state"``.
+        It is the array itself with ``obs_mode="state"``. Otherwise it is a dictionary with the
+        image, (..., H, W, 3K) float32 in [0, 1], as ``"pixels/view_0"``, and with ``"both"`` the
+        (..., S) float32 state as ``"state"``.
         """
         if self.env.obs_mode == "state":
             return obs
@@ -155,14 +146,8 @@ def wrap_fresh_episodes(
 ) -> Wrapper:
     """Wrap for training as Brax does, but start every episode from a sampled initial state.
 
-    For ``wrap_env_fn`` of Brax's trainers. Episode e of an environment is that of
-    ``PixelEnv.next_episode``. A reset costs time only when an episode ends.
-
-    Args:
-        env: the environment.
-        episode_length: time limit in calls of ``step`` of ``env``.
-        action_repeat: as in Brax; should be 1, see ``BraxEnv``.
-        randomization_fn: must be None.
+    For ``wrap_env_fn`` of Brax's trainers. ``episode_length`` counts calls of ``step``, and
+    ``action_repeat`` should be 1, see ``BraxEnv``. A reset costs time only when an episode ends.
 
     Raises:
         ValueError: ``randomization_fn`` is given.
@@ -194,7 +179,6 @@ class _FreshEpisodes(Wrapper):
 
 
 def _patch_trainers() -> None:
-    """Make Brax's trainers run on current JAX."""
     # Imported here, because its trainers load slowly.
     with import_silenced():
         from brax.training import pmap

@@ -27,11 +27,6 @@ def check_env(env: PixelEnv, params: EnvParams, *, seed: int = 0) -> None:
     copies of the first frame; separate termination and truncation; and that a NaN action ends the
     episode with finite numbers.
 
-    Args:
-        env: the environment.
-        params: its parameters.
-        seed: seed of keys and actions.
-
     Raises:
         ContractError: a rule is violated; the message has the rule.
     """

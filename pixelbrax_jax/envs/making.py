@@ -163,7 +163,6 @@ def _check_device() -> None:
 
 
 def _clips(config: EnvConfig, env: PixelEnv) -> Clips | None:
-    """Return the clips on the device, None if no distractor plays any."""
     clips, split = config.clips, config.split
     videos = [link for link in env.chain.links if isinstance(link, Video)]
     if clips is not None and not videos and env.obs_mode != "state":

@@ -94,12 +94,7 @@ class PixelEnv(ProgramConfig):
         return both if self.obs_mode == "both" else both[self.obs_mode]
 
     def check_memory(self, num_envs: int) -> None:
-        """Check that a number of environments fits into this machine's main memory.
-
-        Raises:
-            MemoryError: observations and states of two steps, which exist at the same time, take
-                more bytes than the machine has.
-        """
+        """Raise MemoryError if observations and states of two steps do not fit into main memory."""
         numbers = 2 * self.physics.state_size + 7 * len(self.physics.link_names)
         what, num_bytes = f"num_envs={num_envs}", 8 * num_envs * numbers
         if self.obs_mode != "state":
@@ -178,8 +173,7 @@ class PixelEnv(ProgramConfig):
             params: the parameters.
 
         Returns:
-            The state and the first timestep, with reward 0 and not terminated, even in a pose that
-            ends the task; the next step sets it.
+            The state and the first timestep, never terminated; the next step may be.
 
         Raises:
             ValueError: ``qpos`` or ``qvel`` has another shape.
@@ -359,11 +353,7 @@ def check_action(action: Any, shape: tuple[int, ...]) -> jax.Array:
 
 
 def check_key(key: jax.Array, shape: tuple[int, ...] = ()) -> None:
-    """Check that ``key`` has typed PRNG keys of the given shape.
-
-    Raises:
-        TypeError: it does not; the message says how to make one.
-    """
+    """Raise TypeError unless ``key`` has typed PRNG keys of the given shape."""
     is_array = isinstance(key, jax.Array)
     if not (is_array and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)):
         # Not the type of an array, which is a tracer under jit.

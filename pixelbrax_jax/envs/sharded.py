@@ -23,11 +23,7 @@ AXIS = "envs"
 
 
 def make_env_mesh(num_devices: int | None = None) -> Mesh:
-    """Make a mesh of devices along the axis ``"envs"``; the compiler propagates its shardings.
-
-    Args:
-        num_devices: number of devices; None takes all, including those of other processes.
-    """
+    """Make a mesh of devices, by default all of all processes, along the axis ``"envs"``."""
     num_devices = jax.device_count() if num_devices is None else num_devices
     return jax.make_mesh((num_devices,), (AXIS,), axis_types=(AxisType.Auto,))
 
@@ -62,7 +58,6 @@ class ShardedVectorEnv:
         _ = self._local  # It checks the other fields.
 
     def __getstate__(self) -> dict[str, Any]:
-        """Replace devices in a pickle by their ids."""
         ids = [device.id for device in self.mesh.devices.flat]
         fields = ("env", "num_envs", "autoreset_mode")
         return {name: getattr(self, name) for name in fields} | {"mesh": ids}

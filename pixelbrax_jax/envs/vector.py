@@ -99,14 +99,9 @@ class VectorPixelEnv:
         params: EnvParams,
         key: jax.Array | None = None,
     ) -> tuple[EnvState, Timestep]:
-        """Reset some environments and leave the others unchanged.
+        """Reset the environments where ``mask`` (N,) bool is set, and leave the others unchanged.
 
-        Args:
-            state: the current states.
-            mask: (N,) bool, the environments to reset.
-            params: as in ``reset``.
-            key: None resets to each environment's next episode; a key or (N,) keys, as in
-                ``reset``, to episode 0.
+        Without a ``key`` they start their next episode, with a key or (N,) keys episode 0.
 
         Returns:
             The states and timesteps, with reward 0; other environments repeat their current
@@ -134,12 +129,7 @@ class VectorPixelEnv:
     def step(
         self, state: EnvState, action: jax.Array, params: EnvParams
     ) -> tuple[EnvState, Timestep]:
-        """Step all environments, and reset them according to ``autoreset_mode``.
-
-        Args:
-            state: the current states.
-            action: (N, A) float, clipped to [-1, 1].
-            params: as in ``reset``.
+        """Step all environments under actions (N, A) float, clipped to [-1, 1], and reset some.
 
         Returns:
             The next states and timesteps; ``info`` is that of ``PixelEnv.step``, and in mode
@@ -174,11 +164,7 @@ class VectorPixelEnv:
 
     @staticmethod
     def env_keys(key: jax.Array, num_envs: int) -> jax.Array:
-        """Return the keys of environments 0, 1, ...: (num_envs,) ``fold_in(key, i)``.
-
-        Raises:
-            TypeError: ``key`` is not a single typed key.
-        """
+        """Return the keys of environments 0, 1, ...: (num_envs,) ``fold_in(key, i)``."""
         check_key(key)
         return jax.vmap(partial(jax.random.fold_in, key))(jnp.arange(num_envs))
 

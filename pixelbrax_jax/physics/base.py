@@ -124,11 +124,7 @@ class Physics(abc.ABC):
 
 
 def check_physics(physics: object) -> Physics:
-    """Return ``physics`` if it is one.
-
-    Raises:
-        TypeError: it is not a subclass of ``Physics``.
-    """
+    """Return ``physics``; raise TypeError if it is not a ``Physics``."""
     if isinstance(physics, Physics):
         return physics
     raise TypeError(

@@ -74,8 +74,6 @@ def loading_silenced() -> Iterator[None]:
 
 
 class _JaxOfThisProcess:
-    """``jax`` whose devices are those of this process."""
-
     devices = staticmethod(jax.local_devices)
 
     def __getattr__(self, name: str) -> Any:

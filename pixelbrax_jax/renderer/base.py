@@ -22,11 +22,7 @@ _BANDS = 2
 
 
 def check_renderer(renderer: object) -> str:
-    """Return ``renderer`` if the default device supports it.
-
-    Raises:
-        ValueError: it is unknown or not supported; the message says what is.
-    """
+    """Return ``renderer``; raise ValueError if it is unknown or does not run on the device."""
     name = check_choice("renderer", renderer, RENDERERS)
     if name == "pallas" and (why := choice.why_not_here()) is not None:
         raise ValueError(
@@ -85,23 +81,15 @@ def draw(
     renderer: str,
     change: Callable[[Frame, jax.Array], Frame],
 ) -> jax.Array:
-    """Render an image, change it and pack it, so that a program computes it only once.
+    """Render an image, change it and pack it into (height, width) uint32, only once in a program.
+
+    ``change(frame, rows)`` returns rows of the image with other colors, for their indices (R,)
+    int32. Its pixelwise part runs in the kernel.
 
     Without a barrier XLA fuses the renderer into every reader of its image and runs it again for
     each. A Pallas kernel is never fused. Otherwise the barrier is control flow that XLA keeps: a
     conditional on a CPU (a GPU would wait for the host), an optimization barrier on a TPU, and
     elsewhere a loop over bands, which also halves the memory of intermediate images.
-
-    Args:
-        scene: the scene.
-        height: pixels.
-        width: pixels.
-        renderer: one of ``RENDERERS``.
-        change: ``change(frame, rows)`` returns rows of the image with other colors, for their
-            indices (R,) int32. Its pixelwise part runs in the kernel.
-
-    Returns:
-        (height, width) uint32 packed pixels.
     """
     plain = "fused" if renderer == "auto" else renderer
 

@@ -1,8 +1,4 @@
-"""Choice of the kernel of `kernel.py` on NVIDIA GPUs, if it exists and passes a check.
-
-The kernel is checked once per process, on the host, when an environment is made or an image is
-rendered for the first time. The check's programs are not part of any other program.
-"""
+"""Choice of the kernel of `kernel.py` on NVIDIA GPUs, if it exists and passes a check."""
 
 from __future__ import annotations
 
@@ -66,8 +62,9 @@ def auto_renderer() -> tuple[str, str]:
 def why_no_kernel() -> str | None:
     """Return why ``"auto"`` does not use the kernel on CUDA; None if it does.
 
-    Starts a device. On an NVIDIA GPU the first call in a process checks the kernel, and warns if it
-    fails. Without a GPU there is no check: programs compiled for CUDA use the kernel.
+    Starts a device. On an NVIDIA GPU the first call in a process checks the kernel, with programs
+    of its own, and warns if it fails. Programs compiled for CUDA without a GPU use the kernel
+    unchecked.
     """
     why = why_unsupported()
     if why is None and default_platform() == "gpu":
@@ -137,10 +134,7 @@ def kernel_check() -> KernelCheck:
 
 
 def compare(draw: Draw) -> KernelCheck:
-    """Compare ``draw(scene, height, width)`` with the fused renderer on two small images.
-
-    The images have all kinds of geoms.
-    """
+    """Compare ``draw(scene, height, width)`` with the fused renderer on images of all geoms."""
     # In a separate thread nothing is being traced, and JAX has its default settings.
     with ThreadPoolExecutor(1) as thread:
         return thread.submit(_compare, draw).result()

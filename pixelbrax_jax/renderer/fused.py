@@ -1,14 +1,4 @@
-"""The fast renderer, for any block of pixels, and for an image as one XLA loop.
-
-It works in the camera's frame, where all rays start at the origin, so that a geom costs a few dot
-products and one or two square roots. The nearest hit is an integer minimum: positive float32
-numbers sort like their bits, and the low bits hold the geom's rank. A missed geom gives NaN or a
-negative distance, whose bits are larger as unsigned integers. Only the nearest geom is shaded.
-
-Numbers of a scene are read one by one, ``array[i, j]``, and pixels are computed element by element:
-the same code is traced into an XLA program and into a kernel, where arrays are references (see
-`docs/renderer.md`). The image equals that of `reference.py`; `base.py` defines its derivative.
-"""
+"""The fast renderer for any block of pixels; `docs/renderer.md` explains it."""
 
 from __future__ import annotations
 
@@ -95,10 +85,7 @@ class Seen(NamedTuple):
 def view_of(
     scene: Scene, height: int, einsum: Callable[[str, Any, Any], jax.Array] = jnp.einsum
 ) -> View:
-    """Return a scene in its camera's frame, for images of ``height`` pixels.
-
-    ``einsum`` computes products over an axis of length 3.
-    """
+    """Return a scene in its camera's frame, for images of ``height`` pixels."""
     geoms, look = scene.geoms, scene.look
     to_camera = scene.camera.xmat
     light = None if look.light is None else einsum("i,ij->j", spatial.unit(look.light), to_camera)
@@ -245,8 +232,6 @@ def render(
 
 
 class _Solid(NamedTuple):
-    """One geom in the camera's frame; fields as in ``intersect``."""
-
     kind: int
     center: Vector
     axes: Axes
@@ -273,16 +258,11 @@ def _solid(view: View, rank: int) -> _Solid:
 
 
 def _vector(array: Any) -> Vector:
-    """Return the three numbers of an array or reference."""
     return array[0], array[1], array[2]
 
 
 def _directions(ray: Vector, to_light: Vector | None, lamps: bool) -> list[tuple[Vector, Any]]:
-    """Return vectors whose products with normals are needed, each with its product with the ray.
-
-    They are the camera's z axis and the direction to the light or zero, and with lamps also x and
-    y.
-    """
+    """Return vectors whose products with normals are needed, each with its product with the ray."""
     zero = (0.0, 0.0, 0.0)
     along: list[tuple[Vector, Any]] = [((0.0, 0.0, 1.0), ray[2])]
     along.append((zero, 0.0) if to_light is None else (to_light, dot(ray, to_light)))
@@ -336,7 +316,6 @@ def _no_hit(count: int, shape: tuple[int, ...]) -> jax.Array:
 
 
 def _nearer(key: jax.Array, hit: Hit, rank: int, count: int) -> jax.Array:
-    """Return the key of the nearest hit, given the nearest one so far."""
     bits = jax.lax.bitcast_convert_type(hit.t, jnp.uint32)
     return jnp.minimum(key, (bits & ~_rank_bits(count)) | np.uint32(rank))
 
@@ -350,7 +329,6 @@ def _rank(key: jax.Array, count: int) -> jax.Array:
 
 
 def _surface_colors(view: View, winner: jax.Array) -> list[jax.Array]:
-    """Return the nearest geom's color, one array per channel."""
     materials = view.material
     color = [jnp.full(winner.shape, view.rgb[materials[0], c]) for c in range(3)]
     for rank in range(1, len(materials)):

@@ -1,17 +1,10 @@
 """Intersections of a ray from the origin with one convex geom.
 
 A vector is a tuple of three components, each a scalar or an array over pixels: the same code serves
-camera rays (ray in arrays, geom in scalars) and shadow rays towards a distant light (ray in
-scalars, geom in arrays). Rays have unit length and enter a geom from outside; a geom around the
-origin is invisible.
-
-A missed geom gives NaN or a negative distance, never +inf, as `fused.py` requires. Formulas follow
-from substituting the ray into the surface's equation. Each quotient and root is used once, because
-XLA stores an image of it if two operations read it.
-
-`at_least` and `at_most` are single CPU instructions. ``jnp.maximum`` and ``jnp.minimum`` need two
-more to propagate NaN from both sides, a seventh of an image's time. The derivative is that of the
-result, and of the bound if both are equal.
+camera rays (ray in arrays, geom in scalars) and shadow rays (ray in scalars, geom in arrays). Rays
+have unit length and enter a geom from outside. A missed geom gives NaN or a negative distance,
+never +inf, as `fused.py` requires. Each quotient and root is used once, because XLA stores an image
+of it if two operations read it.
 """
 
 # ruff: noqa: ARG001, ARG005  # all shapes share one signature, whatever they need of it
@@ -46,7 +39,10 @@ class Hit(NamedTuple):
 
 
 def at_least(x: Any, low: Any) -> jax.Array:
-    """Return the larger of the two; ``low`` if ``x`` is NaN, and NaN if ``low`` is."""
+    """Return the larger of the two; ``low`` if ``x`` is NaN, and NaN if ``low`` is.
+
+    It is one CPU instruction. ``jnp.maximum`` needs two more to propagate NaN from both sides.
+    """
     return jnp.where(x > low, x, low)
 
 
@@ -228,11 +224,7 @@ def intersect(
     bounded: bool = False,
     distant: bool = False,
 ) -> Hit:
-    """Return where unit rays from the origin enter a geom, in the shape of ``ray`` and ``pos``.
-
-    In the rays' frame, the geom's center is ``pos`` in metres and its x, y and z directions are
-    ``axes``; see ``Geoms`` for the rest.
-    """
+    """Return where unit rays from the origin enter a geom; ``pos`` is its center in metres."""
     if bounded and kind == GeomKind.PLANE:
         return _rectangle(ray, pos, axes, size)
     kind = GeomKind(kind)

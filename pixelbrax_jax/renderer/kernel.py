@@ -1,14 +1,4 @@
-"""The fast renderer as one Pallas kernel for NVIDIA GPUs.
-
-On a GPU XLA splits the program of `fused.py`, because a fusion has a limited number of operands,
-and stores arrays of pixels between the parts. Here the same code is traced into a kernel: a block
-computes some pixels from references to the scene's numbers, changes their colors if needed, and
-writes each of them once.
-
-A block skips geoms that it cannot see, by their bounding spheres (`GeomKind.reach`). Along one axis
-of the image, a sphere at (c, d), d in front of the camera, covers the slopes s between its two
-tangents, ``|c - s d| = r sqrt(1 + s^2)``. For a convex hull it is the range of its spheres.
-"""
+"""The fast renderer as one Pallas kernel for NVIDIA GPUs; `docs/renderer.md` explains it."""
 
 from __future__ import annotations
 
@@ -46,10 +36,7 @@ Window = tuple[tuple[Any, Any] | None, tuple[Any, Any]]
 
 
 def draw(scene: Scene, height: int, width: int, change: Callable[[Frame], jax.Array]) -> jax.Array:
-    """Render an image and change it into (height, width) uint32, without a derivative.
-
-    The pixelwise part of the change runs in the kernel.
-    """
+    """Render and change an image into (height, width) uint32, without a derivative."""
     plane: Any = jax.ShapeDtypeStruct((height, width), jnp.float32)
     seg, ground = plane.update(dtype=jnp.int32), plane.update(dtype=bool)
     by_pixel = per_pixel(change, Frame(plane, plane, plane, plane, seg, ground))
@@ -147,11 +134,7 @@ def _call(
     band: _Band,
     dtypes: Sequence[Any],
 ) -> list[jax.Array]:
-    """Return bands of images, (num_rows, width), computed from visible geoms.
-
-    ``compute(view, numbers, images, seen)`` returns blocks of them with the given ``dtypes``, from
-    () arrays and blocks of other bands.
-    """
+    """Return bands of images, (num_rows, width), from ``compute(view, numbers, images, seen)``."""
     height, width, first_row, num_rows = band
     inputs, inputs_tree = jax.tree.flatten((view, list(numbers), first_row))
     inputs = [jax.lax.stop_gradient(jnp.asarray(x)) for x in inputs]
@@ -209,7 +192,6 @@ def _unpacked(ref: Any, arrays: Sequence[jax.Array]) -> Iterator[Any]:
 
 
 def _scalar(ref: Any) -> Any:
-    """Return the number of a reference to a scalar; other references unchanged."""
     return ref if ref.shape else ref[()]
 
 
@@ -220,10 +202,7 @@ def window_of(
     height: int,
     width: int,
 ) -> Window:
-    """Return the slopes of rays through pixels and their neighbors.
-
-    Rows and columns are () int32, the first and the last; None for all columns.
-    """
+    """Return the slopes of rays through pixels and their neighbors; None means all columns."""
     top, bottom = (0.5 * (height - 1) - row.astype(jnp.float32) for row in rows)
     along_y = (view.pixel * (bottom - 1.0), view.pixel * (top + 1.0))
     if columns is None:
@@ -233,9 +212,10 @@ def window_of(
 
 
 def may_see(view: View, window: Window) -> Callable[[int], jax.Array]:
-    """Return a function of a geom's rank: whether rays of a window may hit the geom.
+    """Return a function of a geom's rank: whether rays of a window may hit its bounding sphere.
 
-    A vector holds 32 geoms, which suits a GPU.
+    Along one axis of the image, a sphere at (c, d), d in front of the camera, covers the slopes s
+    between its two tangents, ``|c - s d| = r sqrt(1 + s^2)``. A vector holds 32 geoms.
     """
     count = len(view.geom)
     kinds = [view.kind[view.geom.index(g)] for g in range(count)]
@@ -284,7 +264,6 @@ def _word(view: View, window: Window, kinds: Sequence[int], first: int) -> jax.A
 
 
 def _slopes(c: jax.Array, d: jax.Array, radius: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return the slopes of the two tangents of a sphere that is not close."""
     inv = 1.0 / (d * d - radius * radius)
     root = radius * jnp.sqrt(at_least(c * c + d * d - radius * radius, 0.0))
     return (c * d - root) * inv, (c * d + root) * inv

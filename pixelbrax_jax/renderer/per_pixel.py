@@ -1,8 +1,4 @@
-"""Detection of pixelwise changes of an image.
-
-A kernel applies such a change when it renders a pixel. All that does not depend on the frame, such
-as a random offset or a background image, is computed before.
-"""
+"""Detection of pixelwise changes of an image, which a kernel applies when it renders a pixel."""
 
 from __future__ import annotations
 
@@ -148,10 +144,7 @@ class PerPixel:
 
 
 def per_pixel(change: Callable[[Frame], jax.Array], frame: Frame) -> PerPixel | None:
-    """Return a change of a frame into an array of its size; None if it is not pixelwise.
-
-    ``frame`` has the shapes and dtypes of the frame's channels.
-    """
+    """Return a change of a frame into an array of its size; None if it is not pixelwise."""
     closed = jax.make_jaxpr(change)(frame)
     planes = [_Pixel(place) for place in range(len(closed.jaxpr.invars))]
     found = PerPixel(frame.r.shape, len(planes))

@@ -1,8 +1,7 @@
 """The reference renderer, against which others are tested, and which is differentiated.
 
-It works in the world frame with vectors as last axes, one geom after the other, and computes the
-full normal of every hit. Keep it simple. A missed geom is at distance ``inf``, and every root and
-quotient is guarded so that no gradient is NaN.
+It is simple on purpose: world frame, one geom after the other, full normals. A missed geom is at
+distance ``inf``, and every root and quotient is guarded so that no gradient is NaN.
 """
 
 from __future__ import annotations
@@ -97,7 +96,6 @@ def pixel_rays(camera: Camera, height: int, width: int, rows: jax.Array) -> jax.
 def _cast_geom(
     scene: Scene, g: int, origin: jax.Array, rays: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Return distances at which rays enter geom ``g`` (``inf`` if never), and normals."""
     geoms = scene.geoms
     t, normal = _cast(geoms.kind[g], origin, rays, scene.pos[g], scene.xmat[g], geoms.size[g])
     if geoms.is_bounded(g):

@@ -1,13 +1,4 @@
-"""Light, sky and the ground's pattern, for pixels of any shape.
-
-As in `intersect.py` a vector is a tuple of three components, each a scalar or an array over pixels,
-and all vectors of a call are in one frame: the camera's or the world's.
-
-The pattern of a plane is a product of two one-dimensional ones along its x and y. A pixel sees a
-parallelogram of the plane; the pattern is averaged exactly, by its integral, over the
-parallelogram's bounding rectangle. So it does not flicker, and tends to a constant towards the
-horizon.
-"""
+"""Light, sky and the ground's pattern for pixels of any shape; vectors as in `intersect.py`."""
 
 from __future__ import annotations
 
@@ -86,8 +77,10 @@ def second_color_fraction(
 ) -> jax.Array:
     """Return the fraction of the ground's second color in a pixel, in [0, 1].
 
-    The pattern is ``"checker"`` or ``"grid"``. In units of its pitch, (x, y) is the ground at the
-    pixel's center, and the widths are the positive extents of the ground that the pixel sees.
+    The pattern is ``"checker"`` or ``"grid"``, a product of two one-dimensional patterns. In units
+    of its pitch, (x, y) is the ground at the pixel's center, and the widths are the positive
+    extents of the ground that the pixel sees. The mean over this rectangle is exact, so nothing
+    flickers.
     """
     if pattern == "checker":
         # A checker is the product of two waves with a period of two tiles.

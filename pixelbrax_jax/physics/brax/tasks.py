@@ -18,11 +18,7 @@ _Point = tuple[float, float, float]
 
 @dataclass(frozen=True, kw_only=True)
 class BraxOptions:
-    """Options of Brax's tasks.
-
-    Raises:
-        ValueError: an option is out of range; the message says what is allowed.
-    """
+    """Options of Brax's tasks; raises ValueError for one that is out of range."""
 
     backend: str | None = None
     """Physics backend of Brax's tasks: ``spring``, ``positional``, ``generalized`` or ``mjx``. None
