@@ -64,7 +64,7 @@ class Encoder:
         self._log: IO[bytes] | None = None
 
     def append(self, frame: np.ndarray) -> None:
-        """Write a frame, or raise as ``close`` does; an odd side's last row or column is repeated."""
+        """Write a frame; an odd side gets its last row or column twice. Raises as ``close``."""
         height, width = (side % 2 for side in frame.shape[:2])
         if height or width:
             frame = np.pad(frame, ((0, height), (0, width), (0, 0)), mode="edge")

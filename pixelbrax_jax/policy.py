@@ -35,11 +35,7 @@ class Policy:
     env_options: dict[str, Any] | None = None
 
     def __call__(self, pixels: jax.Array) -> jax.Array:
-        """Map (B, H, W, 3 K) uint8 pixels to (B, A) float32 actions.
-
-        Raises:
-            ValueError: the pixels have another shape or dtype.
-        """
+        """Map (B, H, W, 3 K) uint8 pixels to (B, A) float32 actions; others raise ValueError."""
         if pixels.ndim != 4 or pixels.shape[1:] != self.shape or pixels.dtype != jnp.uint8:
             raise ValueError(
                 f"the policy takes (B, {', '.join(map(str, self.shape))}) uint8 pixels, got "
@@ -54,18 +50,11 @@ def list_pretrained() -> tuple[str, ...]:
 
 
 def read_pretrained(name: str) -> dict[str, Any]:
-    """Return the description of a pretrained policy.
+    """Return the description of a pretrained policy; raise ValueError if its name is unknown.
 
-    Args:
-        name: one of ``list_pretrained()``.
-
-    Returns:
-        ``algorithm``, ``config`` (all training settings), ``env_options``, ``command``, ``steps``
-        (control steps of training), ``return``, ``standard_error`` and ``episodes`` of its
-        evaluation, and ``versions`` of the packages that trained it.
-
-    Raises:
-        ValueError: the name is unknown.
+    Keys are ``algorithm``, ``config`` (all training settings), ``env_options``, ``command``,
+    ``steps`` (control steps of training), ``return``, ``standard_error`` and ``episodes`` of its
+    evaluation, and ``versions`` of the packages that trained it.
     """
     check_choice("pretrained policy", name, list_pretrained())
     about: dict[str, Any] = json.loads((FOLDER / f"{name}.json").read_text("utf-8"))
@@ -73,10 +62,7 @@ def read_pretrained(name: str) -> dict[str, Any]:
 
 
 def load_policy(path: str | Path) -> Policy:
-    """Load a policy.
-
-    Args:
-        path: a file ``policy.jax`` of a training run, or one of ``list_pretrained()``.
+    """Load a policy from a file ``policy.jax`` of a training run, or by its pretrained name.
 
     Raises:
         FileNotFoundError: the file does not exist.

@@ -45,12 +45,7 @@ _DAVIS_LAYOUT = (
 
 @dataclass(frozen=True)
 class Source:
-    """One clip on disk.
-
-    Attributes:
-        name: name of the clip.
-        files: its images in order, or a single video file.
-    """
+    """One clip on disk: its name, and its images in order or a single video file."""
 
     name: str
     files: tuple[Path, ...]

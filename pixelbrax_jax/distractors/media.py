@@ -28,15 +28,11 @@ class _UnfitError(ValueError):
 def read_clip(
     source: Source, height: int, width: int, check_count: Callable[[int], None]
 ) -> tuple[list[np.ndarray], str]:
-    """Return the frames of a clip.
+    """Return the frames of a clip, (H, W, 3) uint8 each, and the file's defect, empty if none.
 
     Images are rotated by their EXIF orientation, videos by their display matrix. 16 bits become 8,
-    floats in [0, 1] become 0 to 255, and transparent pixels are blended with black.
-
-    ``check_count`` is called with the number of frames so far, and may raise.
-
-    Returns:
-        (H, W, 3) uint8 each, and the file's defect, to be printed after its name; empty if none.
+    floats in [0, 1] become 0 to 255, and transparent pixels are blended with black. ``check_count``
+    is called with the number of frames so far, and may raise.
 
     Raises:
         ValueError: a file cannot be read; the message has the file, the reason and the fix.

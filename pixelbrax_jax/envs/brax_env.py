@@ -64,11 +64,8 @@ class BraxEnv(Env):
     def reset(self, rng: jax.Array) -> State:
         """Reset to episode 0 of the environment with the key ``rng``, typed or uint32 like Brax's.
 
-        Returns:
-            The first state. Its ``pipeline_state`` is the pixel environment's ``EnvState``.
-
-        Raises:
-            TypeError: ``rng`` is not one key.
+        The state's ``pipeline_state`` is the pixel environment's ``EnvState``. Raises TypeError if
+        ``rng`` is not one key.
         """
         if not jnp.issubdtype(rng.dtype, jax.dtypes.prng_key):
             rng = jax.random.wrap_key_data(rng)

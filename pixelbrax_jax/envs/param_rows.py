@@ -73,8 +73,7 @@ class ParamRows:
 def split_params(params: EnvParams, num_envs: int) -> ParamRows:
     """Split parameters whose arrays have the shapes of ``EnvParams`` or a leading axis N.
 
-    Raises:
-        ValueError: an array has neither shape; the message has its name and both shapes.
+    Other shapes raise a ValueError with the array's name.
     """
     found, tree = jax.tree_util.tree_flatten_with_path(params)
     geoms = params.geoms

@@ -107,11 +107,7 @@ class PixelEnv(ProgramConfig):
     def reset(self, key: jax.Array, params: EnvParams) -> tuple[EnvState, Timestep]:
         """Reset to episode 0 of the environment with a typed PRNG key, ``jax.random.key(seed)``.
 
-        Returns:
-            The state and the first timestep, with reward 0.
-
-        Raises:
-            TypeError: ``key`` is not a single typed key.
+        The reward is 0. Raises TypeError if ``key`` is not a single typed key.
         """
         check_key(key)
         return self._reset(key, jnp.uint32(0), params)

@@ -65,14 +65,11 @@ class VectorPixelEnv:
     @partial(jax.jit, static_argnums=0)
     @under_default_flags
     def reset(self, key: jax.Array, params: EnvParams) -> tuple[EnvState, Timestep]:
-        """Reset all environments to episode 0.
+        """Reset all environments to episode 0; return the states and the first timesteps.
 
         Args:
             key: a typed PRNG key, of which environment i gets ``fold_in(key, i)``; or (N,) keys.
             params: the parameters; each array is shared or has a leading axis N.
-
-        Returns:
-            The states and the first timesteps.
 
         Raises:
             TypeError: ``key`` is neither.

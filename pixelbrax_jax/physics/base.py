@@ -109,8 +109,7 @@ class Physics(abc.ABC):
             key: PRNG key for what else the task samples, such as a target.
 
         Returns:
-            A state for ``step``. ``terminated`` is false even in a pose that ends the task; the
-            next step sets it.
+            A state for ``step``, never terminated; the next step may be.
 
         Raises:
             ValueError: a shape is wrong.
