@@ -124,7 +124,7 @@ def test_a_run_that_is_stopped_goes_on_where_it_was(workers, tmp_path, monkeypat
     command = ["--only", "renderer", "--output-dir", str(tmp_path)]
     monkeypatch.setattr(runner, "measure", killed_at_the_third)
     assert run.main(command) == 130
-    assert "goes on from here" in capsys.readouterr().err
+    assert "same command again to continue" in capsys.readouterr().err
     assert outcomes(tmp_path) == ["ok", "ok"]
     monkeypatch.setattr(runner, "measure", measure)
     assert run.main(command) == 0
@@ -145,7 +145,7 @@ def test_a_scheduler_s_signal_loses_nothing(workers, tmp_path, monkeypatch, caps
 
     monkeypatch.setattr(runner, "measure", told_to_stop_at_the_third)
     assert run.main(["--only", "renderer", "--output-dir", str(tmp_path)]) == 128 + number
-    assert f"stopped by {name}; the same command goes on from here" in capsys.readouterr().err
+    assert f"stopped by {name}; run the same command again" in capsys.readouterr().err
     assert outcomes(tmp_path) == ["ok", "ok"]
     assert signal.getsignal(number) is before
 
@@ -293,7 +293,7 @@ jax.jit(f)(1.0)
         ("import os, signal; os.kill(os.getpid(), signal.SIGKILL)", "killed", "by the system"),
         ("raise ValueError('wrong')", "failed", "ValueError: wrong"),
         ("import sys; sys.stderr.write('no OpenGL'); sys.exit(3)", "absent", "no OpenGL"),
-        ("print('no result')", "failed", "no result"),
+        ("print('no result')", "failed", "is not a result"),
     ],
     ids=["memory", "JAX's memory", "killed", "error", "absent", "no result"],
 )

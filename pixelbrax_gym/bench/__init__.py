@@ -1,1 +1,1 @@
-"""``pixelbrax bench``: how fast PixelBrax is on the user's machine."""
+"""Measure the speed of PixelBrax on the user's machine."""

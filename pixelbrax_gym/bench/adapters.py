@@ -1,4 +1,4 @@
-"""What an adapter to Gymnasium, TorchRL or Stable-Baselines3 costs, interleaved."""
+"""Compare the adapters to Gymnasium, TorchRL and Stable-Baselines3 in interleaved runs."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from pixelbrax_gym.bench.timing import SECONDS, speed_ratio, take_interleaved
 from pixelbrax_jax.tasks import TASKS
 
 Run = Callable[[], Any]
-"""Takes some steps, and waits for them."""
+"""Takes some steps and waits for their results."""
 
 
 def compare(task: str, num_envs: int, seconds: float = SECONDS) -> list[dict[str, Any]]:
-    """Measure steps per second of every adapter that is installed, and of the JAX environment.
+    """Measure steps per second of each installed adapter and of the JAX environment.
 
-    All get the same actions and play the same episodes. ``ratio`` is to a Python loop over the
-    compiled step with the same autoreset mode that waits for each step, as an adapter does.
+    All get the same actions and play the same episodes. ``ratio`` is the speed relative to a
+    Python loop over the compiled step that has the same autoreset mode and waits for each step.
     """
     env, params = pb.make(task)
     shape = (max(8, min(100, 512 // num_envs)), num_envs, env.action_size)
@@ -77,7 +77,7 @@ def scan(task: str, num_envs: int, actions: np.ndarray) -> Run:
 
 
 def loop(env: Any, params: Any, num_envs: int, actions: np.ndarray, mode: str = "next_step") -> Run:
-    """Return a Python loop over the compiled step, which waits for each."""
+    """Return a Python loop over the compiled step that waits for each step."""
     venv = pb.VectorPixelEnv(env, num_envs, mode)
     step = jax.jit(venv.step, donate_argnums=0, compiler_options=pb.compiler_options(venv))
     params = jax.device_put(params)
@@ -141,14 +141,14 @@ def _sb3(task: str, num_envs: int, actions: np.ndarray) -> Run:
 
 
 def _tensors(actions: np.ndarray, device: Any) -> list[Any]:
-    """Return one tensor a step, where the environments are."""
+    """Return one tensor per step, on the environments' device."""
     import torch
 
     return [torch.from_numpy(action).to(device) for action in actions]
 
 
 def _wait_for_torch(obs: Any = None) -> Any:
-    """On a CPU a tensor is complete when it is handed out."""
+    """Return ``obs`` when CUDA is idle; tensors on a CPU are always complete."""
     import torch
 
     if torch.cuda.is_available():

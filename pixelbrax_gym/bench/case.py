@@ -1,4 +1,4 @@
-"""What is measured, as data."""
+"""Define a benchmark as data: cases and groups of them."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from dataclasses import dataclass, field
 from typing import Any
 
 ABSENT = 3
-"""Exit status of a process that lacks what it is to measure."""
+"""Exit status of a process in which something to be measured is not installed."""
 
 Row = dict[str, Any]
-"""A case's outcome as it is kept: ``group``, ``measure``, ``arguments``, ``status``, ``values``."""
+"""Stored outcome of a case: ``group``, ``measure``, ``arguments``, ``status``, ``values``, ..."""
 
 
 class AbsentError(Exception):
-    """What is to be measured is not here; the message says why."""
+    """Something to be measured is not available here, for the reason in the message."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """One measurement, made in a process of its own."""
+    """One measurement, which runs in a separate process."""
 
     group: str
-    """The part of the benchmark that it belongs to."""
+    """Name of its group."""
     measure: str
     """``module.function`` of the package."""
     arguments: Mapping[str, Any] = field(default_factory=dict)
@@ -32,28 +32,28 @@ class Case:
 
     @property
     def key(self) -> str:
-        """Its name in the results."""
+        """Key of the case in the results."""
         arguments = json.dumps(dict(self.arguments), sort_keys=True)
         return f"{self.group} {self.measure} {arguments}"
 
     def command(self) -> list[str]:
-        """Return the command that measures it, whose last line is the result, as JSON.
+        """Return the command to run; the last line of its output is the result as JSON.
 
         Raises:
-            AbsentError: it cannot run here.
+            AbsentError: the case cannot run here.
         """
         function = f"{self.package}.{self.measure}"
         arguments = json.dumps(dict(self.arguments))
         return [sys.executable, "-m", "pixelbrax_gym.bench.worker", function, arguments]
 
     def environ(self) -> dict[str, str]:
-        """Return variables that its process needs besides those of this one."""
+        """Return additional environment variables for the process."""
         return {}
 
 
 @dataclass(frozen=True)
 class Group:
-    """A part of the benchmark: its cases, their outcomes in Markdown, and what these show."""
+    """A part of the benchmark: its cases, a function for their table in Markdown, and a note."""
 
     cases: Callable[[], Iterator[Case]]
     table: Callable[[list[Row]], str]

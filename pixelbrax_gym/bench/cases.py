@@ -1,4 +1,4 @@
-"""What ``pixelbrax bench`` measures: in two and a half minutes, or in full."""
+"""List the cases of ``pixelbrax bench``, quick and full."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ BATCHES = (1, 10, 100, 1000, 4096, 8192)
 
 
 def renderer() -> Iterator[Case]:
-    """The ray-caster alone, as it is used."""
+    """Yield the renderer with default options."""
     yield Case("renderer", "throughput.renderer", {"task": "ant", "num_envs": 256})
 
 
 def renderers() -> Iterator[Case]:
-    """The ray-caster alone: its looks, and the size of the image."""
+    """Yield the renderer with several looks, image sizes and renderers."""
     yield from renderer()
     for options in (
         {"look": "original"},
@@ -29,14 +29,14 @@ def renderers() -> Iterator[Case]:
 
 
 def few_environments() -> Iterator[Case]:
-    """One Ant and a hundred."""
+    """Yield Ant with one and a hundred environments."""
     yield _scan("ant", 1, "pixels")
     yield _scan("ant", 100, "state")
     yield _scan("ant", 100, "pixels")
 
 
 def environments() -> Iterator[Case]:
-    """State only, pixels and the renderer alone, over the number of environments."""
+    """Yield state only, pixels and the renderer for several numbers of environments."""
     for task in TASKS:
         for num_envs in BATCHES:
             yield _scan(task, num_envs, "state")
@@ -51,34 +51,31 @@ def _scan(task: str, num_envs: int, obs_mode: str) -> Case:
 
 
 def adapter() -> Iterator[Case]:
-    """Every adapter that is installed, of the task that compiles fastest.
-
-    An adapter costs Python's time, whatever the task; nearly all of this case is compilation.
-    """
+    """Yield one comparison of all adapters, with the task that compiles fastest."""
     where = {"task": "inverted_pendulum", "num_envs": 100, "seconds": 6.0}
     yield Case("adapters", "adapters.compare", where)
 
 
 def adapters() -> Iterator[Case]:
-    """Every adapter that is installed."""
+    """Yield comparisons of all adapters."""
     for task, num_envs in (("ant", 256), ("ant", 1), *((task, 1000) for task in TASKS)):
         yield Case("adapters", "adapters.compare", {"task": task, "num_envs": num_envs})
 
 
 RENDERER_NOTE = "From link poses to packed pixels, without physics."
 ADAPTERS_NOTE = (
-    "The ratio is that to the JAX loop with the same autoreset mode, which waits for each step: "
-    "medians over rounds, in which each runs 8 to 100 steps in one process, with bootstrap "
-    "intervals of 95 %."
+    "The ratio is relative to the JAX loop with the same autoreset mode, which waits for each "
+    "step. It is a median over rounds with a 95 % bootstrap interval. In each round every adapter "
+    "runs 8 to 100 steps in the same process."
 )
-ENVIRONMENTS_NOTE = "A compiled loop over steps; nothing leaves it."
+ENVIRONMENTS_NOTE = "A compiled loop over steps that returns no observations."
 
 QUICK = {
     "renderer": Group(renderer, tables.renderer, RENDERER_NOTE),
     "environments": Group(few_environments, tables.environments, ENVIRONMENTS_NOTE),
     "adapters": Group(adapter, tables.interleaved("autoreset_mode", "adapter"), ADAPTERS_NOTE),
 }
-"""What takes two and a half minutes on two cores, in the order in which it is measured."""
+"""Groups by default, in the order of measurement; they take two and a half minutes on two cores."""
 
 FULL = {
     "renderer": Group(renderers, tables.renderer, RENDERER_NOTE),
@@ -87,4 +84,4 @@ FULL = {
     ),
     "environments": Group(environments, tables.environments, ENVIRONMENTS_NOTE),
 }
-"""What ``--full`` measures; it takes hours on a CPU."""
+"""Groups of ``--full``; they take hours on a CPU."""

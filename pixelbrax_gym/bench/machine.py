@@ -1,4 +1,4 @@
-"""What figures are measured on."""
+"""Describe the machine that results are measured on."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ PACKAGES = (
 
 
 def num_cores() -> int:
-    """Return how many CPU cores this process may run on; quotas of containers are not seen."""
+    """Return the number of CPU cores this process may use; ignores quotas of containers."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def installed_version(package: str) -> str | None:
-    """Return the release of a package; None where it is not installed."""
+    """Return the version of a package; None if it is not installed."""
     try:
         return version(package)
     except PackageNotFoundError:
@@ -38,9 +38,10 @@ def installed_version(package: str) -> str | None:
 
 
 def describe_cpu() -> dict[str, Any]:
-    """Return what is known of the processor; starts no device of JAX.
+    """Return the processor's description without starting JAX.
 
-    Virtual machines name several generations alike; family, model and vectors tell them apart.
+    ``family``, ``model`` and ``vectors`` tell apart generations that share a name in virtual
+    machines.
     """
     entries: dict[str, str] = {}
     if (cpuinfo := Path("/proc/cpuinfo")).exists():
@@ -60,7 +61,7 @@ def describe_cpu() -> dict[str, Any]:
 
 
 def describe() -> dict[str, Any]:
-    """Return device, processor and versions."""
+    """Return device, processor, versions and XLA flags."""
     import jax
 
     device = jax.devices()[0]
@@ -77,6 +78,6 @@ def describe() -> dict[str, Any]:
 
 
 def file_stem(machine: dict[str, Any]) -> str:
-    """Return the name of the files of results: CPUs with other vectors write into other files."""
+    """Return the stem of the result files: the platform, and the vector extension of a CPU."""
     vectors: str = machine["vectors"] if machine["platform"] == "cpu" else ""
     return "-".join(filter(None, (machine["platform"], vectors.lower().replace("-", ""))))

@@ -1,4 +1,4 @@
-"""Results -> a page of tables, and a plot of steps per second."""
+"""Write results as a page of tables and a plot of steps per second."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from pixelbrax_gym.bench.tables import succeeded, table, title
 _HEADING = (
     "# Measurements",
     "Medians of at least five repetitions of half a second or more, unless a part says "
-    "otherwise; compilation is apart, every call is waited for, actions are random, and "
-    "episodes begin anew. Each case has a process of its own.",
+    "otherwise. Times exclude compilation and include waiting for every result. Actions are "
+    "random, and episodes reset automatically. Each case runs in a separate process.",
 )
 
 
 def write(file: Path, groups: Mapping[str, Group]) -> None:
-    """Write the page, and with matplotlib the plot, that belong to the results in ``file``."""
+    """Write the page of the results in ``file`` beside it, and the plot if matplotlib is there."""
     kept = json.loads(file.read_text("utf-8"))
     picture = file.with_suffix(".png")
     plotted = find_spec("matplotlib") is not None and plot(_rows(kept, groups), picture)
@@ -32,7 +32,7 @@ def write(file: Path, groups: Mapping[str, Group]) -> None:
 
 
 def page(kept: Mapping[str, Row], groups: Mapping[str, Group], picture: str | None) -> str:
-    """Return the page of a file's results, in Markdown, with the plot of that name."""
+    """Return the results as a page in Markdown that includes the plot ``picture``."""
     rows = _rows(kept, groups)
     used = {row["machine"] for row in rows}
     parts = [
@@ -54,12 +54,12 @@ def page(kept: Mapping[str, Row], groups: Mapping[str, Group], picture: str | No
 
 
 def plot(rows: list[Row], path: Path) -> bool:
-    """Draw steps per second over the number of environments, and return if there are any."""
+    """Plot steps per second over the number of environments; return False if there are none."""
     chosen = [row for row in succeeded(rows) if row["group"] == "environments"]
     tasks = list(dict.fromkeys(row["arguments"]["task"] for row in chosen))
     if not tasks:
         return False
-    # A value that other tools leave there keeps matplotlib from being imported.
+    # A value left by another tool would make the import of matplotlib fail.
     os.environ["MPLBACKEND"] = "Agg"
     import matplotlib
 
@@ -92,7 +92,7 @@ def plot(rows: list[Row], path: Path) -> bool:
 
 
 def _rows(kept: Mapping[str, Row], groups: Mapping[str, Group]) -> list[Row]:
-    """Outcomes of the cases that the groups have today."""
+    """Return the outcomes of the groups' cases."""
     known = {case.key for group in groups.values() for case in group.cases()}
     return [row for key, row in kept["cases"].items() if key in known]
 

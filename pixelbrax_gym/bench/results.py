@@ -1,4 +1,4 @@
-"""Outcomes that outlive a run."""
+"""Store outcomes in a file."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from pixelbrax_gym.bench.case import Case
 
 
 class Results:
-    """What has been measured, in a JSON file that is written after every case.
+    """Outcomes in a JSON file that is written after every case.
 
     Raises:
-        ValueError: the file is of another kind.
+        ValueError: the file exists but has no results.
     """
 
     def __init__(self, file: Path, machine: dict[str, Any]) -> None:
@@ -28,18 +28,18 @@ class Results:
             except ValueError:
                 kept = None
             if not isinstance(kept, dict) or not {"machines", "cases"} <= kept.keys():
-                raise ValueError(f"{file} is not a result of this benchmark: move it away.")
+                raise ValueError(f"{file} is not a result of this benchmark: move or delete it.")
             self.kept = kept
         self.kept["machines"][self.machine] = machine
 
     def has(self, case: Case) -> bool:
-        """Whether a case need not be measured again on this machine."""
+        """Return whether the case has a final result on this machine."""
         known = self.kept["cases"].get(case.key, {})
         learned = known.get("status") in ("ok", "out of memory")
         return learned and known["machine"] == self.machine
 
     def add(self, case: Case, outcome: dict[str, Any]) -> None:
-        """Keep an outcome. The file is never half written."""
+        """Store an outcome and replace the file atomically."""
         cases = self.kept["cases"]
         cases[case.key] = {
             "group": case.group,

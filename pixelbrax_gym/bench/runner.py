@@ -1,4 +1,4 @@
-"""Runs cases, each in a process of its own, and keeps what comes out."""
+"""Run cases in separate processes and store their outcomes."""
 
 from __future__ import annotations
 
@@ -38,18 +38,14 @@ def measure_all(
     again: bool = False,
     timeout: float = 900.0,
 ) -> tuple[Path, bool]:
-    """Measure what is not known yet of this machine, and write results, page and plot.
+    """Measure the cases without a result on this machine and write results, page and plot.
 
-    A run that is cut short loses nothing, and the next one goes on where it stopped.
-
-    Returns:
-        The JSON file, and whether a case failed for another reason than memory or something
-        absent.
+    Returns the JSON file, and whether a case failed other than by memory or an absent package.
 
     Raises:
-        KeyboardInterrupt: after a signal to stop, with its number.
+        KeyboardInterrupt: a signal to stop arrived, with its number; the results are written.
     """
-    # A process must not outlive this one and disturb the next one's measurements.
+    # A process that outlives this one would disturb later measurements.
     before = {number: signal.signal(number, _interrupt) for number in stop_signals()}
     try:
         machine = measure(Case("machine", "machine.describe"), 300.0)
@@ -59,7 +55,7 @@ def measure_all(
         results = Results(file, machine["values"])
         todo = [case for case in cases if again or not results.has(case)]
         output_dir.mkdir(parents=True, exist_ok=True)
-        _say(f"{len(todo)} of {len(cases)} cases are to be measured; results in {file}\n")
+        _say(f"{len(todo)} of {len(cases)} cases to measure; results in {file}\n")
         failed = False
         try:
             for index, case in enumerate(todo, 1):
@@ -79,7 +75,7 @@ def measure_all(
 
 
 def measure(case: Case, timeout: float) -> dict[str, Any]:
-    """Return the outcome of a case: ``status`` and its ``values``, or ``why`` there are none."""
+    """Run a case; return its ``status`` and ``values``, or ``why`` it has no values."""
     started = time.perf_counter()
     try:
         outcome = run_process(case.command(), case.environ(), timeout)
@@ -93,8 +89,8 @@ def measure(case: Case, timeout: float) -> dict[str, Any]:
 def run_process(
     command: Sequence[str], environ: Mapping[str, str], timeout: float
 ) -> dict[str, Any]:
-    """Run a command whose last line is its result, as JSON; none of its processes outlives it."""
-    # Compilation is to be measured, and errors are to be reported in their own words.
+    """Run a command whose last line is its result as JSON, then kill the processes it started."""
+    # Without the cache, compilation is measured; without filtering, errors keep their messages.
     own = {"JAX_ENABLE_COMPILATION_CACHE": "false", "JAX_TRACEBACK_FILTERING": "off"}
     with subprocess.Popen(
         command,
@@ -113,7 +109,7 @@ def run_process(
     lines = errors.strip().splitlines()
     last = lines[-1] if lines else f"exit status {child.returncode}"
     if os.name == "posix" and child.returncode == -signal.SIGKILL:
-        return {"status": "killed", "why": "by the system, most likely for its memory"}
+        return {"status": "killed", "why": "by the system, probably because memory ran out"}
     if child.returncode == ABSENT:
         return {"status": "absent", "why": last}
     if child.returncode != 0:
@@ -124,11 +120,14 @@ def run_process(
         found = json.loads(output.strip().splitlines()[-1])
         return {"status": "ok", "values": found["values"], "peak_bytes": found.get("peak_bytes")}
     except (ValueError, TypeError, LookupError):
-        return {"status": "failed", "why": f"its last line is no result: {output[-200:]!r}"}
+        return {
+            "status": "failed",
+            "why": f"its last line is not a result: {output[-200:]!r}",
+        }
 
 
 def _kill(child: subprocess.Popen[str]) -> None:
-    """End the process and those that it began."""
+    """Kill the process and those it started."""
     if os.name != "posix":
         child.kill()
         return

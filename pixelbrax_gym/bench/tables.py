@@ -1,4 +1,4 @@
-"""Outcomes as tables in Markdown."""
+"""Format outcomes as tables in Markdown."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pixelbrax_jax.tasks import TASKS
 
 
 def table(heads: Iterable[str], lines: Iterable[Iterable[Any]]) -> str:
-    """Return heads and lines, in columns that are as wide as what is in them."""
+    """Return a Markdown table with padded columns."""
     rows = [[str(cell) for cell in row] for row in (list(heads), *lines)]
     widths = [max(3, *map(len, column)) for column in zip(*rows, strict=True)]
     rows.insert(1, ["-" * width for width in widths])
@@ -20,7 +20,7 @@ def table(heads: Iterable[str], lines: Iterable[Iterable[Any]]) -> str:
 
 
 def number(value: float | None) -> str:
-    """Return three significant digits, thousands apart; a hyphen for what is not known."""
+    """Format with three significant digits and thousands separators; a hyphen if unknown."""
     if value is None or not math.isfinite(value):
         return "-"
     if value == 0:
@@ -30,17 +30,17 @@ def number(value: float | None) -> str:
 
 
 def title(task: str) -> str:
-    """Return a task's name as in its Gymnasium id."""
+    """Return a task's name in its Gymnasium id."""
     return TASKS[task].gymnasium_id.removeprefix("PixelBrax/").removesuffix("-v0")
 
 
 def succeeded(rows: list[Row]) -> list[Row]:
-    """Return those that have values."""
+    """Return the outcomes that have values."""
     return [row for row in rows if row["status"] == "ok"]
 
 
 def find(rows: list[Row], measure: str, **arguments: Any) -> Row | None:
-    """Return the first outcome of a measure with these arguments, and maybe others."""
+    """Return the first outcome of a measure whose arguments include these."""
     for row in rows:
         if row["measure"] == measure and arguments.items() <= row["arguments"].items():
             return row
@@ -48,24 +48,24 @@ def find(rows: list[Row], measure: str, **arguments: Any) -> Row | None:
 
 
 def value(row: Row | None, name: str) -> Any:
-    """Return a value of an outcome; None if there is none."""
+    """Return a value of an outcome; None if it is missing."""
     return row["values"][name] if row is not None and row["status"] == "ok" else None
 
 
 def cell(row: Row | None, name: str) -> str:
-    """Return a value of an outcome as text, or why there is none."""
+    """Format a value of an outcome, or the reason why it is missing."""
     if row is None:
         return "not yet"
     return number(row["values"][name]) if row["status"] == "ok" else str(row["status"])
 
 
 def ratio(above: float | None, below: float | None) -> str:
-    """Return a quotient as text; a hyphen if one of both is not known."""
+    """Format a quotient; a hyphen if a value is unknown."""
     return number(above / below) if above and below else "-"
 
 
 def renderer(rows: list[Row]) -> str:
-    """Frames per second of the ray-caster."""
+    """Return the table of the renderer's frames per second."""
 
     def line(row: Row) -> list[str]:
         options = {k: v for k, v in row["arguments"].items() if k not in ("task", "num_envs")}
@@ -81,7 +81,7 @@ def renderer(rows: list[Row]) -> str:
 
 
 def environments(rows: list[Row]) -> str:
-    """Steps per second with pixels and without, over the number of environments."""
+    """Return the table of steps per second with and without pixels."""
     lines = []
     for task in dict.fromkeys(row["arguments"]["task"] for row in rows):
         of_task = [row for row in rows if row["arguments"]["task"] == task]
@@ -127,7 +127,7 @@ def _peak_bytes(row: Row | None) -> float | None:
 
 
 def interleaved(*columns: str) -> Callable[[list[Row]], str]:
-    """Return what draws a comparison, whose lines differ in these arguments or values."""
+    """Return a function that formats a comparison with columns for these arguments or values."""
 
     def draw(rows: list[Row]) -> str:
         lines = [

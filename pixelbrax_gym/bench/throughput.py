@@ -1,4 +1,4 @@
-"""Frames and steps per second of the renderer and of the environments."""
+"""Measure frames per second of the renderer and steps per second of environments."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def renderer(
     shadows: bool = False,
     renderer: str = "fused",
 ) -> dict[str, Any]:
-    """Measure the ray-caster alone: packed words from link poses."""
+    """Measure rendering from link poses to packed pixels, without physics."""
     env, params = pb.make(
         task, look=look, shadows=shadows, height=size, width=size, renderer=renderer
     )
@@ -40,7 +40,7 @@ def renderer(
 
 
 def first_states(env: pb.PixelEnv, params: Any, num_envs: int) -> Any:
-    """Return states at the start of an episode, without what drawing does not read."""
+    """Return batched simulator states at the start of episodes."""
     keys = jax.random.split(jax.random.key(0), num_envs)
     reset = jax.jit(jax.vmap(lambda key: env.reset_sim(key, jnp.uint32(0), params)))
     return reset(keys)
@@ -54,7 +54,7 @@ def scan(
 ) -> dict[str, Any]:
     """Measure environment steps in one compiled loop, with random actions and autoreset.
 
-    Every frame enters the frame stack, which is the loop's state: none can be left out.
+    Every frame enters the frame stack in the loop's state, so no rendering is optimised away.
     """
     env, params = pb.make(task, obs_mode=obs_mode, height=size, width=size)
     venv = pb.VectorPixelEnv(env, num_envs)
@@ -85,7 +85,7 @@ def scan(
         )
         return total
 
-    # Fresh memory for a call is a tenth of the time of four steps with 1000 environments.
+    # Memory allocation for a call takes a tenth of the time of four steps of 1000 environments.
     speed = rate(run, least_calls=16)
     return {
         "steps_per_second": num_envs * speed["median"],

@@ -1,4 +1,4 @@
-"""How time is taken: compilation apart, every result waited for."""
+"""Measure run time without compilation, waiting for every result."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ import numpy as np
 from pixelbrax_jax.compilation import compiler_options
 
 SECONDS = 90.0
-"""About how long the runs of a comparison take altogether."""
+"""Approximate total duration of a comparison."""
 REPETITIONS = 5
 REPETITION_SECONDS = 0.5
-"""Least duration of a repetition."""
+"""Minimum duration of a repetition."""
 
 Name = TypeVar("Name")
 
@@ -23,7 +23,7 @@ Name = TypeVar("Name")
 def compiled(
     env: Any, function: Callable, *arguments: Any, **jit_options: Any
 ) -> tuple[Any, float]:
-    """Return an environment's compiled program and the seconds to trace and compile it."""
+    """Return the compiled function and the seconds to trace and compile it."""
     started = time.perf_counter()
     jitted = jax.jit(function, compiler_options=compiler_options(env), **jit_options)
     program = jitted.lower(*arguments).compile()
@@ -31,7 +31,7 @@ def compiled(
 
 
 def rate(run: Callable[[int], Any], least_calls: int = 1) -> dict[str, float]:
-    """Measure calls per second of what does so many calls and returns something to wait for."""
+    """Measure calls per second; ``run(n)`` makes n calls and returns arrays to wait for."""
     calls = least_calls
     _seconds(run, calls)
     while (seconds := _seconds(run, calls)) < REPETITION_SECONDS:
@@ -55,10 +55,9 @@ def _seconds(run: Callable[..., Any], *arguments: Any) -> float:
 def take_interleaved(
     runners: Mapping[Name, Callable[[], Any]], seconds: float = SECONDS
 ) -> dict[Name, list[float]]:
-    """Measure the seconds of each runner's runs, one in each of 5 to 300 rounds.
+    """Measure each runner's seconds in 5 to 300 rounds, about ``seconds`` in total.
 
-    When the machine slows down it does so for all, so that ratios hold where speeds do not. Each
-    round has an order of its own. All runs take about ``seconds`` altogether.
+    Each round runs all in random order, so a slower machine affects all alike and ratios hold.
     """
     for run in runners.values():
         run()
@@ -75,9 +74,8 @@ def take_interleaved(
 def speed_ratio(seconds: list[float], standard: list[float]) -> dict[str, Any]:
     """Compare a runner with a standard, round by round.
 
-    Returns:
-        ``ratio``, the median over the rounds, more than 1 for the faster; ``interval``, the
-        bounds of its bootstrap interval of 95 %; and ``runs``.
+    Returns ``ratio``, the median over rounds, above 1 if the runner is faster; ``interval``, its
+    95 % bootstrap interval; and ``runs``, the number of rounds.
     """
     ratios = np.divide(standard, seconds)
     drawn = np.random.default_rng(0).choice(ratios, (2000, len(ratios)))

@@ -1,7 +1,4 @@
-"""One case in this process: ``python -m pixelbrax_gym.bench.worker MODULE.FUNCTION ARGUMENTS``.
-
-The result is the last line of the output, as JSON.
-"""
+"""Run one case: ``python -m pixelbrax_gym.bench.worker MODULE.FUNCTION ARGUMENTS``."""
 
 from __future__ import annotations
 
@@ -15,14 +12,14 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
 def main() -> None:
-    """Measure, and write what was found."""
+    """Call the function with the arguments, given as JSON, and write its result as a JSON line."""
     module, _, function = sys.argv[1].rpartition(".")
     result = getattr(importlib.import_module(module), function)(**json.loads(sys.argv[2]))
     sys.stdout.write(json.dumps({"values": result, "peak_bytes": peak_bytes()}) + "\n")
 
 
 def peak_bytes() -> dict[str, int | None]:
-    """Most memory that this process has held, on the host and on its device; None if unknown."""
+    """Return the peak memory of this process on host and device in bytes; None if unknown."""
     import jax
 
     device = jax.devices()[0].memory_stats() or {}

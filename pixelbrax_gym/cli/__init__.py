@@ -1,8 +1,4 @@
-"""The command ``pixelbrax``.
-
-Every module here is a command of that name: the first line of its docstring is its line in
-``pixelbrax --help``, and its ``run(arguments)`` returns the exit status.
-"""
+"""Run ``pixelbrax COMMAND``: each module is a command, described by its docstring's first line."""
 
 from __future__ import annotations
 
@@ -25,22 +21,18 @@ Options = TypeVar("Options")
 
 
 class CommandError(Exception):
-    """What a command reports in one line, of an error that has another type."""
+    """An error that a command reports in one line, without a traceback."""
 
 
 class UsageError(Exception):
-    """Options do not go together; the message names the fix."""
+    """Options that cannot be combined."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command.
+    """Run a command; ``arguments`` defaults to the arguments of this process.
 
-    Args:
-        arguments: of the command line; None means those of this process.
-
-    Returns:
-        The exit status: 0 when all is well, 1 for an error, 2 for a wrong command line, and 128
-        plus its number for a signal to stop, as shells have it: 130 for Ctrl-C.
+    The exit status is 0 for success, 1 for an error, 2 for a wrong command line and 128 plus the
+    signal's number after a signal to stop, as in shells: 130 for Ctrl-C.
     """
     first, *rest = (sys.argv[1:] if arguments is None else arguments) or [""]
     if first in ("-h", "--help"):
@@ -75,26 +67,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def say(command: str, message: object) -> None:
-    """Write a line to stderr, if anybody is left to read it."""
+    """Write a line to stderr unless it is closed."""
     with suppress(OSError, ValueError):
         sys.stderr.write(f"pixelbrax {command}: {message}\n")
 
 
 def commands() -> list[str]:
-    """Return the names of all commands."""
+    """List the names of all commands."""
     return sorted(found.name for found in iter_modules(__path__) if not found.name.startswith("_"))
 
 
 def parse(command: str, kind: type[Options], arguments: Sequence[str]) -> Options:
-    """Return a command's options.
+    """Parse the arguments after a command's name into the dataclass ``kind``.
 
-    Args:
-        command: its name.
-        kind: a dataclass: its docstring describes the command, and each field is an option.
-        arguments: those behind the command's name.
+    The docstring of ``kind`` describes the command, and each field is an option.
 
     Raises:
-        SystemExit: an option or its value is unknown, or help is asked for.
+        SystemExit: an option or its value is unknown, or help is requested.
     """
     import tyro
 
@@ -103,7 +92,7 @@ def parse(command: str, kind: type[Options], arguments: Sequence[str]) -> Option
 
 @contextmanager
 def needs_extra(name: str) -> Iterator[None]:
-    """Have an ImportError say how to install what is missing."""
+    """Add the ``pip install`` line of an extra to an ImportError."""
     try:
         yield
     except ImportError as error:
@@ -124,10 +113,7 @@ def _help() -> str:
 
 
 def _find_modules_here() -> None:
-    """Let modules with tasks of the user's be found in the current folder, as `python -m` does.
-
-    It comes last, so that no file in it hides a library.
-    """
+    """Search the current folder for the user's modules, last so that no file hides a library."""
     with suppress(OSError):  # the folder is deleted
         if not {"", (here := str(Path.cwd()))}.intersection(sys.path):
             sys.path.append(here)
@@ -135,7 +121,7 @@ def _find_modules_here() -> None:
 
 @contextmanager
 def _warnings_of(command: str) -> Iterator[None]:
-    """Write warnings in one line, without the line of source that raises them."""
+    """Write each warning in one line, without its source."""
 
     def show(message: Warning | str, *_: Any, **__: Any) -> None:
         say(command, message)
@@ -148,7 +134,7 @@ def _warnings_of(command: str) -> Iterator[None]:
 
 
 def _flush(stream: Any) -> None:
-    """Empty a stream, or give up its text: Python would exit with 120 on account of it."""
+    """Flush a stream; drop its text if that fails, because Python would then exit with 120."""
     try:
         stream.flush()
     except ValueError:  # It is closed.

@@ -1,4 +1,4 @@
-"""Measure this machine."""
+"""Measure the speed of this machine."""
 
 from __future__ import annotations
 
@@ -22,28 +22,27 @@ from pixelbrax_jax.stop_signals import signal_name
 class Options:
     """Measures renderer, environments and adapters on this machine, in two to three minutes.
 
-    Writes JSON, a page of tables and a plot. What has been measured is kept: a run that was stopped
-    goes on where it was.
+    Writes JSON, a page of tables and a plot. A stopped run continues where it stopped.
     """
 
     full: bool = False
-    """More tasks, batches and looks; hours on a CPU."""
+    """Measures more tasks, batches and looks, which takes hours on a CPU."""
     output_dir: Path = Path("runs/bench")
-    """Where results are kept."""
+    """Folder for the results."""
     only: tuple[Literal["renderer", "environments", "adapters"], ...] = ()
-    """Parts to measure; all by default."""
+    """Measures only these parts; default: all."""
     task: tuple[
         Literal["inverted_pendulum", "halfcheetah", "walker2d", "ant", "humanoid"], ...
     ] = ()
-    """Only cases of these tasks."""
+    """Measures only cases of these tasks."""
     max_envs: int | None = None
-    """Only cases of at most so many environments."""
+    """Skips cases with more environments than this."""
     again: bool = False
-    """Measure anew what has been measured."""
+    """Repeats cases that already have a result."""
     timeout: float = 900.0
-    """Seconds of one case at most."""
+    """Time limit of one case in seconds."""
     list: bool = False
-    """List the cases and stop."""
+    """Lists the cases and exits."""
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -56,15 +55,15 @@ def run(arguments: Sequence[str]) -> int:
 
 
 def measure_groups(options: Options, groups: Mapping[str, Group], chosen: Sequence[str]) -> int:
-    """Measure the chosen groups as the options say, and tell where the results are.
+    """Measure the chosen groups and print the paths of the results.
 
-    The exit status is 1 if a case failed for another reason than memory or something absent.
+    The exit status is 1 if a case failed, but 0 if it only ran out of memory or was absent.
     """
     from pixelbrax_gym.bench.runner import measure_all
 
     cases = [case for name in chosen for case in groups[name].cases() if _fits(case, options)]
     if not cases:
-        raise ValueError("no case fits --task and --max-envs")
+        raise ValueError("no case fits --task and --max-envs; --list shows all cases")
     if options.list:
         sys.stdout.write("".join(f"{case.key}\n" for case in cases))
         return 0
@@ -75,7 +74,7 @@ def measure_groups(options: Options, groups: Mapping[str, Group], chosen: Sequen
     except KeyboardInterrupt as stopped:
         number = stopped.args[0] if stopped.args else signal.SIGINT
         sys.stderr.write(
-            f"\nstopped by {signal_name(number)}; the same command goes on from here\n"
+            f"\nstopped by {signal_name(number)}; run the same command again to continue\n"
         )
         return int(128 + number)
     except (RuntimeError, SubprocessError) as error:

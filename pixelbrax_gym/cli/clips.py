@@ -1,4 +1,4 @@
-"""Prepare the videos of a distractor, and show them."""
+"""Prepare and list the clips of a video distractor."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from pixelbrax_gym.cli import parse
 
 @dataclass(frozen=True)
 class Options:
-    """Reads, caches and lists the clips of a folder, or makes procedural ones.
+    """Reads, caches and lists the clips of a folder, or generates procedural clips.
 
-    The folder may be DAVIS-2017, or have video files or folders of images.
+    The folder is DAVIS-2017, or contains video files or folders of images.
     """
 
     source: Annotated[Positional[str], arg(metavar="FOLDER")]
-    """A folder, or 'procedural'."""
+    """Folder of the clips, or 'procedural'."""
     split: str = "train"
-    """train, test or another split of the folder."""
+    """Split of the clips: train, test or another split of the folder."""
     size: int = 84
-    """Pixels, square."""
+    """Height and width of the frames in pixels."""
     num_clips: int | None = None
-    """Only the first ones."""
+    """Reads only the first clips, this many; default: all."""
     cache_dir: str | None = None
-    """Where clips are cached; $PIXELBRAX_CACHE or ~/.cache/pixelbrax by default."""
+    """Folder of the cache; default: $PIXELBRAX_CACHE or ~/.cache/pixelbrax."""
     sheet: str | None = None
-    """Write a contact sheet to this image file."""
+    """Writes a contact sheet to this image file."""
 
 
 def run(arguments: Sequence[str]) -> int:

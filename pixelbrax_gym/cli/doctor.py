@@ -1,4 +1,4 @@
-"""Check whether JAX and PyTorch work together here, and how to fix what does not."""
+"""Check that JAX and PyTorch work together on this machine."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from pixelbrax_gym.cli import parse
 
 @dataclass(frozen=True)
 class Options:
-    """Tells whether JAX and PyTorch see the same device and share frames, and how to fix it if not.
+    """Checks that JAX and PyTorch see the same device and share frames; prints a fix if not.
 
-    Exits with 1 if there is a problem.
+    Exits with 1 if it finds a problem.
     """
 
 

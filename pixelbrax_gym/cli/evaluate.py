@@ -19,35 +19,35 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class AgentOptions:
-    """Which trained agent."""
+    """Options that select a trained agent."""
 
     folder: Annotated[Positional[str | None], arg(metavar="FOLDER")] = None
-    """Output folder of a training run."""
+    """Output folder of the training run."""
     pretrained: str | None = None
-    """In its place a policy that comes with the package, as halfcheetah."""
+    """Loads a policy of the package instead, by its task, such as halfcheetah."""
     steps: int | None = None
-    """Of which checkpoint; the latest by default."""
+    """Loads the checkpoint of this many steps; default: the latest."""
     clips: str | None = None
-    """Folder of the clips, where it is not that of the training; for train it must hold the same
+    """Folder of the clips; default: the folder used in training. Split train needs the same
     clips."""
     best: bool = False
-    """Take the best checkpoint."""
+    """Loads the best checkpoint."""
     run_index: Annotated[int, arg(name="run")] = 0
-    """Which of the runs of --seeds, from 0."""
+    """Index of the run among those of --seeds, from 0."""
 
 
 @dataclass(frozen=True)
 class Options(AgentOptions):
-    """Plays whole episodes of a checkpoint, and writes a line of JSON for each split.
+    """Plays whole episodes with a checkpoint and writes a line of JSON for each split.
 
-    Actions are the means of the policy, and the episodes the same every time.
+    Actions are the policy's means. Every call plays the same episodes.
     """
 
     episodes: int = 32
-    """Of each split."""
+    """Number of episodes of each split."""
     split: tuple[Literal["clean", "train", "test"], ...] = ()
-    """By default clean, with distractors train too, and test where there are clips that training
-    never shows."""
+    """Splits to evaluate; default: clean, with distractors also train, and test if it has clips
+    that training does not show."""
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -69,11 +69,11 @@ def run(arguments: Sequence[str]) -> int:
 
 
 def load(options: AgentOptions) -> Trained:
-    """Return the agent that options choose.
+    """Load the agent that the options select.
 
     Raises:
-        CommandError: there is no such checkpoint.
-        ValueError: options do not go together, or are out of range.
+        CommandError: the checkpoint does not exist.
+        ValueError: options cannot be combined or are out of range.
     """
     with needs_extra("train"):
         from pixelbrax_jax.agents.runner.checkpoint import CheckpointError

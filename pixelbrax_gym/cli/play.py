@@ -1,4 +1,4 @@
-"""See a task as an agent sees it."""
+"""Show a task in a window or write it to a file."""
 
 from __future__ import annotations
 
@@ -21,48 +21,49 @@ if TYPE_CHECKING:
     from pixelbrax_gym.gymnasium.env import GymnasiumEnv
 
 ENV_OPTIONS = ("backend", "camera", "look", "shadows", "distractors", "clips", "split")
-"""Options of an environment that the command takes; one that is not given stays as it is."""
+"""Environment options of the command; those not given keep their defaults."""
 
 Act = Callable[[np.ndarray], np.ndarray]
-"""Gives an (A,) float32 action for an (H, W, 3 K) uint8 observation."""
+"""Maps an (H, W, 3 K) uint8 observation to an (A,) float32 action."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """Plays a task in a window, or into an animated image where there is no display."""
+    """Plays a task in a window, or writes an animated image if there is no display."""
 
     task: Annotated[Positional[str], arg(metavar="TASK")]
-    """As ant; 'pixelbrax tasks' lists them; or MODULE:NAME, which imports the module first."""
+    """Name of a task, such as ant ('pixelbrax tasks' lists all), or MODULE:NAME, which imports the
+    module first."""
     policy: Literal["random", "zero", "pretrained"] = "random"
-    """Who acts; pretrained comes with the package for some tasks."""
+    """Policy that selects the actions; the package has pretrained policies for some tasks."""
     backend: str | None = None
-    """Of the physics."""
+    """Physics backend; default: the task's own."""
     camera: str | None = None
-    """As top; an unknown one lists those of the task."""
+    """Name of a camera, such as top; an unknown name lists the task's cameras."""
     look: str | None = None
-    """default, original or dmc."""
+    """Light, sky and ground: default, original or dmc."""
     shadows: bool = False
-    """Geoms cast shadows."""
+    """Renders shadows."""
     distractors: tuple[str, ...] = ()
-    """Such as dcs-easy, or paper-color."""
+    """Distractors or presets of them, such as dcs-easy or paper-color."""
     clips: str | None = None
-    """Of videos: procedural, or a folder."""
+    """Clips of video distractors: a folder, or procedural."""
     split: str | None = None
-    """Of the clips: train, test, ..."""
+    """Split of the clips: train, test or another split of the folder."""
     observation: bool = False
-    """Show the observation's own pixels, enlarged."""
+    """Shows the pixels of the observation, enlarged."""
     size: int = 336
-    """Pixels, square."""
+    """Height and width of the image in pixels."""
     seed: int = 0
-    """Of the episodes."""
+    """Seed of the episodes and of random actions."""
     gif: str | None = None
-    """Write this .gif or .mp4, and open no window."""
+    """Writes this .gif or .mp4 instead of opening a window."""
     num_frames: int = 200
-    """Of the file."""
+    """Number of frames in the file."""
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Run the command. Ctrl-C leaves a whole file."""
+    """Run the command; after Ctrl-C the file is complete."""
     options = parse("play", Options, arguments)
     from pixelbrax_jax.video import NO_WRITER, write_frames
 
@@ -79,7 +80,7 @@ def run(arguments: Sequence[str]) -> int:
     if written and None in map(find_spec, ("imageio_ffmpeg", "PIL")):
         raise ImportError(f"{lacking}; {NO_WRITER}" if lacking else NO_WRITER)
     if lacking:
-        say("play", f"{lacking}; writing {written} in its place")
+        say("play", f"{lacking}; writing {written} instead")
     say("play", "compiling, which may take two minutes")
     shown = images(env, act, options.seed, options.size if options.observation else None)
     fps = env.metadata["render_fps"]
@@ -92,10 +93,9 @@ def run(arguments: Sequence[str]) -> int:
 
 
 def images(env: GymnasiumEnv, act: Act, seed: int, observed: int | None) -> Iterator[np.ndarray]:
-    """Play for ever, and yield (H, W, 3) uint8 images.
+    """Yield (H, W, 3) uint8 images of endless episodes, as ``render`` returns them.
 
-    They are what ``render`` draws; or, ``observed``, the newest frame of the observation, enlarged
-    by a whole factor to about so many pixels.
+    With ``observed``, yield the observation's newest frame, enlarged to about that many pixels.
     """
     obs, _ = env.reset(seed=seed)
     while True:
@@ -151,10 +151,10 @@ def _show(shown: Iterator[np.ndarray], fps: int, title: str) -> None:
 
 
 def _why_no_window() -> str:
-    """Say why no window can be opened; nothing if one can."""
+    """Return why a window cannot be opened; empty if it can."""
     if find_spec("pygame") is None:
-        return f"no window, for pygame is missing; try: {install_extra('human')}"
+        return f"cannot open a window, pygame is not installed; try: {install_extra('human')}"
     known = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
     if sys.platform == "linux" and not any(map(os.environ.get, known)):
-        return "no window, for there is no display"
+        return "cannot open a window, there is no display"
     return ""

@@ -1,4 +1,4 @@
-"""Make a video of a trained agent."""
+"""Record a video of a trained agent."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from pixelbrax_gym.cli.evaluate import AgentOptions, load
 
 @dataclass(frozen=True)
 class Options(AgentOptions):
-    """Plays several episodes of a checkpoint side by side and writes an MP4."""
+    """Plays several episodes with a checkpoint side by side and writes a video."""
 
     output: str | None = None
-    """An .mp4 or .gif; videos/<steps>_<split>.mp4 in the folder by default."""
+    """Path of the .mp4 or .gif; default: videos/<steps>_<split>.mp4 in the folder."""
     split: str | None = None
-    """clean, train or test; by default train, or clean without distractors."""
+    """Split: clean, train or test; default: train, or clean without distractors."""
     grid: int = 3
-    """Episodes a side."""
+    """Rows and columns of episodes."""
     size: int = 168
-    """Pixels of one episode, square."""
+    """Height and width of one episode in pixels."""
     num_frames: int = 300
-    """At most."""
+    """Maximum number of frames."""
     seed: int = 0
-    """Of the episodes."""
+    """Seed of the episodes."""
 
 
 def run(arguments: Sequence[str]) -> int:

@@ -24,5 +24,5 @@ def run(arguments: Sequence[str]) -> int:
     for name, row in TASKS.items():
         sys.stdout.write(f"{name:{width}}  {row.gymnasium_id}: {row.summary}\n")
     if find_spec("dm_control") is None:
-        say("tasks", f"those named dmc need dm_control: {install_extra('dmc')}")
+        say("tasks", f"tasks named dmc need dm_control: {install_extra('dmc')}")
     return 0

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, make_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_type_hints
@@ -21,24 +20,28 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class First:
-    """What is known before the settings: which defaults they have, and which devices there are."""
+class Launch:
+    """Options that start a run."""
 
     preset: str = "default"
-    """Set of defaults."""
-    task: str | None = None
-    """Task, which a preset may have settings for."""
+    """Named settings, such as cpu; they change the defaults of all other options."""
     cpu_devices: int | None = None
-    """Spread the environments over so many emulated devices, one a core, without an accelerator."""
+    """Emulates this many devices on a CPU and distributes the environments over them; use one per
+    core."""
     coordinator: str | None = None
-    """host:port of process 0, of several processes that share the run."""
+    """HOST:PORT of process 0 in a run with several processes."""
     num_processes: int | None = None
-    """How many processes share the run."""
+    """Number of processes."""
     process_id: int | None = None
-    """Which of them this is, from 0."""
+    """Index of this process, from 0."""
 
     def start(self) -> None:
-        """Emulate devices, and join the other processes."""
+        """Configure JAX's devices and processes.
+
+        Raises:
+            UsageError: options for several processes are incomplete.
+            ValueError: ``cpu_devices`` is not positive, or JAX has already started.
+        """
         import jax
 
         if self.cpu_devices is not None:
@@ -47,68 +50,82 @@ class First:
                 jax.config.update("jax_num_cpu_devices", self.cpu_devices)
             except RuntimeError as error:
                 raise ValueError(
-                    f"--cpu-devices {self.cpu_devices} comes too late: JAX is at work in this "
-                    "process."
+                    f"--cpu-devices {self.cpu_devices} comes too late: JAX has already started in "
+                    "this process. Start a new one."
                 ) from error
-        if self.coordinator is not None:
-            jax.distributed.initialize(self.coordinator, self.num_processes, self.process_id)
+        spread = (self.coordinator, self.num_processes, self.process_id)
+        if None not in spread:
+            jax.distributed.initialize(*spread)
+        elif any(given is not None for given in spread):
+            raise UsageError("--coordinator, --num-processes and --process-id belong together")
+
+
+@dataclass(frozen=True)
+class _First:
+    """Options that select the defaults of all others."""
+
+    preset: str = "default"
+    task: str | None = None
+
+
+def _first(arguments: Sequence[str]) -> _First:
+    first, _ = tyro.cli(_First, args=arguments, return_unknown_args=True, add_help=False)
+    return first
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Run the command.
-
-    Returns:
-        The exit status; 128 plus its number after a signal that stopped the run.
-    """
+    """Run the command."""
     with needs_extra("train"):
         from pixelbrax_jax.agents.on_policy.presets import PRESETS
         from pixelbrax_jax.agents.registry import ALGORITHMS
-        from pixelbrax_jax.agents.runner import train
-    algorithms, presets = ",".join(ALGORITHMS), ",".join(PRESETS)
+        from pixelbrax_jax.agents.runner.checkpoint import CheckpointError, latest_steps
+        from pixelbrax_jax.agents.runner.train import TrainingDivergedError, train
+    import jax
+
+    names = ",".join(ALGORITHMS)
     if not arguments or arguments[0] in ("-h", "--help"):
         sys.stdout.write(
-            f"usage: pixelbrax train {{{algorithms}}} [--preset {{{presets}}}] [options]\n\n"
+            f"usage: pixelbrax train {{{names}}} [--preset {{{','.join(PRESETS)}}}] [options]\n\n"
             "All options: pixelbrax train ppo --help\n"
         )
         return 0
     algorithm, *rest = arguments
     if algorithm.startswith("-"):
         raise UsageError(
-            f"name an algorithm first, as in 'pixelbrax train ppo {algorithm} ...'; there are "
-            f"{algorithms.replace(',', ', ')}"
+            f"name an algorithm first, as in 'pixelbrax train ppo {algorithm} ...'; known "
+            f"algorithms: {', '.join(ALGORITHMS)}"
         )
-    first, rest = read_first(rest)
     try:
         check_choice("algorithm", algorithm, ALGORITHMS)
-        check_choice("preset", first.preset, PRESETS)
+        check_choice("preset", _first(rest).preset, PRESETS)
     except ValueError as error:
         raise UsageError(str(error)) from error
-    spread = (first.coordinator, first.num_processes, first.process_id)
-    if None in spread and any(given is not None for given in spread):
-        raise UsageError("--coordinator, --num-processes and --process-id belong together")
-    first.start()
-    config, options = settings(algorithm, first, rest)
-    with _errors(options):
-        outcome = train.train(config, options, _report)
-        return 128 + outcome.signal if outcome.interrupted else 0
+    launch, config, options = parse(algorithm, rest)
+    launch.start()
+    try:
+        outcome = train(config, options, _report)
+    except (CheckpointError, TrainingDivergedError, jax.errors.JaxRuntimeError) as error:
+        raise CommandError(str(error)) from error
+    except KeyboardInterrupt:
+        kept = "there is no checkpoint"
+        if (latest := latest_steps(Path(options.output_dir) / "checkpoints")) is not None:
+            kept = f"continue from the checkpoint of {latest} steps with --resume latest"
+        say("train", f"stopped at once; {kept}")
+        raise
+    return 128 + outcome.signal if outcome.interrupted else 0
 
 
-def read_first(arguments: Sequence[str]) -> tuple[First, list[str]]:
-    """Return what is known before the settings, and the other arguments."""
-    return tyro.cli(
-        First, prog="pixelbrax train", args=arguments, return_unknown_args=True, add_help=False
-    )
+def _report(line: str) -> None:
+    """Write a line above the progress bar."""
+    import jax
+    from tqdm import tqdm
+
+    if jax.process_index() == 0:
+        tqdm.write(line, file=sys.stderr)
 
 
-def settings(
-    algorithm: str, first: First, arguments: Sequence[str]
-) -> tuple[TrainConfig, RunConfig]:
-    """Return settings of an algorithm and of the run, from options over a preset.
-
-    Args:
-        algorithm: its name.
-        first: the preset, and the task that it may have settings for.
-        arguments: other options, as ``--num-envs 64``.
+def parse(algorithm: str, arguments: Sequence[str]) -> tuple[Launch, TrainConfig, RunConfig]:
+    """Parse the options of an algorithm, such as ``--preset cpu --num-envs 64``.
 
     Raises:
         ValueError: a setting is out of range.
@@ -117,33 +134,31 @@ def settings(
     from pixelbrax_jax.agents.on_policy.presets import PRESETS, preset
     from pixelbrax_jax.agents.runner.settings import RunConfig
 
-    defaults = {
+    # Defaults are those of a preset, which may be those of a task.
+    first = _first(arguments)
+    parts: dict[str, Any] = {
+        "launch": Launch(first.preset),
         "config": preset(algorithm, first.preset, first.task),
         "options": RunConfig(output_dir=f"runs/{algorithm}"),
     }
-    # One flat list of options for both.
+    # One flat list of options for all.
     flat: Any = tyro.conf.OmitArgPrefixes
     command: Any = make_dataclass(
-        "Train", [(name, flat[type(value)]) for name, value in defaults.items()]
+        "Train", [(part, flat[type(value)]) for part, value in parts.items()]
     )
     with _names_for_objects():
         parsed = tyro.cli(
             command,
             prog=f"pixelbrax train {algorithm}",
-            description=(
-                f"Trains {algorithm.upper()} from pixels. --preset {{{','.join(PRESETS)}}} changes "
-                "the defaults; --cpu-devices D spreads the environments over D emulated devices, "
-                "one a core, on a machine without an accelerator; --coordinator HOST:PORT "
-                "--num-processes P --process-id I spreads a run over P processes."
-            ),
-            default=command(**defaults),
-            args=[*arguments, *(["--task", first.task] if first.task else [])],
+            description=f"Trains {algorithm.upper()} from pixels; presets: {', '.join(PRESETS)}.",
+            default=command(**parts),
+            args=arguments,
         )
-    return parsed.config, parsed.options
+    return parsed.launch, parsed.config, parsed.options
 
 
 def _names_for_objects() -> ConstructorRegistry:
-    """Return a context in which options may be names that in Python may be objects."""
+    """Return a context that parses options that may be objects in Python as names."""
     from pixelbrax_jax.config import EnvConfig
 
     types, registry = get_type_hints(EnvConfig), ConstructorRegistry()
@@ -173,32 +188,3 @@ def _names_for_objects() -> ConstructorRegistry:
         )
 
     return registry
-
-
-@contextmanager
-def _errors(options: RunConfig) -> Iterator[None]:
-    """Have what may end a run reported in one line."""
-    import jax
-
-    from pixelbrax_jax.agents.runner.checkpoint import CheckpointError, latest_steps
-    from pixelbrax_jax.agents.runner.train import TrainingDivergedError
-
-    try:
-        yield
-    except (CheckpointError, TrainingDivergedError, jax.errors.JaxRuntimeError) as error:
-        raise CommandError(str(error)) from error
-    except KeyboardInterrupt:
-        kept = "there is no checkpoint"
-        if (latest := latest_steps(Path(options.output_dir) / "checkpoints")) is not None:
-            kept = f"go on from the checkpoint of {latest} steps with --resume latest"
-        say("train", f"stopped at once; {kept}")
-        raise
-
-
-def _report(line: str) -> None:
-    """Write a line of a run above the bar."""
-    import jax
-    from tqdm import tqdm
-
-    if jax.process_index() == 0:
-        tqdm.write(line, file=sys.stderr)

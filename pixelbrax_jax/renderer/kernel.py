@@ -50,7 +50,7 @@ def draw(scene: Scene, height: int, width: int, change: Callable[[Frame], jax.Ar
 
     A change that is made pixel by pixel is part of the kernel.
     """
-    plane = jax.ShapeDtypeStruct((height, width), jnp.float32)
+    plane: Any = jax.ShapeDtypeStruct((height, width), jnp.float32)
     seg, ground = plane.update(dtype=jnp.int32), plane.update(dtype=bool)
     by_pixel = per_pixel(change, Frame(plane, plane, plane, plane, seg, ground))
     if by_pixel is None:

@@ -102,7 +102,12 @@ class PerPixel:
             return self.read(eqn.params["jaxpr"], operands)
         if any(isinstance(x, _Pixel) for x in operands):
             return [self._add(eqn, operands)]
-        results = bind(eqn, *operands)
+        if operands and all(isinstance(x, np.generic) for x in operands):
+            with jax.ensure_compile_time_eval():
+                results = bind(eqn, *operands)
+            results = [np.asarray(x)[()] for x in results]
+        else:
+            results = bind(eqn, *operands)
         if eqn.primitive.name == "broadcast_in_dim" and jnp.ndim(operands[0]) == 0:
             self._scalars[id(results[0])] = (results[0], operands[0])
         elif self._is_elementwise(eqn):
@@ -125,7 +130,7 @@ class PerPixel:
         if isinstance(x, _Pixel):
             return x
         _, x = self._scalars.get(id(x), (x, x))
-        if not isinstance(x, jax.Array) and jnp.ndim(x) == 0:
+        if isinstance(x, np.generic):
             return _Given("constant", x)
         if id(x) not in self._found:
             self._found[id(x)] = (x, self._find(x))
@@ -135,10 +140,10 @@ class PerPixel:
         if id(x) in self._equations:
             with suppress(_NotPerPixelError):  # then the image itself may be read
                 return self._add(*self._equations[id(x)][1:])
-        if x.shape not in ((), self.shape) or x.dtype.name not in _DTYPES[:-1]:
+        if x.dtype.name not in _DTYPES[:-1]:
             raise _NotPerPixelError
         group, array = ("image", self.images) if x.shape else ("number", self.numbers)
-        array.append(x)
+        array.append(jnp.broadcast_to(x, self.shape) if x.shape else x)
         return _Given(group, len(array) - 1)
 
 

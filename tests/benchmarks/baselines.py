@@ -43,11 +43,7 @@ def untrained(settings: dict, episodes: int = 256) -> dict:
 
 
 def play_baselines(configs: dict[str, dict]) -> None:
-    """Play where it is not known yet.
-
-    Args:
-        configs: a run's settings, by `results.task_key`.
-    """
+    """Play where it is not known yet."""
     known = json.loads(KEPT.read_text()) if KEPT.exists() else {}
     for name, config in configs.items():
         settings = {setting: config[setting] for setting in SETTINGS}

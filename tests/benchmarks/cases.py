@@ -34,11 +34,7 @@ DM_CONTROL = {
 
 @dataclass(frozen=True)
 class PeerCase(Case):
-    """A script that measures another simulator, in an environment of that one's own.
-
-    Attributes:
-        peer: its name in ``peers.install.PEERS``; empty for one that is installed beside us.
-    """
+    """A script that measures another simulator, in an environment of that one's own."""
 
     peer: str = ""
 

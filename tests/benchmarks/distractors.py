@@ -39,14 +39,6 @@ def compare(task: str, num_envs: int, seconds: float = SECONDS) -> list[dict[str
 
     The environment without any takes part twice: what lies between the two is not the cost of
     a distractor.
-
-    Args:
-        task: the task.
-        num_envs: environments of each.
-        seconds: about how long all take altogether, compilation apart.
-
-    Returns:
-        One entry for each; ``ratio`` is to the first.
     """
     clips, runs = noise_clips(), {}
     for name, links in chains().items():

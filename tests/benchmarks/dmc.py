@@ -21,14 +21,6 @@ def pixels(task: str, num_envs: int) -> dict[str, Any]:
 
     Two processes follow each other, each with its own clock from its start to the end of its first
     step. The first one finds an empty compilation cache, the second one that of the first.
-
-    Args:
-        task: the task.
-        num_envs: environments.
-
-    Returns:
-        ``steps_per_second`` over all environments, ``speed``, and ``first_frame``, the seconds
-        ``without`` and ``with`` compiled programs.
     """
     with tempfile.TemporaryDirectory() as folder:
         ours = ("JAX_COMPILATION", "JAX_ENABLE_COMPILATION")

@@ -7,10 +7,10 @@
     python -m tests.benchmarks.experiments --gpu                   those for a GPU in place of them
 
 A run that was cut short, by Ctrl-C or by --minutes, goes on from its checkpoint at the next call.
-Of a finished one docs/results/runs/<name>.json is kept; `tests.benchmarks.results` draws all of
-them, with the minutes that follow from the speed which `tests.benchmarks.pace` measures apart.
-Those in tasks of the DM Control Suite are kept in docs/dmc/runs, and `tests.benchmarks.dmc_page`
-draws them. The best policy of each of Brax's tasks goes into the package, for --pretrained.
+Of a finished one docs/results/runs/<name>.json is kept, or docs/dmc/runs/<name>.json of a task of
+the DM Control Suite; `tests.benchmarks.figures` draws all of them, with the minutes that follow
+from the speed that `tests.benchmarks.pace` measures apart. The best policy of each of Brax's tasks
+goes into the package, for --pretrained.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from pathlib import Path
 
 import pixelbrax_jax
 from pixelbrax_gym.bench.machine import describe_cpu
-from pixelbrax_gym.cli.train import read_first, settings
+from pixelbrax_gym.cli.train import parse
 from pixelbrax_jax.agents.config import TrainConfig
 from pixelbrax_jax.agents.on_policy.presets import TASK_SETTINGS, preset
 from pixelbrax_jax.agents.registry import ALGORITHMS
@@ -201,7 +201,7 @@ def run(arguments: list[str], folder: Path, until: float) -> int:
 def config_of(arguments: list[str]) -> TrainConfig:
     """The settings that a command gives."""
     _, algorithm, *line = arguments
-    return settings(algorithm, *read_first(line))[0]
+    return parse(algorithm, line)[1]
 
 
 def is_made(path: Path, arguments: list[str]) -> bool:

@@ -14,14 +14,6 @@ def install_packages(folder: Path, packages: tuple[str, ...], *commands: tuple[s
     """Run commands that install packages into a folder; tried once a process.
 
     A file in the folder names the packages that it has: with the same ones, nothing is run.
-
-    Args:
-        folder: where they go; the commands create it.
-        packages: their names, with versions.
-        *commands: programs with their arguments, one after the other.
-
-    Raises:
-        AbsentError: a command fails; the last line of its errors.
     """
     if why := _failure(folder, packages, commands):
         raise AbsentError(why)

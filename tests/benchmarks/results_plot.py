@@ -21,11 +21,6 @@ def draw(panels: dict[str, tuple[list[list[dict]], dict]], path: Path) -> None:
     """Return over steps: thin lines for seeds, a thick one for their mean, a band between them.
 
     Steps and not minutes, which depend on the machine.
-
-    Args:
-        panels: by title, runs that differ in their seeds alone, for each algorithm, and what is
-            earned without learning.
-        path: of the image.
     """
     figure, all_axes = plt.subplots(
         1, len(panels), figsize=(4 * len(panels), 3.4), layout="constrained", squeeze=False

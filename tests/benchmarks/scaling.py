@@ -18,14 +18,7 @@ from pixelbrax_jax.envs.sharded import ShardedVectorEnv, make_env_mesh
 
 
 def training(task: str, num_devices: int, cores: int, num_envs: int) -> dict[str, Any]:
-    """Iterations of PPO's preset ``ci`` with environments spread over emulated devices.
-
-    Args:
-        task: the task.
-        num_devices: devices; the benchmark has XLA emulate as many.
-        cores: of this machine, on which the process may run.
-        num_envs: environments on all devices together.
-    """
+    """Iterations of PPO's preset ``ci`` with environments spread over emulated devices."""
     allowed = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_setaffinity") else []
     if len(allowed) < cores:
         sys.stderr.write(f"there are {len(allowed)} cores to choose from, not {cores}\n")

@@ -29,7 +29,7 @@ def test_without_a_display_it_becomes_a_gif(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["play", TASK, *SHORT]) == 0
     told = capsys.readouterr()
-    assert "there is no display; writing inverted_pendulum.gif in its place" in told.err
+    assert "there is no display; writing inverted_pendulum.gif instead" in told.err
     assert told.out.strip() == str(tmp_path / "inverted_pendulum.gif")
     assert imageio.imread(tmp_path / "inverted_pendulum.gif", index=None).shape == (3, 40, 40, 3)
 

@@ -63,9 +63,6 @@ def install(platform: str) -> Path:
     """Install what is lacking, 600 MB for ``cuda`` and 500 MB for ``tpu``; return its folder.
 
     Nothing enters the environment that is running, whose JAX finds the plugins by ``PYTHONPATH``.
-
-    Raises:
-        AbsentError: there is no place for it, or pip cannot install it.
     """
     try:
         home = cache_folder() / "compilers"

@@ -25,17 +25,7 @@ PEERS: dict[str, tuple[str, ...]] = {
 
 
 def peer_python(peer: str) -> str:
-    """The Python that has the peer.
-
-    Args:
-        peer: a key of ``PEERS``.
-
-    Returns:
-        The path of the interpreter.
-
-    Raises:
-        AbsentError: the peer cannot be installed.
-    """
+    """The Python that has the peer."""
     home, wanted = HOME / peer, PEERS[peer]
     python = str(home / "bin" / "python")
     make = (sys.executable, "-m", "venv", str(home))

@@ -19,12 +19,7 @@ GYMNASIUM_IDS = {
 
 
 def speed_of(step: Callable[[], int], seconds: float) -> dict[str, float]:
-    """Steps per second over repetitions of so many seconds, after one that warms up.
-
-    Args:
-        step: steps once, and returns how many environments did.
-        seconds: of a repetition.
-    """
+    """Steps per second over repetitions of so many seconds, after one that warms up."""
     rates = []
     for repetition in range(1 + REPETITIONS):
         steps, started = 0, time.perf_counter()
