@@ -58,7 +58,7 @@ class Own(Algorithm):
         )
 
     def act(self, networks, pixels, key=None):
-        mean = jnp.broadcast_to(networks["policy"], (len(pixels), self.envs.env.action_size))
+        mean = jnp.broadcast_to(networks["policy"], (pixels.shape[0], self.envs.env.action_size))
         return mean if key is None else mean + jax.random.normal(key, mean.shape)
 
     def iterate(self, state, env_params):

@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 
 from pixelbrax_jax.agents.on_policy.dcpg import DCPG, Dynamics, dynamics_loss
-from pixelbrax_jax.agents.on_policy.losses import mean
 from pixelbrax_jax.agents.on_policy.phasic import Chunk
-from pixelbrax_jax.agents.on_policy.ppg import PPG
 from pixelbrax_jax.agents.rollout import observations
 from tests.agents.small import (
     AGENTS,
@@ -20,7 +18,6 @@ from tests.agents.small import (
     SMALL,
     Agent,
     assert_close,
-    ball_envs,
     same,
     small_agent,
 )
@@ -101,24 +98,6 @@ def test_steps_that_teach_nothing_change_no_auxiliary_phase(agent):
     returns = state.buffer.returns.at[1, t, i].add(1.0)
     other, _ = agent.auxiliary(state.replace(buffer=state.buffer.replace(returns=returns)))
     assert not same(other.networks["actor"], expected.networks["actor"])
-
-
-def test_the_policy_that_is_kept_has_no_gradient_at_first():
-    """The divergence from the policy before the phase is 0 there, and at its minimum."""
-
-    class KeepsPolicy(PPG):
-        def auxiliary_loss(self, networks, chunk, key):
-            policy = self.agent.actor(networks["actor"], chunk.pixels).policy
-            divergence = chunk.policy.kl_to(policy)
-            return mean(divergence, chunk.weight), {"kl": divergence.max()}
-
-    # Without steps every minibatch is a first one; a critic that is in no term has no gradient.
-    state = full(PPG_AGENT).replace(iteration=jnp.uint32(PPG_AGENT.config.num_iterations + 1))
-    after, facts = Agent(KeepsPolicy(PPG_AGENT.config, ball_envs())).auxiliary(state)
-    assert same(after.networks, state.networks)
-    assert abs(float(facts["kl"])) < 1e-6
-    assert float(facts["auxiliary/grad_norm/actor"]) < 1e-6
-    assert float(facts["auxiliary/grad_norm/critic"]) == 0.0
 
 
 def test_dcpg_s_value_stays_where_it_was_while_the_policy_learns():

@@ -19,17 +19,16 @@ from pixelbrax_jax.agents.networks.actor_critic import Actor, Critic
 from pixelbrax_jax.agents.on_policy.dcpg import DCPG, DCPGConfig
 from pixelbrax_jax.agents.on_policy.ppg import PPG, PPGConfig
 from pixelbrax_jax.agents.on_policy.ppo import PPO, PPOConfig
+from pixelbrax_jax.config import EnvConfig
 from tests.agents.probes import NAMES, TARGETS, TIME_LIMIT, Probes, true_values
 from tests.envs.toy import limited
 from tests.xla_flags import optimized
 
 GAMMA = 0.7
 PARAMS = limited(TIME_LIMIT)
+OPTIONS = {"height": 18, "width": 18, "frame_stack": 1}
 SHARED = {
-    "height": 18,
-    "width": 18,
-    "frame_stack": 1,
-    "episode_length": TIME_LIMIT,
+    "env": EnvConfig(**OPTIONS, episode_length=TIME_LIMIT),
     "encoder": "small",
     "num_envs": 16,
     "num_steps": 8,
@@ -53,8 +52,7 @@ AGENTS = {
 
 @pytest.fixture(scope="module")
 def envs():
-    options = {k: SHARED[k] for k in ("height", "width", "frame_stack")}
-    return VectorPixelEnv(PixelEnv(Probes(), **options), SHARED["num_envs"])
+    return VectorPixelEnv(PixelEnv(Probes(), **OPTIONS), SHARED["num_envs"])
 
 
 @pytest.fixture(scope="module")

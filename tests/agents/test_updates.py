@@ -53,14 +53,14 @@ def test_minibatches_find_the_policy_and_value_that_played(agent):
     assert float(facts["policy/clip_fraction"]) == 0.0
     # Other shapes of a batch may round in another way.
     assert abs(float(facts["policy/approx_kl"])) < 1e-6
-    if "loss/value_distill" in facts:
+    if "loss/value_distill" in facts and "target" not in state.networks:
         assert float(facts["loss/value_distill"]) < 1e-10
 
 
-def test_the_step_size_of_a_run_falls_along_a_line(agent):
-    state, rates = agent.init(), []
-    for _ in range(agent.config.num_iterations):
-        state, facts = agent.iterate(state)
+def test_the_step_size_of_a_run_falls_along_a_line():
+    state, rates = PPO_AGENT.init(), []
+    for _ in range(PPO_AGENT.config.num_iterations):
+        state, facts = PPO_AGENT.iterate(state)
         rates.append(float(facts["learning_rate"]))
     expected = SMALL["learning_rate"] * np.array([1.0, 0.8, 0.6, 0.4, 0.2])
     np.testing.assert_allclose(rates, expected, rtol=1e-5)

@@ -47,9 +47,6 @@ class Actor(nn.Module):
       standard deviation ``softplus`` of another one, clipped to [-10, 10], plus 0.001.
 
     Attributes:
-        encoder: name of the encoder.
-        action_size: length A of an action.
-        policy: name of the policy.
         initial_std: of ``"gaussian"`` and ``"tanh_gaussian"``.
         has_value: whether there is a value head.
     """
@@ -62,11 +59,9 @@ class Actor(nn.Module):
 
     @nn.compact
     def __call__(self, pixels: jax.Array, detach_value: bool = False) -> ActorOutput:
-        """Return the policy, and the value.
+        """Return the policy and value of (B, H, W, C) uint8 pixels.
 
-        Args:
-            pixels: (B, H, W, C) uint8.
-            detach_value: whether the value's gradient stops before the encoder.
+        With ``detach_value`` the value's gradient stops before the encoder.
         """
         features = ENCODERS[self.encoder]()(scaled(pixels))
         mean = dense(self.action_size, 0.01, "mean")(features)
@@ -87,12 +82,7 @@ class Actor(nn.Module):
 
 
 class Critic(nn.Module):
-    """The value of pixels, or of the simulator's state.
-
-    Attributes:
-        encoder: name of the encoder; unused when the critic sees the state.
-        sees_state: whether it sees the state and no pixels.
-    """
+    """The value of pixels, or of the simulator's state alone."""
 
     encoder: str
     sees_state: bool = False

@@ -176,9 +176,9 @@ class OnPolicy(Algorithm):
         """Return the samples of some times, (B, N) int32."""
         rollout, advantage, returns = experience
         pixels = observations(rollout.frames, times, self.config.random_shift)
-        weight = rollout.valid.astype(jnp.float32)
-        rows = (rollout.frames.state, *rollout.choice, advantage, returns, weight)
-        return Batch(pixels, *jax.tree.map(lambda rows: at_times(rows, times), rows))
+        rows = (rollout.frames.state, *rollout.choice, advantage, returns, rollout.valid)
+        *samples, valid = jax.tree.map(lambda rows: at_times(rows, times), rows)
+        return Batch(pixels, *samples, valid.astype(jnp.float32))
 
     def update(
         self,
@@ -231,24 +231,36 @@ class OnPolicy(Algorithm):
             )
             return (*keep, stopped | (metrics["policy/approx_kl"] > target_kl)), (metrics, used)
 
-        def epoch(carry: Any, key: jax.Array) -> tuple[Any, Any]:
-            parts = config.num_minibatches
-            order = minibatch_times(
-                jax.random.fold_in(key, 0), config.num_steps, config.num_envs, parts
-            )
-            keys = jax.random.split(jax.random.fold_in(key, 1), parts)
-            return jax.lax.scan(step, carry, (order, keys))
-
         networks = {name: state.networks[name] for name in state.opt_state}
         opt_state = {name: state.opt_state[name] for name in learners or state.opt_state}
         carry = (networks, opt_state, jnp.bool_(False))
-        keys = jax.random.split(key, num_epochs)
-        (networks, opt_state, _), (metrics, used) = jax.lax.scan(epoch, carry, keys)
+        (networks, opt_state, _), (metrics, used) = passes(
+            step, carry, key, num_epochs, config.num_steps, config.num_envs, config.num_minibatches
+        )
         metrics = {name: jnp.sum(x * used) / jnp.sum(used) for name, x in metrics.items()}
         state = state.replace(
             networks=state.networks | networks, opt_state=state.opt_state | opt_state
         )
         return state, metrics
+
+
+def passes(
+    step: Callable[[Any, tuple[jax.Array, jax.Array]], tuple[Any, Any]],
+    carry: Any,
+    key: jax.Array,
+    num_epochs: int,
+    num_steps: int,
+    num_envs: int,
+    parts: int,
+) -> tuple[Any, Any]:
+    """Scan ``step(carry, (times, key))`` over the minibatches of several epochs."""
+
+    def epoch(carry: Any, key: jax.Array) -> tuple[Any, Any]:
+        order = minibatch_times(jax.random.fold_in(key, 0), num_steps, num_envs, parts)
+        keys = jax.random.split(jax.random.fold_in(key, 1), parts)
+        return jax.lax.scan(step, carry, (order, keys))
+
+    return jax.lax.scan(epoch, carry, jax.random.split(key, num_epochs))
 
 
 def minibatch_times(key: jax.Array, num_steps: int, num_envs: int, parts: int) -> jax.Array:

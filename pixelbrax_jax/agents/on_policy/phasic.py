@@ -21,7 +21,7 @@ from pixelbrax_jax.agents.on_policy.algorithm import (
     Experience,
     OnPolicy,
     OnPolicyState,
-    minibatch_times,
+    passes,
 )
 from pixelbrax_jax.agents.on_policy.config import OnPolicyConfig
 from pixelbrax_jax.agents.on_policy.losses import mean, value_loss
@@ -169,7 +169,7 @@ class Phasic(OnPolicy):
     def auxiliary(self, state: OnPolicyState) -> tuple[OnPolicyState, Metrics]:
         """Pass over a full buffer with an optimiser of its own; metrics are means over steps."""
         config, optimizer, key = self.config, Optimizer(self.config), auxiliary_key(state)
-        num_minibatches = config.aux_minibatches
+        num_chunks = config.aux_minibatches
         # The step size of the rollout before: after the last one, that of the next would be 0.
         iteration = state.iteration - 1
 
@@ -179,12 +179,12 @@ class Phasic(OnPolicy):
             shape = (config.num_envs, chunk.num_steps, -1)
             return None, (policy.mean.reshape(shape), policy.std.reshape(shape))
 
-        _, old = jax.lax.scan(old_policy, None, jnp.arange(num_minibatches))
+        _, old = jax.lax.scan(old_policy, None, jnp.arange(num_chunks))
         squash = config.policy == "tanh_gaussian"
 
         def step(carry: Any, inputs: tuple[jax.Array, jax.Array]) -> tuple[Any, Metrics]:
             networks, opt_state = carry
-            which, key = inputs
+            (which,), key = inputs
             mean, std = (_of_each(x, which) for x in old)
             chunk = self._chunk(state.buffer, which, Normal(mean, std, squash))
             gradients, metrics = jax.grad(self.auxiliary_loss, has_aux=True)(networks, chunk, key)
@@ -193,16 +193,11 @@ class Phasic(OnPolicy):
             metrics |= {f"auxiliary/grad_norm/{name}": norm for name, norm in norms.items()}
             return (self.after_auxiliary_step(networks), opt_state), metrics
 
-        def epoch(carry: Any, key: jax.Array) -> tuple[Any, Metrics]:
-            order = minibatch_times(
-                jax.random.fold_in(key, 0), num_minibatches, config.num_envs, num_minibatches
-            )
-            keys = jax.random.split(jax.random.fold_in(key, 1), num_minibatches)
-            return jax.lax.scan(step, carry, (order[:, 0], keys))
-
         carry = (state.networks, state.aux_opt_state)
-        keys = jax.random.split(key, config.aux_epochs)
-        (networks, opt_state), metrics = jax.lax.scan(epoch, carry, keys)
+        # A minibatch has one chunk of each environment.
+        (networks, opt_state), metrics = passes(
+            step, carry, key, config.aux_epochs, num_chunks, config.num_envs, num_chunks
+        )
         state = state.replace(networks=networks, aux_opt_state=opt_state)
         return state, jax.tree.map(jnp.mean, metrics)
 

@@ -77,7 +77,7 @@ class PPG(Phasic):
             of_policy: bool, of_value: bool, networks: Networks, batch: Batch, key: jax.Array
         ) -> tuple[jax.Array, Metrics]:
             policy, value = agent(networks, batch.pixels, batch.state)
-            total, metrics = jnp.float32(0.0), {}
+            total, metrics = jnp.float32(0.0), dict[str, jax.Array]()
             if of_policy:
                 total, metrics = policy_loss(policy, batch, config, key)
             if of_value:
