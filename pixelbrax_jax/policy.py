@@ -1,4 +1,4 @@
-"""A trained policy from its file, without the code that trained it."""
+"""Trained policies from files, without the code that trained them."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from pixelbrax_jax.extras import install_extra
 from pixelbrax_jax.validation import check_choice, suggest
 
 FOLDER = Path(__file__).parent / "pretrained"
-"""Where the policies lie that come with the package: for each a .jax and a .json."""
+"""Folder of the pretrained policies, with a .jax and a .json file each."""
 
 
 @dataclass(frozen=True, eq=False)
 class Policy:
-    """A policy: ``policy(pixels)`` gives actions.
+    """A policy that maps pixels to actions.
 
     Attributes:
-        program: what computes them.
+        program: the compiled function.
         shape: (H, W, 3 K) of the pixels.
-        env_options: of ``pixelbrax_jax.make``, the environment that a pretrained policy was trained
-            in: ``make(**policy.env_options)``. None for a policy of a file.
+        env_options: options of the environment in which a pretrained policy was trained, for
+            ``make(**policy.env_options)``; None for a policy from a file.
     """
 
     program: Callable[[jax.Array], jax.Array]
@@ -38,7 +38,7 @@ class Policy:
         """Map (B, H, W, 3 K) uint8 pixels to (B, A) float32 actions.
 
         Raises:
-            ValueError: the pixels are others.
+            ValueError: the pixels have another shape or dtype.
         """
         if pixels.ndim != 4 or pixels.shape[1:] != self.shape or pixels.dtype != jnp.uint8:
             raise ValueError(
@@ -49,23 +49,23 @@ class Policy:
 
 
 def list_pretrained() -> tuple[str, ...]:
-    """Return the names of the policies that come with the package, sorted."""
+    """Return the names of the pretrained policies, sorted."""
     return tuple(sorted(path.stem for path in FOLDER.glob("*.json")))
 
 
 def read_pretrained(name: str) -> dict[str, Any]:
-    """Return what is known of a policy that comes with the package.
+    """Return the description of a pretrained policy.
 
     Args:
         name: one of ``list_pretrained()``.
 
     Returns:
-        ``algorithm``, ``config`` (all settings of its training), ``env_options``, ``command``,
-        ``steps`` (control steps of its training), ``return``, ``standard_error`` and ``episodes``
-        of its evaluation, and ``versions`` that it was made with.
+        ``algorithm``, ``config`` (all training settings), ``env_options``, ``command``, ``steps``
+        (control steps of training), ``return``, ``standard_error`` and ``episodes`` of its
+        evaluation, and ``versions`` of the packages that trained it.
 
     Raises:
-        ValueError: there is none of that name.
+        ValueError: the name is unknown.
     """
     check_choice("pretrained policy", name, list_pretrained())
     about: dict[str, Any] = json.loads((FOLDER / f"{name}.json").read_text("utf-8"))
@@ -73,23 +73,22 @@ def read_pretrained(name: str) -> dict[str, Any]:
 
 
 def load_policy(path: str | Path) -> Policy:
-    """Return a policy.
+    """Load a policy.
 
     Args:
-        path: of the file ``policy.jax`` that a training run leaves; or the name of a policy that
-            comes with the package, one of ``list_pretrained()``.
+        path: a file ``policy.jax`` of a training run, or one of ``list_pretrained()``.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it is no policy, or one that the installed JAX cannot read.
-        ImportError: flatbuffers, which JAX reads it with, is not installed.
+        FileNotFoundError: the file does not exist.
+        ValueError: it is not a policy, or the installed JAX cannot read it.
+        ImportError: flatbuffers, which JAX needs to read it, is not installed.
     """
     name, path, about = str(path), Path(path), None
     if not path.is_file():
         if name not in (names := list_pretrained()):
             raise FileNotFoundError(
-                f"{name!r} is no file, and no policy of that name comes with the package; there "
-                f"are: {', '.join(names)}.{suggest(name, names)}"
+                f"{name!r} is neither a file nor a pretrained policy; pretrained policies: "
+                f"{', '.join(names)}.{suggest(name, names)}"
             )
         path, about = FOLDER / f"{name}.jax", read_pretrained(name)
     try:
@@ -101,7 +100,7 @@ def load_policy(path: str | Path) -> Policy:
     except Exception as error:
         made = f" It was made with jax {about['versions']['jax']}." if about else ""
         raise ValueError(
-            f"{path} is no exported policy that jax {version('jax')} can read: {error}.{made}"
+            f"{path} is not a policy that jax {version('jax')} can read: {error}.{made}"
         ) from error
     (wanted,) = exported.in_avals
     options = about["env_options"] if about else None
