@@ -185,7 +185,9 @@ def test_environments_that_agents_cannot_use_are_refused(kind, mode, error):
 
 
 def test_environments_come_with_their_parameters():
-    with pytest.raises(ValueError, match="envs and env_params belong together, got no env_params"):
+    with pytest.raises(
+        ValueError, match="envs and env_params must be given together, got no env_params"
+    ):
         make_train(PPOConfig(**SMALL), ball_envs())
 
 

@@ -373,7 +373,7 @@ def test_no_policy_is_told(tmp_path):
     with pytest.raises(FileNotFoundError, match="no policy"):
         load_policy(tmp_path / "policy.jax")
     (tmp_path / "policy.jax").write_bytes(b"nonsense")
-    with pytest.raises(ValueError, match="no exported policy"):
+    with pytest.raises(ValueError, match="as an exported policy"):
         load_policy(tmp_path / "policy.jax")
 
 
