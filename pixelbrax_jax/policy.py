@@ -1,4 +1,4 @@
-"""Trained policies from files, without the code that trained them."""
+"""Load a trained policy from its file, without the training code."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from pixelbrax_jax.extras import install_extra
 from pixelbrax_jax.validation import check_choice, suggest
 
 FOLDER = Path(__file__).parent / "pretrained"
-"""Folder of the pretrained policies, with a .jax and a .json file each."""
+"""Folder of the package's policies, a .jax and a .json file for each."""
 
 
 @dataclass(frozen=True, eq=False)
 class Policy:
-    """A policy that maps pixels to actions.
+    """A policy that maps pixels to actions: ``policy(pixels)``.
 
     Attributes:
-        program: the compiled function.
+        program: computes the actions.
         shape: (H, W, 3 K) of the pixels.
-        env_options: options of the environment in which a pretrained policy was trained, for
-            ``make(**policy.env_options)``; None for a policy from a file.
+        env_options: options of the training environment, for ``pixelbrax_jax.make(**env_options)``;
+            None for a policy from a file.
     """
 
     program: Callable[[jax.Array], jax.Array]
@@ -45,16 +45,19 @@ class Policy:
 
 
 def list_pretrained() -> tuple[str, ...]:
-    """Return the names of the pretrained policies, sorted."""
+    """List the names of the package's policies, sorted."""
     return tuple(sorted(path.stem for path in FOLDER.glob("*.json")))
 
 
 def read_pretrained(name: str) -> dict[str, Any]:
-    """Return the description of a pretrained policy; raise ValueError if its name is unknown.
+    """Read how a policy of ``list_pretrained()`` was trained and evaluated.
 
-    Keys are ``algorithm``, ``config`` (all training settings), ``env_options``, ``command``,
-    ``steps`` (control steps of training), ``return``, ``standard_error`` and ``episodes`` of its
-    evaluation, and ``versions`` of the packages that trained it.
+    The keys are ``algorithm``, ``config`` (training settings), ``env_options``, ``command``,
+    ``steps`` (control steps of training), ``return``, ``standard_error`` and ``episodes`` of the
+    evaluation, and ``versions`` of the packages.
+
+    Raises:
+        ValueError: no policy has this name.
     """
     check_choice("pretrained policy", name, list_pretrained())
     about: dict[str, Any] = json.loads((FOLDER / f"{name}.json").read_text("utf-8"))
@@ -62,31 +65,31 @@ def read_pretrained(name: str) -> dict[str, Any]:
 
 
 def load_policy(path: str | Path) -> Policy:
-    """Load a policy from a file ``policy.jax`` of a training run, or by its pretrained name.
+    """Load a policy: the file ``policy.jax`` of a training run, or a name of ``list_pretrained()``.
 
     Raises:
-        FileNotFoundError: the file does not exist.
-        ValueError: it is not a policy, or the installed JAX cannot read it.
-        ImportError: flatbuffers, which JAX needs to read it, is not installed.
+        FileNotFoundError: there is no such file and no such name.
+        ValueError: the installed JAX cannot read the file.
+        ImportError: flatbuffers is not installed.
     """
     name, path, about = str(path), Path(path), None
     if not path.is_file():
         if name not in (names := list_pretrained()):
             raise FileNotFoundError(
-                f"{name!r} is neither a file nor a pretrained policy; pretrained policies: "
-                f"{', '.join(names)}.{suggest(name, names)}"
+                f"{name!r} is neither a file nor the name of a policy in the package; the names "
+                f"are: {', '.join(names)}.{suggest(name, names)}"
             )
         path, about = FOLDER / f"{name}.jax", read_pretrained(name)
     try:
         exported = jax.export.deserialize(bytearray(path.read_bytes()))
     except ImportError as error:
         raise ImportError(
-            f"a policy needs flatbuffers, which is not installed; try: {install_extra('train')}"
+            f"policies need flatbuffers, which is not installed; try: {install_extra('train')}"
         ) from error
     except Exception as error:
         made = f" It was made with jax {about['versions']['jax']}." if about else ""
         raise ValueError(
-            f"{path} is not a policy that jax {version('jax')} can read: {error}.{made}"
+            f"jax {version('jax')} cannot read {path} as an exported policy: {error}.{made}"
         ) from error
     (wanted,) = exported.in_avals
     options = about["env_options"] if about else None

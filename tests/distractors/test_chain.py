@@ -294,7 +294,7 @@ def test_make_shares_clips_and_warns_of_procedural_ones():
         (Video, {"dynamics": "ping-pong"}, "Did you mean 'pingpong'"),
         (Video, {"alpha": 1.5}, r"alpha of Video must lie in \[0, 1\], got 1.5"),
         (Video, {"ground_alpha": -0.1}, r"ground_alpha of Video must lie in \[0, 1\], got -0.1"),
-        (Video, {"mode": "overlay", "ground_alpha": 0.0}, "mode='background' alone"),
+        (Video, {"mode": "overlay", "ground_alpha": 0.0}, "only for mode='background'"),
         (Video, {"num_clips": 0}, "num_clips of Video must be a positive integer, got 0"),
         (MovingCamera, {"scale": -1}, r"scale of MovingCamera must lie in \[0, 1\], got -1"),
         (Color, {"sky": True}, r"sky and materials of Color are only for mode='geom'"),

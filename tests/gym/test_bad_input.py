@@ -29,7 +29,7 @@ from tests.gym.conftest import ID, TASK
         ({"split": "test"}, "split='test' is given without a distractor that has splits: add"),
         (
             {"backend": "mjx"},
-            "for Brax.s tasks alone, .* choose it where it was registered",
+            "only for Brax.s tasks, .* choose it where it was registered",
         ),
         ({"max_episode_steps": 0}, "max_episode_steps must be a positive integer"),
         ({"max_episode_steps": -2}, "max_episode_steps must be a positive integer"),
