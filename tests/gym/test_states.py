@@ -99,7 +99,7 @@ def test_what_is_refused(make_single, make_vector):
                 frames=np.zeros((3, 13, 12, 6), np.uint8)
             )
         )
-    with pytest.raises(ValueError, match="has other parts"):
+    with pytest.raises(ValueError, match="does not have the structure"):
         make_single(distractors="color").set_state(state)
     with pytest.raises(ValueError, match="allowed: reset_mask, state"):
         make_vector().reset(options={"mask": 1})
