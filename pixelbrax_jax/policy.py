@@ -1,4 +1,4 @@
-"""A trained policy from its file, without the code that trained it."""
+"""Load a trained policy from its file, without the training code."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from pixelbrax_jax.extras import install_extra
 from pixelbrax_jax.validation import check_choice, suggest
 
 FOLDER = Path(__file__).parent / "pretrained"
-"""Where the policies lie that come with the package: for each a .jax and a .json."""
+"""Folder of the package's policies, a .jax and a .json file for each."""
 
 
 @dataclass(frozen=True, eq=False)
 class Policy:
-    """A policy: ``policy(pixels)`` gives actions.
+    """A policy that maps pixels to actions: ``policy(pixels)``.
 
     Attributes:
-        program: what computes them.
+        program: computes the actions.
         shape: (H, W, 3 K) of the pixels.
-        env_options: of ``pixelbrax_jax.make``, the environment that a pretrained policy was trained
-            in: ``make(**policy.env_options)``. None for a policy of a file.
+        env_options: options of the training environment, for ``pixelbrax_jax.make(**env_options)``;
+            None for a policy from a file.
     """
 
     program: Callable[[jax.Array], jax.Array]
@@ -38,7 +38,7 @@ class Policy:
         """Map (B, H, W, 3 K) uint8 pixels to (B, A) float32 actions.
 
         Raises:
-            ValueError: the pixels are others.
+            ValueError: the pixels have another shape or dtype.
         """
         if pixels.ndim != 4 or pixels.shape[1:] != self.shape or pixels.dtype != jnp.uint8:
             raise ValueError(
@@ -49,23 +49,19 @@ class Policy:
 
 
 def list_pretrained() -> tuple[str, ...]:
-    """Return the names of the policies that come with the package, sorted."""
+    """List the names of the package's policies, sorted."""
     return tuple(sorted(path.stem for path in FOLDER.glob("*.json")))
 
 
 def read_pretrained(name: str) -> dict[str, Any]:
-    """Return what is known of a policy that comes with the package.
+    """Read how a policy of ``list_pretrained()`` was trained and evaluated.
 
-    Args:
-        name: one of ``list_pretrained()``.
-
-    Returns:
-        ``algorithm``, ``config`` (all settings of its training), ``env_options``, ``command``,
-        ``steps`` (control steps of its training), ``return``, ``standard_error`` and ``episodes``
-        of its evaluation, and ``versions`` that it was made with.
+    The keys are ``algorithm``, ``config`` (training settings), ``env_options``, ``command``,
+    ``steps`` (control steps of training), ``return``, ``standard_error`` and ``episodes`` of the
+    evaluation, and ``versions`` of the packages.
 
     Raises:
-        ValueError: there is none of that name.
+        ValueError: no policy has this name.
     """
     check_choice("pretrained policy", name, list_pretrained())
     about: dict[str, Any] = json.loads((FOLDER / f"{name}.json").read_text("utf-8"))
@@ -73,22 +69,18 @@ def read_pretrained(name: str) -> dict[str, Any]:
 
 
 def load_policy(path: str | Path) -> Policy:
-    """Return a policy.
-
-    Args:
-        path: of the file ``policy.jax`` that a training run leaves; or the name of a policy that
-            comes with the package, one of ``list_pretrained()``.
+    """Load a policy: the file ``policy.jax`` of a training run, or a name of ``list_pretrained()``.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it is no policy, or one that the installed JAX cannot read.
-        ImportError: flatbuffers, which JAX reads it with, is not installed.
+        FileNotFoundError: there is no such file and no such name.
+        ValueError: the installed JAX cannot read the file.
+        ImportError: flatbuffers is not installed.
     """
     name, path, about = str(path), Path(path), None
     if not path.is_file():
         if name not in (names := list_pretrained()):
             raise FileNotFoundError(
-                f"{name!r} is no file, and no policy of that name comes with the package; there "
+                f"{name!r} is neither a file nor the name of a policy in the package; the names "
                 f"are: {', '.join(names)}.{suggest(name, names)}"
             )
         path, about = FOLDER / f"{name}.jax", read_pretrained(name)
@@ -96,12 +88,12 @@ def load_policy(path: str | Path) -> Policy:
         exported = jax.export.deserialize(bytearray(path.read_bytes()))
     except ImportError as error:
         raise ImportError(
-            f"a policy needs flatbuffers, which is not installed; try: {install_extra('train')}"
+            f"policies need flatbuffers, which is not installed; try: {install_extra('train')}"
         ) from error
     except Exception as error:
         made = f" It was made with jax {about['versions']['jax']}." if about else ""
         raise ValueError(
-            f"{path} is no exported policy that jax {version('jax')} can read: {error}.{made}"
+            f"jax {version('jax')} cannot read {path} as an exported policy: {error}.{made}"
         ) from error
     (wanted,) = exported.in_avals
     options = about["env_options"] if about else None

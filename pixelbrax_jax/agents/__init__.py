@@ -1,4 +1,4 @@
-"""Agents that learn from pixels, written in JAX: PPO, PPG and DCPG."""
+"""Agents in JAX that learn from pixels: PPO, PPG and DCPG."""
 
 from pixelbrax_jax.agents.algorithm import Algorithm
 from pixelbrax_jax.agents.on_policy.dcpg import DCPG, DCPGConfig

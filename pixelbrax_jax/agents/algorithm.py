@@ -1,4 +1,4 @@
-"""What an algorithm is: settings, environments, and the steps that carry training on."""
+"""The interface of an algorithm, and a whole training run as a pure function."""
 
 from __future__ import annotations
 
@@ -19,17 +19,16 @@ from pixelbrax_jax.types import EnvParams
 
 @dataclass(frozen=True)
 class Algorithm(ABC):
-    """An algorithm with its settings, as pure functions.
+    """An algorithm with its settings and environments, as pure functions.
 
-    Algorithms of equal settings in equal environments are equal, and share compiled programs.
+    Algorithms with equal settings and equal environments are equal, and share compiled programs.
 
     Attributes:
-        config: its settings, of ``config_class``.
-        envs: the environments it plays in.
-        acting: names of the networks that ``act`` needs, which evaluation and export take.
+        config: the settings, of class ``config_class``.
+        acting: names of the networks that ``act`` needs.
 
     Raises:
-        ValueError: the environments are not what the settings say.
+        ValueError: the environments contradict the settings.
         TypeError: the environments cannot be hashed.
     """
 
@@ -45,45 +44,41 @@ class Algorithm(ABC):
 
     @abstractmethod
     def init(self, key: jax.Array, env_params: EnvParams) -> TrainState:
-        """Return the state before the first iteration of the run with a typed PRNG key."""
+        """Return the initial state of a run; ``key`` is a typed PRNG key."""
 
     @abstractmethod
     def iterate(self, state: Any, env_params: EnvParams) -> tuple[TrainState, Metrics]:
-        """Play ``config.steps_per_iteration`` control steps and learn.
+        """Collect ``config.steps_per_iteration`` control steps and learn from them.
 
-        Returns:
-            The state, of the class that ``init`` returns, its ``iteration`` greater by 1; and
-            scalars, among them those of ``Rollout.episode_metrics``.
+        Returns the state, with ``iteration`` increased by 1, and scalars that include
+        ``Rollout.episode_metrics``.
         """
 
     @abstractmethod
     def act(self, networks: Networks, pixels: jax.Array, key: jax.Array | None = None) -> jax.Array:
         """Return (N, A) float32 actions for (N, H, W, 3 K) uint8 pixels.
 
-        Args:
-            networks: parameters; those of ``acting`` are enough.
-            pixels: what is seen.
-            key: for sampled actions; None returns the best ones.
+        Needs only the networks in ``acting``. A key samples the actions; None returns the best.
         """
 
     @property
     def auxiliary_every(self) -> int:
-        """Iterations from one auxiliary phase to the next; 0 has none."""
+        """Iterations between auxiliary phases; 0 if the algorithm has none."""
         return 0
 
     def auxiliary(self, state: Any) -> tuple[TrainState, Metrics]:
-        """Learn from what has been kept of all iterations since the last auxiliary phase."""
+        """Learn from the data stored since the last auxiliary phase."""
         raise NotImplementedError(f"{self.name} has no auxiliary phase.")
 
 
 def check_environments(config: TrainConfig, envs: Environments) -> None:
-    """Reject environments that are not what the settings say, or cannot be hashed."""
+    """Reject environments that contradict the settings or cannot be hashed."""
     try:
         hash(envs)
     except TypeError as error:
         raise TypeError(
             f"environments must be hashable, got a {type(envs).__name__}: make it a frozen "
-            "dataclass, or leave its __eq__ alone."
+            "dataclass, or define __hash__ along with __eq__."
         ) from error
     if envs.autoreset_mode != "next_step":
         raise ValueError(
@@ -94,7 +89,7 @@ def check_environments(config: TrainConfig, envs: Environments) -> None:
         wanted = "both" if config.state_critic else "pixels"
         raise ValueError(
             f"obs_mode of the environments must be {wanted!r} with "
-            f"state_critic={config.state_critic}, but they show {envs.env.obs_spec}."
+            f"state_critic={config.state_critic}, but their obs_spec is {envs.env.obs_spec}."
         )
     found = {
         "num_envs": (config.num_envs, envs.num_envs),
@@ -113,7 +108,7 @@ def check_environments(config: TrainConfig, envs: Environments) -> None:
 def train_function(
     algorithm: Algorithm, env_params: EnvParams
 ) -> Callable[[jax.Array], tuple[TrainState, Metrics]]:
-    """Return a whole run of an algorithm as a pure function, as ``make_train`` does."""
+    """Return a whole run of an algorithm as a pure function; see ``make_train``."""
     iterations, every = algorithm.config.num_iterations, algorithm.auxiliary_every
 
     def several(state: TrainState, number: int) -> tuple[TrainState, Metrics]:

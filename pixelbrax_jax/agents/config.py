@@ -1,4 +1,4 @@
-"""Settings that all algorithms have: the environment, the networks, the optimiser."""
+"""Settings of every algorithm: environment, networks and optimiser."""
 
 from __future__ import annotations
 
@@ -24,40 +24,40 @@ from pixelbrax_jax.validation import (
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Settings that every algorithm has.
+    """Settings of every algorithm.
 
     Raises:
-        ValueError: a setting is out of range; the message says what is allowed.
+        ValueError: a setting is out of range.
     """
 
     env: EnvConfig = EnvConfig()  # noqa: RUF009 (it is frozen)
-    """Options of the environment; camera, look, clips and distractors as names."""
+    """Sets the environment's options; camera, look, clips and distractors are names."""
 
     memory_settings: ClassVar[tuple[str, ...]] = ("num_envs",)
-    """Names of settings that a run takes less memory with when they are lower."""
+    """Settings that reduce memory when they are lowered."""
 
     total_steps: int = 25_000_000
-    """Control steps of the whole run, over all environments; rounded up to whole iterations."""
+    """Control steps of the run over all environments, rounded up to whole iterations."""
     num_envs: int = 256
-    """Environments N."""
+    """Number of environments N that run in parallel."""
 
     encoder: str = "impala"
-    """``impala``, ``nature``, ``drq``, ``small`` or ``patch``."""
+    """Network that encodes pixels: ``impala``, ``nature``, ``drq``, ``small`` or ``patch``."""
     state_critic: bool = False
-    """Whether a separate critic sees the simulator's state in place of pixels."""
+    """Trains a separate critic on the simulator's state instead of pixels."""
 
     gamma: float = 0.99
-    """Discount of rewards, for each action."""
+    """Discount of rewards per action."""
     learning_rate: float = 3e-4
     """Adam's step size."""
     anneal: bool = False
-    """Whether the step size falls to 0 along a line."""
+    """Decreases the step size linearly to 0."""
     adam_eps: float = 1e-5
     """Adam's epsilon."""
     max_grad_norm: float = 0.5
-    """Global norm to which each network's gradient is clipped; 0 clips nothing."""
+    """Clips the gradient of each network to this global norm; 0 disables clipping."""
     memory_budget_gb: float | None = None
-    """Bytes, in 10^9, that stored frames may take; none asks the device."""
+    """Memory limit of the training state in GB (10^9 bytes); None uses the device's memory."""
 
     def __post_init__(self) -> None:
         """Check the settings."""
@@ -81,25 +81,25 @@ class TrainConfig:
 
     @property
     def steps_per_iteration(self) -> int:
-        """Control steps of one iteration, over all environments."""
+        """Control steps of one iteration over all environments."""
         raise NotImplementedError(f"{type(self).__name__} lacks steps_per_iteration.")
 
     @property
     def num_iterations(self) -> int:
-        """Iterations of the whole run."""
+        """Number of iterations of the run."""
         return -(-self.total_steps // self.steps_per_iteration)
 
     @property
     def bytes_per_iteration(self) -> int:
-        """Bytes of the frames that an iteration stores beside the state."""
+        """Bytes of the frames that an iteration stores besides the state."""
         return 0
 
     def replace(self, **settings: Any) -> Self:
-        """Return these settings with others; ``height=64`` and the like are those of ``env``.
+        """Return a copy with changed settings; options of the environment, as ``height``, go to it.
 
         Raises:
-            TypeError: a name is unknown; the message lists those there are.
-            ValueError: a setting is out of range; the message says what is allowed.
+            TypeError: a name is unknown.
+            ValueError: a setting is out of range.
         """
         own = [field.name for field in fields(self)]
         check_options(settings, [*own, *ENV_OPTIONS])
@@ -110,7 +110,7 @@ class TrainConfig:
 
 
 def _check_env(env: EnvConfig) -> None:
-    """Reject an environment whose options JSON has nothing for, or that shows no pixels."""
+    """Reject an environment without pixels, or with options that JSON cannot store."""
     if not isinstance(env, EnvConfig):
         raise TypeError(f"env must be an EnvConfig, got {env!r}.")
     for name, kind in (("camera", str), ("look", str), ("clips", (str, NoneType))):
@@ -120,19 +120,19 @@ def _check_env(env: EnvConfig) -> None:
         raise TypeError(f"distractors of training settings must be names, got {env.distractors!r}.")
     if env.obs_mode != "pixels":
         raise ValueError(
-            f"obs_mode of training settings must be 'pixels', got {env.obs_mode!r}; a critic "
-            "sees the simulator's state with state_critic=True."
+            f"obs_mode of training settings must be 'pixels', got {env.obs_mode!r}; "
+            "state_critic=True shows the simulator's state to a critic."
         )
 
 
 def make_env(config: TrainConfig, **changes: Any) -> tuple[PixelEnv, EnvParams]:
-    """Make the environment that settings name, with ``changes`` of ``EnvConfig``."""
+    """Make the environment of the settings; ``changes`` override its ``EnvConfig``."""
     obs_mode = "both" if config.state_critic else "pixels"
     return make(config.env, **({"obs_mode": obs_mode} | changes))
 
 
 def describe(config: TrainConfig) -> dict[str, Any]:
-    """Return all settings by name, those of the environment among them, as JSON has them."""
+    """Return all settings by name as JSON values, with the environment's options."""
     names = [field.name for field in fields(config) if field.name != "env"]
     values = {name: getattr(config.env, name) for name in ENV_OPTIONS}
     values |= {name: getattr(config, name) for name in names}
@@ -140,7 +140,7 @@ def describe(config: TrainConfig) -> dict[str, Any]:
 
 
 def check_positive(name: str, value: object, or_zero: bool = False) -> None:
-    """Raise a ValueError that names the setting unless it is a positive, finite number."""
+    """Raise a ValueError unless the setting is positive (or zero) and finite."""
     known = isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
     if not (known and (value > 0 or (or_zero and value == 0))):  # type: ignore[operator]
         wanted = "a number of at least 0" if or_zero else "a positive number"
@@ -148,13 +148,13 @@ def check_positive(name: str, value: object, or_zero: bool = False) -> None:
 
 
 def check_count(name: str, value: object) -> None:
-    """Raise a ValueError that names the setting unless it is a whole number of at least 0."""
+    """Raise a ValueError unless the setting is an integer of at least 0."""
     if not isinstance(value, Integral) or isinstance(value, bool) or value < 0:
         raise ValueError(f"{name} must be a whole number of at least 0, got {value!r}.")
 
 
 def check_divides(whole: str, size: int, part: str, count: int) -> None:
-    """Raise a ValueError that tells the next counts unless ``size`` has ``count`` equal parts."""
+    """Raise a ValueError that lists the divisors of ``size`` unless ``count`` divides it."""
     if size % count:
         allowed = ", ".join(str(n) for n in range(1, size + 1) if size % n == 0)
         raise ValueError(f"{part}={count} must divide {whole}={size}; it may be {allowed}.")

@@ -17,15 +17,15 @@ from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.types import EnvParams
 
 ALGORITHMS: dict[str, type[Algorithm]] = {kind.name: kind for kind in (PPO, PPG, DCPG)}
-"""Class of each algorithm, by its name."""
+"""Algorithm classes by name."""
 
 
 def make_algorithm(config: TrainConfig, envs: Environments) -> Algorithm:
-    """Return the algorithm that settings are of.
+    """Make the algorithm that belongs to the class of ``config``.
 
     Raises:
-        TypeError: no algorithm has such settings.
-        ValueError: the environments are not what the settings say.
+        TypeError: no algorithm has settings of this class.
+        ValueError: the environments contradict the settings.
     """
     for kind in ALGORITHMS.values():
         if type(config) is kind.config_class:
@@ -41,22 +41,18 @@ def make_train(
 ) -> Callable[[jax.Array], tuple[TrainState, Metrics]]:
     """Return a whole run as a pure function ``train(key) -> (state, metrics)``.
 
-    The function may be jitted, and mapped over keys by ``jax.vmap``. Metrics have a leading axis
-    of iterations, those of the auxiliary phase one of phases.
-
-    Args:
-        config: settings, which decide the algorithm.
-        envs: environments of your own; None makes those that ``config`` names.
-        env_params: of those.
+    The function works under ``jax.jit`` and, over keys, ``jax.vmap``. Metrics have a leading axis
+    of iterations; those of the auxiliary phase have an axis of phases. ``envs`` and ``env_params``
+    default to the environments of ``config``.
 
     Raises:
-        TypeError: no algorithm has such settings.
-        ValueError: one of the two is given without the other.
+        TypeError: no algorithm has settings of this class.
+        ValueError: only one of ``envs`` and ``env_params`` is given.
     """
     if envs is None and env_params is None:
         env, env_params = make_env(config)
         envs = VectorPixelEnv(env, config.num_envs)
     if envs is None or env_params is None:
         missing = "envs" if envs is None else "env_params"
-        raise ValueError(f"envs and env_params belong together, got no {missing}.")
+        raise ValueError(f"envs and env_params must be given together, got no {missing}.")
     return train_function(make_algorithm(config, envs), env_params)

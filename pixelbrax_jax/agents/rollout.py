@@ -1,8 +1,4 @@
-"""Playing in the environments, and storing what was seen in little memory.
-
-A rollout keeps every frame once. The stack of K frames that the agent saw is put together
-again by index when it is needed.
-"""
+"""Collect rollouts that store every frame once, and rebuild the stacked observations."""
 
 from __future__ import annotations
 
@@ -17,12 +13,12 @@ from pixelbrax_jax.agents.train_state import Metrics, along_envs
 from pixelbrax_jax.types import EnvParams, EnvState, Timestep
 
 Choose = Callable[[jax.Array, jax.Array | None, jax.Array], tuple[jax.Array, Any]]
-"""``choose(pixels, state, key) -> (action, choice)``: actions of N observations, and any tree of
-arrays (N, ...) that learning needs of the choice."""
+"""``choose(pixels, state, key) -> (action, choice)``: actions for N observations, and a tree of
+(N, ...) arrays that learning needs."""
 
 
 class Environments(Protocol):
-    """What agents need: N environments in mode ``"next_step"``, hashable; equal ones are alike."""
+    """N hashable environments that reset in mode ``"next_step"``; equal ones behave the same."""
 
     @property
     def env(self) -> Any:
@@ -34,28 +30,27 @@ class Environments(Protocol):
 
     @property
     def autoreset_mode(self) -> str:
-        """``"next_step"``."""
+        """Must be ``"next_step"``."""
 
     def reset(self, key: jax.Array, params: EnvParams) -> tuple[EnvState, Timestep]:
-        """As ``VectorPixelEnv.reset``."""
+        """See ``VectorPixelEnv.reset``."""
 
     def step(
         self, state: EnvState, action: jax.Array, params: EnvParams
     ) -> tuple[EnvState, Timestep]:
-        """As ``VectorPixelEnv.step``."""
+        """See ``VectorPixelEnv.step``."""
 
     def obs(self, state: EnvState) -> Any:
-        """As ``VectorPixelEnv.obs``."""
+        """See ``VectorPixelEnv.obs``."""
 
 
 class Frames(struct.PyTreeNode):
     """Observations of T steps of N environments.
 
     Attributes:
-        pixels: (K - 1 + T, N, H, W, 3) uint8, single frames; the first K - 1 are from before.
-        age: (T, N) int32, frames of its episode that are older than the observation's newest
-            one, at most K - 1.
-        shift: (N, 2) int32, pixels down and right by which observations are shifted.
+        pixels: (K - 1 + T, N, H, W, 3) uint8 single frames; the first K - 1 precede the rollout.
+        age: (T, N) int32, earlier frames of the same episode, at most K - 1.
+        shift: (N, 2) int32, shift of the observations in pixels down and right.
         state: (T, N, S) float32, the simulator's state; None unless a critic sees it.
     """
 
@@ -69,15 +64,12 @@ class Rollout(struct.PyTreeNode):
     """T steps of N environments.
 
     Attributes:
-        frames: what was seen.
-        choice: what ``choose`` returned beside the actions, (T, N, ...).
+        choice: second output of ``choose``, (T, N, ...).
         last_choice: the same for the observation after the last step, (N, ...).
         reward: (T, N) float32.
-        terminated: (T, N) bool.
-        truncated: (T, N) bool.
-        valid: (T, N) bool. False where the step began an episode and the action was ignored;
-            such a step teaches nothing.
-        episode_return: (T, N) float32, sum of rewards of the episode so far.
+        terminated, truncated: (T, N) bool.
+        valid: (T, N) bool, False where the step reset the episode and ignored the action.
+        episode_return: (T, N) float32, sum of the episode's rewards so far.
         episode_length: (T, N) int32, control steps of the episode so far.
     """
 
@@ -93,11 +85,11 @@ class Rollout(struct.PyTreeNode):
 
     @property
     def done(self) -> jax.Array:
-        """(T, N) bool, an episode ended."""
+        """(T, N) bool, whether an episode ended."""
         return self.terminated | self.truncated
 
     def episode_metrics(self) -> Metrics:
-        """Return what runs log of episodes: sums, which add up over iterations without loss."""
+        """Return count, sum of returns and sum of lengths of the episodes that ended."""
         done = self.done
         return {
             "episode/count": jnp.sum(done, dtype=jnp.int32),
@@ -115,16 +107,9 @@ def collect(
     num_steps: int,
     random_shift: int = 0,
 ) -> tuple[EnvState, Rollout]:
-    """Play ``num_steps`` steps, and return where the environments are then and what happened.
+    """Collect ``num_steps`` steps; return the environments' state after them and the rollout.
 
-    Args:
-        envs: the environments.
-        env_state: where they are.
-        env_params: of the environments.
-        choose: chooses actions.
-        key: of this rollout alone.
-        num_steps: T.
-        random_shift: pixels by which observations are shifted at most.
+    ``random_shift`` is the largest shift of the observations in pixels.
     """
     num_envs = envs.num_envs
     shift_key = jax.random.fold_in(key, num_steps + 1)
@@ -155,8 +140,7 @@ def collect(
         age = jnp.where(begins, 0, jnp.minimum(age + 1, stack - 1))
         return (env_state, age), (kept, choice, outcome)
 
-    # The stack that is there already needs no frames of before to be left out: an episode that
-    # has just begun repeats its first frame in it.
+    # The first stack is complete: an episode that has just been reset repeats its first frame.
     start = (env_state, jnp.full(num_envs, stack - 1))
     (env_state, _), (kept, choice, outcome) = jax.lax.scan(step, start, jnp.arange(num_steps))
     newest, age, state = kept
@@ -166,10 +150,9 @@ def collect(
 
 
 def observations(frames: Frames, times: jax.Array, random_shift: int = 0) -> jax.Array:
-    """Return the pixels that the agent saw at (B, N) int32 times, as it saw them.
+    """Rebuild the observations at (B, N) int32 times.
 
-    Returns:
-        (N B, H, W, 3 K) uint8, one environment after the other, oldest frame first.
+    The pixels are (N B, H, W, 3 K) uint8, ordered by environment, with the oldest frame first.
     """
     stack = frames.pixels.shape[0] - frames.age.shape[0] + 1
     age = jnp.take_along_axis(frames.age, times, axis=0)
@@ -185,16 +168,16 @@ def observations(frames: Frames, times: jax.Array, random_shift: int = 0) -> jax
 
 
 def at_times(rows: jax.Array, times: jax.Array) -> jax.Array:
-    """Map (T, N, ...) rows and (B, N) int32 times to (N B, ...), one environment after the other.
+    """Map (T, N, ...) rows and (B, N) int32 times to (N B, ...), ordered by environment.
 
-    What is spread over devices along environments then stays where it is.
+    The order keeps the samples of an environment on its device.
     """
     picked = jax.vmap(lambda rows, index: rows[index], in_axes=1)(rows, times)
     return picked.reshape(-1, *rows.shape[2:])
 
 
 def split_obs(obs: Any) -> tuple[Any, Any]:
-    """Return pixels and state of an observation, or of its spec; None for a state not there."""
+    """Split an observation or its spec into pixels and state; a missing part is None."""
     if isinstance(obs, dict):
         return obs.get("pixels"), obs.get("state")
     return obs, None
@@ -203,7 +186,7 @@ def split_obs(obs: Any) -> tuple[Any, Any]:
 def shifted(pixels: jax.Array, shift: jax.Array, at_most: int) -> jax.Array:
     """Shift (N, H, W, C) images by (N, 2) int32 pixels down and right, and repeat their edges.
 
-    As Yarats et al., arXiv 2004.13649. ``at_most`` bounds the shifts; it is static.
+    Follows Yarats et al., arXiv 2004.13649. ``at_most`` is a static bound of the shifts.
     """
     if not at_most:
         return pixels

@@ -1,9 +1,4 @@
-"""Where training stands: what each part declares, and the random keys that follow from it.
-
-Several devices share the environments: what belongs to environments is spread along them, and
-everything else is the same on every device. Each field says which of the two it is, and whether a
-checkpoint keeps it.
-"""
+"""The state of training, how its fields are sharded and stored, and its random keys."""
 
 from __future__ import annotations
 
@@ -16,45 +11,43 @@ from flax import struct
 from pixelbrax_jax.types import EnvState
 
 Networks = dict[str, Any]
-"""Parameters by name of the network."""
+"""Parameters by network name."""
 
 Metrics = dict[str, jax.Array]
 """Scalars by name."""
 
 _ENV_AXIS, _KEPT, _NONE = "env_axis", "kept", "none"
 _ENVS, _NETWORKS, _ACTIONS, _UPDATES, _AUXILIARY = range(5)
-"""Names of random streams, folded into the key of a run."""
+"""Random streams, folded into the key of a run."""
 
 
 def along_envs(axis: int, *, kept: bool = True) -> Any:
-    """Declare a field whose arrays have the environments along ``axis``.
+    """Declare a field whose arrays have the environments along ``axis``; devices share that axis.
 
-    Checkpoints leave out what is not ``kept``; a resumed run begins with that of ``init``.
+    Checkpoints skip a field with ``kept=False``; a resumed run takes its value from ``init``.
     """
     return struct.field(metadata={_ENV_AXIS: axis, _KEPT: kept})
 
 
 def without_envs(*, kept: bool = True) -> Any:
-    """Declare a field that belongs to no environment."""
+    """Declare a field without an environment axis, which is the same on every device."""
     return struct.field(metadata={_ENV_AXIS: _NONE, _KEPT: kept})
 
 
 def as_declared(leading_axes: int = 0, *, kept: bool = True) -> Any:
-    """Declare a field whose own class declares its fields, but for ``leading_axes`` more."""
+    """Declare a field whose class declares its fields; its arrays have more ``leading_axes``."""
     return struct.field(metadata={_ENV_AXIS: ("class", leading_axes), _KEPT: kept})
 
 
 class TrainState(struct.PyTreeNode):
-    """What every algorithm needs to go on as if it had never stopped.
+    """The state from which every algorithm can continue a run.
 
-    An algorithm that needs more adds fields in a subclass, each declared by one of the functions
-    above.
+    A subclass declares each further field with ``along_envs``, ``without_envs`` or ``as_declared``.
 
     Attributes:
-        networks: parameters by name of the network.
-        opt_state: of the optimiser, by name of the network.
-        env_state: where the environments are.
-        key: typed PRNG key of the run; never changes.
+        networks: parameters by network name.
+        opt_state: optimiser state by network name.
+        key: typed PRNG key of the run; constant.
         iteration: () uint32, iterations so far, of ``config.steps_per_iteration`` control steps.
     """
 
@@ -69,17 +62,17 @@ State = TypeVar("State", bound=TrainState)
 
 
 def env_axes(tree: Any) -> Any:
-    """Return a dataclass of declared fields with each leaf's axis of environments, or -1.
+    """Replace each leaf of a dataclass by its environment axis, or -1 if it has none.
 
     Raises:
-        TypeError: a field is not declared, or is none of the class that shall declare it.
+        TypeError: a field is not declared, or its class declares no fields.
     """
     found = {}
     for field in fields(tree):
         value, declared = getattr(tree, field.name), field.metadata.get(_ENV_AXIS)
         if declared is None:
             raise TypeError(
-                f"{type(tree).__name__}.{field.name} does not say where its environments are: "
+                f"{type(tree).__name__}.{field.name} does not declare its environment axis: "
                 "declare it with along_envs, without_envs or as_declared."
             )
         if isinstance(declared, tuple) and value is not None:
@@ -99,18 +92,18 @@ def env_axes(tree: Any) -> Any:
 
 
 def parts_not_kept(state: TrainState) -> tuple[str, ...]:
-    """Return the names of the fields that checkpoints leave out."""
+    """Return the names of the fields that checkpoints skip."""
     return tuple(f.name for f in fields(state) if not f.metadata.get(_KEPT, True))
 
 
 def kept(state: State) -> State:
-    """Return a state as checkpoints have it: None in place of the parts that they leave out."""
+    """Return the state with None for the fields that checkpoints skip."""
     without: State = state.replace(**dict.fromkeys(parts_not_kept(state)))
     return without
 
 
 def env_key(key: jax.Array) -> jax.Array:
-    """Return the environments' key of a run."""
+    """Return the key of a run's environments."""
     return jax.random.fold_in(key, _ENVS)
 
 

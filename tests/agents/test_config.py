@@ -81,9 +81,9 @@ CONTRADICTIONS = [
     (PPGConfig, {"layout": "detach", "state_critic": True},
      "state_critic needs layout='dual', got 'detach'"),
     (PPGConfig, {"layout": "detach", "policy_epochs": 2},
-     "policy_epochs=2 and value_epochs=1 may differ with layout='dual' alone, got 'detach'"),
+     "policy_epochs=2 and value_epochs=1 may differ only with layout='dual', got 'detach'"),
     (PPOConfig, {"initial_std": 8.0},
-     "initial_std must be between 0.0067 and 7.39, where standard deviations are kept"),
+     "initial_std must be between 0.0067 and 7.39, the limits of standard deviations"),
     (DCPGConfig, {"aux_epochs": 0}, "aux_epochs must be a positive integer, got 0"),
     (DCPGConfig, {"state_critic": True}, "state_critic needs decoupled=True, got False"),
     (PPGConfig, {"num_policy_phases": 16, "aux_minibatches": 24},
@@ -185,7 +185,9 @@ def test_environments_that_agents_cannot_use_are_refused(kind, mode, error):
 
 
 def test_environments_come_with_their_parameters():
-    with pytest.raises(ValueError, match="envs and env_params belong together, got no env_params"):
+    with pytest.raises(
+        ValueError, match="envs and env_params must be given together, got no env_params"
+    ):
         make_train(PPOConfig(**SMALL), ball_envs())
 
 

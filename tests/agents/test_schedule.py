@@ -69,7 +69,7 @@ def test_a_field_that_declares_nothing_is_an_error():
 
     state = State(jnp.zeros((3, 4)), jnp.zeros(5))
     assert env_axes(state) == State(1, -1)
-    with pytest.raises(TypeError, match=r"Forgetful\.new does not say where its environments are"):
+    with pytest.raises(TypeError, match=r"Forgetful\.new does not declare its environment axis"):
         env_axes(Forgetful(state, jnp.zeros(2)))
 
 

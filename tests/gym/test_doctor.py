@@ -175,7 +175,7 @@ def test_variables_that_other_tools_leave(monkeypatch):
     values = {
         "XLA_FLAGS": ("--xla_nonsense=1", "Unknown flag in XLA_FLAGS: --xla_nonsense=1"),
         "MUJOCO_GL": ("garbage", "invalid value for environment variable MUJOCO_GL: garbage"),
-        "IMAGEIO_FFMPEG_EXE": ("/nowhere/ffmpeg", "'/nowhere/ffmpeg', which is no program"),
+        "IMAGEIO_FFMPEG_EXE": ("/nowhere/ffmpeg", "'/nowhere/ffmpeg', which is not a program"),
         "SDL_VIDEODRIVER": ("garbage", "garbage not available"),
         "MPLBACKEND": ("garbage", "'garbage' is not a valid value"),
     }

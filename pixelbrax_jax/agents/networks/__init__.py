@@ -1,1 +1,1 @@
-"""Networks of agents, and the distributions of their actions."""
+"""Agents' networks and the distributions of their actions."""

@@ -1,4 +1,4 @@
-"""A policy and a value of pixels, of one network or of two."""
+"""Actor and critic networks, separate or with a shared encoder."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from pixelbrax_jax.agents.networks.encoders import ENCODERS, dense, scaled
 from pixelbrax_jax.agents.train_state import Networks
 
 LOG_STD_RANGE = (-5.0, 2.0)
-"""Between which logarithms of standard deviations are kept."""
+"""Range to which the logarithm of a standard deviation is clipped."""
 
 POLICIES = ("gaussian", "tanh_gaussian", "deacrep")
 
 
 class ActorOutput(struct.PyTreeNode):
-    """What an actor says of a batch of observations.
+    """The output of an actor for B observations.
 
     Attributes:
-        policy: the distribution over actions.
-        value: (B,) float32 of the actor's own value head; None if it has none.
-        features: (B, F) float32 of the encoder.
+        policy: distribution of the actions.
+        value: (B,) float32 from the actor's value head; None without a value head.
+        features: (B, F) float32 from the encoder.
     """
 
     policy: Normal
@@ -36,19 +36,17 @@ class ActorOutput(struct.PyTreeNode):
 
 
 class Actor(nn.Module):
-    """Encoder, policy head and, if wanted, a value head.
+    """An encoder with a policy head and an optional value head.
 
     Policies:
 
-    * ``"gaussian"``: mean linear in the features, one log standard deviation for each action,
-      clipped to [-5, 2]; the environment clips the action.
-    * ``"tanh_gaussian"``: the same, and the action is its ``tanh``.
-    * ``"deacrep"``: as in Lyu et al.'s code for arXiv 2502.00021: mean ``tanh`` of a linear layer,
-      standard deviation ``softplus`` of another one, clipped to [-10, 10], plus 0.001.
+    * ``"gaussian"``: the mean is linear in the features. Each action has one log standard
+      deviation, clipped to [-5, 2]. The environment clips the action.
+    * ``"tanh_gaussian"``: the same, but the action is the ``tanh`` of the sample.
+    * ``"deacrep"`` (Lyu et al.'s code for arXiv 2502.00021): the mean is ``tanh`` of a linear
+      layer, the standard deviation ``softplus`` of another one, clipped to [-10, 2], plus 0.001.
 
-    Attributes:
-        initial_std: of ``"gaussian"`` and ``"tanh_gaussian"``.
-        has_value: whether there is a value head.
+    ``initial_std`` applies to the first two.
     """
 
     encoder: str
@@ -59,10 +57,7 @@ class Actor(nn.Module):
 
     @nn.compact
     def __call__(self, pixels: jax.Array, detach_value: bool = False) -> ActorOutput:
-        """Return the policy and value of (B, H, W, C) uint8 pixels.
-
-        With ``detach_value`` the value's gradient stops before the encoder.
-        """
+        """Map (B, H, W, C) uint8 pixels; ``detach_value`` stops value gradients at the encoder."""
         features = ENCODERS[self.encoder]()(scaled(pixels))
         mean = dense(self.action_size, 0.01, "mean")(features)
         if self.policy == "deacrep":
@@ -82,16 +77,16 @@ class Actor(nn.Module):
 
 
 class Critic(nn.Module):
-    """The value of pixels, or of the simulator's state alone."""
+    """A value network of the pixels or, with ``sees_state``, of the simulator's state."""
 
     encoder: str
     sees_state: bool = False
 
     @nn.compact
     def __call__(self, pixels: jax.Array, state: jax.Array | None = None) -> jax.Array:
-        """Return (B,) float32 values of (B, H, W, C) uint8 pixels, or (B, S) float32 states."""
+        """Map (B, H, W, C) uint8 pixels or (B, S) float32 states to (B,) float32 values."""
         if self.sees_state:
-            # Normalising a first layer's output makes the scale of the state unimportant.
+            # The normalised output of the first layer does not depend on the scale of the state.
             features = jnp.tanh(nn.LayerNorm()(dense(256)(state)))
             features = nn.relu(dense(256)(features))
         else:
@@ -101,12 +96,11 @@ class Critic(nn.Module):
 
 @dataclass(frozen=True)
 class ActorCritic:
-    """An actor, and a critic of its own unless they share the encoder.
+    """An actor and a separate critic, or an actor with a value head.
 
     Attributes:
-        actor_module: with a value head, if there is no critic module.
-        critic_module: None where the critic is the actor's value head.
-        detach_value: whether a shared value leaves the encoder alone.
+        critic_module: the separate critic; None if the actor's value head is the critic.
+        detach_value: stops gradients of the actor's value head at the encoder.
     """
 
     actor_module: Actor
@@ -114,7 +108,7 @@ class ActorCritic:
     detach_value: bool = False
 
     def init(self, key: jax.Array, pixels: Any, state: Any) -> Networks:
-        """Sample initial parameters for observations of these ``jax.ShapeDtypeStruct``."""
+        """Sample initial parameters; ``pixels`` and ``state`` are ``jax.ShapeDtypeStruct``."""
         pixels, state = (s and jnp.zeros((1, *s.shape), s.dtype) for s in (pixels, state))
         networks = {"actor": self.actor_module.init(jax.random.fold_in(key, 0), pixels)}
         if self.critic_module is not None:
@@ -123,12 +117,12 @@ class ActorCritic:
         return networks
 
     def actor(self, params: Any, pixels: jax.Array, detach_value: bool = False) -> ActorOutput:
-        """Return the actor's output for (B, H, W, 3 K) pixels."""
+        """Apply the actor to (B, H, W, 3 K) pixels."""
         output: Any = self.actor_module.apply(params, pixels, detach_value)
         return output
 
     def critic(self, params: Any, pixels: jax.Array, state: jax.Array | None) -> jax.Array:
-        """Return (B,) values of the critic of its own."""
+        """Return (B,) values from the separate critic."""
         assert self.critic_module is not None
         value: Any = self.critic_module.apply(params, pixels, state)
         return value
@@ -136,13 +130,13 @@ class ActorCritic:
     def __call__(
         self, networks: Networks, pixels: jax.Array, state: jax.Array | None
     ) -> tuple[Normal, jax.Array]:
-        """Return policy and value of (B, H, W, 3 K) pixels and, if it is seen, (B, S) state."""
+        """Return policy and (B,) values for (B, H, W, 3 K) pixels and (B, S) states or None."""
         output = self.actor(networks["actor"], pixels, self.detach_value)
         if self.critic_module is None:
             return output.policy, output.value
         return output.policy, self.critic(networks["critic"], pixels, state)
 
     def act(self, networks: Networks, pixels: jax.Array, key: jax.Array | None = None) -> jax.Array:
-        """Return actions, (B, A); mean actions without a key."""
+        """Return (B, A) actions: samples with a key, else the mean actions."""
         policy = self.actor(networks["actor"], pixels).policy
         return policy.action(policy.mean if key is None else policy.sample(key))

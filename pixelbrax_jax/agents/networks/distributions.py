@@ -1,4 +1,4 @@
-"""Distributions over actions, in closed form."""
+"""Normal distributions of actions, with an optional ``tanh``."""
 
 from __future__ import annotations
 
@@ -10,15 +10,13 @@ _LOG_2PI = 1.8378770664093453
 
 
 class Normal(struct.PyTreeNode):
-    """Independent normal distributions, over unclipped actions.
+    """Independent normal distributions of unclipped actions.
 
-    The environment gets ``action(unclipped)``: the unclipped action itself, which the environment
-    clips to [-1, 1], or its ``tanh``. Probabilities are always of the unclipped action that was
-    sampled; a clipped action with the density of an unclipped one would bias the gradient.
+    The environment receives ``action(unclipped)`` and clips it to [-1, 1]. Probabilities refer to
+    the unclipped action, because those of a clipped action would bias the gradient.
 
     Attributes:
-        mean: (..., A) float32.
-        std: (..., A) float32, positive.
+        mean, std: (..., A) float32.
         squash: static; whether the action is ``tanh(unclipped)``.
     """
 
@@ -27,18 +25,18 @@ class Normal(struct.PyTreeNode):
     squash: bool = struct.field(pytree_node=False)
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """Sample an unclipped action, (..., A)."""
+        """Sample (..., A) unclipped actions."""
         return self.mean + self.std * jax.random.normal(key, self.mean.shape)
 
     def action(self, unclipped: jax.Array) -> jax.Array:
-        """Return what the environment gets for an unclipped action."""
+        """Map unclipped actions to the actions for the environment."""
         return jnp.tanh(unclipped) if self.squash else unclipped
 
     def log_prob(self, unclipped: jax.Array) -> jax.Array:
-        """Return (...) logarithm of the density of ``action(unclipped)``.
+        """Return the (...) log density of ``action(unclipped)``.
 
-        With a = tanh(u), ``log p(a) = log N(u) - sum 2 (log 2 - u - softplus(-2 u))``, the
-        stable form of ``log(1 - tanh^2 u)`` (Haarnoja et al., arXiv 1801.01290, appendix C).
+        For ``a = tanh(u)`` it is ``log N(u) - sum 2 (log 2 - u - softplus(-2 u))``, with a stable
+        form of ``log(1 - tanh^2 u)`` (Haarnoja et al., arXiv 1801.01290, appendix C).
         """
         scaled = (unclipped - self.mean) / self.std
         log_prob = -0.5 * scaled**2 - jnp.log(self.std) - 0.5 * _LOG_2PI
@@ -47,10 +45,9 @@ class Normal(struct.PyTreeNode):
         return log_prob.sum(-1)
 
     def entropy(self, key: jax.Array) -> jax.Array:
-        """Return (...) differential entropy of the action, in nats.
+        """Return the (...) differential entropy of the action in nats.
 
-        Exact without squashing; with it the mean of ``log(1 - tanh^2 u)`` is estimated from one
-        draw with the key.
+        With ``squash``, one sample estimates the mean of ``log(1 - tanh^2 u)``.
         """
         entropy = (jnp.log(self.std) + 0.5 * (1.0 + _LOG_2PI)).sum(-1)
         if self.squash:
@@ -58,15 +55,15 @@ class Normal(struct.PyTreeNode):
         return entropy
 
     def kl_to(self, new: Normal) -> jax.Array:
-        """Return (...) Kullback-Leibler divergence KL(self || new), in nats.
+        """Return the (...) Kullback-Leibler divergence KL(self || new) in nats.
 
-        ``sum [log(s_n / s_o) + (s_o^2 + (m_o - m_n)^2) / (2 s_n^2) - 1/2]``. A squashing that
-        both share does not change it.
+        ``sum [log(s_n / s_o) + (s_o^2 + (m_o - m_n)^2) / (2 s_n^2) - 1/2]``, with or without
+        ``tanh`` on both sides.
         """
         distance = (self.std**2 + (self.mean - new.mean) ** 2) / (2.0 * new.std**2)
         return (jnp.log(new.std) - jnp.log(self.std) + distance - 0.5).sum(-1)
 
 
 def _log_slope(unclipped: jax.Array) -> jax.Array:
-    """Return ``log(1 - tanh^2 u)``, each coordinate."""
+    """Return ``log(1 - tanh^2 u)`` of each coordinate."""
     return 2.0 * (jnp.log(2.0) - unclipped - jax.nn.softplus(-2.0 * unclipped))

@@ -1,4 +1,4 @@
-"""Networks that turn pixels into features, of layers that are fast and deterministic."""
+"""Networks that map pixels to features, built from fast and deterministic layers."""
 
 from __future__ import annotations
 
@@ -13,18 +13,16 @@ from flax import linen as nn
 from pixelbrax_jax._platform.lowering import by_platform
 
 _GREY = 0.5
-"""Taken from pixels in [0, 1] by the encoders that are not published ones. A gradient has the same
-sign for all weights of a filter that sees positive numbers only, and large steps then leave most
-filters at zero for ever, under videos all of them."""
+"""Centre of the pixels in [0, 1], which ``Small`` and ``Patch`` subtract. Positive inputs give all
+weights of a filter gradients of the same sign, and large steps then turn most filters off."""
 
 Pads = tuple[tuple[int, int], tuple[int, int]]
 
 
 def convolve(x: jax.Array, kernel: jax.Array, stride: int, pads: Pads) -> jax.Array:
-    """Return cross-correlation of (B, H, W, C) with (h, w, C, D), padded by zeros.
+    """Cross-correlate (B, H, W, C) with (h, w, C, D), padded with zeros.
 
-    XLA's own convolution on a CPU, and its derivatives above all, reach a fraction of the speed of
-    matrix products within ``lax.scan``. There it is written as products.
+    A CPU computes matrix products, which are faster there than XLA's convolution in ``lax.scan``.
     """
 
     def products(x: jax.Array, kernel: jax.Array) -> jax.Array:
@@ -40,16 +38,12 @@ def convolve(x: jax.Array, kernel: jax.Array, stride: int, pads: Pads) -> jax.Ar
 
 
 def _as_products(x: jax.Array, kernel: jax.Array, stride: int, pads: Pads) -> jax.Array:
-    """Return the convolution as a sum of matrix products.
-
-    The image is cut into blocks of stride x stride pixels, whose channels are put side by side:
-    over blocks the stride is 1, and each place of the kernel adds one product.
-    """
+    """Convolve over blocks of stride x stride pixels, with one matrix product per kernel block."""
     batch, height, width, channels = x.shape
     (top, bottom), (left, right) = pads
     rows = (top + height + bottom - kernel.shape[0]) // stride + 1
     columns = (left + width + right - kernel.shape[1]) // stride + 1
-    # Blocks of a kernel, and of the image as far as the last place of the kernel reaches.
+    # Blocks of the kernel, and of the part of the image that the kernel covers.
     tall, wide = (-(-side // stride) for side in kernel.shape[:2])
     down, across = rows + tall - 1, columns + wide - 1
     borders = (
@@ -73,7 +67,7 @@ def _as_products(x: jax.Array, kernel: jax.Array, stride: int, pads: Pads) -> ja
 
 
 class Conv(nn.Module):
-    """A convolution with a bias, of channels-last images; as ``flax.linen.Conv``."""
+    """A convolution with a bias over channels-last images, like ``flax.linen.Conv``."""
 
     features: int
     size: int
@@ -93,10 +87,9 @@ class Conv(nn.Module):
 
 
 def max_pool(x: jax.Array) -> jax.Array:
-    """Return the maximum over windows of 3 x 3 with stride 2, padded as ``SAME``.
+    """Take the maximum over 3 x 3 windows with stride 2 and ``SAME`` padding.
 
-    The windows are nine strided slices. ``nn.max_pool`` gives the same numbers, but its gradient
-    is XLA's select-and-scatter, which is slow and on a GPU not deterministic.
+    The gradient of ``nn.max_pool`` is slow and not deterministic on a GPU.
     """
     height, width = x.shape[1:3]
     pads = jax.lax.padtype_to_pads((height, width), (3, 3), (2, 2), "SAME")
@@ -114,11 +107,10 @@ def max_pool(x: jax.Array) -> jax.Array:
 
 
 def dense(size: int, gain: float = math.sqrt(2.0), name: str | None = None) -> nn.Dense:
-    """Return a layer with orthogonal weights, which may be sampled under ``jax.vmap`` too.
+    """Make a layer with orthogonal weights.
 
-    They are Q of a QR decomposition. On a CPU that of a batch waits for threads which others of
-    its kind may hold while they wait as well: where cores are few, jaxlib 0.10 then stands still
-    for ever. Here a batch is drawn one by one.
+    Under ``jax.vmap`` the weights are sampled one by one, because the batched QR decomposition of
+    jaxlib 0.10 can deadlock on a CPU with few cores.
     """
     initializer = nn.initializers.orthogonal(gain)
 
@@ -131,7 +123,7 @@ def dense(size: int, gain: float = math.sqrt(2.0), name: str | None = None) -> n
 
 
 class Impala(nn.Module):
-    """The residual network of IMPALA (Espeholt et al., arXiv 1802.01561), 15 convolutions."""
+    """The residual network of IMPALA with 15 convolutions (Espeholt et al., arXiv 1802.01561)."""
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
@@ -181,10 +173,7 @@ class Small(nn.Module):
 
 
 class Patch(nn.Module):
-    """Three convolutions, the first over patches that do not overlap: little work for each pixel.
-
-    Vision transformers begin with such a layer (Dosovitskiy et al., arXiv 2010.11929).
-    """
+    """Three convolutions, first over disjoint patches (Dosovitskiy et al., arXiv 2010.11929)."""
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
@@ -204,11 +193,11 @@ ENCODERS: dict[str, Callable[[], nn.Module]] = {
 }
 
 SMALLEST = {"impala": 1, "nature": 36, "drq": 15, "small": 18, "patch": 24}
-"""Height and width, in pixels, that an encoder needs at least."""
+"""Smallest height and width of each encoder's images in pixels."""
 
 
 def scaled(pixels: jax.Array) -> jax.Array:
-    """Return uint8 pixels as encoders take them: float32 in [0, 1]."""
+    """Scale uint8 pixels to float32 in [0, 1] for an encoder."""
     return pixels.astype(jnp.float32) / 255.0
 
 

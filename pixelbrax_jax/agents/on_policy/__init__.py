@@ -1,1 +1,1 @@
-"""Algorithms that learn from what their current policy does: PPO, PPG and DCPG."""
+"""On-policy algorithms: PPO, PPG and DCPG."""

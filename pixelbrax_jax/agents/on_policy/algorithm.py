@@ -1,4 +1,4 @@
-"""What on-policy algorithms share: a rollout, and passes over it in minibatches."""
+"""The base of on-policy algorithms: rollouts, and updates in minibatches."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.types import EnvParams
 
 Loss = Callable[[Networks, Batch, jax.Array], tuple[jax.Array, Metrics]]
-"""Of networks, a batch and a key: the loss, and scalars to log."""
+"""Maps networks, a batch and a key to the loss and scalars to log."""
 
 
 class OnPolicyState(TrainState):
-    """Where an on-policy algorithm stands.
+    """The state of an on-policy algorithm.
 
     Attributes:
-        aux_opt_state: of the optimiser of the auxiliary phase; None where there is none.
+        aux_opt_state: optimiser state of the auxiliary phase, or None.
         scaler: statistics of rewards.
-        buffer: what the auxiliary phase will learn from; None where there is none.
+        buffer: rollouts for the auxiliary phase, or None.
     """
 
     aux_opt_state: Networks | None = without_envs()
@@ -49,7 +49,7 @@ class OnPolicyState(TrainState):
 
 
 class Decision(NamedTuple):
-    """What learning needs of an action: itself, its log-probability, and the value it was at."""
+    """An unclipped action, its log-probability and the value of its observation."""
 
     unclipped_action: jax.Array
     log_prob: jax.Array
@@ -57,7 +57,7 @@ class Decision(NamedTuple):
 
 
 class Experience(NamedTuple):
-    """A rollout whose ``choice`` is a ``Decision``, and its advantages and returns, (T, N)."""
+    """A rollout with a ``Decision`` as ``choice``, and its (T, N) advantages and returns."""
 
     rollout: Rollout
     advantage: jax.Array
@@ -66,10 +66,7 @@ class Experience(NamedTuple):
 
 @dataclass(frozen=True)
 class OnPolicy(Algorithm):
-    """An algorithm that learns from each rollout with the policy that played it.
-
-    A subclass has ``agent``, its networks, and ``learn``.
-    """
+    """An algorithm that learns from rollouts of its current policy."""
 
     config: OnPolicyConfig
     config_class: ClassVar[type[TrainConfig]] = OnPolicyConfig
@@ -77,19 +74,19 @@ class OnPolicy(Algorithm):
     @property
     @abstractmethod
     def agent(self) -> ActorCritic:
-        """Its networks."""
+        """The networks."""
 
     @abstractmethod
     def learn(self, state: OnPolicyState, experience: Experience) -> tuple[OnPolicyState, Metrics]:
-        """Learn from the rollout of iteration ``state.iteration``, after which ``state`` is."""
+        """Learn from a rollout; ``state`` is the state after it."""
 
     def make_agent(self, *, shared: bool, has_value: bool, detach: bool = False) -> ActorCritic:
-        """Return networks as the settings say.
+        """Make the networks of the settings.
 
         Args:
-            shared: whether the critic is the actor's value head.
+            shared: whether the actor's value head is the critic.
             has_value: whether the actor has a value head.
-            detach: whether a shared value leaves the encoder alone.
+            detach: whether gradients of a shared value stop at the encoder.
         """
         config = self.config
         action_size = self.envs.env.action_size
@@ -98,12 +95,12 @@ class OnPolicy(Algorithm):
         return ActorCritic(actor, critic, detach)
 
     def init_networks(self, key: jax.Array) -> Networks:
-        """Sample initial parameters, by name of the network."""
+        """Sample initial parameters by network name."""
         return self.agent.init(key, *split_obs(self.envs.env.obs_spec))
 
     @under_default_flags
     def init(self, key: jax.Array, env_params: EnvParams) -> OnPolicyState:
-        """As ``Algorithm.init``."""
+        """See ``Algorithm.init``."""
         networks = self.init_networks(network_key(key))
         env_state, _ = self.envs.reset(env_key(key), env_params)
         return OnPolicyState(
@@ -119,7 +116,7 @@ class OnPolicy(Algorithm):
 
     @under_default_flags
     def iterate(self, state: OnPolicyState, env_params: EnvParams) -> tuple[OnPolicyState, Metrics]:
-        """Play a rollout and learn from it."""
+        """Collect a rollout and learn from it."""
         state, experience, metrics = self.gather(state, env_params)
         state, learn_metrics = self.learn(state, experience)
         rate = Optimizer(self.config).learning_rate(state.iteration)
@@ -128,13 +125,13 @@ class OnPolicy(Algorithm):
 
     @under_default_flags
     def act(self, networks: Networks, pixels: jax.Array, key: jax.Array | None = None) -> jax.Array:
-        """As ``Algorithm.act``, with mean actions where there is no key."""
+        """See ``Algorithm.act``; without a key the actions are the mean actions."""
         return self.agent.act(networks, pixels, key)
 
     def gather(
         self, state: OnPolicyState, env_params: EnvParams
     ) -> tuple[OnPolicyState, Experience, Metrics]:
-        """Play a rollout, and return the state after it, the experience and its metrics."""
+        """Collect a rollout; return the state after it, the experience and its metrics."""
         config = self.config
 
         def choose(pixels: jax.Array, seen: jax.Array | None, key: jax.Array) -> Any:
@@ -173,12 +170,12 @@ class OnPolicy(Algorithm):
         return state, Experience(rollout, advantage, returns), metrics
 
     def batch_at(self, experience: Experience, times: jax.Array) -> Batch:
-        """Return the samples of some times, (B, N) int32."""
+        """Return the samples at (B, N) int32 times."""
         rollout, advantage, returns = experience
         pixels = observations(rollout.frames, times, self.config.random_shift)
         rows = (rollout.frames.state, *rollout.choice, advantage, returns, rollout.valid)
         *samples, valid = jax.tree.map(lambda rows: at_times(rows, times), rows)
-        return Batch(pixels, *samples, valid.astype(jnp.float32))
+        return Batch._make((pixels, *samples, valid.astype(jnp.float32)))
 
     def update(
         self,
@@ -191,19 +188,19 @@ class OnPolicy(Algorithm):
         learners: Collection[str] | None = None,
         target_kl: float | None = None,
     ) -> tuple[OnPolicyState, Metrics]:
-        """Pass over a rollout in minibatches, with a step of the optimiser for each.
+        """Take an optimiser step for each minibatch of a rollout, ``num_epochs`` times.
 
         Args:
-            state: with the parameters.
-            loss: of networks, a batch and a key.
+            state: contains the parameters.
+            loss: function to minimise.
             experience: the rollout.
             num_epochs: number of passes.
-            key: of these passes alone.
-            learners: names of the networks that learn; None takes all that have an optimiser.
-            target_kl: approximate KL divergence beyond which no further minibatch is used.
+            key: for minibatches and loss.
+            learners: networks that learn; None means all that have an optimiser state.
+            target_kl: approximate KL divergence above which the update stops.
 
         Returns:
-            The state, and the mean of each metric over all minibatches that were used.
+            The state, and the mean of each metric over the minibatches used.
         """
         config, optimizer = self.config, Optimizer(self.config)
 
@@ -214,7 +211,7 @@ class OnPolicy(Algorithm):
             times, key = inputs
             batch = self.batch_at(experience, times)
             gradients, metrics = jax.grad(loss, has_aux=True)(networks, batch, key)
-            # A gradient of 0 would not do: Adam goes on for a while in the direction it had.
+            # Adam's momentum moves parameters even at a gradient of 0, so the others get none.
             gradients = {name: gradients[name] for name in opt_state}
             new, new_opt_state, norms = optimizer.step(
                 networks, opt_state, gradients, state.iteration
@@ -222,7 +219,7 @@ class OnPolicy(Algorithm):
             metrics |= {f"grad_norm/{name}": norm for name, norm in norms.items()}
             if target_kl is None:
                 return (new, new_opt_state, stopped), (metrics, jnp.float32(1.0))
-            # This minibatch is still used: its divergence is known only now.
+            # This minibatch still counts, because its divergence is known only after the step.
             used = jnp.where(stopped, 0.0, 1.0)
             keep = jax.tree.map(
                 lambda old, new: jnp.where(stopped, old, new),
@@ -264,10 +261,9 @@ def passes(
 
 
 def minibatch_times(key: jax.Array, num_steps: int, num_envs: int, parts: int) -> jax.Array:
-    """Return a random partition of T steps into M minibatches, (M, T / M, N) int32.
+    """Sample a partition of T steps into M minibatches for each environment, (M, T / M, N) int32.
 
-    Every minibatch has equally many steps of each environment. So a minibatch is cut along the
-    environments alike, on however many devices they live.
+    A minibatch has the same number of steps of each environment, so devices share it equally.
     """
     keys = jax.vmap(lambda i: jax.random.fold_in(key, i))(jnp.arange(num_envs))
     order = jax.vmap(lambda key: jax.random.permutation(key, num_steps), out_axes=1)(keys)

@@ -1,4 +1,4 @@
-"""Settings that every on-policy algorithm has."""
+"""Settings of every on-policy algorithm."""
 
 from __future__ import annotations
 
@@ -15,31 +15,31 @@ ADVANTAGE_NORMS = ("batch", "minibatch", "none")
 
 @dataclass(frozen=True)
 class OnPolicyConfig(TrainConfig):
-    """Settings of rollouts, of the policy, and of PPO's objective."""
+    """Settings of rollouts, the policy and PPO's objective."""
 
     memory_settings: ClassVar[tuple[str, ...]] = ("num_envs", "num_steps")
 
     num_steps: int = 64
-    """Steps T of each environment in one rollout."""
+    """Number of steps T of each environment in a rollout."""
     random_shift: int = 0
-    """Pixels by which images are shifted at most, one random shift for each rollout."""
+    """Shifts images randomly by up to this many pixels, once per rollout."""
     policy: str = "gaussian"
-    """``gaussian``, ``tanh_gaussian`` or ``deacrep``."""
+    """Distribution of the actions: ``gaussian``, ``tanh_gaussian`` or ``deacrep``."""
     initial_std: float = 1.0
-    """Standard deviation of a new policy, unless it is ``deacrep``."""
+    """Initial standard deviation of a ``gaussian`` or ``tanh_gaussian`` policy."""
 
     gae_lambda: float = 0.95
     """Lambda of generalised advantage estimation."""
     num_minibatches: int = 8
-    """Minibatches of an epoch; each has T / num_minibatches steps of every environment."""
+    """Number of minibatches per epoch, with T / num_minibatches steps of every environment each."""
     clip_coef: float = 0.2
     """Epsilon of PPO's clipped ratio."""
     ent_coef: float = 0.001
     """Weight of the entropy bonus."""
     normalize_advantage: str = "batch"
-    """Over what advantages get mean 0 and deviation 1: ``batch``, ``minibatch`` or ``none``."""
+    """Normalises advantages over the ``batch`` or the ``minibatch``, or not at all: ``none``."""
     normalize_reward: bool = True
-    """Whether rewards are divided by the deviation of discounted returns."""
+    """Divides rewards by the standard deviation of discounted returns."""
 
     def __post_init__(self) -> None:
         """Check the settings."""
@@ -57,17 +57,17 @@ class OnPolicyConfig(TrainConfig):
         low, high = (math.exp(x) for x in LOG_STD_RANGE)
         if not low < self.initial_std < high:
             raise ValueError(
-                f"initial_std must be between {low:.4f} and {high:.2f}, where standard deviations "
-                f"are kept, got {self.initial_std}."
+                f"initial_std must be between {low:.4f} and {high:.2f}, the limits of standard "
+                f"deviations, got {self.initial_std}."
             )
 
     @property
     def steps_per_iteration(self) -> int:
-        """Control steps of one rollout, over all environments."""
+        """Control steps of one rollout over all environments."""
         return self.num_envs * self.num_steps * self.env.action_repeat
 
     @property
     def bytes_per_iteration(self) -> int:
-        """Bytes of the frames of one rollout, over all environments."""
+        """Bytes of the frames of one rollout over all environments."""
         frames = self.num_envs * (self.num_steps + self.env.frame_stack - 1)
         return frames * self.env.height * self.env.width * 3

@@ -1,9 +1,4 @@
-"""Delayed critic policy gradient (Moon, Lee and Song, arXiv 2210.09960), and two variants.
-
-Policy and value share an encoder, and the value learns from returns only in the delayed phase,
-long after they were collected: that keeps the encoder from memorising. DDCPG adds a dynamics
-head to the delayed phase; the decoupled variant has a critic of its own.
-"""
+"""Delayed critic policy gradient (Moon, Lee and Song, arXiv 2210.09960), and two variants."""
 
 from __future__ import annotations
 
@@ -27,33 +22,34 @@ from pixelbrax_jax.validation import check_fraction, check_positive_int
 
 @dataclass(frozen=True)
 class DCPGConfig(PhasicConfig):
-    """Settings of DCPG; of DDCPG with ``dynamics_coef`` = 1."""
+    """Settings of DCPG, or of DDCPG with ``dynamics_coef=1``."""
 
     update_epochs: int = 1
-    """Passes over a rollout in the policy phase."""
+    """Number of passes over a rollout in the policy phase."""
     value_distill_coef: float = 1.0
-    """lambda_V, weight that keeps the value where it was while the policy learns."""
+    """Weight lambda_V of the loss that keeps values constant in the policy phase."""
     dynamics_coef: float = 0.0
-    """c_f, weight of DDCPG's dynamics loss in the delayed phase; 0 has no dynamics head."""
+    """Weight c_f of DDCPG's dynamics loss in the delayed phase; 0 omits the dynamics head."""
     decoupled: bool = False
-    """Whether advantages come from a critic of its own, which learns in every policy phase."""
+    """Computes advantages with a separate critic that learns in every policy phase."""
     vf_coef: float = 1.0
-    """Weight of that critic's loss."""
+    """Weight of the separate critic's loss."""
     target_rate: float = 0.05
-    """tau of the averaged actor whose value is kept in the decoupled variant."""
+    """Rate tau of the averaged actor that provides the old values in the decoupled variant."""
 
     def __post_init__(self) -> None:
         """Check the settings."""
         super().__post_init__()
         check_positive_int("update_epochs", self.update_epochs)
-        # The delayed phase is where values learn.
+        # Values learn only in the delayed phase.
         check_positive_int("aux_epochs", self.aux_epochs)
         for name in ("value_distill_coef", "dynamics_coef", "vf_coef"):
             check_positive(name, getattr(self, name), or_zero=True)
         check_fraction("target_rate", self.target_rate)
         if self.state_critic and not self.decoupled:
             raise ValueError(
-                "state_critic needs decoupled=True, got False: else there is no critic apart."
+                "state_critic needs decoupled=True, got False: only the decoupled variant has a "
+                "separate critic."
             )
         if self.dynamics_coef and self.num_steps * self.num_policy_phases == self.aux_minibatches:
             raise ValueError(
@@ -64,11 +60,11 @@ class DCPGConfig(PhasicConfig):
 
 
 class Dynamics(nn.Module):
-    """Tells whether an action leads from one observation's features to another's."""
+    """Classifies whether an action leads from one observation's features to another's."""
 
     @nn.compact
     def __call__(self, features: jax.Array, action: jax.Array, following: jax.Array) -> jax.Array:
-        """Return (B,) logits of (B, F) features, (B, A) unclipped actions and (B, F) features."""
+        """Map (B, F) features, (B, A) unclipped actions and (B, F) features to (B,) logits."""
         x = jnp.concatenate([features, action, following], axis=-1)
         for _ in range(2):
             x = nn.relu(dense(256)(x))
@@ -77,7 +73,10 @@ class Dynamics(nn.Module):
 
 @dataclass(frozen=True)
 class DCPG(Phasic):
-    """DCPG with its settings, in the given environments."""
+    """DCPG: policy and value share an encoder, and values learn from old returns.
+
+    DDCPG adds a dynamics head in the delayed phase. The decoupled variant has a separate critic.
+    """
 
     config: DCPGConfig
     name: ClassVar[str] = "dcpg"
@@ -85,11 +84,11 @@ class DCPG(Phasic):
 
     @cached_property
     def agent(self) -> ActorCritic:
-        """Its networks, but for the dynamics head."""
+        """The networks without the dynamics head."""
         return self.make_agent(shared=not self.config.decoupled, has_value=True)
 
     def init_networks(self, key: jax.Array) -> Networks:
-        """As ``OnPolicy.init_networks``, with the averaged actor and the dynamics head."""
+        """Sample initial parameters, also of the averaged actor and the dynamics head."""
         config, networks = self.config, super().init_networks(key)
         if config.decoupled:
             networks["target"] = networks["actor"]
@@ -103,14 +102,14 @@ class DCPG(Phasic):
         return networks
 
     def learn(self, state: OnPolicyState, experience: Experience) -> tuple[OnPolicyState, Metrics]:
-        """Learn the policy, and keep the value where it was (the policy phase)."""
+        """Run the policy phase: improve the policy and keep the values constant."""
         config, agent = self.config, self.agent
         target = state.networks.get("target")
 
         def loss(networks: Networks, batch: Batch, key: jax.Array) -> tuple[jax.Array, Metrics]:
             output = agent.actor(networks["actor"], batch.pixels)
             loss, metrics = policy_loss(output.policy, batch, config, key)
-            # Coupled, the actor's value is what played: its old values are in the batch.
+            # Without a separate critic, the batch contains the old values of the actor.
             kept = batch.value
             if config.decoupled:
                 kept = agent.actor(target, batch.pixels).value
@@ -130,7 +129,7 @@ class DCPG(Phasic):
     def auxiliary_loss(
         self, networks: Networks, chunk: Chunk, key: jax.Array
     ) -> tuple[jax.Array, Metrics]:
-        """Learn the value from old returns, and keep the policy (the delayed phase)."""
+        """Return the loss of the delayed phase, which fits old returns and keeps the policy."""
         config = self.config
         output, loss, metrics = self.loss_with_kept_policy(networks, chunk, config.vf_coef)
         if config.dynamics_coef:
@@ -140,7 +139,7 @@ class DCPG(Phasic):
         return loss, metrics
 
     def after_auxiliary_step(self, networks: Networks) -> Networks:
-        """Move the averaged actor."""
+        """Update the averaged actor."""
         if not self.config.decoupled:
             return networks
         rate = self.config.target_rate
@@ -151,12 +150,11 @@ class DCPG(Phasic):
 
 
 def dynamics_loss(params: Networks, features: jax.Array, chunk: Chunk, key: jax.Array) -> jax.Array:
-    """Return DDCPG's loss: true transitions are told from wrong ones.
+    """Return DDCPG's loss of a classifier of true and false transitions.
 
-    With features z, action a and features z' one step later, and a logistic loss l:
-    ``l(f(z, a, z'), 1) + l(f(z, a~, z'), 0) / 2 + l(f(z, a, z~'), 0)``, with the weights of the
-    authors' code. Here a~ and z~' are those of another sample. Pairs that an episode's end parts
-    are left out. ``features`` are those of the chunk, (N C, F); the key is for the exchange.
+    ``l(f(z, a, z'), 1) + l(f(z, a~, z'), 0) / 2 + l(f(z, a, z~'), 0)`` with the logistic loss l,
+    features z, action a, next features z', and a~ and z~' from other samples; the weights are those
+    of the authors' code. Pairs across an episode's end have no weight. ``features`` are (N C, F).
     """
 
     def in_time(rows: jax.Array) -> jax.Array:
@@ -167,7 +165,7 @@ def dynamics_loss(params: Networks, features: jax.Array, chunk: Chunk, key: jax.
 
     now, following = flat(in_time(features)[:, :-1]), flat(in_time(features)[:, 1:])
     action = flat(in_time(chunk.unclipped_action)[:, :-1])
-    # A step that ends an episode returns a true last observation; the one after it begins anew.
+    # A step that ends an episode returns its last observation; the next step resets the episode.
     weight = flat(in_time(chunk.weight)[:, :-1])
     action_key, following_key = jax.random.split(key)
     others = jax.random.permutation(action_key, len(action))

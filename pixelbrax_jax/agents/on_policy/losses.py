@@ -1,4 +1,4 @@
-"""What on-policy algorithms learn towards: returns, advantages, and the terms of their losses."""
+"""Advantages, reward scaling and the losses of on-policy algorithms."""
 
 from __future__ import annotations
 
@@ -22,17 +22,12 @@ def gae(
     gamma: float,
     gae_lambda: float,
 ) -> tuple[jax.Array, jax.Array]:
-    """Return generalised advantage estimates (Schulman et al., arXiv 1506.02438).
+    """Return advantages (Schulman et al., arXiv 1506.02438) and returns ``A_t + V(o_t)``, (T, N).
 
     ``delta_t = r_t + gamma (1 - d_t) V(o_{t+1}) - V(o_t)`` and
-    ``A_t = delta_t + gamma lambda (1 - d_t) (1 - u_t) A_{t+1}``, where d is termination and u is
-    truncation. ``o_{t+1}`` is the observation that the step returned, also of the step that ended
-    the episode: a time limit does not make the future worthless.
-
-    Returns:
-        Advantages and returns ``A_t + V(o_t)``, (T, N) float32 each, of arrays (T, N) and the
-        (N,) value of the last observation. At a step that only begins an episode both are without
-        meaning.
+    ``A_t = delta_t + gamma lambda (1 - d_t) (1 - u_t) A_{t+1}`` with termination d and truncation
+    u. ``o_{t+1}`` is the observation that the step returned, also at the end of an episode.
+    ``last_value`` is (N,), the other arrays are (T, N). Results at a reset are meaningless.
     """
     following = jnp.concatenate([value[1:], last_value[None]])
     delta = reward + gamma * jnp.where(terminated, 0.0, following) - value
@@ -48,17 +43,16 @@ def gae(
 
 
 class RewardScaler(struct.PyTreeNode):
-    """Divides rewards by the standard deviation of discounted returns seen so far.
+    """Divides rewards by the running standard deviation of discounted returns.
 
-    ``G_t = gamma G_{t-1} + r_t``, from 0 in every episode; rewards become
-    ``clip(r / sqrt(var(G) + 1e-8), -10, 10)``, as in OpenAI's baselines and PPG
-    (arXiv 2009.04416).
+    ``G_t = gamma G_{t-1} + r_t`` starts from 0 in every episode. Rewards become
+    ``clip(r / sqrt(var(G) + 1e-8), -10, 10)``, as in OpenAI's baselines and PPG (arXiv 2009.04416).
 
     Attributes:
         discounted: (N,) float32, G of each environment.
-        count: () float32, number of returns seen; to 24 bits.
+        count: () float32, number of returns with 24 bits of precision.
         mean: () float32.
-        square: () float32, mean squared deviation from the mean.
+        square: () float32, variance.
     """
 
     discounted: jax.Array = along_envs(0)
@@ -68,19 +62,19 @@ class RewardScaler(struct.PyTreeNode):
 
     @classmethod
     def start(cls, num_envs: int) -> RewardScaler:
-        """Return a scaler that has seen nothing."""
+        """Return a scaler without data."""
         zero = jnp.float32(0.0)
         return cls(discounted=jnp.zeros(num_envs), count=zero, mean=zero, square=zero)
 
     @property
     def scale(self) -> jax.Array:
-        """() float32, what a reward is divided by."""
+        """() float32 divisor of rewards."""
         return jnp.sqrt(self.square + 1e-8)
 
     def __call__(
         self, reward: jax.Array, done: jax.Array, valid: jax.Array, gamma: float
     ) -> tuple[RewardScaler, jax.Array]:
-        """Return the scaler that has seen a rollout, (T, N) each, and its rewards, scaled."""
+        """Add the (T, N) arrays of a rollout; return the new scaler and the scaled rewards."""
 
         def forwards(before: jax.Array, now: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
             reward, done = now
@@ -92,7 +86,7 @@ class RewardScaler(struct.PyTreeNode):
         weight = valid / jnp.maximum(number, 1)
         mean = jnp.sum(weight * seen)
         square = jnp.sum(weight * (seen - mean) ** 2)
-        # Chan et al.'s union of two samples, in fractions of their sizes.
+        # Merges two samples by the formula of Chan et al., in fractions of their sizes.
         count = self.count + number
         fraction = number / jnp.maximum(count, 1.0)
         shift = mean - self.mean
@@ -108,15 +102,15 @@ class RewardScaler(struct.PyTreeNode):
 
 
 class Batch(NamedTuple):
-    """B samples of a rollout, environment by environment.
+    """B samples of a rollout, ordered by environment.
 
     Attributes:
         pixels: (B, H, W, 3 K) uint8.
         state: (B, S) float32, or None.
         unclipped_action: (B, A) float32.
-        log_prob, value: (B,) float32, of the policy and value that played.
+        log_prob, value: (B,) float32, from the networks that collected the rollout.
         advantage, returns: (B,) float32.
-        weight: (B,) float32, 1 or, for steps that teach nothing, 0.
+        weight: (B,) float32, 0 at an episode reset, else 1.
     """
 
     pixels: jax.Array
@@ -130,12 +124,12 @@ class Batch(NamedTuple):
 
 
 def mean(x: jax.Array, weight: jax.Array) -> jax.Array:
-    """Return () weighted mean; 0 where nothing has weight."""
+    """Return the () weighted mean, or 0 if all weights are 0."""
     return jnp.sum(x * weight) / jnp.maximum(jnp.sum(weight), 1.0)
 
 
 def normalized(x: jax.Array, weight: jax.Array) -> jax.Array:
-    """Return ``x`` with weighted mean 0 and standard deviation 1."""
+    """Normalise ``x`` to weighted mean 0 and standard deviation 1."""
     center = x - mean(x, weight)
     return center / (jnp.sqrt(mean(center**2, weight)) + 1e-8)
 
@@ -143,10 +137,10 @@ def normalized(x: jax.Array, weight: jax.Array) -> jax.Array:
 def policy_loss(
     policy: Normal, batch: Batch, config: OnPolicyConfig, key: jax.Array
 ) -> tuple[jax.Array, Metrics]:
-    """Return PPO's clipped objective and the entropy bonus (Schulman et al., arXiv 1707.06347).
+    """Return PPO's clipped loss with entropy bonus (Schulman et al., arXiv 1707.06347).
 
     ``- mean min(rho A, clip(rho, 1 - eps, 1 + eps) A) - c_H H`` with the ratio
-    ``rho = exp(log pi(a) - log pi_old(a))``. The key is for entropies that are estimated.
+    ``rho = exp(log pi(a) - log pi_old(a))``. The key is for estimates of the entropy.
     """
     advantage = batch.advantage
     if config.normalize_advantage == "minibatch":
@@ -171,12 +165,12 @@ def policy_loss(
 
 
 def value_loss(value: jax.Array, target: jax.Array, weight: jax.Array) -> jax.Array:
-    """Return () half the mean squared error."""
+    """Return half the mean squared error, ()."""
     return 0.5 * mean((value - target) ** 2, weight)
 
 
 def clipped_value_loss(value: jax.Array, batch: Batch, clip_coef: float) -> jax.Array:
-    """Return () the larger of the errors of the value and of the value kept near what it was."""
+    """Return the larger of the losses of the value and of the value clipped to the old one, ()."""
     near = batch.value + jnp.clip(value - batch.value, -clip_coef, clip_coef)
     error = jnp.maximum((value - batch.returns) ** 2, (near - batch.returns) ** 2)
     return 0.5 * mean(error, batch.weight)

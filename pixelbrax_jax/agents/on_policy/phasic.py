@@ -1,8 +1,4 @@
-"""What PPG and DCPG share: a buffer of rollouts, and a phase that learns from all of them.
-
-A buffer holds P rollouts of N environments. The phase cuts each rollout into equal chunks of
-consecutive steps, and each of its minibatches has one chunk of every environment.
-"""
+"""The base of PPG and DCPG: a buffer of rollouts and an auxiliary phase that learns from it."""
 
 from __future__ import annotations
 
@@ -41,16 +37,16 @@ from pixelbrax_jax.validation import check_positive_int
 
 @dataclass(frozen=True)
 class PhasicConfig(OnPolicyConfig):
-    """Settings of a phase that learns from several rollouts."""
+    """Settings of an auxiliary phase that learns from several rollouts."""
 
     memory_settings: ClassVar[tuple[str, ...]] = ("num_envs", "num_steps", "num_policy_phases")
 
     num_policy_phases: int = 16
-    """N_pi, rollouts between auxiliary phases (DCPG's delayed ones), which learn from all."""
+    """Number N_pi of rollouts between auxiliary phases (DCPG: delayed phases)."""
     aux_epochs: int = 4
-    """E_aux, passes over the buffer."""
+    """Number E_aux of passes over the buffer in an auxiliary phase."""
     aux_minibatches: int = 16
-    """Minibatches of such a pass, a multiple of ``num_policy_phases``."""
+    """Number of minibatches per pass, a multiple of ``num_policy_phases``."""
     beta_clone: float = 1.0
     """Weight of KL(old policy || policy) in the auxiliary phase."""
 
@@ -71,7 +67,7 @@ class PhasicConfig(OnPolicyConfig):
         if minibatches % phases:
             raise ValueError(
                 f"aux_minibatches={minibatches} must be a multiple of num_policy_phases={phases}: "
-                "a minibatch has steps of one rollout."
+                "the steps of a minibatch come from one rollout."
             )
         of_rollout = "aux_minibatches / num_policy_phases"
         check_divides("num_steps", self.num_steps, of_rollout, minibatches // phases)
@@ -81,11 +77,10 @@ class Buffer(struct.PyTreeNode):
     """P rollouts; every array has a leading axis P.
 
     Attributes:
-        frames: what was seen.
         unclipped_action: (P, T, N, A) float32.
         returns: (P, T, N) float32.
-        done: (P, T, N) bool, an episode ended.
-        valid: (P, T, N) bool, the step did not merely begin an episode.
+        done: (P, T, N) bool, whether an episode ended.
+        valid: (P, T, N) bool, False at an episode reset.
     """
 
     frames: Frames = as_declared(leading_axes=1)
@@ -96,15 +91,15 @@ class Buffer(struct.PyTreeNode):
 
 
 class Chunk(NamedTuple):
-    """B = N C samples, C consecutive steps of each of N environments, one after the other.
+    """B = N C samples: C consecutive steps of each of N environments, ordered by environment.
 
     Attributes:
         pixels: (B, H, W, 3 K) uint8.
         state: (B, S) float32, or None.
         unclipped_action: (B, A) float32.
         returns: (B,) float32.
-        weight: (B,) float32, 0 for steps that teach nothing.
-        policy: the distribution of actions before the phase.
+        weight: (B,) float32, 0 at an episode reset, else 1.
+        policy: distribution of actions before the phase.
         num_steps: C.
     """
 
@@ -119,7 +114,11 @@ class Chunk(NamedTuple):
 
 @dataclass(frozen=True)
 class Phasic(OnPolicy):
-    """An on-policy algorithm with an auxiliary phase; its ``learn`` ends with ``remember``."""
+    """An on-policy algorithm with an auxiliary phase; ``learn`` must call ``remember``.
+
+    The phase splits each rollout into chunks of consecutive steps. A minibatch has one chunk of
+    every environment.
+    """
 
     config: PhasicConfig
 
@@ -127,25 +126,25 @@ class Phasic(OnPolicy):
     def auxiliary_loss(
         self, networks: Networks, chunk: Chunk, key: jax.Array
     ) -> tuple[jax.Array, Metrics]:
-        """Return the loss of a chunk in the auxiliary phase, and scalars to log."""
+        """Return the loss of a chunk in the auxiliary phase and scalars to log."""
 
     def after_auxiliary_step(self, networks: Networks) -> Networks:
-        """Return the networks after a step of the optimiser in the auxiliary phase."""
+        """Change the networks after an optimiser step of the auxiliary phase."""
         return networks
 
     @property
     def auxiliary_every(self) -> int:
-        """As ``Algorithm.auxiliary_every``."""
+        """See ``Algorithm.auxiliary_every``."""
         return self.config.num_policy_phases if self.config.aux_epochs else 0
 
     @under_default_flags
     def init(self, key: jax.Array, env_params: EnvParams) -> OnPolicyState:
-        """As ``Algorithm.init``, with an empty buffer."""
+        """See ``Algorithm.init``; the buffer is zero."""
         state = super().init(key, env_params)
         rollout = jax.eval_shape(lambda: _entry(self.gather(state, env_params)[1]))
         phases = self.config.num_policy_phases
         buffer = jax.tree.map(lambda x: jnp.zeros((phases, *x.shape), x.dtype), rollout)
-        # An averaged actor follows without a gradient; other networks learn in one phase alone.
+        # The averaged actor "target" has no gradient; "dynamics" learns only in auxiliary phases.
         optimizer, networks = Optimizer(self.config), state.networks
         learners = {n: p for n, p in networks.items() if n in ("actor", "critic")}
         aux_learners = {n: p for n, p in networks.items() if n != "target"}
@@ -156,7 +155,7 @@ class Phasic(OnPolicy):
         )
 
     def remember(self, state: OnPolicyState, experience: Experience) -> OnPolicyState:
-        """Put a rollout into the buffer, in place of the oldest one."""
+        """Replace the oldest rollout in the buffer."""
         slot = state.iteration % self.config.num_policy_phases
         buffer = jax.tree.map(
             lambda whole, one: jax.lax.dynamic_update_index_in_dim(whole, one, slot, 0),
@@ -167,10 +166,10 @@ class Phasic(OnPolicy):
 
     @under_default_flags
     def auxiliary(self, state: OnPolicyState) -> tuple[OnPolicyState, Metrics]:
-        """Pass over a full buffer with an optimiser of its own; metrics are means over steps."""
+        """Learn from the full buffer with a separate optimiser state; average the metrics."""
         config, optimizer, key = self.config, Optimizer(self.config), auxiliary_key(state)
         num_chunks = config.aux_minibatches
-        # The step size of the rollout before: after the last one, that of the next would be 0.
+        # Uses the step size of the previous iteration, because an annealed one ends at 0.
         iteration = state.iteration - 1
 
         def old_policy(_: None, number: jax.Array) -> tuple[None, tuple[jax.Array, jax.Array]]:
@@ -204,9 +203,9 @@ class Phasic(OnPolicy):
     def loss_with_kept_policy(
         self, networks: Networks, chunk: Chunk, critic_coef: float
     ) -> tuple[ActorOutput, jax.Array, Metrics]:
-        """Return the actor's output, a loss by which values learn while the policy stays, metrics.
+        """Return the actor's output, a loss that fits values and keeps the policy, and metrics.
 
-        ``critic_coef`` is the weight of the loss of a critic of its own.
+        ``critic_coef`` is the weight of a separate critic's loss.
         """
         output = self.agent.actor(networks["actor"], chunk.pixels)
         error = value_loss(output.value, chunk.returns, chunk.weight)
@@ -260,6 +259,6 @@ def _entry(experience: Experience) -> Buffer:
 
 
 def _of_each(chunks: jax.Array, which: jax.Array) -> jax.Array:
-    """Map (Q, N, C, ...) and (N,) to (N C, ...), of each environment another chunk."""
+    """Map (Q, N, C, ...) and (N,) to (N C, ...), with another chunk for each environment."""
     picked = jax.vmap(lambda x, i: x[i], in_axes=(1, 0))(chunks, which)
     return picked.reshape(-1, *picked.shape[2:])

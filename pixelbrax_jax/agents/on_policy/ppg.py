@@ -25,13 +25,14 @@ class PPGConfig(PhasicConfig):
     """Settings of PPG."""
 
     layout: str = "dual"
-    """``dual`` encoders; or one, ``shared``, or of which values ``detach`` in policy phases."""
+    """Encoders of policy and value: ``dual`` (separate), ``shared``, or ``detach`` (shared, without
+    gradients of the value in policy phases)."""
     policy_epochs: int = 1
-    """E_pi, passes over a rollout for the policy."""
+    """Number E_pi of passes over a rollout for the policy."""
     value_epochs: int = 1
-    """E_V, passes over a rollout for the value."""
+    """Number E_V of passes over a rollout for the value."""
     vf_coef: float = 1.0
-    """Weight of the value loss, half the mean squared error."""
+    """Weight of the value loss, which is half the mean squared error."""
     aux_value_coef: float = 1.0
     """Weight of the separate critic's loss in the auxiliary phase."""
 
@@ -46,18 +47,19 @@ class PPGConfig(PhasicConfig):
         if self.layout != "dual" and self.policy_epochs != self.value_epochs:
             raise ValueError(
                 f"policy_epochs={self.policy_epochs} and value_epochs={self.value_epochs} may "
-                f"differ with layout='dual' alone, got {self.layout!r}: Adam would move what both "
-                "share in passes of one of them."
+                f"differ only with layout='dual', got {self.layout!r}: the passes of one would "
+                "change the other, because they share a network."
             )
         if self.state_critic and self.layout != "dual":
             raise ValueError(
-                f"state_critic needs layout='dual', got {self.layout!r}: no encoder is shared."
+                f"state_critic needs layout='dual', got {self.layout!r}: a critic of the "
+                "simulator's state has no encoder to share."
             )
 
 
 @dataclass(frozen=True)
 class PPG(Phasic):
-    """PPG with its settings, in the given environments."""
+    """PPG: policy phases, and auxiliary phases that distil values into the actor's encoder."""
 
     config: PPGConfig
     name: ClassVar[str] = "ppg"
@@ -65,12 +67,12 @@ class PPG(Phasic):
 
     @cached_property
     def agent(self) -> ActorCritic:
-        """Its networks."""
+        """The networks."""
         layout = self.config.layout
         return self.make_agent(shared=layout != "dual", has_value=True, detach=layout == "detach")
 
     def learn(self, state: OnPolicyState, experience: Experience) -> tuple[OnPolicyState, Metrics]:
-        """Learn as PPO does (the policy phase), and remember the rollout."""
+        """Run the policy phase: learn like PPO and store the rollout."""
         config, agent, key = self.config, self.agent, update_key(state)
 
         def loss(
@@ -86,7 +88,7 @@ class PPG(Phasic):
                 metrics["loss/value"] = error
             return total, metrics
 
-        # Passes that both make are made together, then those that one makes alone.
+        # Policy and value share the first passes; further passes follow for one of them.
         shared_epochs = min(config.policy_epochs, config.value_epochs)
         value_network = "critic" if config.layout == "dual" else "actor"
         plan = (
@@ -97,7 +99,7 @@ class PPG(Phasic):
         metrics: Metrics = {}
         for part, (part_loss, num_epochs, learners) in enumerate(plan):
             if num_epochs:
-                # Far from the numbers of passes, by which keys are split.
+                # Does not collide with the keys of the passes, which have small numbers.
                 part_key = key if part == 0 else jax.random.fold_in(key, 2**31 + part)
                 state, part_metrics = self.update(
                     state, part_loss, experience, num_epochs, part_key, learners=learners
@@ -108,7 +110,7 @@ class PPG(Phasic):
     def auxiliary_loss(
         self, networks: Networks, chunk: Chunk, key: jax.Array
     ) -> tuple[jax.Array, Metrics]:
-        """Distil values into the actor's encoder, and keep its policy."""
+        """Return the loss that distils values into the actor's encoder and keeps the policy."""
         del key
         _, loss, metrics = self.loss_with_kept_policy(networks, chunk, self.config.aux_value_coef)
         return loss, metrics

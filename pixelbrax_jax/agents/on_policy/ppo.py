@@ -29,15 +29,15 @@ class PPOConfig(OnPolicyConfig):
     """Settings of PPO."""
 
     layout: str = "separate"
-    """``separate`` encoders for policy and value, or one that is ``shared``."""
+    """Encoders of policy and value: ``separate`` or ``shared``."""
     update_epochs: int = 3
-    """Passes over a rollout."""
+    """Number of passes over a rollout."""
     vf_coef: float = 0.5
-    """Weight of the value loss, half the mean squared error."""
+    """Weight of the value loss, which is half the mean squared error."""
     clip_value: bool = False
-    """Whether the value is kept near what it was, as the policy is."""
+    """Limits the change of the value with ``clip_coef``, like that of the policy."""
     target_kl: float | None = None
-    """Approximate KL divergence beyond which an update stops early."""
+    """Stops an update early above this approximate KL divergence."""
 
     def __post_init__(self) -> None:
         """Check the settings."""
@@ -49,13 +49,14 @@ class PPOConfig(OnPolicyConfig):
             check_positive("target_kl", self.target_kl)
         if self.state_critic and self.layout == "shared":
             raise ValueError(
-                "state_critic needs layout='separate', got 'shared': it has no encoder to share."
+                "state_critic needs layout='separate', got 'shared': a critic of the simulator's "
+                "state has no encoder to share."
             )
 
 
 @dataclass(frozen=True)
 class PPO(OnPolicy):
-    """PPO with its settings, in the given environments."""
+    """PPO: several epochs of a clipped objective after each rollout."""
 
     config: PPOConfig
     name: ClassVar[str] = "ppo"
@@ -63,12 +64,12 @@ class PPO(OnPolicy):
 
     @cached_property
     def agent(self) -> ActorCritic:
-        """Its networks."""
+        """The networks."""
         shared = self.config.layout == "shared"
         return self.make_agent(shared=shared, has_value=shared)
 
     def learn(self, state: OnPolicyState, experience: Experience) -> tuple[OnPolicyState, Metrics]:
-        """As ``OnPolicy.learn``."""
+        """See ``OnPolicy.learn``."""
         config = self.config
         return self.update(
             state,
@@ -80,7 +81,7 @@ class PPO(OnPolicy):
         )
 
     def loss(self, networks: Networks, batch: Batch, key: jax.Array) -> tuple[jax.Array, Metrics]:
-        """Return the loss of a batch, and scalars to log."""
+        """Return the loss of a batch and scalars to log."""
         config = self.config
         policy, value = self.agent(networks, batch.pixels, batch.state)
         loss, metrics = policy_loss(policy, batch, config, key)

@@ -1,4 +1,4 @@
-"""Named settings of each algorithm."""
+"""Presets: named settings of each algorithm."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ _CPU = {
 }
 
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
-    # As each class says.
+    # The defaults of each class.
     "default": {},
     # Lyu et al.'s scripts for Brax (the code of arXiv 2502.00021).
     "deacrep": {
@@ -82,7 +82,7 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
         },
         "dcpg": _PROCGEN | {"num_policy_phases": 32, "aux_minibatches": 32, "aux_epochs": 6},
     },
-    # Minutes on two CPU cores.
+    # Takes minutes on two CPU cores.
     "ci": {
         "ppo": _CI | {"layout": "shared", "update_epochs": 3},
         "ppg": _CI
@@ -97,7 +97,7 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
         "dcpg": _CI
         | {"num_policy_phases": 2, "aux_minibatches": 8, "aux_epochs": 2, "update_epochs": 2},
     },
-    # 6 to 9 minutes on two CPU cores; see docs/results.md.
+    # Takes 6 to 9 minutes on two CPU cores; see docs/results.md.
     "cpu": {
         "ppo": _CPU | {"layout": "shared", "update_epochs": 2},
         "ppg": _CPU
@@ -113,22 +113,23 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
         | {"num_policy_phases": 2, "aux_minibatches": 16, "aux_epochs": 2, "update_epochs": 2},
     },
 }
-"""Changes of the defaults, by name of the preset and of the algorithm."""
+"""Changes to the defaults, by preset and algorithm."""
 
 _CPU_TASKS: dict[str, dict[str, Any]] = {
     "halfcheetah": {"action_repeat": 2, "gamma": 0.97, "total_steps": 3_100_000},
-    # By Brax's reward it stands, and hardly walks; see docs/results.md.
+    # With Brax's reward the walker stands and hardly walks; see docs/results.md.
     "walker2d": {
         "reward_preset": "paper",
         "action_repeat": 4,
         "gamma": 0.99,
         "total_steps": 6_800_000,
     },
-    # Brax charges half of each squared action: noise of 0.5 costs Ant all that staying up earns.
+    # Brax's reward subtracts half of each squared action, so noise of 0.5 costs Ant its reward for
+    # staying up.
     "ant": {"initial_std": 0.25, "action_repeat": 2, "gamma": 0.97, "total_steps": 3_400_000},
     "humanoid": {"action_repeat": 3, "gamma": 0.98, "total_steps": 3_500_000},
 }
-# Tasks of the DM Control Suite; tried with PPO alone.
+# Tasks of the DM Control Suite, only for PPO.
 _CPU_DMC_TASKS: dict[str, dict[str, Any]] = {
     "dmc_cartpole_swingup": {
         "action_repeat": 8,
@@ -145,7 +146,7 @@ _CPU_DMC_TASKS: dict[str, dict[str, Any]] = {
     },
 }
 _CPU_SHARES = {"ppo": 1.0, "ppg": 0.7, "dcpg": 0.6}
-"""An algorithm's number of steps over PPO's: an update of the others takes longer."""
+"""Number of steps relative to PPO, whose updates are faster."""
 
 TASK_SETTINGS: dict[str, dict[str, dict[str, dict[str, Any]]]] = {
     "cpu": {
@@ -158,8 +159,7 @@ TASK_SETTINGS: dict[str, dict[str, dict[str, dict[str, Any]]]] = {
         for algorithm, share in _CPU_SHARES.items()
     },
 }
-"""Further changes, by name of the preset, of the algorithm and of the task; such a preset has no
-other tasks."""
+"""Further changes, by preset, algorithm and task; these presets support no other tasks."""
 
 
 def preset(
@@ -170,12 +170,11 @@ def preset(
     Args:
         algorithm: ``"ppo"``, ``"ppg"`` or ``"dcpg"``.
         name: ``"default"``, ``"deacrep"``, ``"procgen"``, ``"ci"`` or ``"cpu"``.
-        task: name of the task; None means the preset's own.
-        **changes: settings that shall be others, as of ``TrainConfig.replace``.
+        task: name of the task; None uses the preset's task.
+        **changes: settings to change, passed to ``TrainConfig.replace``.
 
     Raises:
-        ValueError: one of them is unknown or out of range, or the preset has no settings for the
-            task.
+        ValueError: a name is unknown, a setting is out of range, or the preset lacks the task.
     """
     check_choice("algorithm", algorithm, ALGORITHMS)
     check_choice("preset", name, [n for n in PRESETS if n == "default" or algorithm in PRESETS[n]])
