@@ -89,7 +89,7 @@ def test_what_is_refused(make_single, make_vector):
         env.get_state()
     env.reset(seed=0)
     state = env.get_state()
-    with pytest.raises(TypeError, match="must be an EnvState, as get_state"):
+    with pytest.raises(TypeError, match="must be an EnvState from get_state"):
         env.set_state({"frames": state.frames})
     with pytest.raises(ValueError, match=r"takes a seed or options\['state'\], got both"):
         env.reset(seed=1, options={"state": state})
