@@ -34,10 +34,7 @@ class TorchPolicy:
         self._act = load_policy(path)
 
     def __call__(self, pixels: torch.Tensor) -> torch.Tensor:
-        """Return mean actions, (B, A) float32 on the same device.
-
-        Args:
-            pixels: observations, (B, H, W, 3K) uint8, oldest frame first.
+        """Return mean actions, (B, A) float32, of pixels, (B, H, W, 3K) uint8, oldest frame first.
 
         Raises:
             ValueError: the dtype or shape differs from training.

@@ -67,11 +67,7 @@ class Programs:
     that are not read again. Outputs are not read again and can be handed out.
 
     ``programs_of`` makes one object per set of options, compared by identity, because JAX compares
-    it in every call.
-
-    Attributes:
-        vector: the environments.
-        single: whether actions and outputs lack the leading axis, for one environment.
+    it in every call. With ``single``, actions and outputs lack the leading axis.
     """
 
     def __init__(self, vector: VectorPixelEnv, single: bool) -> None:
@@ -85,10 +81,7 @@ class Programs:
 
     @compilation.jit(_env, static_argnums=0)
     def reset(self, seeds: Array, params: EnvParams, offsets: Array | None) -> Stepped:
-        """Reset all environments to episode 0 of their (N,) uint32 seeds.
-
-        ``offsets``, (N,) int32, replace the ``time_limit_offset`` of all; None keeps those.
-        """
+        """Start episode 0 of (N,) uint32 seeds, with (N,) int32 ``time_limit_offset``."""
         state, timestep = self.vector.reset(jax.vmap(jax.random.key)(seeds), params)
         return self._stepped(_with_offsets(state, offsets), timestep)
 

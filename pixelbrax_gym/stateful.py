@@ -59,13 +59,8 @@ class StatefulEnv:
     Methods that compute raise ``ClosedEnvironmentError`` after ``close`` and ``RuntimeError`` in a
     fork that cannot run JAX; all but ``reset`` raise ``ResetNeeded`` before the first reset.
 
-    Attributes:
-        env: the pixel environment.
-        params: its parameters.
-        num_envs: N.
-        single: whether outputs lack the leading axis; N is then 1.
-        episode_length: time limit in control steps.
-        is_limited: whether the caller gave the time limit.
+    With ``single``, outputs lack the leading axis. ``episode_length`` is the time limit in control
+    steps, and ``is_limited`` tells whether the caller gave it.
     """
 
     def __init__(
@@ -82,16 +77,9 @@ class StatefulEnv:
     ) -> None:
         """Build the environment without compiling it.
 
-        Args:
-            adapter: class of the adapter; errors about unknown options list its arguments too.
-            task: one of ``pixelbrax_jax.list_envs()``.
-            options: fields of ``pixelbrax_jax.EnvConfig``.
-            num_envs: N.
-            autoreset_mode: as in ``VectorPixelEnv``.
-            single: whether outputs lack the leading axis.
-            max_episode_steps: time limit in calls of ``step``; None or -1 keeps
-                ``options["episode_length"]`` in control steps. The shorter of two limits holds.
-            render_size: ``render_height`` and ``render_width`` in pixels.
+        Errors about unknown ``options`` also list the arguments of ``adapter``. The limit
+        ``max_episode_steps`` counts calls of ``step`` (None or -1: no limit), and
+        ``options["episode_length"]`` counts control steps. The shorter of the two holds.
         """
         # Without `self` and `task` at the start and `options` at the end.
         own = list(inspect.signature(vars(adapter)["__init__"]).parameters)[2:-1]
@@ -132,21 +120,12 @@ class StatefulEnv:
         time_limit_offsets: np.ndarray | None = None,
         keep: Keep | None = None,
     ) -> dict[str, Any]:
-        """Reset environments.
+        """Reset environments where ``mask``, (N,) bool, or all; ``state`` as in ``set_state``.
 
-        Args:
-            seed: s seeds environment i with s + i; a sequence has one seed for each. A seeded
-                environment starts its episode 0; None starts the next episode, or samples a seed
-                at the first reset.
-            rng: generator of sampled seeds; None means the operating system's entropy.
-            mask: (N,) bool, environments to reset; None means all.
-            state: state to continue from, as in ``set_state``.
-            time_limit_offsets: (N,) int32, control steps by which the time limits are shorter, in
-                [0, limit); None means 0.
-            keep: see ``step``.
-
-        Returns:
-            Outputs with reward 0; unmasked environments repeat their observation and flags.
+        Environments with a seed, ``seed + i`` or entry i of a sequence, start their episode 0. The
+        others start their next episode, or sample a seed from ``rng`` at the first reset.
+        ``time_limit_offsets``, (N,) int32 in [0, limit), shorten the time limits. Outputs have
+        reward 0; environments that are not reset repeat their observation and flags.
         """
         self._check_usable()
         if state is not None:
@@ -180,16 +159,11 @@ class StatefulEnv:
     def step(
         self, action: Any, mask: np.ndarray | None = None, keep: Keep | None = None
     ) -> dict[str, Any]:
-        """Step environments.
+        """Step environments where ``mask``, (N,) bool, or all; a single one takes no mask.
 
-        Args:
-            action: (N, A), or (A,) for a single environment; see ``as_actions``.
-            mask: (N,) bool, environments to step; None means all. Not for a single environment.
-            keep: computes ``extra`` from the program's result; it is replaced with the states.
-
-        Returns:
-            Outputs. Environments that were not stepped repeat their observation with ``done``
-            False; their other outputs are undefined.
+        ``action`` is (N, A), or (A,) for a single environment. ``keep`` computes ``extra`` from the
+        program's result. Environments that are not stepped repeat their observation with ``done``
+        False; their other outputs are undefined.
         """
         self._check_ready("step")
         if self._must_reset:
@@ -219,12 +193,9 @@ class StatefulEnv:
         return self._programs.state(self._latest.packed, self.params)
 
     def set_state(self, state: Any, mask: np.ndarray | None = None) -> dict[str, Any]:
-        """Continue from states; return outputs as ``reset`` does.
+        """Continue from states where ``mask``, (N,) bool, or all; return outputs as ``reset`` does.
 
-        Args:
-            state: from ``get_state`` of an environment with the same options, or from
-                ``PixelEnv.reset`` or ``PixelEnv.step``; arrays may be NumPy's.
-            mask: (N,) bool, environments to set; None means all. Not for a single environment.
+        Arrays may be NumPy's. A single environment takes no mask.
         """
         self._check_usable()
         self._programs.check_state(state, self.params)
@@ -357,11 +328,9 @@ class StatefulEnv:
 
 
 def _make(config: EnvConfig) -> tuple[PixelEnv, EnvParams]:
-    """Make an environment, or return a known one in a fork that cannot run JAX.
-
-    The fork then fails in ``reset``, whose errors Gymnasium's ``AsyncVectorEnv`` reports; an error
-    in the constructor would only close a pipe.
-    """
+    """Make an environment, or return a known one in a fork that cannot run JAX."""
+    # The fork fails in `reset`, whose errors Gymnasium's AsyncVectorEnv reports; an error in the
+    # constructor would only close a pipe.
     known = [made for made in _made if _is_equal(made[0], config)]
     if is_forked():
         if not known:
