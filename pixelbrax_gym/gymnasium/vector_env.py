@@ -49,7 +49,8 @@ class GymnasiumVectorEnv(StatefulAdapter, gymnasium.vector.VectorEnv):
     Observations are never overwritten, and in-place operations on them change no later result.
     ``call``, ``get_attr`` and ``set_attr`` address a ``SubEnv`` for each environment.
 
-    Methods raise ``ClosedEnvironmentError`` after ``close``, ``RuntimeError`` in a fork of JAX.
+    Methods raise ``ClosedEnvironmentError`` after ``close`` and ``RuntimeError`` in a fork that
+    cannot run JAX.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012  # as Gymnasium declares it
