@@ -24,16 +24,12 @@ def cache_folder(given: str | Path | None = None) -> Path:
 
 
 def whole_path(path: str | os.PathLike[str]) -> Path:
-    """Return the absolute path, with ``~`` expanded.
-
-    Raises:
-        FileNotFoundError: the home folder is unknown; the message has the fix.
-    """
+    """Return the absolute path, with ``~`` expanded; raise the same error as ``in_home``."""
     return in_home(Path(path)).absolute()
 
 
 def in_home(path: Path) -> Path:
-    """Expand ``~``; raise the same error as ``whole_path``."""
+    """Expand ``~``; raise FileNotFoundError with the fix if the home folder is unknown."""
     try:
         return path.expanduser()
     except RuntimeError as error:

@@ -52,7 +52,6 @@ class ProgramConfig:
     ``plain.to_plain`` may stand for a distractor."""
 
     def __post_init__(self) -> None:
-        """Check the options and convert them to Python's own types."""
         for name in ("height", "width", "frame_stack", "action_repeat"):
             self._store(name, check_positive_int(name, self._static(name)))
         check_choice("obs_mode", self._static("obs_mode"), OBS_MODES)
@@ -86,9 +85,7 @@ _SUITE_OPTIONS = fields(BraxOptions)
 class EnvConfig(BraxOptions, ProgramConfig):
     """All options of an environment; ``pixelbrax_jax.make(task, **options)`` takes them.
 
-    Raises:
-        ValueError: an option is out of range; the message says what is allowed.
-        TypeError: an option has another type, or is an array or tracer.
+    Raises the errors of ``ProgramConfig``.
     """
 
     task: str = "ant"
@@ -110,7 +107,6 @@ class EnvConfig(BraxOptions, ProgramConfig):
     """Split of the clips: ``train``, ``test`` or another one they have; see ``load_clips``."""
 
     def __post_init__(self) -> None:
-        """Check the options and convert them to Python's own types."""
         ProgramConfig.__post_init__(self)
         for name in ("task", "split", *(option.name for option in _SUITE_OPTIONS)):
             self._static(name)
@@ -140,13 +136,10 @@ ENV_OPTIONS = tuple(field.name for field in fields(EnvConfig))
 def env_config(
     base: str | EnvConfig, options: Mapping[str, Any], also_allowed: Iterable[str] = ()
 ) -> EnvConfig:
-    """Return the options of an environment.
+    """Return the options of ``base``, or the defaults for a task's name, with some changed.
 
-    Args:
-        base: a task, with default options; or options to start from. Fields that a subclass of
-            ``EnvConfig`` adds are ignored.
-        options: the options to change, by name.
-        also_allowed: names of the caller's other options, for the message about an unknown one.
+    Fields that a subclass of ``EnvConfig`` adds are ignored. ``also_allowed`` are the caller's
+    other options, for the message about an unknown one.
 
     Raises:
         TypeError: an option is unknown; the message lists all options and the nearest name.

@@ -48,12 +48,7 @@ def find_ffmpeg() -> str:
 
 
 def check_ffmpeg() -> None:
-    """Check that FFmpeg exists and starts.
-
-    Raises:
-        ImportError: imageio-ffmpeg, which includes it, is not installed.
-        OSError: it does not start; with the reason.
-    """
+    """Raise the errors of ``find_ffmpeg``, or OSError with the reason if FFmpeg does not start."""
     command = [find_ffmpeg(), "-version"]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     if result.returncode:
@@ -64,17 +59,12 @@ class Encoder:
     """Writes frames to an MP4 file in H.264, 4:2:0, which every player supports."""
 
     def __init__(self, path: Path, fps: float) -> None:
-        """Find FFmpeg, with the errors of ``find_ffmpeg``; start no process."""
         self._program, self._path, self._fps = find_ffmpeg(), path, fps
         self._process: subprocess.Popen[bytes] | None = None
         self._log: IO[bytes] | None = None
 
     def append(self, frame: np.ndarray) -> None:
-        """Write a frame; repeat the last row or column of an odd side.
-
-        Raises:
-            OSError: FFmpeg could not write it; with the reason.
-        """
+        """Write a frame; an odd side gets its last row or column twice. Raises as ``close``."""
         height, width = (side % 2 for side in frame.shape[:2])
         if height or width:
             frame = np.pad(frame, ((0, height), (0, width), (0, 0)), mode="edge")
@@ -103,11 +93,7 @@ class Encoder:
         )
 
     def close(self) -> None:
-        """Finish the file.
-
-        Raises:
-            OSError: FFmpeg could not write it; with the reason.
-        """
+        """Finish the file; raise OSError with the reason if FFmpeg could not write it."""
         process, log = self._process, self._log
         if process is None or log is None:
             return
@@ -138,7 +124,6 @@ class Decoder:
     """
 
     def __init__(self, path: Path) -> None:
-        """Find FFmpeg, with the errors of ``find_ffmpeg``; start no process."""
         self._program, self._path = find_ffmpeg(), path
         self.declared: int | None = None
         self.of_file = False
@@ -195,7 +180,6 @@ def _start(command: list[str], **pipes: Any) -> subprocess.Popen[bytes]:
 
 
 def _read_ppm(pipe: IO[bytes]) -> np.ndarray | None:
-    """Return the next image of a pipe; None at its end."""
     if pipe.readline() != b"P6\n":
         return None
     width, height = map(int, pipe.readline().split())

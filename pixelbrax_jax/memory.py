@@ -9,13 +9,10 @@ import jax
 
 
 def check_fits(what: str, num_bytes: float) -> None:
-    """Raise an error if ``what``, options and their values, takes more bytes than main memory.
+    """Raise MemoryError if ``what``, options and their values, exceeds main memory.
 
     This finds mistyped numbers early. The allocation itself fails if the device or other programs
     leave too little room.
-
-    Raises:
-        MemoryError: it does not fit; the message has both sizes.
     """
     limit = _main_memory()
     if num_bytes > limit:
@@ -38,7 +35,6 @@ def device_memory() -> float:
 
 
 def _main_memory() -> float:
-    """Return the bytes of main memory; infinite if unknown."""
     try:
         return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     except (AttributeError, OSError, ValueError):

@@ -35,11 +35,7 @@ class Policy:
     env_options: dict[str, Any] | None = None
 
     def __call__(self, pixels: jax.Array) -> jax.Array:
-        """Map (B, H, W, 3 K) uint8 pixels to (B, A) float32 actions.
-
-        Raises:
-            ValueError: the pixels have another shape or dtype.
-        """
+        """Map (B, H, W, 3 K) uint8 pixels to (B, A) float32 actions; others raise ValueError."""
         if pixels.ndim != 4 or pixels.shape[1:] != self.shape or pixels.dtype != jnp.uint8:
             raise ValueError(
                 f"the policy takes (B, {', '.join(map(str, self.shape))}) uint8 pixels, got "

@@ -19,8 +19,6 @@ from pixelbrax_jax.validation import check_choice, suggest
 
 @dataclass
 class _OwnTask:
-    """A registered task."""
-
     make_physics: Callable[[], Physics]
     camera: CameraRig | Camera | None
 
@@ -35,12 +33,8 @@ _OWN_TASKS: dict[str, _OwnTask] = {}
 def list_envs(suite: str | None = None) -> tuple[str, ...]:
     """Return the names that ``make`` accepts, sorted.
 
-    Args:
-        suite: ``"brax"`` or ``"dmc"`` (the DM Control Suite); None for all tasks, including
-            registered ones.
-
-    Raises:
-        ValueError: the suite is unknown.
+    ``suite`` is ``"brax"``, ``"dmc"`` (the DM Control Suite) or None for all tasks, including
+    registered ones; others raise ValueError.
     """
     if suite is None:
         return tuple(sorted([*TASKS, *_OWN_TASKS]))
@@ -57,8 +51,8 @@ def register(
 
     Args:
         name: new name of the task.
-        make_physics: builds the physics, e.g. ``lambda: BraxPhysics(MyEnv())`` or ``lambda:
-            mjcf_physics("arm.xml", reward=my_reward)``. The first ``make`` calls it once.
+        make_physics: builds the physics, e.g. ``lambda: BraxPhysics(MyEnv())``. The first ``make``
+            calls it once.
         camera: default viewpoint. None takes the rig ``default`` of the physics; without one the
             camera shows all geoms but the ground from a corner and follows
             ``Physics.followed_link``.
@@ -80,11 +74,7 @@ def register(
 
 @default_flags()
 def make_physics(task: str, **options: Any) -> Physics:
-    """Make the physics of a task. Equal arguments give equal objects.
-
-    Args:
-        task: one of ``list_envs()``.
-        **options: options of its suite, such as ``backend`` for Brax's tasks.
+    """Make the physics of a task with options of its suite. Equal arguments give equal objects.
 
     Raises:
         ValueError: the task is unknown, or does not take such an option.

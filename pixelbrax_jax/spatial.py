@@ -57,10 +57,7 @@ def unit(vector: jax.Array) -> jax.Array:
 def look_at(eye: jax.Array, target: jax.Array, up: jax.Array) -> jax.Array:
     """Return the orientation (3, 3) of a camera: columns are its right, up and back directions.
 
-    Args:
-        eye: (3,) metres.
-        target: (3,) metres, different from ``eye``.
-        up: (3,) not parallel to the viewing direction.
+    ``eye`` and ``target`` (3,) are in metres; ``up`` (3,) is not parallel to the view.
     """
     back = unit(eye - target)
     right = unit(jnp.cross(up, back))

@@ -80,10 +80,8 @@ class StopRequest:
 def stop_requests(report: Callable[[str], object]) -> Iterator[StopRequest]:
     """Handle the signals that ask a process to stop, until the end of the block.
 
-    Outside the main thread, where Python allows no handlers, no request is recorded.
-
-    Args:
-        report: is called with one line at the first signal; it may raise.
+    ``report`` gets one line at the first signal. Outside the main thread, where Python allows no
+    handlers, no request is recorded.
     """
     request = StopRequest(report)
     before = {}

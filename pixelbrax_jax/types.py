@@ -51,11 +51,7 @@ class GeomKind(IntEnum):
         is_long: bool = False,
         has_far_form: bool = False,
     ) -> GeomKind:
-        """Make a row.
-
-        Raises:
-            TypeError: ``num_sizes`` or ``reach`` is missing or unknown.
-        """
+        """Make a row; raise TypeError if ``num_sizes`` or ``reach`` is invalid."""
         if not 1 <= num_sizes <= 3 or reach not in ("first", "largest", "diagonal", "all"):
             raise TypeError(f"GeomKind {number} needs a number of sizes and a reach.")
         kind = int.__new__(cls, number)
@@ -78,15 +74,9 @@ _Formula = TypeVar("_Formula")
 def for_each_kind(
     what: str, formulas: Mapping[GeomKind, _Formula], kinds: Iterable[GeomKind] = GeomKind
 ) -> Mapping[GeomKind, _Formula]:
-    """Return ``formulas`` if it has exactly one entry for each kind of geom.
+    """Return ``formulas``; raise TypeError unless it has exactly one entry for each of ``kinds``.
 
-    Args:
-        what: name of the table in the message.
-        formulas: the table.
-        kinds: the required kinds.
-
-    Raises:
-        TypeError: a kind is missing or superfluous.
+    ``what`` is the name of the table in the message.
     """
     wrong = set(kinds) ^ set(formulas)
     if wrong:

@@ -41,11 +41,7 @@ def check_choice(
 ) -> str:
     """Return ``value`` if it is one of ``allowed``.
 
-    Args:
-        what: name of the option in the message.
-        value: the user's value.
-        allowed: every accepted name.
-        meant: the name to suggest; None suggests the nearest one.
+    ``what`` names the option in the message; ``meant`` replaces the nearest name as suggestion.
 
     Raises:
         ValueError: it is not; the message has the value, all allowed names and the nearest one.
@@ -85,33 +81,21 @@ def suggest(value: object, names: Iterable[str], likeness: float = _SIMILAR) -> 
 
 
 def check_bool(what: str, value: object) -> bool:
-    """Return a bool of Python or NumPy as a Python bool.
-
-    Raises:
-        TypeError: it is something else.
-    """
+    """Return a bool of Python or NumPy as a Python bool; raise TypeError for anything else."""
     if isinstance(value, (bool, np.bool_)):
         return bool(value)
     raise TypeError(f"{what} must be True or False, got {value!r}.")
 
 
 def check_positive_int(what: str, value: object) -> int:
-    """Return an integer of Python or NumPy, at least 1, as a Python int.
-
-    Raises:
-        ValueError: it is something else, or a bool.
-    """
+    """Return an integer of at least 1 as a Python int; raise ValueError for anything else."""
     if isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= 1:
         return int(value)
     raise ValueError(f"{what} must be a positive integer, got {value!r}.")
 
 
 def check_fraction(what: str, value: object) -> float:
-    """Return ``value`` if it is a number in [0, 1].
-
-    Raises:
-        ValueError: it is not.
-    """
+    """Return ``value`` if it is a number in [0, 1]; raise ValueError otherwise."""
     if isinstance(value, Real) and not isinstance(value, bool) and 0.0 <= float(value) <= 1.0:
         return float(value)
     raise ValueError(f"{what} must lie in [0, 1], got {value!r}.")

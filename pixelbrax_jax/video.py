@@ -26,15 +26,12 @@ def write_frames(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> 
     """Write frames to a video file as they arrive, and read the file back to check it.
 
     An MP4 repeats the last row or column of an odd side. After an error or Ctrl-C the file keeps
-    the frames before it.
+    the frames before it. The path is returned.
 
     Args:
         path: the file, ``.mp4`` or ``.gif`` (which loops forever); folders are created.
         frames: (H, W, 3) uint8 each, all of one size.
         fps: frames per second.
-
-    Returns:
-        The path.
 
     Raises:
         ValueError: the suffix is unknown, ``fps`` is not positive, there are no frames, a frame has
@@ -74,8 +71,6 @@ def write_frames(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> 
 
 
 class _Gif:
-    """Writer of GIF files, with the interface of ``Encoder``."""
-
     def __init__(self, path: Path, fps: float) -> None:
         from PIL import Image
 

@@ -1,1 +1,1 @@
-"""What differs by device: decided when a program is lowered, and known to nothing else."""
+"""Code that depends on the device; the choice is made when a program is lowered."""

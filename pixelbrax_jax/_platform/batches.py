@@ -1,4 +1,4 @@
-"""Functions of one row for all rows of a batch, as the device computes them fastest."""
+"""Functions of one row mapped over a batch, in the fastest form for the device."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from pixelbrax_jax._platform.interpreter import batch_last
 from pixelbrax_jax._platform.lowering import by_platform, trace_once
 
 _CHUNK = 128
-"""Largest number of rows that a CPU computes together, so that what it computes on the way stays in
-its caches; see `chunk_size`."""
+"""Largest number of rows that a CPU computes together, to keep intermediate results in its
+caches."""
 
 Step = Callable[..., tuple[Any, jax.Array]]
 
@@ -24,18 +24,9 @@ def step_rows(
 ) -> tuple[Any, jax.Array]:
     """Step every row of a batch, as ``jax.vmap(step, (0, 0, None))(state, rows, shared)``.
 
-    A CPU steps the rows chunk by chunk; the results differ from those of ``jax.vmap`` by rounding.
-
-    Args:
-        step: of one row; returns its next state, of the same tree, and a () float32.
-        state: tree of arrays with a leading axis N.
-        rows: what else differs from row to row, likewise.
-        shared: what is the same for all.
-        last: whether, on a CPU, the batch is the last axis of intermediate results, see
-            ``batch_last``; else it is the first.
-
-    Returns:
-        The next states and (N,) results.
+    A CPU steps the rows in chunks; the results differ from those of ``jax.vmap`` by rounding.
+    ``step`` returns a row's next state, with the same tree, and a () float32. With ``last`` the
+    batch is the last axis of intermediate results on a CPU, see ``batch_last``.
     """
     step = trace_once(step)
     together = jax.vmap(step, in_axes=(0, 0, None))
@@ -62,7 +53,7 @@ def _step_chunks(
     if size == num_rows:
         return step_chunk(state, rows, shared)
 
-    # Some engines carry empty arrays, of which no dimension can be left to be found.
+    # Sizes are explicit, because an empty array (some engines have one) allows no -1.
     def chunks(x: jax.Array) -> jax.Array:
         return x.reshape(num_rows // size, size, *x.shape[1:])
 
@@ -73,13 +64,13 @@ def _step_chunks(
         moved = step_chunk(*chunk, shared)
         return jax.tree.map(lambda x, new: x.at[i].set(new), carry, moved)
 
-    # In place: the results of `jax.lax.map` would be cleared first and copied afterwards.
+    # In place, because `jax.lax.map` would clear its results first and copy them afterwards.
     carry = (states, jnp.zeros((num_rows // size, size), jnp.float32))
     moved = jax.lax.fori_loop(0, num_rows // size, put, carry)
     return jax.tree.map(lambda x: x.reshape(num_rows, *x.shape[2:]), moved)
 
 
 def chunk_size(num_rows: int) -> int:
-    """Return the largest divisor of ``num_rows`` from half of ``_CHUNK`` to it; if none, all."""
+    """Return the largest divisor of ``num_rows`` from ``_CHUNK / 2`` to ``_CHUNK``, else all."""
     sizes = range(min(_CHUNK, num_rows), _CHUNK // 2 - 1, -1)
     return next((size for size in sizes if num_rows % size == 0), num_rows)

@@ -1,4 +1,4 @@
-"""Stacks of frames, which each device writes fastest in another way."""
+"""Frame stacks, in the fastest form for each device."""
 
 from __future__ import annotations
 
@@ -15,22 +15,16 @@ def unpack(packed: jax.Array) -> jax.Array:
 
 
 def push(frames: jax.Array, newest: jax.Array, is_first: jax.Array) -> jax.Array:
-    """Return the frame stack after one more frame.
+    """Return the frame stack (H, W, 3 K) uint8 after one more frame, (H, W) uint32 packed pixels.
 
-    Args:
-        frames: (H, W, 3 K) uint8, oldest first.
-        newest: (H, W) uint32 packed pixels.
-        is_first: () bool, the first frame of an episode: the stack becomes K copies of ``newest``.
-
-    Returns:
-        (H, W, 3 K) uint8.
+    With ``is_first``, () bool, it becomes K copies of the frame.
     """
     pushed: jax.Array = by_platform(frames, newest, is_first, cpu=_concatenate, default=_shift)
     return pushed
 
 
 def _concatenate(frames: jax.Array, newest: jax.Array, is_first: jax.Array) -> jax.Array:
-    """See ``push``; one frame after the other, as a CPU copies fastest."""
+    """Push by a concatenation of frames, which is fastest on a CPU."""
     pixels = unpack(newest)
     copies = jnp.tile(pixels, (1, 1, frames.shape[-1] // 3 - 1))
     older = jnp.where(is_first, copies, frames[..., 3:])
@@ -38,10 +32,7 @@ def _concatenate(frames: jax.Array, newest: jax.Array, is_first: jax.Array) -> j
 
 
 def _shift(frames: jax.Array, newest: jax.Array, is_first: jax.Array) -> jax.Array:
-    """See ``push``; number by number.
-
-    A GPU writes a concatenation of bytes byte by byte, and this in words.
-    """
+    """Push by arithmetic on words; a GPU would write a concatenation byte by byte."""
     channel = np.arange(frames.shape[-1])
     is_new = channel >= len(channel) - 3
     shifts = np.asarray(8 * (channel % 3), np.uint32)

@@ -1,9 +1,4 @@
-"""``jax.vmap`` with the batch as last axis of intermediate results, which is what a CPU wants.
-
-``jax.vmap`` puts the batch first. What Brax computes are vectors of three and matrices of three by
-three, so that XLA's innermost loops over (N, links, 3) have three turns, no vectors, and a product
-of matrices is a call for every link. Over (links, 3, N) they are loops over environments.
-"""
+"""``jax.vmap`` with the batch as last axis of intermediate results, which is faster on a CPU."""
 
 from __future__ import annotations
 
@@ -20,23 +15,22 @@ from jax.extend import core
 from pixelbrax_jax._platform.rules import FEW, RULES, Operand, bind, row_aval, rule, spread
 
 _LANES = 16
-"""Rows are padded to a multiple, so that loops over vectors leave no scalar remainder."""
+"""Rows are padded to a multiple, so that SIMD loops have no scalar remainder."""
 
 
 def batch_last(fn: Callable[..., Any], in_axes: Sequence[int | None]) -> Callable[..., Any]:
     """Return ``jax.vmap(fn, in_axes)``, computed with the batch as last axis.
 
-    Results differ from those of ``jax.vmap`` by rounding. What has no rule here, among it
-    functions with derivatives of their own, is computed by ``jax.vmap``, as is everything within
-    ``jax.shard_map`` if that keeps track of what varies.
-    More than a few rows are padded by copies of the last one, whose side effects happen too.
+    ``jax.vmap`` puts it first, and XLA's innermost loops then run over vectors of three; here they
+    run over environments. Results differ by rounding. ``jax.vmap`` computes what has no rule, such
+    as functions with custom derivatives, and everything within a ``jax.shard_map`` that tracks
+    varying values. More than a few rows are padded by copies of the last one, including side
+    effects.
 
-    The parameters of JAX's primitives, which are read here, are not public. With a release whose
-    parameters are others, all of ``fn`` is computed by ``jax.vmap``, with a RuntimeWarning once in
-    a process. Side effects, such as those of ``jax.debug.print``, may happen twice then.
+    The rules read private parameters of JAX's primitives. If a release changes them, ``jax.vmap``
+    computes all of ``fn``, with one RuntimeWarning per process and side effects possibly twice.
 
-    An argument's axis is 0 or None; at least one is 0. If arguments have different numbers of rows,
-    the function raises a ValueError.
+    Raises ValueError if arguments have different numbers of rows. An argument's axis is 0 or None.
     """
 
     def rows_of(*args: Any) -> Any:
@@ -71,7 +65,7 @@ def batch_last(fn: Callable[..., Any], in_axes: Sequence[int | None]) -> Callabl
 
 
 _warned: list[str] = []
-"""Warnings given in this process: one at most."""
+"""Content of the only warning given in this process."""
 
 
 def _warn_once(error: Exception) -> None:
@@ -86,7 +80,7 @@ def _warn_once(error: Exception) -> None:
 
 
 def _varies(x: jax.Array) -> bool:
-    """Return whether ``jax.shard_map`` tracks that devices have different values of ``x``."""
+    """Return whether ``jax.shard_map`` tracks that ``x`` differs between devices."""
     return bool(getattr(getattr(jax.typeof(x), "manual_axis_type", None), "varying", ()))
 
 
@@ -95,12 +89,10 @@ def _row(x: jax.Array) -> jax.ShapeDtypeStruct:
 
 
 def _pad_rows(x: jax.Array, size: int) -> jax.Array:
-    """Return the rows, and the last one again until there are ``size``."""
     return x if len(x) == size else x[jnp.minimum(jnp.arange(size), len(x) - 1)]
 
 
 def _evaluate(closed: core.ClosedJaxpr, operands: Sequence[Operand], size: int) -> list[Operand]:
-    """Return the results of a program, equation by equation."""
     known: dict[core.Var, Operand] = {}
 
     def read(atom: core.Var | core.Literal) -> Operand:
@@ -138,21 +130,17 @@ def _apply(eqn: core.JaxprEqn, inputs: list[Operand], size: int) -> list[Operand
 
 
 def _by_vmap(eqn: core.JaxprEqn, inputs: list[Operand]) -> list[Any]:
-    """Compute what has no rule."""
     in_axes = [-1 if x.batched else None for x in inputs]
     rows = jax.vmap(lambda *row: bind(eqn, *row), in_axes=in_axes, out_axes=-1)
     return list(rows(*(x.value for x in inputs)))
 
 
 _CALLS = {"jit": "jaxpr", "closed_call": "call_jaxpr"}
-"""Primitives that are programs, and the parameter that has it."""
+"""Primitives that contain a program, and its parameter."""
 
 
 def _program(eqn: core.JaxprEqn) -> core.ClosedJaxpr | None:
-    """Return the program that an equation stands for, to be written out in its place.
-
-    It takes the equation's last operands. Of ``by_platform`` it is the form of a CPU.
-    """
+    """Return the program in an equation, to be inlined; of ``by_platform`` the CPU's form."""
     if eqn.primitive.name in _CALLS:
         return eqn.params[_CALLS[eqn.primitive.name]]
     for platforms, branch in zip(
@@ -177,7 +165,7 @@ def _cond(eqn: core.JaxprEqn, inputs: Sequence[Operand], size: int) -> list[Any]
     values = [x.value for x in operands]
     platforms = eqn.params.get("branches_platforms")
     if platforms is not None:
-        # Of `by_platform`: batches have this form on a CPU alone.
+        # The CPU's form of `by_platform`, because only CPUs use this module.
         return next(
             take(*values)
             for take, names in zip(branches, platforms, strict=True)
@@ -185,7 +173,7 @@ def _cond(eqn: core.JaxprEqn, inputs: Sequence[Operand], size: int) -> list[Any]
         )
     if not index.batched:
         return list(lax.switch(index.value, branches, *values))
-    # Rows differ in their branch: all are computed, as under `jax.vmap`.
+    # Rows take different branches: all branches are computed, as under `jax.vmap`.
     chosen = Operand(lax.clamp(0, index.value, len(branches) - 1), True)
     cases = zip(shapes, *(take(*values) for take in branches), strict=True)
     return [lax.select_n(spread(chosen, shape, size), *case) for shape, *case in cases]
@@ -215,7 +203,7 @@ def _scan(eqn: core.JaxprEqn, inputs: list[Operand], size: int) -> list[Operand]
 
 
 def _while(eqn: core.JaxprEqn, inputs: list[Operand], size: int) -> list[Operand]:
-    """Go on until all rows have ended; those that have keep what they ended with."""
+    """Loop until all rows have ended; rows that have ended keep their values."""
     params = eqn.params
     cond, body = params["cond_jaxpr"], params["body_jaxpr"]
     start, stop = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
@@ -263,19 +251,17 @@ def _spread_where(
 
 
 def _scan_sizes(params: Mapping[str, Any]) -> tuple[int, int]:
-    """Return how many of a scan's operands are constants, and how many are carried."""
     if "num_carry" in params:
         return params["num_consts"], params["num_carry"]
-    # From jax 0.12 on: operands in groups.
+    # From jax 0.12 on, operands are in groups.
     consts, carry, _ = params["ft_in"].unpack()
     return len(consts), len(carry)
 
 
 def _reach_scan(eqn: core.JaxprEqn, flags: list[bool]) -> list[bool]:
-    """Return which carries and results of a scan are batched."""
     start, num_carry = _scan_sizes(eqn.params)
     stop = start + num_carry
-    # What reaches a carry in one turn reaches others in the next.
+    # A carry that becomes batched may make others batched in the next iteration.
     carried, before = flags[start:stop], None
     while carried != before:
         before = carried
@@ -285,7 +271,7 @@ def _reach_scan(eqn: core.JaxprEqn, flags: list[bool]) -> list[bool]:
 
 
 def _reach(closed: core.ClosedJaxpr, flags: Sequence[bool]) -> list[bool]:
-    """Return which results of a program are batched, as `_evaluate` finds."""
+    """Return which results of a program are batched, as in `_evaluate`."""
     known = dict(zip(closed.jaxpr.invars, flags, strict=True))
 
     def read(atom: core.Var | core.Literal) -> bool:

@@ -1,4 +1,4 @@
-"""What a program does on each platform, decided when it is lowered."""
+"""Choices by platform, made when a program is lowered."""
 
 from __future__ import annotations
 
@@ -11,29 +11,23 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
 def by_platform(*args: Any, default: Callable[..., Any], **forms: Callable[..., Any]) -> Any:
-    """Return what the function for a platform gives.
+    """Return the result of the function for the platform: one of ``forms``, or ``default``.
 
-    The choice is made when a program is lowered: one that is lowered for a GPU is that of a GPU,
-    also on a machine without one. All functions are traced, and one is lowered. Where tracing
-    takes long, trace what they share once, by ``trace_once``.
-
-    Args:
-        *args: trees of arrays, for all functions.
-        default: what is computed on all other platforms.
-        **forms: other functions by platform: ``cpu``, ``cuda``, ``rocm`` or ``tpu``. Their results
-            have the tree, shapes and dtypes of those of ``default``.
+    ``forms`` are functions for ``cpu``, ``cuda``, ``rocm`` or ``tpu``, with results like those of
+    ``default``. The choice is made when a program is lowered, even on a machine without the device.
+    All functions are traced; trace what they share with ``trace_once`` if tracing is slow.
     """
     return jax.lax.platform_dependent(*args, default=default, **forms)
 
 
 def trace_once(function: _Function) -> _Function:
-    """Return a function that is traced once and written out wherever it is called."""
+    """Return a function that is traced once and inlined wherever it is called."""
     return jax.jit(function, inline=True)  # type: ignore[return-value]
 
 
 def default_platform() -> str:
-    """Return ``cpu``, ``gpu`` or ``tpu``: where JAX computes by default.
+    """Return JAX's default platform, ``cpu``, ``gpu`` or ``tpu``; starts the device.
 
-    For compiler options and messages, never for what a program computes. It starts the device.
+    Use it for compiler options and messages, never for what a program computes.
     """
     return jax.default_backend()

@@ -1,4 +1,4 @@
-"""Work for those rows of a batch alone that need it, such as environments that are reset."""
+"""Work for some rows of a batch, such as environments that are reset."""
 
 from __future__ import annotations
 
@@ -18,12 +18,11 @@ _BLOCK = 32
 def reset_rows(
     fn: Callable[..., Any], arguments: tuple[Any, ...], mask: jax.Array, rows: Any
 ) -> Any:
-    """Return ``rows`` with those where ``mask`` reset.
+    """Return ``rows``, reset where ``mask`` is set. Arguments are those of ``replace_rows``.
 
-    A CPU resets the masked rows alone, in a loop whose length depends on the mask. An accelerator
-    would wait for the host in every turn of such a loop: it resets all rows and selects. A reset
-    that tries until it succeeds waits in any case, and is done for masked rows alone. Arguments
-    are those of ``replace_rows``.
+    A CPU resets only the masked rows, in a loop whose length depends on the mask. An accelerator
+    would wait for the host in every iteration, so it resets all rows and selects, unless the reset
+    contains a loop that waits in any case.
     """
     fn = trace_once(fn)
     row = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), arguments)
@@ -36,26 +35,18 @@ def reset_rows(
 def replace_rows(
     fn: Callable[..., Any], arguments: tuple[Any, ...], mask: jax.Array, rows: Any
 ) -> Any:
-    """Return ``rows`` with ``fn`` of the arguments' rows in place of those where ``mask``.
+    """Return ``rows`` with ``fn`` of the arguments' rows where ``mask`` (N,) bool is set.
 
-    The work is done in blocks and grows with the number of masked rows, not with N: most steps
-    end no episode, and a select over the whole batch would pay for all of them.
-
-    The loop carries which rows are left. With a counter in their place XLA takes what the blocks
-    have in common, such as physics at the initial pose, out of the loop and into every step.
-
-    Args:
-        fn: of one row of each argument; returns one row of ``rows``.
-        arguments: trees of arrays with a leading axis N.
-        mask: (N,) bool.
-        rows: tree of arrays with a leading axis N.
+    The work is done in blocks and grows with the number of masked rows, not with N: most steps end
+    no episode. The loop carries the remaining rows. With a counter instead, XLA would move what
+    blocks have in common, such as physics at the initial pose, out of the loop and into every step.
     """
     num_rows = mask.shape[0]
     block = min(_BLOCK, num_rows)
 
     def put(carry: tuple[jax.Array, Any]) -> tuple[jax.Array, Any]:
         left, rows = carry
-        # Past the last one of those left: read as the last row, never written.
+        # Indices past the end read the last row, and are never written.
         index = jnp.nonzero(left, size=block, fill_value=num_rows)[0]
         inputs = jax.tree.map(lambda x: jnp.take(x, index, axis=0, mode="clip"), arguments)
         outputs = jax.vmap(fn)(*inputs)
@@ -68,7 +59,6 @@ def replace_rows(
 def _select_rows(
     fn: Callable[..., Any], arguments: tuple[Any, ...], mask: jax.Array, rows: Any
 ) -> Any:
-    """Return what ``replace_rows`` does, from ``fn`` of all rows."""
 
     def select(new: jax.Array, old: jax.Array) -> jax.Array:
         return jnp.where(mask.reshape(-1, *(1,) * (old.ndim - 1)), new, old)
@@ -77,7 +67,7 @@ def _select_rows(
 
 
 def _has_open_loop(jaxpr: Any) -> bool:
-    """Return whether a program has a loop that goes on until its data says otherwise."""
+    """Return whether a program has a loop whose length depends on data."""
     for eqn in jaxpr.eqns:
         parts = [
             getattr(part, "jaxpr", part) for part in jax.tree.leaves(list(eqn.params.values()))

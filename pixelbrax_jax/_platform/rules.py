@@ -1,4 +1,4 @@
-"""What each primitive of JAX does to rows whose batch is the last axis."""
+"""Rules for JAX's primitives with the batch as last axis."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from jax import lax
 from jax.extend import core
 
 FEW = 4
-"""So many rows are not padded, and their products of matrices not written out: loops over so few
+"""Number of rows up to which there is no padding and no inlining of matrix products: short loops
 gain nothing."""
 
 _LONGEST_SUM = 16
-"""Products of matrices over longer axes stay calls of a library."""
+"""Longest axis of matrix products that are written as sums; longer ones call a library."""
 
 
 class Operand(NamedTuple):
@@ -27,15 +27,15 @@ class Operand(NamedTuple):
 
 
 Rule = Callable[[core.JaxprEqn, Sequence[Operand], int], "list[Any] | None"]
-"""``rule(eqn, inputs, size)``: results with ``size`` rows as last axis; None if none is there for
-such inputs, of which at least one is batched."""
+"""``rule(eqn, inputs, size)`` returns results with ``size`` rows as last axis, or None for
+unsupported inputs. At least one input is batched."""
 
 RULES: dict[str, Rule] = {}
-"""Rules by name of the primitive. What has none is computed by ``jax.vmap``."""
+"""Rules by primitive. ``jax.vmap`` computes primitives without a rule."""
 
 
 def rule(*names: str) -> Callable[[Rule], Rule]:
-    """Decorate the rule of some primitives."""
+    """Register the rule of some primitives."""
 
     def register(function: Rule) -> Rule:
         RULES.update(dict.fromkeys(names, function))
@@ -45,7 +45,7 @@ def rule(*names: str) -> Callable[[Rule], Rule]:
 
 
 def _rule_of_first(name: str) -> Callable[..., Callable[..., jax.Array]]:
-    """Decorate a rule for a batched first operand and further ones that are alike for all rows."""
+    """Register a rule for a batched first operand and shared others."""
 
     def register(function: Callable[..., jax.Array]) -> Callable[..., jax.Array]:
         def apply(eqn: core.JaxprEqn, inputs: Sequence[Operand], size: int) -> list[Any] | None:
@@ -62,14 +62,14 @@ def _rule_of_first(name: str) -> Callable[..., Callable[..., jax.Array]]:
 
 
 def row_aval(atom: core.Var | core.Literal) -> Any:
-    """Return shape and dtype of one row, which JAX types as anything abstract."""
+    """Return shape and dtype of one row."""
     return atom.aval
 
 
 def bind(eqn: core.JaxprEqn, *values: Any, **changed: Any) -> list[Any]:
-    """Compute an equation's primitive of other values, with some of its parameters changed."""
+    """Compute an equation's primitive for other values, with some parameters changed."""
     params = eqn.primitive.get_bind_params({**eqn.params, **changed})
-    # Other releases of JAX hand out functions apart.
+    # Other releases of JAX return functions separately.
     functions, params = params if isinstance(params, tuple) else ((), params)
     outputs = eqn.primitive.bind(*functions, *values, **params)
     return list(outputs) if eqn.primitive.multiple_results else [outputs]
@@ -106,7 +106,7 @@ reduce_prod reduce_sum rev split squeeze
 
 @rule(*_NAMED_AXES_NAMES.split())
 def _named_axes(eqn: core.JaxprEqn, inputs: Sequence[Operand], size: int) -> list[Any]:
-    """Bind as it is: parameters name the axes, and one more at the end changes nothing."""
+    """Bind unchanged: parameters name the axes, and one more at the end does not matter."""
     del size
     return bind(eqn, *(x.value for x in inputs))
 
@@ -115,8 +115,8 @@ def _named_axes(eqn: core.JaxprEqn, inputs: Sequence[Operand], size: int) -> lis
 def _join(eqn: core.JaxprEqn, inputs: Sequence[Operand], size: int) -> list[Any]:
     parts = zip(inputs, eqn.invars, strict=True)
     joined = bind(eqn, *(spread(x, row_aval(atom).shape, size) for x, atom in parts))
-    # A barrier: else XLA reads the parts in place of slices of the whole, and computes them anew
-    # in each kernel that reads one.
+    # Without the barrier XLA reads the parts instead of slices of the whole, and computes them
+    # again in each kernel that reads one.
     return list(lax.optimization_barrier(joined))
 
 
@@ -153,7 +153,7 @@ def _slice(eqn: core.JaxprEqn, x: jax.Array) -> jax.Array:
 
 @_rule_of_first("dynamic_slice")
 def _dynamic_slice(eqn: core.JaxprEqn, x: jax.Array, *start: jax.Array) -> jax.Array:
-    # Bound as it is: `lax.dynamic_slice` would take negative indices from the end once more.
+    # Bound directly, because `lax.dynamic_slice` would count negative indices from the end again.
     zero = jnp.zeros((), start[0].dtype if start else jnp.int32)
     sizes = (*eqn.params["slice_sizes"], x.shape[-1])
     return bind(eqn, x, *start, zero, slice_sizes=sizes)[0]
@@ -187,7 +187,7 @@ def _scatter(eqn: core.JaxprEqn, inputs: Sequence[Operand], size: int) -> list[A
 
 @rule("dot_general")
 def _dot(eqn: core.JaxprEqn, inputs: Sequence[Operand], size: int) -> list[Any] | None:
-    """Write a product of matrices as sums of products of entries: no call of a library."""
+    """Write a matrix product as sums of products of entries, without a library call."""
     if not _is_short(eqn):
         return None
     left, right = inputs
@@ -195,7 +195,7 @@ def _dot(eqn: core.JaxprEqn, inputs: Sequence[Operand], size: int) -> list[Any] 
     out = row_aval(eqn.outvars[0])
 
     def arrange(side: int, operand: Operand) -> tuple[jax.Array, int]:
-        """Return axes in the order contracted, batch, own, environments; and how many are own."""
+        """Order axes as contracted, batch, own, environments; return the number of own ones."""
         rank = row_aval(eqn.invars[side]).ndim
         own = [i for i in range(rank) if i not in contracted[side] and i not in batch[side]]
         axes = (*contracted[side], *batch[side], *own, *([rank] if operand.batched else []))
@@ -218,7 +218,7 @@ def _dot(eqn: core.JaxprEqn, inputs: Sequence[Operand], size: int) -> list[Any] 
 
     if size <= FEW:
         return [jnp.sum(multiply(x, y, lengths), tuple(range(len(lengths))), dtype=out.dtype)]
-    # Additions run over many rows at a time, which a sum over an axis was seen not to.
+    # Additions are vectorised over rows; a sum over an axis is not.
     terms = [multiply(x[index], y[index], ()) for index in itertools.product(*map(range, lengths))]
     return [sum(terms[1:], start=terms[0])]
 
@@ -228,7 +228,7 @@ def _is_short(eqn: core.JaxprEqn) -> bool:
     terms = 1
     for axis in contracted:
         terms *= row_aval(eqn.invars[0]).shape[axis]
-    # Libraries add the products of short floats in longer ones.
+    # Libraries accumulate products of short floats in longer ones.
     dtype = row_aval(eqn.outvars[0]).dtype
     is_short_float = jnp.issubdtype(dtype, jnp.floating) and dtype.itemsize < 4
     return 0 < terms <= _LONGEST_SUM and not is_short_float

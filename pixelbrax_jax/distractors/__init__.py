@@ -1,4 +1,4 @@
-"""What an agent must learn to ignore: changes of color, background and viewpoint."""
+"""Distractors: changes of color, background and camera that an agent must ignore."""
 
 from pixelbrax_jax.distractors.base import Distractor
 from pixelbrax_jax.distractors.camera import MovingCamera

@@ -1,4 +1,4 @@
-"""The interface of a distractor, and how several work together."""
+"""The interface of distractors, and chains of them."""
 
 from __future__ import annotations
 
@@ -11,106 +11,94 @@ from pixelbrax_jax.types import EnvParams, Frame
 
 
 class Distractor:
-    """A change of what an environment looks like and of nothing else.
+    """A change of an environment's image, written for ONE environment.
 
-    Written for ONE environment. A distractor is a frozen dataclass of plain numbers and strings,
-    for it decides which program is compiled. Whatever varies is in its *state*, a pytree that
-    ``reset`` samples at an episode's reset and ``advance`` carries from frame to frame.
-
-    ``change_params`` acts before the image is rendered, ``change_frame`` after. Each is a no-op
-    unless it is overridden.
+    It is a frozen dataclass of plain numbers and strings, which decide the program. All that varies
+    is in the *state*, a pytree that ``reset`` samples for an episode and ``advance`` updates for
+    each frame. ``change_params`` acts before the image is rendered, ``change_frame`` after it.
 
     Attributes:
-        kind: name of the distractor; an environment has at most one of a kind.
-        stream: name of its random stream, folded into an episode's key; its own for each kind.
+        kind: name of the distractor; an environment has at most one of each kind.
+        stream: unique number of its random stream, folded into an episode's key.
     """
 
     kind: ClassVar[str]
     stream: ClassVar[int]
 
     def reset(self, key: jax.Array, params: EnvParams) -> Any:
-        """Sample the state at the first frame of an episode, by a key of its own."""
+        """Sample the state at the first frame of an episode."""
         raise NotImplementedError
 
     def advance(self, state: Any, key: jax.Array, frame: jax.Array, params: EnvParams) -> Any:
-        """Return the state at the next frame, () int32 ``frame`` of its episode, 0 first.
+        """Return the state at the next frame, () int32 ``frame`` of its episode, from 0.
 
-        The key is that of this frame and this distractor alone.
+        The key is unique for this frame and distractor.
         """
         del key, frame, params
         return state
 
     def change_params(self, state: Any, params: EnvParams) -> EnvParams:
-        """Return the parameters to draw the frame with: other colors, another camera."""
+        """Return the parameters for the frame, such as other colors or another camera."""
         del state
         return params
 
     def backdrop(
         self, state: Any, params: EnvParams, rows: jax.Array, height: int, width: int
     ) -> jax.Array | None:
-        """Return ``rows``, (R,) int32, of an image that ``change_frame`` mixes in.
+        """Return (R, width) uint32 packed pixels of an image for ``change_frame``; None for none.
 
-        They are numbered in [0, height), and are (R, width) uint32 packed pixels; None for none.
+        ``rows``, (R,) int32, are row indices in [0, height).
         """
         del state, params, rows, height, width
         return None
 
     def change_frame(self, state: Any, frame: Frame, backdrop: jax.Array | None) -> Frame:
-        """Return some rows of the image, or all, with other colors, all in [0, 1].
+        """Return some or all rows of the image with other colors in [0, 1].
 
-        ``backdrop`` are the same rows of the backdrop, if there is one. What differs from pixel to
-        pixel, such as noise, belongs there.
+        ``backdrop`` has the same rows of the backdrop, if there is one; noise per pixel belongs
+        there.
         """
         del state, backdrop
         return frame
 
     def info(self, state: Any) -> dict[str, jax.Array]:
-        """Return what the state adds to ``Timestep.info``."""
+        """Return the entries that the state adds to ``Timestep.info``."""
         del state
         return {}
 
 
 class Chain:
-    """Distractors one after the other; of each kind at most one.
-
-    Its state is the tuple of theirs. An image passes them in the order camera, video, color,
-    others, whatever the order in which they were given.
-    """
+    """A chain of distractors in the order camera, video, color, others; its state is a tuple."""
 
     _ORDER = ("camera", "video", "color")
 
     def __init__(self, distractors: Iterable[object] = ()) -> None:
-        """Sort and check.
-
-        Raises:
-            ValueError: two are of one kind, or have one stream.
-            TypeError: one is no distractor, or cannot be hashed.
-        """
+        """Sort and check the distractors: unique kinds and streams, hashable."""
         links = [_checked(distractor) for distractor in distractors]
         kinds = [distractor.kind for distractor in links]
         for kind in kinds:
             if kinds.count(kind) > 1:
-                raise ValueError(f"there are two distractors of kind {kind!r}; give one of them.")
+                raise ValueError(f"there are two distractors of kind {kind!r}; give only one.")
         if len({distractor.stream for distractor in links}) < len(kinds):
-            raise ValueError(f"the distractors {', '.join(kinds)} must differ in their streams.")
+            raise ValueError(f"the distractors {', '.join(kinds)} must have different streams.")
         known = {kind: place for place, kind in enumerate(self._ORDER)}
         self.links = tuple(sorted(links, key=lambda d: known.get(d.kind, len(known))))
 
     def reset(self, key: jax.Array, params: EnvParams) -> tuple[Any, ...]:
-        """Sample states at the first frame of the episode that ``key`` stands for."""
+        """Sample states at the first frame of the episode with this key."""
         return tuple(link.reset(self._key(key, link, 0), params) for link in self.links)
 
     def advance(
         self, states: tuple[Any, ...], key: jax.Array, frame: jax.Array, params: EnvParams
     ) -> tuple[Any, ...]:
-        """Return states at frame ``frame``, at least 1, of the episode that ``key`` stands for."""
+        """Return states at frame ``frame``, at least 1, of the episode with this key."""
         return tuple(
             link.advance(state, self._key(key, link, frame), frame, params)
             for link, state in zip(self.links, states, strict=True)
         )
 
     def change_params(self, states: tuple[Any, ...], params: EnvParams) -> EnvParams:
-        """Return the parameters to draw with."""
+        """Return the parameters for the frame."""
         for link, state in zip(self.links, states, strict=True):
             params = link.change_params(state, params)
         return params
@@ -124,7 +112,7 @@ class Chain:
         height: int,
         width: int,
     ) -> Frame:
-        """Return rows of the image with other colors, given (R,) int32, which rows they are."""
+        """Return the image's rows with indices (R,) int32 in other colors."""
         for link, state in zip(self.links, states, strict=True):
             backdrop = link.backdrop(state, params, rows, height, width)
             frame = link.change_frame(state, frame, backdrop)
@@ -143,20 +131,15 @@ class Chain:
 
 
 def _checked(distractor: object) -> Distractor:
-    """Return a distractor, and reject what a program cannot be compiled for.
-
-    Raises:
-        TypeError: it is no distractor, or cannot be hashed.
-        ValueError: its stream is not a number of its own.
-    """
+    """Return a valid distractor, or raise the errors of ``Chain``."""
     if not isinstance(distractor, Distractor):
         raise TypeError(
-            f"expected a Distractor, got {type(distractor).__name__}; names are for "
-            "pixelbrax_jax.make."
+            f"expected a Distractor, got {type(distractor).__name__}; only pixelbrax_jax.make "
+            "takes names."
         )
     name = type(distractor).__name__
     if not isinstance(getattr(distractor, "kind", None), str):
-        raise TypeError(f"{name} needs a kind, a name of its own.")
+        raise TypeError(f"{name} needs a kind, a unique name.")
     stream = getattr(distractor, "stream", None)
     if not isinstance(stream, int) or stream < 1:
         raise ValueError(f"{name} needs a stream, a positive integer, got {stream!r}.")

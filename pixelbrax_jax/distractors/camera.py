@@ -1,4 +1,4 @@
-"""A camera that stands elsewhere in each episode, and may wander."""
+"""Random cameras."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from pixelbrax_jax.types import CameraRig, EnvParams
 from pixelbrax_jax.validation import check_fraction
 
 _RADIUS = 4.0
-"""Metres from its target at which a camera has the suite's speeds; they grow in proportion."""
+"""Distance from the target in metres for the suite's speeds; other distances scale them."""
 
 _POLE = 0.02
-"""Radians from straight above that a camera keeps, for there it would not know what is up."""
+"""Least angle in radians from straight above, where the up direction is undefined."""
 
 
 class CameraState(struct.PyTreeNode):
-    """Where the camera is, as spherical coordinates about the point it looks at.
+    """Spherical coordinates of the camera about its target, relative to the undisturbed camera.
 
     Attributes:
-        radius: () float32, distance over that of the undisturbed camera.
-        azimuth: () float32, radians about the world's z axis, from the undisturbed camera.
-        polar: () float32, radians from the world's z axis, from the undisturbed camera.
+        radius: () float32, ratio of the distances.
+        azimuth: () float32, radians about the world's z axis.
+        polar: () float32, radians from the world's z axis.
         roll: () float32, radians about the viewing axis.
-        velocity: (3,) float32, metres a frame.
-        roll_velocity: () float32, radians a frame.
+        velocity: (3,) float32, metres per frame.
+        roll_velocity: () float32, radians per frame.
     """
 
     radius: jax.Array
@@ -43,28 +43,27 @@ class CameraState(struct.PyTreeNode):
 
 @dataclass(frozen=True)
 class MovingCamera(Distractor):
-    """Moves the camera about the point that it looks at.
+    """Moves the camera about its target.
 
-    It stays in a box of spherical coordinates about that point. With b the ``scale`` and r0 the
-    distance of the undisturbed camera: azimuth and polar angle within +- (pi/2) b of its own,
-    the polar angle also within [0, pi/2] unless the camera looks up from below, so that it
-    never sinks into the ground; roll within +- (pi/2) b; distance from (1 - b/2) r0 to
-    (1 + 3b/2) r0. An episode starts at a uniform sample from the box.
+    It stays in a box of spherical coordinates about the target. With b the ``scale`` and r0 the
+    distance of the undisturbed camera: azimuth and polar angle within +- (pi/2) b of the
+    undisturbed ones, the polar angle also within [0, pi/2] unless the camera looks up from below,
+    so that it is not below the ground; roll within +- (pi/2) b; distance from (1 - b/2) r0 to (1 +
+    3b/2) r0. An episode starts at a uniform sample from the box.
 
-    With ``dynamic=True`` the velocity v is on a random walk: ``v += N(0, (0.1 b s)^2)`` in each
-    world axis, its length at most ``0.4 b s``, where ``s = r0 / 4``; the roll's velocity does
-    ``+= N(0, (pi b / 300)^2)``, at most ``pi b / 50``. The camera moves by v and is clipped to
-    the box, and v becomes what it has really moved by.
+    With ``dynamic=True`` the velocity v is a random walk: ``v += N(0, (0.1 b s)^2)`` along each
+    world axis, its length at most ``0.4 b s``, where ``s = r0 / 4``; the roll's velocity changes by
+    ``N(0, (pi b / 300)^2)`` and is at most ``pi b / 50``. The camera moves by v and is clipped to
+    the box, and v becomes the actual motion.
 
     Source: the Distracting Control Suite, arXiv 2101.02722 and its code, at scales 0.1, 0.2 and
-    0.3. Two differences: distances are relative to the point that our camera rigs look at, not
-    to the agent's center of mass (of a plain ``types.Camera`` that point is 1 m ahead; give a
-    ``CameraRig`` instead); and the suite's limit of the azimuth, which is never
-    reached from where its cameras stand, is left out.
+    0.3. Two differences: distances are relative to the target of our camera rigs, not to the
+    agent's center of mass (the target of a plain ``types.Camera`` is 1 m ahead; use a ``CameraRig``
+    instead); and the suite's limit of the azimuth, which its cameras never reach, is omitted.
 
     Attributes:
         scale: b in [0, 1]; 0.1 is easy, 0.2 medium, 0.3 hard.
-        dynamic: whether the camera wanders within an episode.
+        dynamic: whether the camera moves within an episode.
 
     Raises:
         ValueError: the scale is out of range.
@@ -77,11 +76,10 @@ class MovingCamera(Distractor):
     stream: ClassVar[int] = 3
 
     def __post_init__(self) -> None:
-        """Check the options."""
         check_fraction("scale of MovingCamera", self.scale)
 
     def reset(self, key: jax.Array, params: EnvParams) -> CameraState:
-        """Return a place sampled from the box, and a velocity."""
+        """Sample a position from the box, and a velocity."""
         low, high = self._box(params.rig)
         place_key, direction_key, speed_key, roll_key = jax.random.split(key, 4)
         place = jax.random.uniform(place_key, (4,), minval=low, maxval=high)
@@ -102,7 +100,7 @@ class MovingCamera(Distractor):
     def advance(
         self, state: CameraState, key: jax.Array, frame: jax.Array, params: EnvParams
     ) -> CameraState:
-        """Take one step of the walk."""
+        """Take one step of the random walk."""
         del frame
         if not self.dynamic:
             return state
@@ -118,7 +116,7 @@ class MovingCamera(Distractor):
         radius, azimuth, polar = _spherical(params.rig.eye - params.rig.target)
         before = _cartesian(state.radius * radius, state.azimuth + azimuth, state.polar + polar)
         new_radius, new_azimuth, new_polar = _spherical(before + velocity)
-        # The same angle, counted from the undisturbed camera's, the short way round.
+        # Relative to the undisturbed camera's azimuth, in [-pi, pi].
         turned = jnp.arctan2(jnp.sin(new_azimuth - azimuth), jnp.cos(new_azimuth - azimuth))
         place = jnp.stack([new_radius / radius, turned, new_polar - polar, 0.0])
         place = jnp.clip(place, low, high)
@@ -134,7 +132,7 @@ class MovingCamera(Distractor):
         )
 
     def change_params(self, state: CameraState, params: EnvParams) -> EnvParams:
-        """Return the rig with its camera elsewhere."""
+        """Return the parameters with the moved camera."""
         rig = params.rig
         radius, azimuth, polar = _spherical(rig.eye - rig.target)
         away = _cartesian(state.radius * radius, state.azimuth + azimuth, state.polar + polar)
@@ -142,7 +140,7 @@ class MovingCamera(Distractor):
         return params.replace(rig=rig.replace(eye=rig.target + away, up=up))
 
     def info(self, state: CameraState) -> dict[str, jax.Array]:
-        """Return ``camera``, (4,): distance over the undisturbed, azimuth, polar angle, roll."""
+        """Return ``camera``, (4,): relative distance, azimuth, polar angle and roll."""
         return {"camera": jnp.stack([state.radius, state.azimuth, state.polar, state.roll])}
 
     def _box(self, rig: CameraRig) -> tuple[jax.Array, jax.Array]:
@@ -157,15 +155,14 @@ class MovingCamera(Distractor):
         return low, high
 
     def _speeds(self, rig: CameraRig) -> tuple[jax.Array, float]:
-        """Return the greatest velocities: metres a frame, and radians of roll a frame."""
+        """Return the largest velocities: metres per frame, and radians of roll per frame."""
         radius = jnp.linalg.norm(rig.eye - rig.target)
         return 0.4 * self.scale * radius / _RADIUS, float(jnp.pi) * self.scale / 50.0
 
 
 def _spherical(away: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return distance, azimuth and polar angle of a vector."""
     x, y, z = jnp.asarray(away)
-    # Straight above, where neither the azimuth nor the square root has a derivative.
+    # Straight above neither the azimuth nor the square root has a derivative.
     pole = (x == 0.0) & (y == 0.0)
     across = jnp.where(pole, 0.0, jnp.sqrt(jnp.where(pole, 1.0, x * x + y * y)))
     azimuth = jnp.arctan2(jnp.where(pole, 0.0, y), jnp.where(pole, 1.0, x))
@@ -180,6 +177,6 @@ def _cartesian(radius: jax.Array, azimuth: jax.Array, polar: jax.Array) -> jax.A
 
 
 def _turn(vector: jax.Array, axis: jax.Array, angle: jax.Array) -> jax.Array:
-    """Return a vector turned about a unit axis, by Rodrigues' formula."""
+    """Rotate a vector about a unit axis, by Rodrigues' formula."""
     along = jnp.dot(axis, vector) * axis
     return along + jnp.cos(angle) * (vector - along) + jnp.sin(angle) * jnp.cross(axis, vector)

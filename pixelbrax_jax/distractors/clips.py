@@ -1,4 +1,4 @@
-"""Banks of clips: from a folder, from a cache, or made on the spot."""
+"""Banks of clips: from a folder, the cache or a procedure."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from pixelbrax_jax.types import Clips
 from pixelbrax_jax.validation import check_choice, check_positive_int
 
 MAX_BYTES = 2 * 1024**3
-"""Device memory that a bank may take by default."""
+"""Default limit of a bank's device memory."""
 
 _CACHE_VERSION = 2
-"""Raised when the same files would give other pixels."""
+"""Increased when the same files give other pixels."""
 
 _NOT_THE_USER = {
     "pixelbrax_jax",
@@ -38,31 +38,31 @@ _NOT_THE_USER = {
     "torchrl",
     "contextlib",
 }
-"""Packages between a user's line and ``load_clips``."""
+"""Packages between a user's code and ``load_clips``."""
 
 
 _Decoded = tuple[np.ndarray, np.ndarray, list[str]]
-"""Frames, and of each clip its length and what its file lacks."""
+"""Frames, lengths of the clips, and defects of their files."""
 
 
 class ProceduralClipsWarning(UserWarning):
-    """Procedural clips are in use, not DAVIS."""
+    """Procedural clips are in use instead of DAVIS."""
 
 
 class OnlySplitWarning(UserWarning):
-    """A folder has one split, and it is taken for the training's."""
+    """A folder has only one split, which is used for training."""
 
 
 @dataclass(frozen=True, eq=False)
 class ClipBank:
-    """Clips of one size, in host memory.
+    """Clips of one size in host memory.
 
     Attributes:
-        frames: (T, H, W, 3) uint8, all clips one after the other, row 0 at the top.
-        length: (C,) int32, frames of each clip.
-        names: of the clips.
-        source: where they come from.
-        split: which split they are.
+        frames: (T, H, W, 3) uint8, all clips concatenated, row 0 at the top.
+        length: (C,) int32, number of frames of each clip.
+        names: names of the clips.
+        source: folder or ``procedural``.
+        split: name of the split.
 
     Raises:
         ValueError: the parts do not agree; the message says how.
@@ -75,7 +75,6 @@ class ClipBank:
     split: str
 
     def __post_init__(self) -> None:
-        """Check that the parts agree."""
         shape, dtype = np.shape(self.frames), getattr(self.frames, "dtype", None)
         if len(shape) != 4 or shape[-1] != 3 or dtype != np.uint8:
             raise ValueError(f"frames must be (T, H, W, 3) uint8, got {shape} {dtype}.")
@@ -87,7 +86,7 @@ class ClipBank:
 
     @cached_property
     def digest(self) -> str:
-        """A hash of the content."""
+        """Hash of the content."""
         content = hashlib.sha256(repr((self.frames.shape, self.length.tolist())).encode())
         content.update(np.ascontiguousarray(self.frames).data)
         return content.hexdigest()
@@ -99,11 +98,11 @@ class ClipBank:
 
     @property
     def device_bytes(self) -> int:
-        """Bytes that ``to_device`` takes: four for each pixel."""
+        """Bytes that ``to_device`` takes: four per pixel."""
         return int(self.frames.shape[0] * self.frames.shape[1] * self.frames.shape[2] * 4)
 
     def to_device(self) -> Clips:
-        """Return the clips as ``EnvParams.clips`` wants them, on JAX's default device."""
+        """Return ``EnvParams.clips``, on JAX's default device."""
         pixels = np.zeros((*self.frames.shape[:3], 4), np.uint8)
         pixels[..., :3] = self.frames
         return Clips(
@@ -126,36 +125,30 @@ def load_clips(
 ) -> ClipBank:
     """Return a bank of clips.
 
-    Images are cut to the middle of the wanted proportions and scaled with an antialiasing
-    filter; ``media.read_clip`` says how their pixels become colors. What was read once is cached
-    on disk, under a name made from all that decides it. A warning names each file that has fewer
-    frames than it declares.
+    Images are cropped to the center at the requested aspect ratio and scaled with an antialiasing
+    filter; see ``media.read_clip`` for colors. Decoded clips are cached on disk. A warning names
+    each file with fewer frames than it declares.
 
     Args:
-        source: a folder: DAVIS-2017, or videos, or folders of images; see
-            ``folders.find``. ``"procedural"`` makes clips without any file; results with them
-            are not results with DAVIS.
+        source: a folder with DAVIS-2017, videos or folders of images, see ``folders.find``; or
+            ``"procedural"`` for generated clips, whose results are not comparable with DAVIS.
         split: of a DAVIS folder ``"train"``, ``"test"``, ``"paper-train"``, ``"paper-test"``; of
             procedural clips ``"train"``, ``"test"`` (other clips of the same families) and
-            ``"ood"`` (other families); of another folder its subfolders, or ``"all"``. Where a
-            folder has one split, ``"train"`` takes it, with an ``OnlySplitWarning``; a test on the
-            same clips must be asked for by their split's own name.
+            ``"ood"`` (other families); of another folder its subfolders, or ``"all"``. If a folder
+            has only one split, ``"train"`` selects it, with an ``OnlySplitWarning``; for a test on
+            the same clips, use the split's name.
         height: pixels.
         width: pixels.
-        num_clips: how many of the split, the first ones; None means all.
-        max_bytes: device memory that the bank may take.
-        cache_dir: where to cache; None means ``$PIXELBRAX_CACHE``, else
-            ``~/.cache/pixelbrax``.
-        progress: whether a terminal shows a bar while files are read, if tqdm is installed.
-
-    Returns:
-        The bank.
+        num_clips: number of clips, from the first; None means all.
+        max_bytes: limit of the bank's device memory.
+        cache_dir: cache folder; None means ``$PIXELBRAX_CACHE``, else ``~/.cache/pixelbrax``.
+        progress: whether a terminal shows a progress bar, if tqdm is installed.
 
     Raises:
-        FileNotFoundError: something is missing; the message names it and what was expected.
-        ValueError: an unknown split, a file that cannot be read, or a clip without frames.
-        MemoryError: the bank would be too large; the message says how to make it smaller.
-        ImportError: Pillow or imageio-ffmpeg is missing, with the fix.
+        FileNotFoundError: something is missing; the message says what was expected.
+        ValueError: the split is unknown, a file cannot be read, or a clip has no frames.
+        MemoryError: the bank is too large; the message has the fix.
+        ImportError: Pillow or imageio-ffmpeg is missing; the message has the fix.
     """
     height, width = check_positive_int("height", height), check_positive_int("width", width)
     if num_clips is not None:
@@ -169,8 +162,8 @@ def load_clips(
     sources, present = folders.find(folder, split)
     if present != split:
         warnings.warn(
-            f"split={split!r} is split {present!r} of {folder}, the only one that it has; there is "
-            f"none to test on. Say split={present!r} if that is what you want, or put the clips "
+            f"split={split!r} selects {present!r}, the only split of {folder}, which has no clips "
+            f"to test on. Pass split={present!r} if that is what you want, or put the clips "
             "into subfolders train and test.",
             OnlySplitWarning,
             stacklevel=_stacklevel_of_the_user(),
@@ -199,21 +192,18 @@ def _procedural(names: tuple[str, ...], split: str, height: int, width: int) -> 
 
 
 def warn_procedural() -> None:
-    """Say, once for each place in the user's code, that these clips are not DAVIS."""
+    """Warn, once per place in the user's code, that clips are not DAVIS."""
     warnings.warn(
-        "the background plays procedural clips, as no clips= were given; results are not results "
-        "on DAVIS. Say clips='procedural' if that is what you want, or clips='<folder of "
-        "DAVIS-2017>'.",
+        "the background plays procedural clips, because clips= is not given; results are not "
+        "comparable with DAVIS. Pass clips='procedural' if that is what you want, or "
+        "clips='<folder of DAVIS-2017>'.",
         ProceduralClipsWarning,
         stacklevel=_stacklevel_of_the_user(),
     )
 
 
 def _stacklevel_of_the_user() -> int:
-    """Return what ``warnings.warn`` wants in the calling function to point at the user's own line.
-
-    An environment is made at many depths: by ``make``, by Gymnasium's, by the class of a adapter.
-    """
+    """Return the ``stacklevel`` with which the caller's warning points to the user's line."""
     level, frame = 1, sys._getframe(1)
     while frame.f_globals.get("__name__", "").partition(".")[0] in _NOT_THE_USER:
         if frame.f_back is None:
@@ -227,7 +217,7 @@ def _check_size(frames: int, height: int, width: int, max_bytes: int) -> None:
     if needed > max_bytes:
         raise MemoryError(
             f"{frames} frames of {height} x {width} pixels take {needed / 1e6:.0f} MB on the "
-            f"device, and max_bytes allows {max_bytes / 1e6:.0f} MB; take fewer clips "
+            f"device, and max_bytes allows {max_bytes / 1e6:.0f} MB; use fewer clips "
             "(num_clips), smaller images, or load_clips(..., max_bytes=...)."
         )
 
@@ -257,16 +247,16 @@ def _with_progress(sources: list[folders.Source], progress: bool) -> Iterable[fo
         from tqdm import tqdm
     except ImportError:
         return sources
-    # None: nothing where standard error is no terminal, such as a log.
+    # None hides the bar if standard error is not a terminal.
     return tqdm(sources, desc="reading clips", unit="clip", leave=False, disable=None)
 
 
 def _digest(sources: list[folders.Source], height: int, width: int) -> str:
-    """Return a name for the content of these files at this size, wherever they lie."""
+    """Return a hash of the files' content and the size, independent of their folder."""
     digest = hashlib.sha256(json.dumps([_CACHE_VERSION, height, width]).encode())
     for source in sources:
         digest.update(json.dumps([source.name, len(source.files)]).encode())
-        # One after the other: threads would wait for Python's lock longer than for a hash.
+        # Sequential: threads would wait for Python's lock longer than for a hash.
         for file in source.files:
             with file.open("rb") as opened:  # a video need not fit into memory
                 digest.update(hashlib.file_digest(opened, "sha256").digest())
@@ -295,7 +285,7 @@ def _write_cache(
     length: np.ndarray,
     lacks: list[str],
 ) -> None:
-    """Write beside and then rename: a half-written cache never has the name that is read."""
+    """Write to a temporary file and rename it, so that the cache is never incomplete."""
     half: Path | None = None
     try:
         file = cache_folder(cache_dir) / name
@@ -312,7 +302,7 @@ def _write_cache(
             with contextlib.suppress(OSError):
                 half.unlink(missing_ok=True)
         warnings.warn(
-            f"clips could not be cached ({error}); name a folder in the environment variable "
-            "PIXELBRAX_CACHE, or they are read anew each time.",
+            f"clips could not be cached ({error}) and are decoded again each time; set the "
+            "environment variable PIXELBRAX_CACHE to a folder.",
             stacklevel=_stacklevel_of_the_user(),
         )

@@ -1,4 +1,4 @@
-"""Colors that change: of the whole image, or of each thing in it."""
+"""Random colors of the image or of its materials."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ DYNAMICS = ("iid", "walk", "static")
 DISTRIBUTIONS = ("normal", "uniform")
 
 _WALK = 0.03
-"""Standard deviation of a walk's step in units of the scale, of the Distracting Control Suite."""
+"""Standard deviation of a walk's step in units of the scale, from the Distracting Control Suite."""
 
 
 @dataclass(frozen=True)
@@ -25,35 +25,32 @@ class Color(Distractor):
     """Shifts colors by random amounts of size ``scale``.
 
     ``mode="frame"`` adds one offset (red, green, blue) to every pixel and clips to [0, 1].
-    ``mode="geom"`` gives every material a color of its own near the true one, clipped to
-    [0, 1]; the ground shifts by what its material shifts by. With ``sky=True`` the sky is one
-    more: straight above it shifts by all of the amount, at the horizon by all or, of a sky that
-    has a color below too, by half, and below not at all.
+    ``mode="geom"`` shifts every material's color and clips it to [0, 1]; the ground shifts like its
+    material. With ``sky=True`` the sky shifts too: straight above by the whole amount, at the
+    horizon by the whole amount (by half if the sky has a color below), and below not at all.
 
-    An amount x is sampled from a normal distribution of standard deviation ``scale``, or from a
-    uniform one on [-scale, scale], cut to where colors stay in [0, 1] for materials. When, is
-    decided by ``dynamics``:
+    A shift x is sampled from a normal distribution with standard deviation ``scale``, or from a
+    uniform one on [-scale, scale], and is limited so that materials stay in [0, 1]. ``dynamics``
+    decides when:
 
-    * ``"static"``: once for each episode,
-    * ``"iid"``: for each frame,
-    * ``"walk"``: once for each episode, and then ``x += N(0, (0.03 scale)^2)`` for each frame,
-      clipped to [-scale, scale].
+    * ``"static"``: once per episode, * ``"iid"``: for each frame, * ``"walk"``: once per episode,
+    and then ``x += N(0, (0.03 scale)^2)`` for each frame,   clipped to [-scale, scale].
 
-    Sources: one normal offset for each frame, of standard deviation 0.3, is that of the paper,
-    arXiv 2502.00021 (preset ``"paper-color"``). Materials on a walk are those of the Distracting
-    Control Suite, arXiv 2101.02722, at scales 0.1, 0.2, 0.3. Robot, ground and sky in another
-    color each episode are color-easy and color-hard of the DMControl Generalization Benchmark,
-    arXiv 2011.13389; it picks one of 100 recorded palettes, which are normal samples of standard
-    deviation 0.1 and 0.2 about the true colors, cut to [0, 1]. We sample new ones.
+    Sources: one normal offset per frame with standard deviation 0.3 is from the paper, arXiv
+    2502.00021 (preset ``"paper-color"``). Materials on a walk are from the Distracting Control
+    Suite, arXiv 2101.02722, at scales 0.1, 0.2, 0.3. New colors of robot, ground and sky in each
+    episode are color-easy and color-hard of the DMControl Generalization Benchmark, arXiv
+    2011.13389. It selects one of 100 recorded palettes, which are normal samples with standard
+    deviation 0.1 and 0.2 about the true colors, clipped to [0, 1]; PixelBrax samples new ones.
 
     Attributes:
         mode: ``"frame"`` or ``"geom"``.
         dynamics: ``"iid"``, ``"walk"`` or ``"static"``.
         scale: size of the shift, in units of the color range [0, 1].
         distribution: ``"normal"`` or ``"uniform"``.
-        sky: whether the sky shifts too; of ``mode="geom"`` only.
-        materials: the model's names of the materials that shift, of ``mode="geom"`` only; None
-            for all. Where materials have no names, all shift.
+        sky: whether the sky shifts too; only with ``mode="geom"``.
+        materials: the model's names of the materials that shift, only with ``mode="geom"``; None
+            for all. If materials have no names, all shift.
 
     Raises:
         ValueError: an option is unknown or out of range; the message says what is allowed.
@@ -70,23 +67,22 @@ class Color(Distractor):
     stream: ClassVar[int] = 1
 
     def __post_init__(self) -> None:
-        """Check the options."""
         check_choice("mode of Color", self.mode, MODES)
         check_choice("dynamics of Color", self.dynamics, DYNAMICS)
         check_choice("distribution of Color", self.distribution, DISTRIBUTIONS)
         check_fraction("scale of Color", self.scale)
         if self.mode == "frame" and (self.sky or self.materials is not None):
-            raise ValueError("sky and materials of Color mean something with mode='geom' alone.")
+            raise ValueError("sky and materials of Color are only for mode='geom'.")
         if self.materials is not None and not _are_names(self.materials):
             raise ValueError(
-                f"materials of Color must be a tuple of names, as ('self', 'grid'), or None, got "
-                f"{self.materials!r}."
+                f"materials of Color must be a tuple of names, such as ('self', 'grid'), or None, "
+                f"got {self.materials!r}."
             )
 
     def reset(self, key: jax.Array, params: EnvParams) -> jax.Array:
-        """Return the shift: (3,) of the frame, or (M, 3) of the materials, the sky's last."""
+        """Sample the shift: (3,) of the frame, or (M, 3) of the materials and then the sky."""
         shift = self._draw(key, params)
-        # A walk starts inside the box that it stays in.
+        # A walk starts inside its bounds.
         return self._in_box(shift, params) if self.dynamics == "walk" else shift
 
     def advance(
@@ -102,7 +98,7 @@ class Color(Distractor):
         return self._in_box(state + step, params)
 
     def change_params(self, state: jax.Array, params: EnvParams) -> EnvParams:
-        """Return materials and ground in other colors."""
+        """Return the parameters with shifted materials and ground."""
         if self.mode == "frame":
             return params
         geoms, look = params.geoms, params.look
@@ -114,12 +110,12 @@ class Color(Distractor):
         plane = _plane_material(params)
         if plane is not None:
             look = look.replace(ground_rgb=look.ground_rgb + state[plane])
-        # A plane may share its material with other geoms, which may have tighter bounds.
+        # A plane may share its material with other geoms that have tighter bounds.
         rgb = jnp.clip(geoms.rgb + state, 0.0, 1.0)
         return params.replace(geoms=geoms.replace(rgb=rgb), look=look)
 
     def change_frame(self, state: jax.Array, frame: Frame, backdrop: jax.Array | None) -> Frame:
-        """Return the frame with the offset."""
+        """Return the frame plus the offset."""
         del backdrop
         if self.mode == "geom":
             return frame
@@ -130,7 +126,7 @@ class Color(Distractor):
         )
 
     def info(self, state: jax.Array) -> dict[str, jax.Array]:
-        """Return ``color``: the shift."""
+        """Return the shift as ``color``."""
         return {"color": state}
 
     def _draw(self, key: jax.Array, params: EnvParams) -> jax.Array:
@@ -145,23 +141,23 @@ class Color(Distractor):
         return jnp.clip(shift, jnp.maximum(low, -self.scale), jnp.minimum(high, self.scale))
 
     def _bounds(self, params: EnvParams) -> tuple[jax.Array, jax.Array]:
-        """Return bounds of a shift: of materials, those that leave every color in [0, 1]."""
+        """Return bounds of the shift that keep every material in [0, 1]."""
         if self.mode == "frame":
-            # The sum is clipped, and not the shift.
+            # The sum is clipped, not the shift.
             return jnp.full(3, -jnp.inf), jnp.full(3, jnp.inf)
         rgb = jnp.asarray(params.geoms.rgb)
         low, high = -rgb, 1.0 - rgb
         plane = _plane_material(params)
         if plane is not None:
-            # Planes show the ground's colors, not in their own.
+            # Planes show the ground's colors instead of their own.
             ground = jnp.asarray(params.look.ground_rgb)
             low, high = low.at[plane].set(-ground.min(0)), high.at[plane].set(1 - ground.max(0))
         names = params.geoms.material_name
         if self.materials is not None and names:
             if not set(self.materials) & set(names):
                 raise ValueError(
-                    f"materials={self.materials!r} of Color are none of this model's: "
-                    f"{', '.join(sorted(filter(None, set(names)))) or 'it names none'}."
+                    f"the model has none of materials={self.materials!r} of Color; it has: "
+                    f"{', '.join(sorted(filter(None, set(names)))) or 'none with a name'}."
                 )
             moves = jnp.array([name in self.materials for name in names])[:, None]
             low, high = jnp.where(moves, low, 0.0), jnp.where(moves, high, 0.0)
@@ -173,7 +169,6 @@ class Color(Distractor):
 
 
 def _plane_material(params: EnvParams) -> int | None:
-    """Return the material of the first plane that is ground."""
     for g, material in enumerate(params.geoms.material):
         if params.geoms.is_ground(g):
             return material

@@ -1,4 +1,4 @@
-"""An image of all clips of a bank."""
+"""Contact sheets of clip banks."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ from pixelbrax_jax.distractors.clips import ClipBank
 from pixelbrax_jax.distractors.media import pillow
 
 _COLUMNS = 6
-"""Frames shown of each clip, evenly spaced."""
+"""Frames per clip, evenly spaced."""
 
 _GAP = 2
 
 
 def check_image(path: str) -> None:
-    """Check, before anything is read, that an image can be saved under a name.
+    """Check that an image can be saved under a name, before clips are read.
 
     Raises:
-        ValueError: its suffix is that of no image; the message lists some that are.
-        FileNotFoundError: there is no such folder.
-        ImportError: Pillow is missing, with the fix.
+        ValueError: its suffix is unknown.
+        FileNotFoundError: the folder does not exist.
+        ImportError: Pillow is missing; the message has the fix.
     """
     suffix, folder = Path(path).suffix.lower(), Path(path).absolute().parent
     if suffix not in pillow().registered_extensions():
-        raise ValueError(f"a contact sheet is an image, as .png, .jpg or .webp, got {path!r}.")
+        raise ValueError(f"a contact sheet must be a .png, .jpg or .webp image, got {path!r}.")
     if not folder.is_dir():
         raise FileNotFoundError(f"there is no folder {folder} for the contact sheet.")
 
 
 def contact_sheet(bank: ClipBank) -> Any:
-    """Return a Pillow image with a row for each clip: a few of its frames."""
+    """Return a Pillow image with a row of frames for each clip."""
     height = bank.frames.shape[1]
     rows = []
     for first, length in zip(bank.first, bank.length, strict=True):

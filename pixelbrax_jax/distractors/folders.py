@@ -1,4 +1,4 @@
-"""Which clips a folder has, and which of them belong to a split."""
+"""Clips and splits of a folder."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ VIDEOS = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".gif"})
 _RESOLUTION = "480p"
 
 ALL = "all"
-"""The split of a folder without subfolders."""
+"""Split of a folder without subfolders."""
 
 _FOR_TESTS = frozenset({"test", "val", "valid", "validation", "eval", "evaluation", "ood"})
-"""Splits that are for tests; clips of theirs are trained on only if they are asked for by name."""
+"""Names of test splits, which are never used for training by default."""
 
 # The split of the original PixelBrax, arXiv 2502.00021. It mixes DAVIS's own two.
 _PAPER = {
@@ -45,12 +45,7 @@ _DAVIS_LAYOUT = (
 
 @dataclass(frozen=True)
 class Source:
-    """One clip on disk.
-
-    Attributes:
-        name: of the clip.
-        files: its images in order, or a single video file.
-    """
+    """One clip on disk: its name, and its images in order or a single video file."""
 
     name: str
     files: tuple[Path, ...]
@@ -62,31 +57,23 @@ class Source:
 
 
 def find(folder: Path, split: str) -> tuple[list[Source], str]:
-    """Return the clips of a split.
+    """Return the clips of a split, and the split's name.
 
-    A folder in DAVIS's layout has the splits ``"train"``, ``"test"`` (DAVIS's validation set),
-    ``"paper-train"`` and ``"paper-test"``. Any other folder holds video files, or folders of
-    images, in subfolders named like the splits; without subfolders all are in split ``"all"``.
-    Where there is one split, and its name is not that of a test, ``"train"`` stands for it too.
-    Subfolders that may not be read are left out, and a warning names them.
-
-    The folder ``DAVIS``, the one above it, and its ``JPEGImages`` and ``JPEGImages/480p`` have the
-    same clips.
-
-    Returns:
-        The clips, in the order of the split file, else by name; and the split that they are,
-        which is not ``split`` where ``"train"`` stands for it.
+    A folder in DAVIS's layout (or any of its folders) has the splits ``"train"``, ``"test"``
+    (DAVIS's validation set), ``"paper-train"`` and ``"paper-test"``. Any other folder has video
+    files, or folders of images, in subfolders named like the splits; without subfolders all are in
+    split ``"all"``. If there is only one split and its name is not that of a test, ``"train"`` also
+    selects it. Unreadable subfolders are skipped with a warning. Clips are in the order of the
+    split file, else by name.
 
     Raises:
-        FileNotFoundError: the folder, a split file or a listed clip is missing; the message
-            names it and the layout that was expected.
-        PermissionError: the folder may not be read.
-        ValueError: there is no such split, or it has no clips.
+        FileNotFoundError: the folder, a split file or a listed clip is missing; the message has the
+            expected layout.
+        PermissionError: the folder cannot be read.
+        ValueError: the split is unknown or has no clips.
     """
     if folder.is_file():
-        raise FileNotFoundError(
-            f"clips must be a folder, and {folder} is a file; give the folder that it is in."
-        )
+        raise FileNotFoundError(f"clips must be a folder, but {folder} is a file; give its folder.")
     if not folder.is_dir():
         raise FileNotFoundError(
             f"there is no folder of clips at {folder}. {_DAVIS_LAYOUT}. Or give a folder with "
@@ -100,11 +87,11 @@ def find(folder: Path, split: str) -> tuple[list[Source], str]:
 
 
 def _davis_images(folder: Path) -> Path | None:
-    """Return the folder of DAVIS's clips, of whichever of its folders was given; else None."""
+    """Return the folder of DAVIS's clips for any of its folders, else None."""
     for root in (folder, folder / "DAVIS"):
         if (root / "JPEGImages").is_dir():
             return root / "JPEGImages" / _RESOLUTION
-    # Other benchmarks ask for the folder of the images; any part of the path may be a link.
+    # Other benchmarks take the folder of the images; any part of the path may be a link.
     for part in (Path(os.path.abspath(folder)), folder.resolve()):  # noqa: PTH100  # keeps links
         for images in (part, part / _RESOLUTION):
             if images.parent.name == "JPEGImages" and _lists(images).is_dir() and images.is_dir():
@@ -143,7 +130,7 @@ def _davis(images: Path, split: str) -> list[Source]:
 
 
 def _plain(folder: Path, split: str) -> tuple[list[Source], str]:
-    # A folder of images is a clip; one that holds clips is a split; others do not matter.
+    # A folder of images is a clip; a folder of clips is a split; other folders are ignored.
     closed: dict[Path, None] = {}
 
     def clips_in(part: Path) -> list[Path]:
@@ -157,14 +144,14 @@ def _plain(folder: Path, split: str) -> tuple[list[Source], str]:
     clips = clips_in(folder)
     if closed:
         warnings.warn(
-            f"left out, as they may not be read: {', '.join(map(str, closed))}; if they have clips "
-            "that you want, allow it.",
-            stacklevel=4,  # whoever calls load_clips
+            f"folders that cannot be read are skipped: {', '.join(map(str, closed))}; if they have "
+            "clips that you want, change their permissions.",
+            stacklevel=4,  # the caller of load_clips
         )
     if parts and clips:
         raise ValueError(
-            f"{folder} has clips beside the folders {', '.join(parts)} that hold clips too; move "
-            "them into a folder of their own."
+            f"{folder} has clips next to the folders {', '.join(parts)}, which also have clips; "
+            "move them into a separate folder."
         )
     if not parts and not clips:
         kinds = ", ".join(sorted(VIDEOS))
@@ -175,20 +162,18 @@ def _plain(folder: Path, split: str) -> tuple[list[Source], str]:
 
 
 def _present(folder: Path, split: str, splits: list[str]) -> str:
-    """Return the split that is meant."""
     if split not in splits and len(splits) == 1:
         (only,) = splits
         if split == "train" and only.lower() not in _FOR_TESTS:
             return only
         raise ValueError(
             f"{folder} has no split {split!r}, only {only!r}; for more than one, put the clips "
-            "into subfolders named like the splits, as train and test."
+            "into subfolders named like the splits, such as train and test."
         )
     return check_choice(f"split of {folder}", split, splits)
 
 
 def _clips(folder: Path, closed: dict[Path, None]) -> list[Path]:
-    """Return what is a clip in a folder: videos, and folders of images."""
     return [
         entry
         for entry in _entries(folder)
@@ -201,7 +186,7 @@ def _clips(folder: Path, closed: dict[Path, None]) -> list[Path]:
 def _if_open(
     look: Callable[[Path], list[Path]], folder: Path, closed: dict[Path, None]
 ) -> list[Path]:
-    """Return what is in a folder; nothing, and the folder in ``closed``, if it may not be read."""
+    """Return a folder's content; if it cannot be read, nothing, and add it to ``closed``."""
     try:
         return look(folder)
     except PermissionError:
@@ -226,7 +211,7 @@ def _pictures(folder: Path) -> list[Path]:
 
 
 def _entries(folder: Path) -> list[Path]:
-    """Return entries by name, 2 before 10; what begins with a dot is not meant."""
+    """Return entries in natural order (2 before 10), without hidden ones."""
     return sorted(
         (p for p in folder.iterdir() if not p.name.startswith(".")), key=lambda p: _natural(p.name)
     )

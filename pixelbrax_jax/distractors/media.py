@@ -1,4 +1,4 @@
-"""Frames of images and videos as people have them, as 8-bit colors at the wanted size."""
+"""Decoding of images and videos to 8-bit colors of one size."""
 
 from __future__ import annotations
 
@@ -14,36 +14,31 @@ from pixelbrax_jax.extras import install_extra
 from pixelbrax_jax.ffmpeg import Decoder
 
 AGAIN = "get it again, or remove it"
-"""What to do with a file that cannot be read, or lacks something."""
+"""Fix for a file that cannot be read or is incomplete."""
 
 
 _TOLERANCE = 2
-"""Frames that a sound video may have less than its container says."""
+"""Frames that an intact video may have less than its container declares."""
 
 
 class _UnfitError(ValueError):
-    """A file that is whole and cannot be taken; the message is the reason and the fix."""
+    """An intact file cannot be used; the message has the reason and the fix."""
 
 
 def read_clip(
     source: Source, height: int, width: int, check_count: Callable[[int], None]
 ) -> tuple[list[np.ndarray], str]:
-    """Return the frames of a clip.
+    """Return the frames of a clip, (H, W, 3) uint8 each, and the file's defect, empty if none.
 
-    Images are turned as their EXIF orientation says, videos as their display matrix does. 16 bits
-    become 8, floats in [0, 1] become 0 to 255, and what is transparent lies on black.
-
-    ``check_count`` is called with the number of frames so far, and may raise.
-
-    Returns:
-        (H, W, 3) uint8 each, and what the file lacks, to be said after its name; empty if it lacks
-        nothing.
+    Images are rotated by their EXIF orientation, videos by their display matrix. 16 bits become 8,
+    floats in [0, 1] become 0 to 255, and transparent pixels are blended with black. ``check_count``
+    is called with the number of frames so far, and may raise.
 
     Raises:
         ValueError: a file cannot be read; the message has the file, the reason and the fix.
-        OSError: a file may not be read, or FFmpeg is not found, with the fix.
-        MemoryError: a file is too large for this machine's memory, or ``check_count`` says so.
-        ImportError: Pillow or imageio-ffmpeg is missing, with the fix.
+        OSError: a file cannot be opened, or FFmpeg is not found; the message has the fix.
+        MemoryError: a file is too large for this machine's memory, or ``check_count`` raises it.
+        ImportError: Pillow or imageio-ffmpeg is missing; the message has the fix.
     """
     if not source.is_video:
         check_count(len(source.files))
@@ -82,7 +77,7 @@ def _read_video(file: Path, keep: Callable[[Any], None]) -> str:
     short = declared - found > _TOLERANCE + declared / 500
     if short and (decoder.complaint or not decoder.of_file):
         why = f" ({decoder.complaint})" if decoder.complaint else ""
-        return f"declares {declared} frames and has {found}{why}"
+        return f"declares {declared} frames but has {found}{why}"
     return ""
 
 
@@ -96,7 +91,7 @@ def _read_gif(file: Path, keep: Callable[[Any], None]) -> str:
                 found += 1
                 image.seek(found)
     except EOFError:
-        # It does not declare a number, but marks its end.
+        # A GIF declares no number of frames, but marks its end.
         ended = file.read_bytes().rstrip(b"\0").endswith(b";")
         return "" if ended else f"is cut short after {found} frames"
     except MemoryError:
@@ -114,10 +109,10 @@ def _picture(file: Path, height: int, width: int) -> np.ndarray:
     try:
         with image_module.open(file) as image:
             count = getattr(image, "n_frames", 1)
-            # Telephones put a preview beside the image.
+            # Phones add a preview to the image.
             if count > 1 and image.format != "MPO":
                 raise _UnfitError(
-                    f"it has {count} images, and one is expected; save each in a file of its own"
+                    f"it has {count} images instead of one; save each in a separate file"
                 )
             return _fit(ImageOps.exif_transpose(image), height, width)
     except MemoryError:
@@ -127,7 +122,6 @@ def _picture(file: Path, height: int, width: int) -> np.ndarray:
 
 
 def _say(file: Path, error: Exception) -> str:
-    """Return why Pillow cannot read a file, and the fix."""
     image_module = pillow()
     if isinstance(error, _UnfitError):
         return str(error)
@@ -135,12 +129,12 @@ def _say(file: Path, error: Exception) -> str:
         limit = f"{2 * image_module.MAX_IMAGE_PIXELS:,} pixels"
         return f"it has more than {limit}; scale it down, or raise PIL.Image.MAX_IMAGE_PIXELS"
     unknown = type(error).__name__ == "UnidentifiedImageError"
-    why = _content(file) or ("it is no image" if unknown else str(error).rstrip("."))
+    why = _content(file) or ("it is not an image" if unknown else str(error).rstrip("."))
     return f"{why}; {AGAIN}"
 
 
 def _content(file: Path) -> str:
-    """Return what is in a file in place of what its name says; empty if that is unknown."""
+    """Return what an unreadable file contains instead, or an empty string."""
     with file.open("rb") as opened:
         start = opened.read(256)
     if not start:
@@ -151,7 +145,7 @@ def _content(file: Path) -> str:
 
 
 def _fit(image: Any, height: int, width: int) -> np.ndarray:
-    """Return the middle of an image at the wanted proportions, scaled; (height, width, 3) uint8."""
+    """Return the center of an image at the requested size, (height, width, 3) uint8."""
     image = _to_rgb(image)
     scale = min(image.width / width, image.height / height)
     across, down = max(1, round(scale * width)), max(1, round(scale * height))
@@ -162,18 +156,18 @@ def _fit(image: Any, height: int, width: int) -> np.ndarray:
 
 def _to_rgb(image: Any) -> Any:
     image_module = pillow()
-    # Pillow itself cuts what is above 255.
+    # Pillow would clip values above 255.
     if image.mode == "F" or image.mode.startswith("I"):
         values, top = np.asarray(image), 1 if image.mode == "F" else 65535
         if not 0 <= values.min() <= values.max() <= top:
             raise _UnfitError(
-                f"its pixels lie in [{values.min()}, {values.max()}] and not in [0, {top}]; save "
+                f"its pixels are in [{values.min()}, {values.max()}], not in [0, {top}]; save "
                 "it with 8 bits"
             )
         if values.dtype.itemsize == 4 and top > 1 and 0 < values.max() <= 255:
             raise _UnfitError(
-                f"its pixels of 32 bits lie in [{values.min()}, {values.max()}], which is black "
-                "as 16 bits and may be meant as 8; save it with 8 bits"
+                f"its 32-bit pixels are in [{values.min()}, {values.max()}], which is black in 16 "
+                "bits but may mean 8 bits; save it with 8 bits"
             )
         image = image_module.fromarray(np.rint(values * (255 / top)).astype(np.uint8))
     if image.has_transparency_data:
@@ -183,7 +177,7 @@ def _to_rgb(image: Any) -> Any:
 
 
 def pillow() -> Any:
-    """Return Pillow's module of images, or raise an ImportError that has the fix."""
+    """Return Pillow's module ``Image``, or raise an ImportError with the fix."""
     try:
         from PIL import Image
     except ImportError as error:

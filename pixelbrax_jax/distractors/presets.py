@@ -1,4 +1,4 @@
-"""Names for the distractors of published benchmarks."""
+"""Presets: the distractors of published benchmarks."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ _GROUND_ALPHA = {
     "dmc_walker": 1.0,
     "dmc_cheetah": 1.0,
 }
-"""Of the Distracting Control Suite, which has 0 for reacher, 1 for walker and cheetah; for its own
-tasks by domain."""
+"""The Distracting Control Suite's values (0 for reacher, 1 for walker and cheetah); for other tasks
+by domain."""
 
 _OTHER_GROUND_ALPHA = 0.3
 
@@ -51,24 +51,14 @@ PRESETS = (
 
 
 def preset(name: str, task: str) -> tuple[Distractor, ...]:
-    """Return the distractors of a benchmark.
+    """Return the distractors of a benchmark, one of ``PRESETS``; others raise ValueError.
 
-    * ``"color"``, ``"video"``, ``"camera"``: each with its defaults.
-    * ``"paper-color"``, ``"paper-video"``: those of the paper, arXiv 2502.00021.
-    * ``"dcs-easy"``, ``"dcs-medium"``, ``"dcs-hard"``, and each with ``"-static"``: color, video
-      and camera of the Distracting Control Suite, arXiv 2101.02722.
-    * ``"color-easy"``, ``"color-hard"``, ``"video-easy"``, ``"video-hard"``: of the DMControl
-      Generalization Benchmark, arXiv 2011.13389; colors are sampled, see ``Color``.
-
-    Args:
-        name: one of ``PRESETS``.
-        task: the task, which decides how much of the ground a DCS video covers.
-
-    Returns:
-        The distractors.
-
-    Raises:
-        ValueError: there is no such preset; the message lists them.
+    * ``"color"``, ``"video"``, ``"camera"``: each with its defaults. * ``"paper-color"``,
+    ``"paper-video"``: those of the paper, arXiv 2502.00021. * ``"dcs-easy"``, ``"dcs-medium"``,
+    ``"dcs-hard"``, and each with ``"-static"``: color, video   and camera of the Distracting
+    Control Suite, arXiv 2101.02722. The task decides how much of   the ground the video covers. *
+    ``"color-easy"``, ``"color-hard"``, ``"video-easy"``, ``"video-hard"``: of the DMControl
+    Generalization Benchmark, arXiv 2011.13389; colors are sampled, see ``Color``.
     """
     check_choice("distractor", name, PRESETS)
     if name in _FIXED:
@@ -93,7 +83,7 @@ def preset(name: str, task: str) -> tuple[Distractor, ...]:
 
 
 def _ground_alpha(task: str) -> float:
-    """Return the fraction of the ground that DCS keeps; of DM Control's tasks by their domain."""
+    """Return the fraction of the ground that DCS keeps; for DM Control's tasks by domain."""
     for name, alpha in _GROUND_ALPHA.items():
         if task == name or (name.startswith("dmc_") and task.startswith(f"{name}_")):
             return alpha
@@ -103,11 +93,7 @@ def _ground_alpha(task: str) -> float:
 def as_tuple(
     distractors: str | Distractor | Iterable[str | Distractor] | None,
 ) -> tuple[str | Distractor, ...]:
-    """Return one or several distractors, or their names, as a tuple.
-
-    Raises:
-        TypeError: something is neither a name nor a distractor.
-    """
+    """Return distractors or names as a tuple; raise TypeError for anything else."""
     if distractors is None:
         return ()
     if not isinstance(distractors, (str, Distractor, Iterable)):
@@ -128,12 +114,7 @@ def as_tuple(
 def resolve(
     distractors: str | Distractor | Iterable[str | Distractor] | None, task: str
 ) -> tuple[Distractor, ...]:
-    """Return distractors, those of a preset for the task in place of its name.
-
-    Raises:
-        ValueError: a name is unknown.
-        TypeError: something is neither a name nor a distractor.
-    """
+    """Return distractors, with presets for the task in place of names; errors as in ``preset``."""
     resolved: list[Distractor] = []
     for item in as_tuple(distractors):
         resolved += preset(item, task) if isinstance(item, str) else [item]

@@ -1,15 +1,11 @@
-"""Clips made from integers, for those who have no videos at hand.
-
-Nothing but additions, multiplications, divisions, square roots and floors in float64, which
-IEEE 754 defines to the bit: the same clips on every machine.
-"""
+"""Procedural clips, the same on every machine: IEEE 754 defines all operations to the bit."""
 
 from __future__ import annotations
 
 import numpy as np
 
 FRAMES = 64
-"""Frames of every clip. The last one goes over into the first."""
+"""Frames of every clip, which loops without a jump."""
 
 _FAMILIES = {
     "train": ("noise", "gratings"),
@@ -23,7 +19,7 @@ SPLITS = tuple(_FAMILIES)
 
 
 def names(split: str) -> list[str]:
-    """Return names of a split's clips: family and seed."""
+    """Return the names of a split's clips: family and seed."""
     families, first = _FAMILIES[split], _FIRST_SEED[split]
     return [f"{families[i % len(families)]}-{first + i}" for i in range(_CLIPS[split])]
 
@@ -31,21 +27,18 @@ def names(split: str) -> list[str]:
 def clip(name: str, height: int, width: int) -> np.ndarray:
     """Return the clip of one of ``names``, (FRAMES, height, width, 3) uint8."""
     family, seed = name.split("-")
-    draw = _Draws(int(seed))
-    # Units of an image's smaller side, whatever its size.
+    random = _SplitMix64(int(seed))
+    # In units of the image's smaller side.
     unit = 1.0 / min(height, width)
     y = (np.arange(height) + 0.5)[:, None] * unit
     x = (np.arange(width) + 0.5)[None, :] * unit
-    palette = draw.uniform((3, 3))
-    planes = _PAINTERS[family](x, y, draw)
+    palette = random.uniform((3, 3))
+    planes = _PAINTERS[family](x, y, random)
     return np.stack([_colored(plane, palette) for plane in planes])
 
 
-class _Draws:
-    """Numbers from a seed by SplitMix64 (Steele, Lea and Flood, OOPSLA 2014).
-
-    NumPy's own generators may change their streams from release to release.
-    """
+class _SplitMix64:
+    """SplitMix64 (Steele, Lea and Flood, OOPSLA 2014); NumPy may change its generators' streams."""
 
     def __init__(self, seed: int) -> None:
         self._state = np.uint64(seed)
@@ -68,7 +61,7 @@ class _Draws:
 
 
 def _colored(plane: np.ndarray, palette: np.ndarray) -> np.ndarray:
-    """Return a plane of values in [0, 1] in colors between the three of a palette."""
+    """Map values in [0, 1] to colors between the three of a palette."""
     value = np.minimum(np.maximum(plane, 0.0), 1.0)[..., None] * 2.0
     low = palette[0] + (palette[1] - palette[0]) * np.minimum(value, 1.0)
     colors = low + (palette[2] - palette[1]) * np.maximum(value - 1.0, 0.0)
@@ -80,16 +73,15 @@ def _smooth(t: np.ndarray) -> np.ndarray:
 
 
 def _wave(phase: np.ndarray) -> np.ndarray:
-    """Return a wave of period 1 between 0 and 1, much like a sine."""
     fraction = phase - np.floor(phase)
     return _smooth(np.abs(2.0 * fraction - 1.0))
 
 
-def _noise(x: np.ndarray, y: np.ndarray, draw: _Draws) -> list[np.ndarray]:
-    """Return drifting value noise in three octaves, on lattices that repeat."""
-    lattices = [draw.uniform((size, size)) for size in (8, 16, 32)]
-    # Whole repeats in a clip, so that its end meets its beginning.
-    drift = [(draw.integer(-1, 1), draw.integer(-1, 1)) for _ in lattices]
+def _noise(x: np.ndarray, y: np.ndarray, random: _SplitMix64) -> list[np.ndarray]:
+    """Return moving value noise in three octaves, on lattices that repeat."""
+    lattices = [random.uniform((size, size)) for size in (8, 16, 32)]
+    # Whole periods per clip, so that it loops.
+    drift = [(random.integer(-1, 1), random.integer(-1, 1)) for _ in lattices]
     drift[0] = (1, drift[0][1])
     planes = []
     for frame in range(FRAMES):
@@ -116,14 +108,13 @@ def _value_noise(lattice: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarra
     return upper + (lower - upper) * fv
 
 
-def _gratings(x: np.ndarray, y: np.ndarray, draw: _Draws) -> list[np.ndarray]:
-    """Return two gratings that run across each other."""
+def _gratings(x: np.ndarray, y: np.ndarray, random: _SplitMix64) -> list[np.ndarray]:
     waves = []
     for _ in range(2):
-        along = (draw.integer(-4, 4), draw.integer(1, 4))
+        along = (random.integer(-4, 4), random.integer(1, 4))
         length = np.sqrt(float(along[0] ** 2 + along[1] ** 2))
-        pitch = 2.0 + 6.0 * float(draw.uniform((1,))[0])
-        speed = draw.integer(1, 3) * (1 if draw.integer(0, 1) else -1)
+        pitch = 2.0 + 6.0 * float(random.uniform((1,))[0])
+        speed = random.integer(1, 3) * (1 if random.integer(0, 1) else -1)
         waves.append((along[0] / length * pitch, along[1] / length * pitch, speed))
     (a, b, fast), (c, d, slow) = waves
     return [
@@ -133,12 +124,11 @@ def _gratings(x: np.ndarray, y: np.ndarray, draw: _Draws) -> list[np.ndarray]:
     ]
 
 
-def _blobs(x: np.ndarray, y: np.ndarray, draw: _Draws) -> list[np.ndarray]:
-    """Return soft discs on closed paths."""
+def _blobs(x: np.ndarray, y: np.ndarray, random: _SplitMix64) -> list[np.ndarray]:
     number = 7
-    centers, radii = draw.uniform((number, 2)), 0.08 + 0.17 * draw.uniform((number,))
-    reach, phases = 0.3 * draw.uniform((number, 2)), draw.uniform((number, 2))
-    heights = 0.4 + 0.6 * draw.uniform((number,))
+    centers, radii = random.uniform((number, 2)), 0.08 + 0.17 * random.uniform((number,))
+    reach, phases = 0.3 * random.uniform((number, 2)), random.uniform((number, 2))
+    heights = 0.4 + 0.6 * random.uniform((number,))
     planes = []
     for frame in range(FRAMES):
         plane = np.zeros(np.broadcast_shapes(x.shape, y.shape))
@@ -152,14 +142,14 @@ def _blobs(x: np.ndarray, y: np.ndarray, draw: _Draws) -> list[np.ndarray]:
     return planes
 
 
-def _tiles(x: np.ndarray, y: np.ndarray, draw: _Draws) -> list[np.ndarray]:
-    """Return a scrolling page of small glyphs: 5 x 5 dots each, with a gap."""
+def _tiles(x: np.ndarray, y: np.ndarray, random: _SplitMix64) -> list[np.ndarray]:
+    """Return a scrolling page of glyphs with 5 x 5 dots."""
     size = 48
-    dots = (draw.uniform((size, size)) < 0.45).astype(np.float64)
+    dots = (random.uniform((size, size)) < 0.45).astype(np.float64)
     gap = np.arange(size) % 6 == 5
     dots[gap, :] = 0.0
     dots[:, gap] = 0.0
-    across, down = draw.integer(-1, 1), draw.integer(0, 1) * 2 - 1
+    across, down = random.integer(-1, 1), random.integer(0, 1) * 2 - 1
     planes = []
     for frame in range(FRAMES):
         i = np.floor(x * 24.0 + across * frame * size / FRAMES).astype(np.int64) % size

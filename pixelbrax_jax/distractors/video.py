@@ -1,4 +1,4 @@
-"""A video in place of the background, or over the whole image."""
+"""Videos in the background or over the whole image."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ DYNAMICS = ("pingpong", "loop", "static")
 
 
 class VideoState(struct.PyTreeNode):
-    """What is played.
+    """State of the video.
 
     Attributes:
         clip: () int32, index of the clip.
         start: () int32, its frame at the start of the episode.
         direction: () int32, +1 or -1.
-        frame: () int32, its frame now.
+        frame: () int32, its current frame.
     """
 
     clip: jax.Array
@@ -40,29 +40,26 @@ class Video(Distractor):
 
     With v the video's pixel and a = ``alpha``:
 
-    * ``mode="overlay"``: every pixel p becomes ``(1 - a) p + a v``.
-    * ``mode="background"``: the sky s becomes ``(1 - a) s + a v``, the ground g
-      ``g ground_alpha + (1 - ground_alpha) v``; all else stays as it is, to the bit.
+    * ``mode="overlay"``: every pixel p becomes ``(1 - a) p + a v``. * ``mode="background"``: the
+    sky s becomes ``(1 - a) s + a v``, the ground g becomes   ``g ground_alpha + (1 - ground_alpha)
+    v``; all other pixels keep their bits.
 
-    A clip, its first frame and its direction are sampled at an episode's reset. At frame t of
-    the episode a clip of L frames that started at s in direction d shows
+    Clip, first frame and direction are sampled at an episode reset. At frame t of the episode a
+    clip of L frames that started at s in direction d shows
 
-    * ``"loop"``: frame ``(s + d t) mod L``,
-    * ``"pingpong"``: there and back: with ``P = 2 (L - 1)`` and ``q = (s + d t) mod P``, frame
-      ``min(q, P - q)``,
-    * ``"static"``: frame s.
+    * ``"loop"``: frame ``(s + d t) mod L``, * ``"pingpong"``: with ``P = 2 (L - 1)`` and ``q = (s +
+    d t) mod P``, frame ``min(q, P - q)``, * ``"static"``: frame s.
 
-    Sources: an overlay at a = 0.5 is that of the paper, arXiv 2502.00021; backgrounds that go
-    back and forth are those of the Distracting Control Suite, arXiv 2101.02722; sky alone, or sky
-    and ground, on a loop are video-easy and video-hard of the DMControl Generalization
-    Benchmark, arXiv 2011.13389.
+    Sources: an overlay with a = 0.5 is from the paper, arXiv 2502.00021; pingpong backgrounds are
+    from the Distracting Control Suite, arXiv 2101.02722; loops in the sky, or in sky and ground,
+    are video-easy and video-hard of the DMControl Generalization Benchmark, arXiv 2011.13389.
 
     Attributes:
         mode: ``"overlay"`` or ``"background"``.
         alpha: fraction of the video, in [0, 1]; None means 0.5 for an overlay, 1 for a background.
-        ground_alpha: fraction of the ground that is kept, in [0, 1]; of a background only.
+        ground_alpha: fraction of the ground that is kept, in [0, 1]; only with a background.
         dynamics: ``"pingpong"``, ``"loop"`` or ``"static"``.
-        num_clips: how many clips of the split are used, the first ones; None means all.
+        num_clips: number of the split's clips to use, from the first; None means all.
         random_start: whether the first frame is sampled; else it is the clip's first.
 
     Raises:
@@ -80,13 +77,12 @@ class Video(Distractor):
     stream: ClassVar[int] = 2
 
     def __post_init__(self) -> None:
-        """Check the options."""
         check_choice("mode of Video", self.mode, MODES)
         check_choice("dynamics of Video", self.dynamics, DYNAMICS)
         check_fraction("alpha of Video", self.fraction)
         check_fraction("ground_alpha of Video", self.ground_alpha)
         if self.mode == "overlay" and self.ground_alpha != 1.0:
-            raise ValueError("ground_alpha of Video means something with mode='background' alone.")
+            raise ValueError("ground_alpha of Video is only for mode='background'.")
         if self.num_clips is not None:
             check_positive_int("num_clips of Video", self.num_clips)
 
@@ -98,7 +94,7 @@ class Video(Distractor):
         return 0.5 if self.mode == "overlay" else 1.0
 
     def reset(self, key: jax.Array, params: EnvParams) -> VideoState:
-        """Return a clip, where it starts and which way it goes."""
+        """Sample a clip, its first frame and its direction."""
         clips = _clips(params)
         clip_key, start_key, direction_key = jax.random.split(key, 3)
         count = clips.length.shape[0]
@@ -116,7 +112,7 @@ class Video(Distractor):
     def advance(
         self, state: VideoState, key: jax.Array, frame: jax.Array, params: EnvParams
     ) -> VideoState:
-        """Return the clip's next frame."""
+        """Return the state with the clip's next frame."""
         del key
         length = jnp.asarray(_clips(params).length)[state.clip]
         return state.replace(
@@ -126,7 +122,7 @@ class Video(Distractor):
     def backdrop(
         self, state: VideoState, params: EnvParams, rows: jax.Array, height: int, width: int
     ) -> jax.Array:
-        """Return rows of the clip's frame, nearest pixels where the image is of another size."""
+        """Return rows of the clip's frame, with nearest pixels if the image has another size."""
         clips = _clips(params)
         index = jnp.asarray(clips.first)[state.clip] + state.frame
         packed = jnp.asarray(clips.packed)
@@ -139,7 +135,7 @@ class Video(Distractor):
         return image[:, (2 * np.arange(width) + 1) * present_width // (2 * width)]
 
     def change_frame(self, state: VideoState, frame: Frame, backdrop: jax.Array | None) -> Frame:
-        """Return the frame with the video in it."""
+        """Return the frame blended with the video."""
         del state
         assert backdrop is not None
         kept: float | jax.Array = 1.0 - self.fraction
@@ -147,7 +143,7 @@ class Video(Distractor):
             kept = jnp.where(frame.depth == FAR, kept, 1.0)
             if self.ground_alpha != 1.0:
                 kept = jnp.where(frame.ground, self.ground_alpha, kept)
-        # Where all is kept, the video's fraction is an exact zero and the pixel stays to the bit.
+        # For a pixel that is kept the video's fraction is exactly 0, so it keeps its bits.
         added = (1.0 - kept) * (1.0 / 255.0)
         video = [(backdrop >> shift & 0xFF).astype(jnp.float32) for shift in (0, 8, 16)]
         r, g, b = (
@@ -157,7 +153,7 @@ class Video(Distractor):
         return frame.replace(r=r, g=g, b=b)
 
     def info(self, state: VideoState) -> dict[str, jax.Array]:
-        """Return ``video_clip`` and ``video_frame``: which clip, and which of its frames."""
+        """Return ``video_clip`` and ``video_frame``, the indices of clip and frame."""
         return {"video_clip": state.clip, "video_frame": state.frame}
 
 
@@ -175,7 +171,7 @@ def frame_index(
     place = first + direction * jnp.asarray(frame, jnp.int32)
     if dynamics == "loop":
         return jnp.mod(place, length)
-    # A clip of one frame has no way to go; a period of 1 keeps it there.
+    # For a clip of one frame the period is 1.
     period = jnp.maximum(2 * (jnp.int32(length) - 1), 1)
     there = jnp.mod(place, period)
     return jnp.asarray(jnp.where(jnp.int32(length) > 1, jnp.minimum(there, period - there), 0))
@@ -184,7 +180,7 @@ def frame_index(
 def _clips(params: EnvParams) -> Clips:
     if params.clips is None:
         raise ValueError(
-            "a Video needs clips: pass clips= to pixelbrax_jax.make, or put them into "
-            "EnvParams.clips with load_clips(...).to_device()."
+            "a Video needs clips: pass clips= to pixelbrax_jax.make, or set EnvParams.clips to "
+            "load_clips(...).to_device()."
         )
     return params.clips

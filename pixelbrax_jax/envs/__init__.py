@@ -1,1 +1,1 @@
-"""Physics, scene and renderer put together: one environment, and batches of them."""
+"""Pixel environments and batches of them."""

@@ -1,4 +1,4 @@
-"""A pixel environment as one of Brax's own, for Brax's trainers."""
+"""Pixel environments for Brax's trainers."""
 
 from __future__ import annotations
 
@@ -19,28 +19,27 @@ with import_silenced():
     from brax.envs.wrappers.training import EpisodeWrapper, VmapWrapper
 
 PIXELS = "pixels/view_0"
-"""Name of the image in an observation; Brax takes entries named ``pixels/...`` for images."""
+"""Name of the image in an observation; Brax treats entries named ``pixels/...`` as images."""
 
 _LEVEL = np.float32(1 / 255)
-"""One of the 255 steps from black to white. It is multiplied with: where XLA divides by a constant,
-the last bit is the compiler's choice."""
+"""1 / 255. Pixels are multiplied with it, because XLA may round a division by a constant
+differently."""
 
 _NO_LIMIT = 2**31 - 1
-"""Control steps that no episode lasts."""
+"""More control steps than any episode has."""
 
 
 class BraxEnv(Env):
     """A ``PixelEnv`` with its parameters as a ``brax.envs.Env``.
 
-    As everywhere in Brax, the environment itself has no time limit: ``done`` is the task's own
-    termination, and Brax's ``EpisodeWrapper`` counts calls of ``step`` and sets
-    ``info["truncation"]`` at the ``episode_length`` that the trainer was given. The limit of the
-    pixel environment does not apply; as a number of calls it is the attribute
-    ``episode_length``. Likewise repeat actions with ``action_repeat`` of the pixel environment:
-    Brax's would draw frames that nobody sees, and step on beyond a termination.
+    As in Brax, the environment has no time limit: ``done`` is the task's termination, and Brax's
+    ``EpisodeWrapper`` counts calls of ``step`` and sets ``info["truncation"]`` at the trainer's
+    ``episode_length``. The pixel environment's limit, in calls, is the attribute
+    ``episode_length``. Repeat actions with ``action_repeat`` of the pixel environment: Brax's
+    renders frames that nobody sees, and continues after a termination.
 
-    Brax's ``AutoResetWrapper`` returns to the first state of the first episode whenever one
-    ends; ``wrap_fresh_episodes`` goes on to the next ones instead.
+    Brax's ``AutoResetWrapper`` resets every episode to the state of the first one;
+    ``wrap_fresh_episodes`` resets to a new one.
 
     Example:
         >>> env = BraxEnv(*pixelbrax_jax.make("inverted_pendulum"))
@@ -48,21 +47,13 @@ class BraxEnv(Env):
 
     Attributes:
         env: the pixel environment.
-        sys: its ``EnvParams`` without a time limit, called as what Brax's ``randomization_fn`` is
-            given: that function may randomise them per environment.
+        sys: its ``EnvParams`` without a time limit, under the name that Brax's ``randomization_fn``
+            expects; it may randomise them per environment.
         episode_length: time limit of the given parameters, in calls of ``step``.
     """
 
     def __init__(self, env: PixelEnv, params: EnvParams) -> None:
-        """Join the two; compile nothing.
-
-        Args:
-            env: the pixel environment; never modified.
-            params: what may be randomised.
-
-        Raises:
-            TypeError: ``env`` is not a ``PixelEnv``.
-        """
+        """Wrap ``env``, which is not modified; raise TypeError if it is not a ``PixelEnv``."""
         if not isinstance(env, PixelEnv):
             raise TypeError(f"env must be a PixelEnv, got {type(env).__name__}.")
         _patch_trainers()
@@ -71,16 +62,10 @@ class BraxEnv(Env):
         self.episode_length = -(-int(params.episode_length) // env.action_repeat)
 
     def reset(self, rng: jax.Array) -> State:
-        """Reset to episode 0 of the environment that ``rng`` stands for.
+        """Reset to episode 0 of the environment with the key ``rng``, typed or uint32 like Brax's.
 
-        Args:
-            rng: one PRNG key, uint32 as Brax's are or typed.
-
-        Returns:
-            The first state. Its ``pipeline_state`` is the pixel environment's ``EnvState``.
-
-        Raises:
-            TypeError: ``rng`` is not one key.
+        The state's ``pipeline_state`` is the pixel environment's ``EnvState``. Raises TypeError if
+        ``rng`` is not one key.
         """
         if not jnp.issubdtype(rng.dtype, jax.dtypes.prng_key):
             rng = jax.random.wrap_key_data(rng)
@@ -88,15 +73,11 @@ class BraxEnv(Env):
         return State(pipeline_state=state, **self._fields(timestep))
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Act, and draw one frame.
-
-        Args:
-            state: what ``reset`` or ``step`` returned, wrapped or not.
-            action: (A,) float, clipped to [-1, 1].
+        """Step with an action (A,) float, clipped to [-1, 1], and render one frame.
 
         Returns:
-            The next state. ``done`` is 1 where the task ended; ``metrics["non_finite"]`` is 1
-            where it did because the physics diverged, hence 0 or 1 summed over an episode.
+            The next state. ``done`` is 1 if the task ended; ``metrics["non_finite"]`` is 1 if it
+            ended because the physics diverged, so its sum over an episode is 0 or 1.
 
         Raises:
             ValueError: ``action`` has another shape.
@@ -104,20 +85,16 @@ class BraxEnv(Env):
         """
         pipeline, timestep = self.env.step(state.pipeline_state, action, self.sys)
         fields = self._fields(timestep)
-        # Brax's wrappers keep metrics of their own beside ours.
+        # Brax's wrappers add their own metrics.
         fields["metrics"] = {**state.metrics, **fields["metrics"]}
         return state.replace(pipeline_state=pipeline, **fields)
 
     def observation(self, obs: Any) -> Any:
-        """Return an observation of the pixel environment in Brax's form.
+        """Return an observation of one or many pixel environments in Brax's form.
 
-        Args:
-            obs: as ``Timestep.obs``, of one environment or many.
-
-        Returns:
-            The array itself with ``obs_mode="state"``. Otherwise a dict with the image,
-            (..., H, W, 3K) float32 in [0, 1], under ``"pixels/view_0"``, and with ``"both"`` the
-            (..., S) float32 state under ``"state"``.
+        It is the array itself with ``obs_mode="state"``. Otherwise it is a dictionary with the
+        image, (..., H, W, 3K) float32 in [0, 1], as ``"pixels/view_0"``, and with ``"both"`` the
+        (..., S) float32 state as ``"state"``.
         """
         if self.env.obs_mode == "state":
             return obs
@@ -128,7 +105,7 @@ class BraxEnv(Env):
 
     @property
     def observation_size(self) -> int | dict[str, tuple[int, ...]]:
-        """S with ``obs_mode="state"``, else the shapes of the dict's entries."""
+        """S with ``obs_mode="state"``, else the shapes of the dictionary's entries."""
         if self.env.obs_mode == "state":
             return self.env.physics.state_size
         shapes = jax.eval_shape(self.observation, self.env.obs_spec)
@@ -150,7 +127,6 @@ class BraxEnv(Env):
         return self.env.dt
 
     def _fields(self, timestep: Timestep) -> dict[str, Any]:
-        """Return the fields of a Brax state that a timestep decides."""
         return {
             "obs": self.observation(timestep.obs),
             "reward": timestep.reward,
@@ -165,24 +141,14 @@ def wrap_fresh_episodes(
     action_repeat: int = 1,
     randomization_fn: Any = None,
 ) -> Wrapper:
-    """Wrap for training as Brax does, but let every episode start from a sampled initial state.
+    """Wrap for training as Brax does, but start every episode from a sampled initial state.
 
-    For ``wrap_env_fn`` of Brax's trainers. Episode e of an environment is that of
-    ``PixelEnv.next_episode``. A reset costs where episodes end, not at every step.
-
-    Args:
-        env: the environment.
-        episode_length: time limit in control steps as Brax counts them: calls of ``step`` of
-            ``env``.
-        action_repeat: as in Brax; see ``BraxEnv`` for why it should be 1.
-        randomization_fn: must be None.
-
-    Returns:
-        The environment for batches.
+    For ``wrap_env_fn`` of Brax's trainers. ``episode_length`` counts calls of ``step``, and
+    ``action_repeat`` should be 1, see ``BraxEnv``. A reset costs time only when an episode ends.
 
     Raises:
         ValueError: ``randomization_fn`` is given.
-        TypeError: ``env`` is wrapped already.
+        TypeError: ``env`` is already wrapped.
     """
     if not isinstance(env, BraxEnv):
         raise TypeError(f"env must be a bare BraxEnv, got {type(env).__name__}.")
@@ -198,8 +164,8 @@ class _FreshEpisodes(Wrapper):
     """Resets to the next episode in the step that ends one, as ``AutoResetWrapper`` does."""
 
     def step(self, state: State, action: jax.Array) -> State:
-        # After a step that ends an episode Brax reads its flag and its count of steps; only the
-        # next step may clear them.
+        # Brax reads flag and step count after the step that ends an episode; the next step may
+        # clear them.
         steps = jnp.where(state.done, 0.0, state.info["steps"])
         info = {**state.info, "steps": steps}
         state = self.env.step(state.replace(done=jnp.zeros_like(state.done), info=info), action)
@@ -210,8 +176,7 @@ class _FreshEpisodes(Wrapper):
 
 
 def _patch_trainers() -> None:
-    """Let Brax's trainers run on current JAX."""
-    # Only now: who does not train with Brax need not wait for its trainers to load.
+    # Imported here, because its trainers load slowly.
     with import_silenced():
         from brax.training import pmap
         from brax.training.agents.apg import train as apg

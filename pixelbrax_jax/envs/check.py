@@ -1,4 +1,4 @@
-"""The contract of a pixel environment as a function that third parties can run."""
+"""A check of the rules for pixel environments."""
 
 from __future__ import annotations
 
@@ -15,25 +15,20 @@ _NUM_STEPS = 3
 
 
 class ContractError(AssertionError):
-    """An environment breaks a rule that agents and adapters rely on."""
+    """An environment violates a rule that agents and adapters rely on."""
 
 
 def check_env(env: PixelEnv, params: EnvParams, *, seed: int = 0) -> None:
-    """Run an environment for a few steps and check everything others rely on.
+    """Run an environment for a few steps and check the rules for environments.
 
-    Checked are: shapes and dtypes of observation, reward and flags; that state and timestep keep
-    their structure; one compilation for any state; equal results under jit, ``vmap`` and
-    ``lax.scan``; equal bits for equal keys and different ones for different keys; frame stacks
-    that start as copies of the first frame; termination and truncation apart; and that a NaN
-    action ends the episode and leaves nothing but finite numbers.
-
-    Args:
-        env: the environment.
-        params: its parameters.
-        seed: of the keys and actions used.
+    It checks shapes and dtypes of observation, reward and flags; that state and timestep keep their
+    structure; one compilation for any state; equal results under jit, ``vmap`` and ``lax.scan``;
+    equal bits for equal keys and different ones for different keys; frame stacks that start with
+    copies of the first frame; separate termination and truncation; and that a NaN action ends the
+    episode with finite numbers.
 
     Raises:
-        ContractError: naming the rule that is broken.
+        ContractError: a rule is violated; the message has the rule.
     """
     key = jax.random.key(seed)
     actions = jax.random.uniform(
@@ -157,11 +152,11 @@ def _equal(a: Any, b: Any) -> bool:
 
 
 def _close(a: Any, b: Any) -> bool:
-    """Return whether two are equal but for the order of float operations in a few steps."""
+    """Return whether two results are equal up to the order of float operations in a few steps."""
     for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
         x, y = np.asarray(x), np.asarray(y)
         if x.dtype == np.uint8:
-            # A pixel on a silhouette may tip over; an image may not.
+            # Rounding may change a pixel on a silhouette, but not an image.
             if (np.abs(x.astype(int) - y.astype(int)) > 1).mean() > 0.01:
                 return False
         elif not np.allclose(x, y, rtol=1e-2, atol=1e-2):

@@ -1,4 +1,4 @@
-"""Options -> pixel environment and its parameters."""
+"""Construction of pixel environments from options."""
 
 from __future__ import annotations
 
@@ -30,25 +30,25 @@ from pixelbrax_jax.types import CameraRig, Clips, EnvParams, Look
 def make(task: str | EnvConfig, **options: Any) -> tuple[PixelEnv, EnvParams]:
     """Make a pixel environment and its parameters.
 
-    Environments made of equal options are equal, and share compiled programs. Those that differ
-    in nothing but camera, look, time limit or clips are equal too: these are parameters.
+    Environments with equal options are equal, and share compiled programs. Camera, look, time limit
+    and clips do not matter for equality, because they are parameters.
 
     Args:
-        task: one of ``list_envs()``; or ``"module:name"``, a task that importing the module
-            registers; or an ``EnvConfig``, of which ``options`` are changed.
-        **options: the fields of ``EnvConfig``, which says what they are.
+        task: one of ``list_envs()``; ``"module:name"``, a task that importing the module registers;
+            or an ``EnvConfig`` to change with ``options``.
+        **options: the fields of ``EnvConfig``, documented there.
 
     Returns:
         The environment and its parameters.
 
     Raises:
-        ValueError: a name is unknown, a number out of range, or an option for other tasks alone;
+        ValueError: a name is unknown, a number is out of range, or an option is for other tasks;
             the message says what is allowed.
-        TypeError: there is no such option; the message lists them and names the nearest one.
-        ImportError: the task is of the DM Control Suite, and dm_control is not installed; the
-            message has the line that installs it. Or the module of a task cannot be imported.
+        TypeError: an option is unknown; the message lists all options and the nearest name.
+        ImportError: dm_control, needed for a task of the DM Control Suite, is not installed (the
+            message has the command that installs it), or the task's module cannot be imported.
         FileNotFoundError: clips are missing.
-        MemoryError: the clips would take too much memory.
+        MemoryError: the clips do not fit into memory.
         RuntimeError: JAX has no device to compute on.
     """
     config = env_config(task, options)
@@ -70,11 +70,11 @@ def make(task: str | EnvConfig, **options: Any) -> tuple[PixelEnv, EnvParams]:
         look=_look(config, physics),
         episode_length=np.int32(config.episode_length),
     )
-    # Here, so that no program has to: JAX may be told to refuse that (`jax.transfer_guard`).
+    # Here, because a transfer in a program may be forbidden (`jax.transfer_guard`).
     return env, jax.device_put(params).replace(clips=_clips(config, env))
 
 
-# What help() and editors show.
+# For help() and editors.
 make.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
     [
         inspect.Parameter("task", inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation="str"),
@@ -94,16 +94,16 @@ make.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
 
 @default_flags()
 def named_rigs(task: str) -> dict[str, CameraRig]:
-    """Return the viewpoints of a task by name, which ``camera=`` takes.
+    """Return a task's viewpoints by name, for the option ``camera``.
 
     Args:
-        task: as ``make`` takes it.
+        task: as in ``make``.
 
     Returns:
-        ``default``, ``side`` (seen along +y), ``front`` (along -x), ``top`` (from above, +y up in
-        the image); ``original`` where the paper has the task; of the DM Control Suite and of tasks
-        of your own the model's cameras that keep their orientation, also in place of others of
-        that name.
+        ``default``, ``side`` (looks along +y), ``front`` (along -x), ``top`` (from above, +y is up
+        in the image), and ``original`` if the paper has the task. For tasks of the DM Control Suite
+        and your own, also the model's cameras that keep their orientation; they replace others of
+        the same name.
 
     Raises:
         ValueError: the task is unknown.
@@ -135,7 +135,7 @@ def _rig(config: EnvConfig, physics: Physics) -> CameraRig:
     if isinstance(camera, str) and camera in unfit and camera not in rigs:
         raise ValueError(
             f"camera {camera!r} of task {config.task!r} cannot be a viewpoint: {unfit[camera]}, "
-            "and a viewpoint is a perspective that keeps its direction. Allowed: "
+            "but a viewpoint must be a perspective camera with a fixed direction. Allowed: "
             f"{', '.join(sorted(rigs))}, a CameraRig or a Camera."
         )
     return choose_rig(config.task, camera, rigs)
@@ -149,11 +149,7 @@ def _look(config: EnvConfig, physics: Physics) -> Look:
 
 
 def _check_device() -> None:
-    """Start JAX, whose own error may be without a word.
-
-    Raises:
-        RuntimeError: it finds no device; the message names what was asked for, and has the fix.
-    """
+    """Start JAX; raise a RuntimeError with the fix if it has no device."""
     try:
         jax.devices()
     except (RuntimeError, AssertionError) as error:
@@ -167,14 +163,13 @@ def _check_device() -> None:
 
 
 def _clips(config: EnvConfig, env: PixelEnv) -> Clips | None:
-    """Return the clips on the device, None where nothing plays any."""
     clips, split = config.clips, config.split
     videos = [link for link in env.chain.links if isinstance(link, Video)]
     if clips is not None and not videos and env.obs_mode != "state":
-        raise ValueError("clips are given, but no video is: add 'video' to the distractors.")
+        raise ValueError("clips are given without a video: add 'video' to the distractors.")
     if split != "train" and not config.distractors:
         raise ValueError(
-            f"split={split!r} is given, but no distractor is: add one that has splits, such as "
+            f"split={split!r} is given without a distractor that has splits: add one, such as "
             "'video', to the distractors."
         )
     if not videos:
@@ -192,12 +187,12 @@ def _clips(config: EnvConfig, env: PixelEnv) -> Clips | None:
     return _on_device(bank)
 
 
-# Weakly, so that clips leave the device with the last environment that shows them.
+# Weak references, so that clips leave the device with the last environment that shows them.
 _resident: WeakValueDictionary[str, Clips] = WeakValueDictionary()
 
 
 def _on_device(bank: ClipBank) -> Clips:
-    """Return the clips on the device, where equal ones are once."""
+    """Return the clips on the device, shared by equal banks."""
     clips = _resident.get(bank.digest)
     if clips is None:
         clips = _resident[bank.digest] = bank.to_device()

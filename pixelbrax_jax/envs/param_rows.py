@@ -1,4 +1,4 @@
-"""Parameters of a batch, of which some arrays have a row for each environment."""
+"""Parameters of a batch, with some arrays per environment and others shared."""
 
 from __future__ import annotations
 
@@ -44,12 +44,12 @@ _SHAPES: dict[str, tuple[int | str, ...]] = {
     "clips.length": ("C",),
     "episode_length": (),
 }
-"""Shapes of the parameters of one environment, as ``types`` has them."""
+"""Shapes of the parameters of one environment, as in ``types``."""
 
 
 @dataclass(frozen=True)
 class ParamRows:
-    """Parameters taken apart: arrays with a row for each environment, and those alike for all."""
+    """Parameters split into arrays with a row for each environment, and shared ones."""
 
     own: tuple[Any, ...]
     shared: tuple[Any, ...]
@@ -57,7 +57,7 @@ class ParamRows:
     tree: Any
 
     def join(self, own: Sequence[Any], shared: Sequence[Any] | None = None) -> EnvParams:
-        """Return the parameters of one environment, of its own rows and what is shared."""
+        """Return the parameters of one environment from its rows and the shared arrays."""
         rest = iter(self.shared if shared is None else shared)
         rows = iter(own)
         leaves = [next(rows) if is_own else next(rest) for is_own in self.is_own]
@@ -65,16 +65,15 @@ class ParamRows:
         return params
 
     def mark(self, own: Any, shared: Any) -> Any:
-        """Return a tree like the parameters, of one value for rows and another for the rest."""
+        """Return a tree like the parameters, with one value for rows, another for shared arrays."""
         marks = [own if is_own else shared for is_own in self.is_own]
         return jax.tree.unflatten(self.tree, marks)
 
 
 def split_params(params: EnvParams, num_envs: int) -> ParamRows:
-    """Take apart parameters that are as ``EnvParams`` has them, or have a leading axis N.
+    """Split parameters whose arrays have the shapes of ``EnvParams`` or a leading axis N.
 
-    Raises:
-        ValueError: an array has neither shape; the message names it, and both.
+    Other shapes raise a ValueError with the array's name.
     """
     found, tree = jax.tree_util.tree_flatten_with_path(params)
     geoms = params.geoms

@@ -1,4 +1,4 @@
-"""One pixel environment: physics -> scene -> renderer -> observation."""
+"""One pixel environment: physics, scene, renderer and observation."""
 
 from __future__ import annotations
 
@@ -23,17 +23,16 @@ from pixelbrax_jax.types import EnvParams, EnvState, Frame, Scene, SimState, Tim
 from pixelbrax_jax.validation import check_positive_int
 
 _RESET_STREAM = 0
-"""Name of the random stream of physics resets, folded into an episode's key."""
+"""Random stream of physics resets, folded into an episode's key."""
 
 
 @dataclass(frozen=True)
 class PixelEnv(ProgramConfig):
-    """A continuous-control task that is seen through a camera.
+    """A continuous-control task that is observed through a camera.
 
-    Functional: ``reset`` and ``step`` are pure, jitted, and work under ``jax.vmap``, ``lax.scan``
-    and a jit of your own. Everything that decides the program is a field, and environments whose
-    fields are equal are equal and share compiled programs. Everything that may be randomised is
-    in ``EnvParams``, an ordinary argument.
+    ``reset`` and ``step`` are pure and jitted, and work under ``jax.vmap``, ``lax.scan`` and
+    ``jax.jit``. Fields decide the program: environments with equal fields are equal and share
+    compiled programs. ``EnvParams``, an ordinary argument, has all that may be randomised.
 
     All randomness of episode e comes from ``fold_in(key, e)``.
 
@@ -43,20 +42,19 @@ class PixelEnv(ProgramConfig):
         >>> state, timestep = env.step(state, jnp.zeros(env.action_size), params)
 
     Attributes:
-        physics: the physics with its task; further fields are those of ``ProgramConfig``. Of
-            ``distractors`` there may be one of a kind, none of them a name; without pixels there
-            are none.
+        physics: the physics with its task; further fields are those of ``ProgramConfig``.
+            ``distractors`` may have one object of each kind and no names, and must be empty without
+            pixels.
 
     Raises:
         ValueError: a field is out of range; the message says what is allowed.
-        TypeError: a field is of another type, or an array or tracer.
-        MemoryError: frames would not fit into this machine's memory.
+        TypeError: a field has another type, or is an array or tracer.
+        MemoryError: frames do not fit into this machine's memory.
     """
 
     physics: Physics
 
     def __post_init__(self) -> None:
-        """Check the fields."""
         super().__post_init__()
         check_physics(self.physics)
         try:
@@ -64,7 +62,7 @@ class PixelEnv(ProgramConfig):
         except TypeError as error:
             raise TypeError(
                 f"physics must be hashable, got a {type(self.physics).__name__}: make it a frozen "
-                "dataclass, or leave its __eq__ alone."
+                "dataclass, or do not override its __eq__."
             ) from error
         chain = Chain(as_tuple(self.distractors) if self.obs_mode != "state" else ())
         self._store("distractors", chain.links)
@@ -74,7 +72,7 @@ class PixelEnv(ProgramConfig):
 
     @cached_property
     def chain(self) -> Chain:
-        """The distractors, one after the other."""
+        """The chain of all distractors."""
         return Chain(as_tuple(self.distractors))
 
     @property
@@ -96,12 +94,7 @@ class PixelEnv(ProgramConfig):
         return both if self.obs_mode == "both" else both[self.obs_mode]
 
     def check_memory(self, num_envs: int) -> None:
-        """Reject a number of environments that cannot fit into this machine's main memory.
-
-        Raises:
-            MemoryError: observations and states of two steps, which are there at the same time,
-                take more bytes than the machine has.
-        """
+        """Raise MemoryError if observations and states of two steps do not fit into main memory."""
         numbers = 2 * self.physics.state_size + 7 * len(self.physics.link_names)
         what, num_bytes = f"num_envs={num_envs}", 8 * num_envs * numbers
         if self.obs_mode != "state":
@@ -112,17 +105,9 @@ class PixelEnv(ProgramConfig):
     @partial(jax.jit, static_argnums=0)
     @under_default_flags
     def reset(self, key: jax.Array, params: EnvParams) -> tuple[EnvState, Timestep]:
-        """Reset to episode 0 of the environment that ``key`` stands for.
+        """Reset to episode 0 of the environment with a typed PRNG key, ``jax.random.key(seed)``.
 
-        Args:
-            key: a typed PRNG key, ``jax.random.key(seed)``.
-            params: what may be randomised.
-
-        Returns:
-            The state and the first timestep, with reward 0.
-
-        Raises:
-            TypeError: ``key`` is not a single typed key.
+        The reward is 0. Raises TypeError if ``key`` is not a single typed key.
         """
         check_key(key)
         return self._reset(key, jnp.uint32(0), params)
@@ -132,16 +117,16 @@ class PixelEnv(ProgramConfig):
     def step(
         self, state: EnvState, action: jax.Array, params: EnvParams
     ) -> tuple[EnvState, Timestep]:
-        """Act for ``action_repeat`` control steps and draw one frame.
+        """Step for ``action_repeat`` control steps and render one frame.
 
-        Nothing is reset by itself: when ``state.done`` is set, call ``reset`` or
-        ``next_episode``, or let ``VectorPixelEnv`` do so.
+        The environment does not reset itself: when ``state.done`` is set, call ``reset`` or
+        ``next_episode``, or use ``VectorPixelEnv``.
 
         Args:
             state: the current state.
-            action: (A,) float; clipped to [-1, 1] before physics and control cost. A NaN ends the
+            action: (A,) float, clipped to [-1, 1] before physics and control cost. A NaN ends the
                 episode, with ``info["non_finite"]`` set.
-            params: what may be randomised.
+            params: the parameters.
 
         Returns:
             The next state and timestep. The reward is the sum over the control steps up to the
@@ -150,7 +135,7 @@ class PixelEnv(ProgramConfig):
             * ``episode_return``: () float32, sum of this episode's rewards so far,
             * ``episode_length``: () int32, control steps so far,
             * ``non_finite``: () bool, the physics diverged; the episode is then terminated with
-              reward 0 and the last finite pose is shown,
+              reward 0 and the last finite pose is rendered,
 
             and the info of the distractors.
 
@@ -167,7 +152,7 @@ class PixelEnv(ProgramConfig):
     @partial(jax.jit, static_argnums=0)
     @under_default_flags
     def next_episode(self, state: EnvState, params: EnvParams) -> tuple[EnvState, Timestep]:
-        """Reset to the environment's next episode, from any of its states."""
+        """Reset to the environment's next episode."""
         return self._reset(state.key, state.sim.episode + 1, params)
 
     @partial(jax.jit, static_argnums=0)
@@ -175,17 +160,16 @@ class PixelEnv(ProgramConfig):
     def from_qpos(
         self, qpos: jax.Array, qvel: jax.Array | None, key: jax.Array, params: EnvParams
     ) -> tuple[EnvState, Timestep]:
-        """Start as ``reset(key, params)`` does, but in a chosen pose.
+        """Reset as ``reset(key, params)`` does, but to a chosen pose.
 
         Args:
             qpos: (Q,) float, joint positions in MuJoCo's order: metres, radians, quaternions.
             qvel: (V,) float, joint velocities, per second; None for rest.
-            key: a typed PRNG key; decides targets and distractors.
-            params: what may be randomised.
+            key: a typed PRNG key, for targets and distractors.
+            params: the parameters.
 
         Returns:
-            The state and the first timestep, with reward 0 and not terminated, even if the task
-            would end in this pose; the next step says so.
+            The state and the first timestep, never terminated; the next step may be.
 
         Raises:
             ValueError: ``qpos`` or ``qvel`` has another shape.
@@ -211,14 +195,7 @@ class PixelEnv(ProgramConfig):
         height: int | None = None,
         width: int | None = None,
     ) -> Frame:
-        """Draw the float frame of a state, at any size, distractors included.
-
-        Args:
-            state: the state to draw.
-            params: what may be randomised.
-            height: pixels, the observation's by default.
-            width: likewise.
-        """
+        """Render a state with its distractors; height and width default to the observation's."""
         height, width = self._size(height, width)
         frame = render(self._scene(state.sim, params), height, width, self.renderer)
         rows, distractor_state = jnp.arange(height), state.sim.distractor_state
@@ -233,20 +210,16 @@ class PixelEnv(ProgramConfig):
         height: int | None = None,
         width: int | None = None,
     ) -> jax.Array:
-        """Draw a state as ``render`` does, rounded like an observation.
-
-        Returns:
-            (height, width, 3) uint8, row 0 at the top.
-        """
+        """Render a state to (height, width, 3) uint8, rounded like an observation."""
         height, width = self._size(height, width)
         return unpack(self.draw(state.sim, params, height, width))
 
-    # The pieces of a step, which `VectorPixelEnv` puts together in another order.
+    # The parts of a step, which `VectorPixelEnv` calls in another order.
 
     def reset_sim(
         self, key: jax.Array, episode: jax.Array, params: EnvParams, pose: Any = None
     ) -> SimState:
-        """Return the first state of an episode, in joint positions and velocities if given."""
+        """Return the first state of an episode, at the given joint positions if any."""
         episode_key = jax.random.fold_in(key, episode)
         physics_key = jax.random.fold_in(episode_key, _RESET_STREAM)
         physics: Any = self.physics
@@ -287,7 +260,7 @@ class PixelEnv(ProgramConfig):
             (physics, reward, count, _), _ = jax.lax.scan(
                 control_step, start, length=self.action_repeat
             )
-        # The number of this frame in its episode; the last one may come early.
+        # The index of this frame in its episode; the last one may come early.
         frame = -(-count // self.action_repeat)
         episode_key = jax.random.fold_in(key, sim.episode)
         sim = sim.replace(
@@ -302,7 +275,7 @@ class PixelEnv(ProgramConfig):
     def draw(
         self, sim: SimState, params: EnvParams, height: int | None = None, width: int | None = None
     ) -> jax.Array:
-        """Return the image of a state, (height, width) uint32 packed pixels."""
+        """Render a state to (height, width) uint32 packed pixels."""
         height, width = self._size(height, width)
 
         def change(frame: Frame, rows: jax.Array) -> Frame:
@@ -318,13 +291,13 @@ class PixelEnv(ProgramConfig):
     def push_frame(
         self, frames: jax.Array, sim: SimState, params: EnvParams, is_first: jax.Array
     ) -> jax.Array:
-        """Return the frame stack with the image of a state, K copies of it if it is the first."""
+        """Return the frame stack with the image of a state, or K copies of it in a first state."""
         if self.obs_mode == "state":
             return frames
         return push(frames, self.draw(sim, params), is_first)
 
     def timestep(self, state: EnvState, reward: jax.Array, params: EnvParams) -> Timestep:
-        """Return what the agent sees of a state."""
+        """Return the timestep of a state."""
         sim, terminated = state.sim, state.sim.physics.terminated
         limit_reached = sim.step_count + sim.time_limit_offset >= params.episode_length
         return Timestep(
@@ -341,7 +314,7 @@ class PixelEnv(ProgramConfig):
         )
 
     def obs(self, state: EnvState) -> Any:
-        """Return the observation of a state, as ``obs_mode`` says."""
+        """Return the observation of a state according to ``obs_mode``."""
         if self.obs_mode == "state":
             return state.sim.physics.obs
         if self.obs_mode == "pixels":
@@ -361,7 +334,7 @@ class PixelEnv(ProgramConfig):
 
 
 def check_action(action: Any, shape: tuple[int, ...]) -> jax.Array:
-    """Return actions as an array, if they are floats of the given shape.
+    """Return floating-point actions of the given shape as an array.
 
     Raises:
         ValueError: they have another shape.
@@ -376,18 +349,14 @@ def check_action(action: Any, shape: tuple[int, ...]) -> jax.Array:
 
 
 def check_key(key: jax.Array, shape: tuple[int, ...] = ()) -> None:
-    """Reject anything but typed PRNG keys of the given shape.
-
-    Raises:
-        TypeError: it is not; the message says how to get one.
-    """
+    """Raise TypeError unless ``key`` has typed PRNG keys of the given shape."""
     is_array = isinstance(key, jax.Array)
     if not (is_array and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)):
-        # An array's type is no help: under jit it is a tracer, which the caller has not made.
+        # Not the type of an array, which is a tracer under jit.
         got = f"{key.dtype}{list(key.shape)}" if is_array else type(key).__name__
         raise TypeError(
-            f"key must come from jax.random.key(seed), got {got}; jax.random.wrap_key_data turns "
-            "one of jax.random.PRNGKey into such a key."
+            f"key must come from jax.random.key(seed), got {got}; jax.random.wrap_key_data "
+            "converts a key of jax.random.PRNGKey."
         )
     if key.shape != shape:
         raise TypeError(f"key must have shape {shape}, got {key.shape}.")

@@ -1,4 +1,4 @@
-"""Environments spread over several devices, or over those of several processes."""
+"""Environments on several devices and processes."""
 
 from __future__ import annotations
 
@@ -19,35 +19,30 @@ from pixelbrax_jax.types import EnvParams, EnvState, Timestep
 from pixelbrax_jax.validation import check_positive_int
 
 AXIS = "envs"
-"""Name of the mesh axis along which environments are spread."""
+"""Name of the mesh axis of environments."""
 
 
 def make_env_mesh(num_devices: int | None = None) -> Mesh:
-    """Make a mesh of devices along the axis ``"envs"``; the compiler propagates its shardings.
-
-    Args:
-        num_devices: how many; None takes all, those of other processes too.
-    """
+    """Make a mesh of devices, by default all of all processes, along the axis ``"envs"``."""
     num_devices = jax.device_count() if num_devices is None else num_devices
     return jax.make_mesh((num_devices,), (AXIS,), axis_types=(AxisType.Auto,))
 
 
 @dataclass(frozen=True)
 class ShardedVectorEnv:
-    """``VectorPixelEnv`` with equally many environments on each device of a mesh.
+    """A ``VectorPixelEnv`` with the same number of environments on each device of a mesh.
 
-    Each device steps its own; nothing crosses between them. Environment i is the same as without
-    sharding.
+    Devices exchange no data while they step. Environment i is the same as without sharding.
 
     Attributes:
         env: the environment.
         num_envs: N, over all devices; a multiple of their number.
-        mesh: the devices, along an axis ``"envs"``, of `make_env_mesh`.
-        autoreset_mode: as of ``VectorPixelEnv``.
+        mesh: the devices, from `make_env_mesh`.
+        autoreset_mode: as in ``VectorPixelEnv``.
 
     Raises:
-        ValueError: a field is out of range, or the environments cannot be spread evenly.
-        MemoryError: observations would not fit into this machine's memory.
+        ValueError: a field is out of range, or the environments cannot be divided evenly.
+        MemoryError: observations do not fit into this machine's memory.
     """
 
     env: PixelEnv
@@ -56,7 +51,6 @@ class ShardedVectorEnv:
     autoreset_mode: str = "next_step"
 
     def __post_init__(self) -> None:
-        """Check the fields."""
         num_envs, size = check_positive_int("num_envs", self.num_envs), self.mesh.shape[AXIS]
         if num_envs % size:
             raise ValueError(f"num_envs={num_envs} must be a multiple of the {size} devices.")
@@ -64,7 +58,6 @@ class ShardedVectorEnv:
         _ = self._local  # It checks the other fields.
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what is pickled: of devices, which ones they are."""
         ids = [device.id for device in self.mesh.devices.flat]
         fields = ("env", "num_envs", "autoreset_mode")
         return {name: getattr(self, name) for name in fields} | {"mesh": ids}
@@ -74,10 +67,10 @@ class ShardedVectorEnv:
         missing = [i for i in state["mesh"] if i not in devices]
         if missing:
             raise ValueError(
-                f"environments spread over devices {state['mesh']} need devices {missing}, which "
-                f"this process has not; it has {sorted(devices)}."
+                f"environments on devices {state['mesh']} need devices {missing}, but this process "
+                f"has only {sorted(devices)}."
             )
-        # In their order, which `jax.make_mesh` might change.
+        # In their original order, which `jax.make_mesh` might change.
         own = np.array([devices[i] for i in state["mesh"]])
         mesh = Mesh(own, (AXIS,), axis_types=(AxisType.Auto,))
         self.__dict__.update(state | {"mesh": mesh})
@@ -85,7 +78,7 @@ class ShardedVectorEnv:
     @partial(jax.jit, static_argnums=0)
     @under_default_flags
     def reset(self, key: jax.Array, params: EnvParams) -> tuple[EnvState, Timestep]:
-        """As ``VectorPixelEnv.reset``, of one key."""
+        """See ``VectorPixelEnv.reset``; takes a single key."""
         keys = self._local.env_keys(key, self.num_envs)
         result: tuple[EnvState, Timestep] = self._shard(self._local.reset, 1, params)(keys, params)
         return result
@@ -95,7 +88,7 @@ class ShardedVectorEnv:
     def step(
         self, state: EnvState, action: jax.Array, params: EnvParams
     ) -> tuple[EnvState, Timestep]:
-        """As ``VectorPixelEnv.step``."""
+        """See ``VectorPixelEnv.step``."""
         shard = self._shard(self._local.step, 2, params)
         result: tuple[EnvState, Timestep] = shard(state, action, params)
         return result
@@ -106,17 +99,16 @@ class ShardedVectorEnv:
 
     @cached_property
     def _local(self) -> VectorPixelEnv:
-        """The environments of one device."""
         num_envs = self.num_envs // self.mesh.shape[AXIS]
         return VectorPixelEnv(self.env, num_envs, self.autoreset_mode)
 
     def _shard(
         self, fn: Callable[..., Any], num_spread: int, params: EnvParams
     ) -> Callable[..., Any]:
-        """Return ``fn`` on each device, of its rows of the first arguments and of the params."""
+        """Run ``fn`` on each device with its rows of the first arguments and of the params."""
         spread, same = PartitionSpec(AXIS), PartitionSpec()
         rows = split_params(params, self.num_envs)
-        # Loops and branches inside differ between devices, which the checker cannot follow.
+        # The checker does not support loops and branches that differ between devices.
         return jax.shard_map(
             fn,
             mesh=self.mesh,

@@ -1,4 +1,4 @@
-"""A batch of pixel environments, and when their episodes are reset."""
+"""Batches of pixel environments and their autoreset modes."""
 
 from __future__ import annotations
 
@@ -25,27 +25,23 @@ AUTORESET_MODES = ("next_step", "same_step", "disabled")
 class VectorPixelEnv:
     """``num_envs`` independent copies of a pixel environment that step together.
 
-    States, observations, rewards and flags have a leading axis N. Environment i draws from
-    ``fold_in(key, i)``, so that it is the same whatever N is.
+    States, observations, rewards and flags have a leading axis N. Environment i uses the key
+    ``fold_in(key, i)``, so it does not depend on N.
 
-    A CPU steps the physics of more than 128 environments in equal chunks of 64 to 128, if N divides
-    into such: prefer multiples of 128. To spread environments over several devices, take
-    ``ShardedVectorEnv``.
+    A CPU steps the physics of more than 128 environments in equal chunks of 64 to 128 if N is
+    divisible so: prefer multiples of 128. ``ShardedVectorEnv`` uses several devices.
 
-    Arrays of ``EnvParams`` may have a leading axis N, a row for each environment: cameras, colors,
-    lights, clips or time limits of their own. The others are the same for all.
+    Arrays of ``EnvParams`` may have a leading axis N, for a camera, colors, lights, clips or time
+    limit per environment. All others are shared.
 
-    An ended episode is followed by the next one as ``autoreset_mode`` says, with Gymnasium's
-    meanings:
+    ``autoreset_mode`` has Gymnasium's meanings:
 
-    * ``"next_step"``: the step that ends an episode returns its last observation. The next
-      step ignores that environment's action and returns the first observation of the next
-      episode, with reward 0.
-    * ``"same_step"``: the step that ends an episode returns the first observation of the
-      next one. The last observation is in ``info["final_obs"]`` and what ``info`` had been in
-      ``info["final_info"]``; both are meaningful where the episode ended.
-    * ``"disabled"``: nothing is reset by itself; call ``reset_where``. Until then the
-      environment is stepped on, finite but without meaning.
+    * ``"next_step"``: the step that ends an episode returns its last observation. The next   step
+    ignores that environment's action and returns the first observation of the next   episode, with
+    reward 0. * ``"same_step"``: the step that ends an episode returns the first observation of the
+    next one. ``info["final_obs"]`` and ``info["final_info"]`` have the last observation and   info;
+    they are meaningful only where an episode ended. * ``"disabled"``: nothing resets by itself;
+    call ``reset_where``. Until then the   environment continues with finite but meaningless values.
 
     Attributes:
         env: the environment.
@@ -54,7 +50,7 @@ class VectorPixelEnv:
 
     Raises:
         ValueError: a field is out of range; the message says what is allowed.
-        MemoryError: observations would not fit into this machine's memory.
+        MemoryError: observations do not fit into this machine's memory.
     """
 
     env: PixelEnv
@@ -62,7 +58,6 @@ class VectorPixelEnv:
     autoreset_mode: str = "next_step"
 
     def __post_init__(self) -> None:
-        """Check the fields."""
         object.__setattr__(self, "num_envs", check_positive_int("num_envs", self.num_envs))
         check_choice("autoreset_mode", self.autoreset_mode, AUTORESET_MODES)
         self.env.check_memory(self.num_envs)
@@ -70,20 +65,15 @@ class VectorPixelEnv:
     @partial(jax.jit, static_argnums=0)
     @under_default_flags
     def reset(self, key: jax.Array, params: EnvParams) -> tuple[EnvState, Timestep]:
-        """Reset all environments to episode 0.
+        """Reset all environments to episode 0; return the states and the first timesteps.
 
         Args:
-            key: a typed PRNG key, from which environment i gets ``fold_in(key, i)``; or (N,) keys,
-                one for each.
-            params: what may be randomised; each array the same for all, or with a leading axis N
-                (see the class).
-
-        Returns:
-            The states and the first timesteps.
+            key: a typed PRNG key, of which environment i gets ``fold_in(key, i)``; or (N,) keys.
+            params: the parameters; each array is shared or has a leading axis N.
 
         Raises:
             TypeError: ``key`` is neither.
-            ValueError: an array of ``params`` has another shape; the message names it.
+            ValueError: an array of ``params`` has another shape; the message has its name.
         """
         keys, rows = self._env_keys(key), self._rows(params)
 
@@ -106,22 +96,17 @@ class VectorPixelEnv:
         params: EnvParams,
         key: jax.Array | None = None,
     ) -> tuple[EnvState, Timestep]:
-        """Reset some environments and leave the others as they are.
+        """Reset the environments where ``mask`` (N,) bool is set, and leave the others unchanged.
 
-        Args:
-            state: the present states.
-            mask: (N,) bool, which ones to reset.
-            params: as in ``reset``.
-            key: None goes on to each environment's next episode; else a key or (N,) keys as in
-                ``reset``, and episode 0.
+        Without a ``key`` they start their next episode, with a key or (N,) keys episode 0.
 
         Returns:
-            The states and timesteps; reward 0 everywhere, and unmasked environments repeat their
-            present observation and flags.
+            The states and timesteps, with reward 0; other environments repeat their current
+            observation and flags.
 
         Raises:
-            TypeError: ``key`` is of another kind.
-            ValueError: ``mask`` is not (N,) bool, or ``params`` are others.
+            TypeError: ``key`` has another type.
+            ValueError: ``mask`` is not (N,) bool, or an array of ``params`` has another shape.
         """
         if mask.shape != (self.num_envs,) or mask.dtype != bool:
             raise ValueError(
@@ -141,19 +126,14 @@ class VectorPixelEnv:
     def step(
         self, state: EnvState, action: jax.Array, params: EnvParams
     ) -> tuple[EnvState, Timestep]:
-        """Step all environments, and reset them as ``autoreset_mode`` says.
-
-        Args:
-            state: the present states.
-            action: (N, A) float, clipped to [-1, 1].
-            params: as in ``reset``.
+        """Step all environments under actions (N, A) float, clipped to [-1, 1], and reset some.
 
         Returns:
             The next states and timesteps; ``info`` is that of ``PixelEnv.step``, and in mode
-            ``"same_step"`` has ``final_obs`` and ``final_info`` besides.
+            ``"same_step"`` also has ``final_obs`` and ``final_info``.
 
         Raises:
-            ValueError: ``action`` has another shape, or an array of ``params``.
+            ValueError: ``action`` or an array of ``params`` has another shape.
             TypeError: ``action`` is not floating point.
         """
         action = check_action(action, (self.num_envs, self.env.action_size))
@@ -181,11 +161,7 @@ class VectorPixelEnv:
 
     @staticmethod
     def env_keys(key: jax.Array, num_envs: int) -> jax.Array:
-        """Return the keys of environments 0, 1, ...: (num_envs,) ``fold_in(key, i)``.
-
-        Raises:
-            TypeError: ``key`` is not a single typed key.
-        """
+        """Return the keys of environments 0, 1, ...: (num_envs,) ``fold_in(key, i)``."""
         check_key(key)
         return jax.vmap(partial(jax.random.fold_in, key))(jnp.arange(num_envs))
 
@@ -195,7 +171,7 @@ class VectorPixelEnv:
     def _advance(
         self, sim: SimState, keys: jax.Array, action: jax.Array, params: ParamRows
     ) -> tuple[SimState, jax.Array]:
-        """Return the states after their actions, with no episode reset, and the rewards."""
+        """Return the states after their actions, without resets, and the rewards."""
 
         def step(sim: SimState, rows: tuple[Any, Any, Any], shared: Any) -> Any:
             key, action, own = rows
@@ -227,7 +203,7 @@ class VectorPixelEnv:
     def _reset_rows(
         self, state: EnvState, mask: jax.Array, episode: jax.Array, params: ParamRows
     ) -> SimState:
-        """Return the simulation states, those where ``mask`` at the start of an episode."""
+        """Return the simulation states, reset where ``mask`` is set."""
 
         def reset(key: jax.Array, episode: jax.Array, own: Any) -> SimState:
             return self.env.reset_sim(key, episode, params.join(own))
@@ -238,7 +214,7 @@ class VectorPixelEnv:
     def _reset_and_draw(
         self, state: EnvState, mask: jax.Array, episode: jax.Array, params: ParamRows
     ) -> EnvState:
-        """Return the states, reset and rendered where ``mask``; the others keep their frames."""
+        """Return the states, reset and rendered where ``mask`` is set; others keep their frames."""
         sim = self._reset_rows(state, mask, episode, params)
         state = state.replace(sim=sim)
         if self.env.obs_mode == "state":
@@ -250,5 +226,5 @@ class VectorPixelEnv:
 
         newest = replace_rows(draw, (sim, params.own), mask, blank)
         first = jax.vmap(push)(state.frames, newest, jnp.ones_like(mask))
-        # Environments that go on keep their stack as it is: nothing new was rendered for them.
+        # Other environments keep their stack, because nothing was rendered for them.
         return state.replace(frames=jnp.where(mask[:, None, None, None], first, state.frames))

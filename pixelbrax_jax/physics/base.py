@@ -109,8 +109,7 @@ class Physics(abc.ABC):
             key: PRNG key for what else the task samples, such as a target.
 
         Returns:
-            A state for ``step``. ``terminated`` is false even in a pose that ends the task; the
-            next step sets it.
+            A state for ``step``, never terminated; the next step may be.
 
         Raises:
             ValueError: a shape is wrong.
@@ -124,11 +123,7 @@ class Physics(abc.ABC):
 
 
 def check_physics(physics: object) -> Physics:
-    """Return ``physics`` if it is one.
-
-    Raises:
-        TypeError: it is not a subclass of ``Physics``.
-    """
+    """Return ``physics``; raise TypeError if it is not a ``Physics``."""
     if isinstance(physics, Physics):
         return physics
     raise TypeError(

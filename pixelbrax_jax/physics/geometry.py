@@ -35,11 +35,7 @@ class Shape(NamedTuple):
 
 
 def as_geoms(shapes: Sequence[Shape]) -> Geoms:
-    """Return shapes as ``Geoms``.
-
-    Shapes of equal color share a material. Planes never share one with other kinds, so that the
-    ground can be recolored separately.
-    """
+    """Return shapes as ``Geoms``; equal colors share a material, except planes with other kinds."""
     materials: dict[tuple[bool, tuple[float, ...]], str] = {}
     keys = []
     for shape in shapes:

@@ -196,7 +196,6 @@ def _sky(model: mujoco.MjModel) -> Any:
 
 
 def _pixels(model: mujoco.MjModel, texture: int) -> np.ndarray:
-    """Return (H, W, 3) uint8."""
     height, width = int(model.tex_height[texture]), int(model.tex_width[texture])
     channels, first = int(model.tex_nchannel[texture]), int(model.tex_adr[texture])
     pixels = model.tex_data[first : first + height * width * channels]

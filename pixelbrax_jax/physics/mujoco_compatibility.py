@@ -52,8 +52,7 @@ def import_silenced() -> Iterator[None]:
 def loading_silenced() -> Iterator[None]:
     """Hide known warnings of compiling a model; turn MuJoCo's others into Python warnings.
 
-    Without a handler MuJoCo appends its warnings to ``MUJOCO_LOG.TXT`` in the working directory. A
-    handler that was installed before is still called.
+    Without a handler MuJoCo writes them to ``MUJOCO_LOG.TXT``. A previous handler is still called.
     """
     previous = mujoco.get_mju_user_warning()
     messages: list[str] = []
@@ -74,8 +73,6 @@ def loading_silenced() -> Iterator[None]:
 
 
 class _JaxOfThisProcess:
-    """``jax`` whose devices are those of this process."""
-
     devices = staticmethod(jax.local_devices)
 
     def __getattr__(self, name: str) -> Any:
@@ -85,8 +82,7 @@ class _JaxOfThisProcess:
 def load_onto_own_device(module: ModuleType) -> None:
     """Let a module that uses ``jax`` put arrays on a device of this process.
 
-    MuJoCo XLA puts models on ``jax.devices()[0]``, which in a run of several processes belongs to
-    the first one; others cannot read it.
+    MuJoCo XLA uses ``jax.devices()[0]``, which in a run of several processes belongs to the first.
     """
     if jax.process_count() > 1 and vars(module)["jax"] is jax:
         vars(module)["jax"] = _JaxOfThisProcess()

@@ -1,8 +1,4 @@
-"""Import of MuJoCo without OpenGL: ``from pixelbrax_jax.physics.opengl import mujoco``.
-
-MuJoCo loads OpenGL while it is imported, and never later, so that ``mujoco.Renderer`` would fail
-without it. A ``__getattr__`` in its modules therefore loads ``GLContext`` at its first use.
-"""
+"""Import of MuJoCo without OpenGL: ``from pixelbrax_jax.physics.opengl import mujoco``."""
 
 from __future__ import annotations
 
@@ -24,9 +20,9 @@ _HOME = "mujoco.rendering.classic.gl_context"
 def import_mujoco() -> None:
     """Import MuJoCo without the OpenGL of ``MUJOCO_GL``, unless it is already imported.
 
-    MuJoCo cannot be imported if that OpenGL is missing or unknown. ``mujoco.GLContext`` is loaded
-    at its first use, also by ``mujoco.Renderer``, with the value of the variable and the errors of
-    MuJoCo's import at that time. A MuJoCo that loads OpenGL elsewhere is not changed.
+    MuJoCo loads OpenGL only at import, and fails if it is missing. A ``__getattr__`` in its modules
+    therefore loads ``mujoco.GLContext`` at its first use, also by ``mujoco.Renderer``, with
+    MuJoCo's own errors. A MuJoCo that loads OpenGL elsewhere is not changed.
     """
     if "mujoco" in sys.modules or not _is_there():
         return

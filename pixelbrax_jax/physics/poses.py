@@ -12,11 +12,7 @@ from pixelbrax_jax.spatial import quat_normalize
 def check_pose(
     model: mujoco.MjModel, q: jax.Array, qd: jax.Array | None
 ) -> tuple[jax.Array, jax.Array]:
-    """Return joint positions (Q,) and velocities (V,) in float32; the latter 0 by default.
-
-    Raises:
-        ValueError: a shape is wrong.
-    """
+    """Return (Q,) and (V,) float32, velocities 0 by default; raise ValueError for a wrong shape."""
     q = jnp.asarray(q, jnp.float32)
     qd = jnp.asarray(jnp.zeros(model.nv) if qd is None else qd, jnp.float32)
     if q.shape != (model.nq,) or qd.shape != (model.nv,):

@@ -54,12 +54,9 @@ def followed_body(model: mujoco.MjModel) -> int:
 def read_rigs(model: mujoco.MjModel, com_link: int) -> dict[str, CameraRig]:
     """Return rigs of a model's cameras by name, without ``unfit_cameras``, in the model's order.
 
-    A camera without a name is ``camera/<index>``. A rig's target lies on the camera's axis, at the
-    depth of the tracked point or of the model's center of mass: camera distractors turn about it.
-
-    Args:
-        model: the compiled model; link i is its body i + 1.
-        com_link: index of the link at the tracked center of mass, -1 for none.
+    A camera without a name is ``camera/<index>``. ``com_link`` is the link at the tracked center of
+    mass, -1 for none. A rig's target lies on the camera's axis, at the depth of the tracked point
+    or of the model's center of mass: camera distractors turn about it.
     """
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)

@@ -1,1 +1,1 @@
-"""Scene -> frame."""
+"""Renderers."""

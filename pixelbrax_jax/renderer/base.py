@@ -1,4 +1,4 @@
-"""Scene -> image, by the chosen ray-caster, with a derivative that can be trusted."""
+"""Rendering with a chosen renderer and the reference's derivative."""
 
 from __future__ import annotations
 
@@ -18,20 +18,16 @@ from pixelbrax_jax.validation import check_choice
 RENDERERS = ("auto", "fused", "pallas", "reference")
 
 _BANDS = 2
-"""Parts in which an accelerator draws an image, one above the other: a loop of one is none."""
+"""Bands of rows that an accelerator renders in a loop. XLA would remove a loop of one."""
 
 
 def check_renderer(renderer: object) -> str:
-    """Return ``renderer`` if it can draw here.
-
-    Raises:
-        ValueError: it is unknown, or the default device cannot run it; the message says what can.
-    """
+    """Return ``renderer``; raise ValueError if it is unknown or does not run on the device."""
     name = check_choice("renderer", renderer, RENDERERS)
     if name == "pallas" and (why := choice.why_not_here()) is not None:
         raise ValueError(
-            f"renderer='pallas' is a kernel for NVIDIA GPUs, and {why}. Use 'auto' (the fastest on "
-            "every device, this kernel in programs compiled for CUDA) or 'fused'."
+            f"renderer='pallas' is a kernel for NVIDIA GPUs, but {why}. Use 'auto' (the fastest on "
+            "every device, and this kernel in programs compiled for CUDA) or 'fused'."
         )
     return name
 
@@ -46,27 +42,27 @@ def render(
     first_row: jax.Array | int = 0,
     num_rows: int | None = None,
 ) -> Frame:
-    """Draw an image of the scene.
+    """Render an image of the scene.
 
-    Colors and depth may be differentiated by everything in the scene that is an array: poses,
-    sizes, colors, camera and light. The derivative is finite everywhere. It is that of the
-    surface seen at the pixel's center, hence right away from silhouettes, shadow edges and
-    the borders between geoms; how those edges move is not in it, nor is the gloss that begins
-    or ends where a surface turns to the light. ``seg`` and ``ground`` have none.
+    Colors and depth may be differentiated by all arrays of the scene: poses, sizes, colors, camera
+    and light. The derivative is finite everywhere, and is that of the surface at the pixel's
+    center. It ignores the motion of silhouettes, shadow edges and borders between geoms, and the
+    highlight that begins or ends where a surface turns to the light. ``seg`` and ``ground`` have
+    none.
 
     Args:
-        scene: what to draw, in the world frame.
+        scene: the scene, in the world frame.
         height: pixels, at least 1.
         width: pixels, at least 1.
-        renderer: one of ``RENDERERS``; same image, other speed. See ``ProgramConfig``.
-        first_row: () int, may be traced: first row of the band to draw.
-        num_rows: rows of the band; None draws all rows.
+        renderer: one of ``RENDERERS``; they give the same image. See ``ProgramConfig``.
+        first_row: () int, may be traced: first row of the band to render.
+        num_rows: rows of the band; None renders all rows.
 
     Returns:
         The frame, or its band of rows.
 
     Raises:
-        ValueError: a size below 1, or a renderer that is unknown or cannot draw here.
+        ValueError: a size is below 1, or the renderer is unknown or not supported.
     """
     for name, value in (("height", height), ("width", width)):
         if value < 1:
@@ -85,24 +81,15 @@ def draw(
     renderer: str,
     change: Callable[[Frame, jax.Array], Frame],
 ) -> jax.Array:
-    """Draw an image, change it and pack it, as a program computes it once, whoever reads it.
+    """Render an image, change it and pack it into (height, width) uint32, only once in a program.
+
+    ``change(frame, rows)`` returns rows of the image with other colors, for their indices (R,)
+    int32. Its pixelwise part runs in the kernel.
 
     Without a barrier XLA fuses the renderer into every reader of its image and runs it again for
-    each. Nothing is fused into a kernel of its own. Where there is none, control flow is a barrier
-    that XLA keeps: on a CPU a conditional, for which a GPU would wait for the host; on a TPU an
-    optimization barrier is enough; elsewhere a loop over bands, which also halves what XLA keeps of
-    an image that it does not fuse.
-
-    Args:
-        scene: what to draw.
-        height: pixels.
-        width: pixels.
-        renderer: one of ``RENDERERS``.
-        change: ``change(frame, rows)``, some rows of the image with other colors, given the
-            numbers of these rows, (R,) int32. What it does pixel by pixel is part of the kernel.
-
-    Returns:
-        (height, width) uint32 packed pixels.
+    each. A Pallas kernel is never fused. Otherwise the barrier is control flow that XLA keeps: a
+    conditional on a CPU (a GPU would wait for the host), an optimization barrier on a TPU, and
+    elsewhere a loop over bands, which also halves the memory of intermediate images.
     """
     plain = "fused" if renderer == "auto" else renderer
 
@@ -117,17 +104,17 @@ def draw(
         return bands.reshape(-1, width)[:height]
 
     def in_a_conditional() -> jax.Array:
-        # On a CPU, XLA clears the result of a loop beforehand, and runs in one thread whatever is
-        # fused into the writes to it. A conditional costs nothing; were it known to be always
-        # taken, the compiler would remove it, and the barrier with it.
+        # On a CPU, XLA first clears the result of a loop, and runs what is fused into the writes
+        # to it in one thread. A conditional costs nothing. The inner barrier hides from the
+        # compiler that it is always taken; otherwise the compiler would remove it.
         zero = jax.lax.optimization_barrier(jnp.int32(0))
         blank = jnp.zeros(height * width, jnp.uint32)
-        # In one axis, as the renderer computes it.
+        # Flat, as the renderer computes it.
         image = jax.lax.cond(zero == 0, lambda: draw_rows(zero, height).ravel(), lambda: blank)
         return image.reshape(height, width)
 
     def behind_a_barrier() -> jax.Array:
-        # A TPU's compiler keeps it, and keeps less of an image than of its bands in a loop.
+        # A TPU's compiler keeps the barrier, which needs less memory than a loop over bands.
         return jax.lax.optimization_barrier(draw_rows(jnp.int32(0), height))
 
     def by_kernel() -> jax.Array:
@@ -147,12 +134,9 @@ def draw(
 
 
 def pack(frame: Frame) -> jax.Array:
-    """Pack a frame into 32 bits a pixel: red in the low byte, then green, then blue.
+    """Pack a frame into (H, W) uint32: red in the low byte, then green, then blue.
 
-    The only place where colors are rounded: each channel is ``floor(255 x + 1/2)``.
-
-    Returns:
-        (H, W) uint32.
+    This is the only place that rounds colors: each channel is ``floor(255 x + 1/2)``.
     """
 
     def level(plane: jax.Array) -> jax.Array:

@@ -1,8 +1,4 @@
-"""Whether NVIDIA GPUs draw by the kernel of `kernel.py`: it must be there, and draw what it should.
-
-The kernel is checked once in a process: where an environment is made or an image drawn for the
-first time, on the host, by programs of its own that are no part of any other.
-"""
+"""Choice of the kernel of `kernel.py` on NVIDIA GPUs, if it exists and passes a check."""
 
 from __future__ import annotations
 
@@ -24,29 +20,29 @@ from pixelbrax_jax.renderer import fused
 from pixelbrax_jax.types import Camera, Frame, GeomKind, Geoms, Lamp, Look, Scene
 
 _CAPABILITY = 8.0
-"""Least compute capability for which XLA compiles such kernels: Ampere's."""
+"""Least compute capability of XLA's Triton kernels: Ampere."""
 
 _HEIGHT, _WIDTH = 24, 40
 
 _EYES = ((-2.0, -4.25, 2.25), (0.5, -4.25, 1.75))
-"""Metres, where the check looks from: no edge in its images goes through the middle of a pixel."""
+"""Camera positions of the check, metres. No edge goes through the middle of a pixel."""
 
 Draw = Callable[[Scene, int, int], Frame]
 
 _COLOR = 1.0 / 255.0
-"""Difference of colors that rounding may make."""
+"""Largest difference of colors from rounding."""
 
 _DEPTH = 1e-4
-"""The same of depths, relative."""
+"""Largest relative difference of depths from rounding."""
 
 
 @dataclass(frozen=True)
 class KernelCheck:
-    """Whether the kernel draws what the plain ray-caster draws.
+    """Result of comparing the kernel with the fused renderer.
 
     Attributes:
-        passed: whether it does.
-        text: what was compared, or what differed, in a sentence without its period.
+        passed: whether the images agree.
+        text: what was compared, or what differs, as a sentence without its period.
     """
 
     passed: bool
@@ -54,9 +50,9 @@ class KernelCheck:
 
 
 def auto_renderer() -> tuple[str, str]:
-    """Return the renderer that ``"auto"`` stands for on JAX's default device, and why."""
+    """Return the renderer that ``"auto"`` means on JAX's default device, and the reason."""
     if default_platform() != "gpu":
-        return "fused", f"JAX computes on a {default_platform()}, and the kernel is for NVIDIA GPUs"
+        return "fused", f"JAX computes on a {default_platform()}; the kernel is for NVIDIA GPUs"
     why = why_no_kernel()
     if why is not None:
         return "fused", f"not by one kernel: {why}"
@@ -64,11 +60,11 @@ def auto_renderer() -> tuple[str, str]:
 
 
 def why_no_kernel() -> str | None:
-    """Return why ``"auto"`` draws without the kernel on CUDA; None if it draws with it.
+    """Return why ``"auto"`` does not use the kernel on CUDA; None if it does.
 
-    Starts a device. If it is an NVIDIA GPU, the first call in a process checks the kernel there,
-    and warns if it does not pass. Without a GPU nothing can be checked: a program that is compiled
-    for one has the kernel.
+    Starts a device. On an NVIDIA GPU the first call in a process checks the kernel, with programs
+    of its own, and warns if it fails. Programs compiled for CUDA without a GPU use the kernel
+    unchecked.
     """
     why = why_unsupported()
     if why is None and default_platform() == "gpu":
@@ -78,22 +74,21 @@ def why_no_kernel() -> str | None:
 
 
 def why_unsupported() -> str | None:
-    """Return why programs for CUDA cannot have the kernel; None if they can.
+    """Return why programs for CUDA cannot use the kernel; None if they can.
 
-    What JAX computes on need not be a GPU: where its plugin for CUDA is installed, programs may be
-    compiled for one ahead of time. jax 0.12.0.1 must then be told which, and 0.10.2 need not; see
-    `docs/renderer.md`.
+    With JAX's CUDA plugin, programs can be compiled for a GPU on a machine without one. jax
+    0.12.0.1 must be told the GPU, jax 0.10.2 need not; see `docs/renderer.md`.
     """
     platform = default_platform()
-    # Without a plugin nothing is imported or traced that only a GPU needs.
+    # Without a plugin nothing for GPUs is imported or traced.
     if platform != "gpu" and not _has_plugin():
-        return f"JAX computes on a {platform}, and the kernel is for NVIDIA GPUs"
+        return f"JAX computes on a {platform}; the kernel is for NVIDIA GPUs"
     if platform == "gpu" and "rocm" in _driver(jax.devices()[0]).lower():
-        return "JAX computes on ROCm, and the kernel is for NVIDIA GPUs"
+        return "JAX computes on ROCm; the kernel is for NVIDIA GPUs"
     try:
         from jax.experimental.pallas import triton
 
-        # jax 0.12.0.1 tells of an abstract or a real card; 0.10.2 has no such function.
+        # In jax 0.12.0.1 this describes an abstract or a real GPU; 0.10.2 has no such function.
         info = triton.get_gpu_info() if hasattr(triton, "get_gpu_info") else None
     except ImportError:
         return f"jax {jax.__version__} has no Pallas for Triton"
@@ -121,20 +116,17 @@ def why_not_here() -> str | None:
 
 @cache
 def kernel_check() -> KernelCheck:
-    """Return what the check of the kernel found on JAX's default device, a GPU.
-
-    The first call in a process draws, and warns if the kernel does not pass.
-    """
+    """Check the kernel on JAX's default device, a GPU, once per process; warn if it fails."""
     from pixelbrax_jax.renderer import kernel
 
     check = compare(kernel.render)
     if not check.passed:
         card = jax.devices()[0]
         warnings.warn(
-            f"PixelBrax's kernel for NVIDIA GPUs is not used, for {check.text} ({card.device_kind},"
-            f" jax {jax.__version__}, {' '.join(_driver(card).split())}). Images are drawn by "
-            "renderer='fused', which is right and slower. Please report this line with what "
-            "`pixelbrax doctor` says; renderer='fused' silences it.",
+            f"PixelBrax does not use its kernel for NVIDIA GPUs: {check.text} ({card.device_kind}, "
+            f"jax {jax.__version__}, {' '.join(_driver(card).split())}). renderer='fused' renders "
+            "images instead, correctly but slower. Please report this line with the output of "
+            "`pixelbrax doctor`; renderer='fused' silences it.",
             RuntimeWarning,
             stacklevel=2,
         )
@@ -142,12 +134,8 @@ def kernel_check() -> KernelCheck:
 
 
 def compare(draw: Draw) -> KernelCheck:
-    """Compare a renderer with the plain ray-caster, on two small images of every kind of geom.
-
-    Args:
-        draw: the renderer; of a scene, a height and a width.
-    """
-    # In a thread of its own nothing is being traced, and JAX has its default settings.
+    """Compare ``draw(scene, height, width)`` with the fused renderer on images of all geoms."""
+    # In a separate thread nothing is being traced, and JAX has its default settings.
     with ThreadPoolExecutor(1) as thread:
         return thread.submit(_compare, draw).result()
 
@@ -171,19 +159,19 @@ def _compare(draw: Draw) -> KernelCheck:
     colors = np.abs([getattr(found, c) - getattr(wanted, c) for c in "rgb"]).max(0)
     depths = np.abs(found.depth / wanted.depth - 1.0)
     right = (found.seg == wanted.seg) & (found.ground == wanted.ground)
-    # NaN is wrong, too.
+    # Comparisons with NaN are False.
     right &= (colors <= _COLOR) & (depths <= _DEPTH)
     if right.all():
-        return KernelCheck(True, f"it draws {right.size} pixels as the plain ray-caster does")
+        return KernelCheck(True, f"it renders {right.size} pixels like renderer='fused'")
     return KernelCheck(
         False,
-        f"{(~right).sum()} of {right.size} pixels differ from the plain ray-caster's, colors by up "
-        f"to {255.0 * colors.max():.0f} of 255, depth by up to {100.0 * depths.max():.2g} %",
+        f"{(~right).sum()} of {right.size} pixels differ from those of renderer='fused', colors by "
+        f"up to {255.0 * colors.max():.0f} of 255, depth by up to {100.0 * depths.max():.2g} %",
     )
 
 
 def _scene(eye: jax.Array) -> Scene:
-    """Return one of each kind of geom on the ground, in light with shadows, seen from ``eye``."""
+    """Return one of each kind of geom on the ground, with light and shadows, seen from ``eye``."""
     kinds = tuple(GeomKind)
     angles = jnp.linspace(0.3, 1.2, len(kinds))
     axes = jnp.array([[0.0, 0.0, 0.0]] + [[0.6, 0.0, 0.8]] * (len(kinds) - 1))

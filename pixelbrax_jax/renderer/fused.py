@@ -1,16 +1,4 @@
-"""The fast ray-caster: what pixels see, for any block of them, and an image as one loop of XLA's.
-
-It works in the camera's frame, where all rays start at the origin, so that a geom costs a few
-dot products and a square root or two. The nearest hit is one integer minimum: positive
-float32 numbers sort like their bits, and the low bits, replaced by the geom's rank, carry the
-winner along. A missed geom gives NaN or a negative distance, whose bits lose by themselves as
-unsigned integers. Only the winner is shaded, from two products of its normal.
-
-Numbers of a scene are read one by one, ``array[i, j]``, and pixels are computed element by element:
-the same code is traced into a program of XLA's and into a kernel, to which arrays are references.
-`docs/renderer.md` tells why. The image is that of `reference.py`; it has no useful derivative of
-its own, see `base.py`.
-"""
+"""The fast renderer for any block of pixels; `docs/renderer.md` explains it."""
 
 from __future__ import annotations
 
@@ -42,13 +30,13 @@ _INF_BITS = np.uint32(0x7F800000)
 
 
 class View(struct.PyTreeNode):
-    """A scene in the camera's frame: all that its pixels are computed from.
+    """A scene in the camera's frame.
 
-    Static fields are in the order of ranks, in which geoms of one material are neighbors; arrays
-    are in the scene's order, with its shapes and units.
+    Static fields are ordered by rank; geoms of one material have neighboring ranks. Arrays are in
+    the scene's order, with its shapes and units.
 
     Attributes:
-        geom: (G,) static, the index in the scene of the geom of each rank.
+        geom: (G,) static, the scene's index of each rank.
         kind, material, bounded, ground, distant: static, as in ``Geoms``.
         pos, xmat, size, rgb: centers, orientations, sizes and colors.
         look: light and lamps in the camera's frame.
@@ -72,14 +60,14 @@ class View(struct.PyTreeNode):
 
 
 class Seen(NamedTuple):
-    """What some pixels see, each in the shape of their block.
+    """Colors, depth and geom of a block of pixels, each in the block's shape.
 
     Attributes:
         r, g, b: float32 in [0, 1].
         depth: float32, metres along the viewing axis, ``FAR`` for the sky; exact to a relative
-            ``2**(b - 24)``, where b bits hold a rank.
-        rank: int32, rank of the geom; their number for the sky.
-        ground: bool, a plane that is ground is seen.
+            ``2**(b - 24)``, with b bits for a rank.
+        rank: int32, rank of the geom; the number of geoms for the sky.
+        ground: bool, whether a plane that is ground is visible.
     """
 
     r: jax.Array
@@ -97,10 +85,7 @@ class Seen(NamedTuple):
 def view_of(
     scene: Scene, height: int, einsum: Callable[[str, Any, Any], jax.Array] = jnp.einsum
 ) -> View:
-    """Return a scene in its camera's frame, for images of ``height`` pixels.
-
-    ``einsum`` computes products over an axis of length 3.
-    """
+    """Return a scene in its camera's frame, for images of ``height`` pixels."""
     geoms, look = scene.geoms, scene.look
     to_camera = scene.camera.xmat
     light = None if look.light is None else einsum("i,ij->j", spatial.unit(look.light), to_camera)
@@ -131,7 +116,7 @@ def view_of(
 
 
 def rays(view: View, height: int, width: int, row: jax.Array, column: jax.Array) -> Vector:
-    """Return unit rays through the centers of pixels, given their int32 rows and columns."""
+    """Return unit rays through the centers of pixels with the given int32 rows and columns."""
     x = (column.astype(jnp.float32) - 0.5 * (width - 1)) * view.pixel
     y = (0.5 * (height - 1) - row.astype(jnp.float32)) * view.pixel
     inv_length = jax.lax.rsqrt(x * x + y * y + 1.0)
@@ -139,12 +124,12 @@ def rays(view: View, height: int, width: int, row: jax.Array, column: jax.Array)
 
 
 Near = Callable[[int, Callable[[Any], Any], Any], Any]
-"""``near(rank, update, value)``: ``update(value)`` where some of a block's pixels may see the geom
-of that rank; where none does, it may be ``value``."""
+"""``near(rank, update, value)`` returns ``update(value)`` if some pixel of a block may see the geom
+of that rank, and may return ``value`` otherwise."""
 
 
 def see(view: View, ray: Vector, near: Near | None = None) -> Seen:
-    """Return what the pixels of unit rays see; ``near`` may leave out geoms that none sees."""
+    """Return what pixels with unit rays see; ``near`` may skip geoms that none sees."""
     look, shape = view.look, ray[0].shape
     ranks, count = range(len(view.kind)), len(view.kind)
 
@@ -155,7 +140,7 @@ def see(view: View, ray: Vector, near: Near | None = None) -> Seen:
         return solid(rank).hit(ray, solid(rank).center)
 
     if near is None:
-        # Of branches, none knows what another one has computed.
+        # Branches cannot share results.
         solid, hit = cache(solid), cache(hit)
 
     to_light = None if look.light is None else _vector(look.light)
@@ -175,7 +160,7 @@ def see(view: View, ray: Vector, near: Near | None = None) -> Seen:
     t, winner = _distance(key, count), _rank(key, count)
     seen = [winner == rank for rank in ranks]
     if near is None:
-        # Of the winner alone: XLA on a CPU is faster where no choice waits for another.
+        # Only for the nearest geom: XLA on a CPU is faster without dependent selects.
         for rank in ranks:
             products = _normal_products(hit(rank), along, seen[rank], products)
     n_z, n_l, *n_xy = products
@@ -204,7 +189,7 @@ def see(view: View, ray: Vector, near: Near | None = None) -> Seen:
         if look.shadows:
             for rank in ranks:
                 if view.kind[rank] != GeomKind.PLANE:
-                    # A convex geom cannot shade a point of itself that faces the light.
+                    # A convex geom casts no shadow on its side that faces the light.
                     there = tuple(c - p for c, p in zip(solid(rank).center, points, strict=True))
                     blocked = solid(rank).hit(to_light, there).t > SHADOW_BIAS
                     lit &= ~(blocked & ~seen[rank])
@@ -234,9 +219,9 @@ def render(
     scene: Scene, height: int, width: int, first_row: jax.Array | int, num_rows: int
 ) -> Frame:
     """Return a band of rows of an image of the scene; see ``base.render``."""
-    # The barrier keeps these few numbers out of the loop over pixels.
+    # The barrier keeps these numbers out of the loop over pixels.
     view = jax.lax.optimization_barrier(view_of(scene, height))
-    # Row after row in one axis: rows would end in pixels that fill no vector and go one by one.
+    # All rows in one axis, because separate rows would end in pixels that do not fill a vector.
     index = jnp.arange(num_rows * width, dtype=jnp.int32)
     row = jax.lax.div(index, np.int32(width)) + first_row
     column = jax.lax.rem(index, np.int32(width))
@@ -247,8 +232,6 @@ def render(
 
 
 class _Solid(NamedTuple):
-    """One geom in the camera's frame; fields as in ``intersect``."""
-
     kind: int
     center: Vector
     axes: Axes
@@ -275,15 +258,11 @@ def _solid(view: View, rank: int) -> _Solid:
 
 
 def _vector(array: Any) -> Vector:
-    """Return the three numbers of an array, or of a reference to one."""
     return array[0], array[1], array[2]
 
 
 def _directions(ray: Vector, to_light: Vector | None, lamps: bool) -> list[tuple[Vector, Any]]:
-    """Return vectors with which products of normals are needed, each with the ray's product.
-
-    They are the camera's z axis and the direction to the light, or zero; for lamps also x and y.
-    """
+    """Return vectors whose products with normals are needed, each with its product with the ray."""
     zero = (0.0, 0.0, 0.0)
     along: list[tuple[Vector, Any]] = [((0.0, 0.0, 1.0), ray[2])]
     along.append((zero, 0.0) if to_light is None else (to_light, dot(ray, to_light)))
@@ -295,7 +274,7 @@ def _directions(ray: Vector, to_light: Vector | None, lamps: bool) -> list[tuple
 def _normal_products(
     hit: Hit, along: list[tuple[Vector, Any]], here: jax.Array, products: list[jax.Array]
 ) -> list[jax.Array]:
-    """Return products of the outer unit normal, those of ``hit`` in place of others ``here``."""
+    """Return products of the outer normal, those of ``hit`` where ``here`` is set."""
     return [
         jnp.where(here, hit.normal_dot(v, ray_v), product)
         for (v, ray_v), product in zip(along, products, strict=True)
@@ -310,7 +289,7 @@ def _lamplight(
     seen: list[jax.Array],
     solid: Callable[[int], _Solid],
 ) -> tuple[jax.Array, jax.Array]:
-    """Return what a lamp adds to the factor of colors, and to colors themselves."""
+    """Return what a lamp adds to the factor of colors, and to the colors."""
     look, pos = view.look, _vector(lamp.pos)
     ray, inv_distance, strength = shading.beam(lamp, pos, _vector(lamp.axis), points)
     to_lamp = tuple(-component for component in ray)
@@ -337,7 +316,6 @@ def _no_hit(count: int, shape: tuple[int, ...]) -> jax.Array:
 
 
 def _nearer(key: jax.Array, hit: Hit, rank: int, count: int) -> jax.Array:
-    """Return the key of the nearest hit, given that of the nearest one so far."""
     bits = jax.lax.bitcast_convert_type(hit.t, jnp.uint32)
     return jnp.minimum(key, (bits & ~_rank_bits(count)) | np.uint32(rank))
 
@@ -351,7 +329,6 @@ def _rank(key: jax.Array, count: int) -> jax.Array:
 
 
 def _surface_colors(view: View, winner: jax.Array) -> list[jax.Array]:
-    """Return the winner's own color, one plane a channel; ranks of a material are neighbors."""
     materials = view.material
     color = [jnp.full(winner.shape, view.rgb[materials[0], c]) for c in range(3)]
     for rank in range(1, len(materials)):
@@ -364,7 +341,7 @@ def _surface_colors(view: View, winner: jax.Array) -> list[jax.Array]:
 def _ground_fraction(
     look: Look, ray: Vector, t: jax.Array, pixel: jax.Array, plane: _Solid
 ) -> jax.Array:
-    """Return the fraction of the ground's second color in pixels that see a plane at ``t``."""
+    """Return the fraction of the ground's second color for pixels that see a plane at ``t``."""
     normal = plane.axes[2]
     slope = 1.0 / at_most(dot(ray, normal), -1e-7)
     inv_pitch = 1.0 / look.ground_pitch
@@ -374,7 +351,7 @@ def _ground_fraction(
         ray_axis = dot(ray, axis)
         along = t * ray_axis - dot(plane.center, axis)
         if plane.bounded:
-            # MuJoCo's textures begin at the corner of least x and greatest y.
+            # MuJoCo's textures start at the corner of least x and largest y.
             along = along + half if number == 0 else half - along
         coords.append(along * inv_pitch)
         # Derivatives of the coordinate by one pixel to the right and one up.

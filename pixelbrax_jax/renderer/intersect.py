@@ -1,17 +1,10 @@
-"""Closed forms for a ray from the origin against one convex geom.
+"""Intersections of a ray from the origin with one convex geom.
 
-A vector is a tuple of its three components, and each component is either a scalar or an
-array over pixels: the same code serves rays that fan out from the camera (ray in arrays,
-geom in scalars) and shadow rays towards a distant light (ray in scalars, geom in arrays).
-Rays have unit length. A ray enters a geom from outside; a geom around the origin is not seen.
-
-A missed geom yields NaN or a negative distance, never +inf: `fused.py` relies on it. Formulas
-follow from substituting the ray into the surface's equation. A quotient or a root is used once: if
-two operations read it, XLA keeps an image of it in memory.
-
-``jnp.maximum`` and ``jnp.minimum`` hand on a NaN from either side, for which a CPU needs two more
-instructions each: a seventh of an image's time. `at_least` and `at_most` are the single
-instruction. Their derivative is that of what they give, of the bound where both are equal.
+A vector is a tuple of three components, each a scalar or an array over pixels: the same code serves
+camera rays (ray in arrays, geom in scalars) and shadow rays (ray in scalars, geom in arrays). Rays
+have unit length and enter a geom from outside. A missed geom gives NaN or a negative distance,
+never +inf, as `fused.py` requires. Each quotient and root is used once, because XLA stores an image
+of it if two operations read it.
 """
 
 # ruff: noqa: ARG001, ARG005  # all shapes share one signature, whatever they need of it
@@ -29,16 +22,16 @@ Vector = Sequence[Any]
 Axes = tuple[Vector, Vector, Vector]
 
 _TINY = 1e-7
-"""Keeps a ray that is parallel to an axis or a face away from a division by zero."""
+"""Avoids a division by zero for a ray parallel to an axis or a face."""
 
 
 class Hit(NamedTuple):
-    """Where a ray enters a geom.
+    """The point where a ray enters a geom.
 
     Attributes:
-        t: distance from the origin, metres; NaN or negative where the geom is missed.
-        normal_dot: ``normal_dot(v, ray_v)`` is the product of the outer unit normal with the
-            vector ``v``, given also the product ``ray_v`` of the ray with ``v``.
+        t: distance from the origin, metres; NaN or negative for a missed geom.
+        normal_dot: ``normal_dot(v, ray_v)`` is the product of the outer unit normal and the vector
+            ``v``, given also the product ``ray_v`` of the ray and ``v``.
     """
 
     t: jax.Array
@@ -46,17 +39,20 @@ class Hit(NamedTuple):
 
 
 def at_least(x: Any, low: Any) -> jax.Array:
-    """Return the larger of the two; ``low`` where ``x`` is NaN, and NaN where ``low`` is."""
+    """Return the larger of the two; ``low`` if ``x`` is NaN, and NaN if ``low`` is.
+
+    It is one CPU instruction. ``jnp.maximum`` needs two more to propagate NaN from both sides.
+    """
     return jnp.where(x > low, x, low)
 
 
 def at_most(x: Any, high: Any) -> jax.Array:
-    """Return the smaller of the two; ``high`` where ``x`` is NaN, and NaN where ``high`` is."""
+    """Return the smaller of the two; ``high`` if ``x`` is NaN, and NaN if ``high`` is."""
     return jnp.where(x < high, x, high)
 
 
 def between(low: Any, x: Any, high: Any) -> jax.Array:
-    """Return ``x``, or the bound of the interval that it passes; ``low`` for NaN."""
+    """Clip ``x`` to an interval; ``low`` for NaN."""
     return at_most(at_least(x, low), high)
 
 
@@ -66,14 +62,14 @@ def dot(a: Vector, b: Vector) -> jax.Array:
 
 
 def _inverse(x: jax.Array) -> jax.Array:
-    """Return ``1 / x``, or a great number where ``x`` is nearly 0."""
+    """Return ``1 / x``, or a large number if ``x`` is nearly 0."""
     return jnp.where(jnp.abs(x) < _TINY, 1.0 / _TINY, 1.0 / x)
 
 
 def _plane(ray: Vector, pos: Vector, axes: Axes, size: Vector) -> Hit:
     normal = axes[2]
     descent = dot(ray, normal)
-    # Seen from above alone; from below, the quotient is negative by itself.
+    # Visible only from above; from below the quotient is negative.
     t = jnp.where(descent < -_TINY, dot(pos, normal) / at_most(descent, -_TINY), -1.0)
     return Hit(t, lambda v, ray_v: dot(normal, v))
 
@@ -96,8 +92,8 @@ def _distant_sphere(ray: Vector, pos: Vector, axes: Axes, size: Vector) -> Hit:
 
 
 def _distant_capsule(ray: Vector, pos: Vector, axes: Axes, size: Vector) -> Hit:
-    # As below, but distances between lines are products of small numbers, not differences of great
-    # ones: those lose what is smaller than a three thousandth of the distance.
+    # As below, but distances between lines are products of small numbers. Differences of large
+    # numbers are exact only to a three thousandth of the distance.
     radius, half, axis = size[0], size[1], axes[2]
     pos_axis = dot(pos, axis)
     ray_axis, ray_pos = dot(ray, axis), dot(ray, pos)
@@ -131,7 +127,7 @@ def _capsule(ray: Vector, pos: Vector, axes: Axes, size: Vector) -> Hit:
     b = ray_pos - ray_axis * pos_axis
     c = pos_pos - pos_axis * pos_axis - radius * radius
     y = (b - jnp.sqrt(b * b - a * c)) / a * ray_axis - pos_axis
-    # Of a line that misses the cylinder NaN became an end: that sphere is missed all the more.
+    # For a line that misses the cylinder, NaN is clamped to an end, whose sphere it misses too.
     y = between(-half, y, half)
     b = ray_pos + y * ray_axis
     c = (pos_pos - radius * radius) + y * (2.0 * pos_axis + y)
@@ -228,11 +224,7 @@ def intersect(
     bounded: bool = False,
     distant: bool = False,
 ) -> Hit:
-    """Return where unit rays from the origin enter a geom, in the shape of ``ray`` and ``pos``.
-
-    In the rays' frame, the geom's center is at ``pos``, metres, and its x, y and z directions are
-    ``axes``; for the rest see ``Geoms``.
-    """
+    """Return where unit rays from the origin enter a geom; ``pos`` is its center in metres."""
     if bounded and kind == GeomKind.PLANE:
         return _rectangle(ray, pos, axes, size)
     kind = GeomKind(kind)

@@ -1,14 +1,4 @@
-"""The fast ray-caster as one kernel for NVIDIA GPUs, written in Pallas.
-
-On a GPU XLA splits the program of `fused.py`, as a fusion takes only so many operands, and keeps
-planes of pixels between the parts. Here the same code is traced into a kernel: a block of it
-computes some pixels from references to the scene's numbers, changes their colors if asked to, and
-writes each of them once.
-
-A block leaves out geoms that it cannot see, by spheres around them (`GeomKind.reach`). Along one
-axis of the image, a sphere at (c, d), d in front of the camera, covers the slopes s between its two
-tangents, ``|c - s d| = r sqrt(1 + s^2)``. A convex hull covers what is between.
-"""
+"""The fast renderer as one Pallas kernel for NVIDIA GPUs; `docs/renderer.md` explains it."""
 
 from __future__ import annotations
 
@@ -27,29 +17,26 @@ from pixelbrax_jax.renderer.per_pixel import per_pixel
 from pixelbrax_jax.types import Frame, GeomKind, Scene
 
 BLOCK = 256
-"""Pixels of a block, some rows of a small image: fewer share the work that is done once a block,
-more see more geoms."""
+"""Pixels of a block, some rows of a small image. In smaller blocks fewer pixels share work; larger
+ones see more geoms."""
 
 _WARPS = 4
 
 INTERPRET = False
-"""Whether XLA computes the kernel, slowly and on any device; tests set it."""
+"""Whether XLA computes the kernel, slowly and on any device; for tests."""
 
 _GEOMS = 32
-"""Geoms of which a word has one bit each."""
+"""Geoms per word, one bit each."""
 
 _CLOSE = 1.01
-"""Radii in front of the camera within which a sphere counts as seen everywhere."""
+"""Distance in radii in front of the camera below which a sphere is never skipped."""
 
 Window = tuple[tuple[Any, Any] | None, tuple[Any, Any]]
-"""Least and greatest slope along the image's x axis, and along y; None for all, else () float32."""
+"""Least and largest slope along the image's x axis and along y; None for all, else () float32."""
 
 
 def draw(scene: Scene, height: int, width: int, change: Callable[[Frame], jax.Array]) -> jax.Array:
-    """Draw an image and change it into (height, width) uint32; it has no derivative.
-
-    A change that is made pixel by pixel is part of the kernel.
-    """
+    """Render and change an image into (height, width) uint32, without a derivative."""
     plane: Any = jax.ShapeDtypeStruct((height, width), jnp.float32)
     seg, ground = plane.update(dtype=jnp.int32), plane.update(dtype=bool)
     by_pixel = per_pixel(change, Frame(plane, plane, plane, plane, seg, ground))
@@ -71,7 +58,7 @@ def render(
     first_row: jax.Array | int = 0,
     num_rows: int | None = None,
 ) -> Frame:
-    """Return a band of rows of an image; see ``fused.render``. It has no derivative."""
+    """Render a band of rows, without a derivative; see ``fused.render``."""
 
     def planes(view: View, numbers: Any, images: Any, seen: Seen) -> list[jax.Array]:
         del numbers, images
@@ -89,7 +76,7 @@ def render(
 
 
 class _Band(NamedTuple):
-    """Rows of an image: its size, the first row, which may be traced, and their number."""
+    """Size of the image, first row of the band, which may be traced, and number of rows."""
 
     height: int
     width: int
@@ -103,7 +90,7 @@ def _near(view: View, band: _Band, start: jax.Array, last: jax.Array) -> Near:
     top, bottom = (jax.lax.div(i, width) + band.first_row for i in (start, last))
     columns = None
     if band.width >= BLOCK:
-        # The block ends in the row in which it begins, or in the next one.
+        # The block ends in the row where it starts, or in the next one.
         first, end = (jax.lax.rem(i, width) for i in (start, last))
         one_row = top == bottom
         columns = (jnp.where(one_row, first, 0), jnp.where(one_row, end, width - 1))
@@ -118,7 +105,7 @@ def _near(view: View, band: _Band, start: jax.Array, last: jax.Array) -> Near:
 
 
 def _einsum(subscripts: str, a: Any, b: Any) -> jax.Array:
-    """Return ``jnp.einsum`` over one axis as a sum, which XLA fuses: products it launches apart."""
+    """Return ``jnp.einsum`` over one axis as a sum, because XLA does not fuse products."""
     inputs, output = subscripts.split("->")
     (over,) = set(inputs) - {",", *output}
     terms = [
@@ -132,7 +119,7 @@ def _einsum(subscripts: str, a: Any, b: Any) -> jax.Array:
 
 
 def _geom(view: View, seen: Seen) -> jax.Array:
-    """Return the geom of each pixel: a kernel has no table to look it up in."""
+    """Return the geom of each pixel without a lookup table, which a kernel cannot have."""
     geom = jnp.full(seen.rank.shape, -1, jnp.int32)
     for rank, of_rank in enumerate(view.geom):
         geom = jnp.where(seen.rank == rank, of_rank, geom)
@@ -147,18 +134,14 @@ def _call(
     band: _Band,
     dtypes: Sequence[Any],
 ) -> list[jax.Array]:
-    """Return bands of images, (num_rows, width), from what pixels see.
-
-    ``compute(view, numbers, images, seen)`` gives blocks of them, of the given ``dtypes``, given ()
-    arrays and blocks of other bands of images.
-    """
+    """Return bands of images, (num_rows, width), from ``compute(view, numbers, images, seen)``."""
     height, width, first_row, num_rows = band
     inputs, inputs_tree = jax.tree.flatten((view, list(numbers), first_row))
     inputs = [jax.lax.stop_gradient(jnp.asarray(x)) for x in inputs]
     packed = [x.ndim <= 1 and x.dtype == jnp.float32 for x in inputs]
     few = [x for x, is_packed in zip(inputs, packed, strict=True) if is_packed]
     others = [x for x, is_packed in zip(inputs, packed, strict=True) if not is_packed]
-    # In one array, or XLA would compute them in launches of their own.
+    # In one array, because XLA would compute each in a separate launch.
     arrays = [jnp.concatenate([x.ravel() for x in few]), *others]
     num_pixels = num_rows * width
 
@@ -167,7 +150,7 @@ def _call(
         of_images = refs[len(arrays) : -len(dtypes)]
         start = pl.program_id(0) * BLOCK
         index = start + jnp.arange(BLOCK, dtype=jnp.int32)
-        # The last block has more pixels than are left.
+        # The last block may have more pixels than are left.
         inside = index < num_pixels
         read, rest = iter(_unpacked(of_few, few)), iter(of_arrays)
         leaves = [next(read) if is_packed else _scalar(next(rest)) for is_packed in packed]
@@ -200,7 +183,7 @@ def _call(
 
 
 def _unpacked(ref: Any, arrays: Sequence[jax.Array]) -> Iterator[Any]:
-    """Yield the numbers of arrays that are one after the other in ``ref``: tuples, and scalars."""
+    """Yield tuples and scalars from arrays that are concatenated in ``ref``."""
     start = 0
     for array in arrays:
         numbers = tuple(ref[start + i] for i in range(array.size))
@@ -209,7 +192,6 @@ def _unpacked(ref: Any, arrays: Sequence[jax.Array]) -> Iterator[Any]:
 
 
 def _scalar(ref: Any) -> Any:
-    """Return the number that a reference to a scalar is to; other references as they are."""
     return ref if ref.shape else ref[()]
 
 
@@ -220,10 +202,7 @@ def window_of(
     height: int,
     width: int,
 ) -> Window:
-    """Return the slopes of rays through pixels and those beside them.
-
-    Rows and columns are () int32, the first and the last; None for all columns.
-    """
+    """Return the slopes of rays through pixels and their neighbors; None means all columns."""
     top, bottom = (0.5 * (height - 1) - row.astype(jnp.float32) for row in rows)
     along_y = (view.pixel * (bottom - 1.0), view.pixel * (top + 1.0))
     if columns is None:
@@ -233,9 +212,10 @@ def window_of(
 
 
 def may_see(view: View, window: Window) -> Callable[[int], jax.Array]:
-    """Return a function that tells of the geom of a rank whether rays of a window may hit it.
+    """Return a function of a geom's rank: whether rays of a window may hit its bounding sphere.
 
-    32 geoms are looked at in one vector, as is right for a GPU.
+    Along one axis of the image, a sphere at (c, d), d in front of the camera, covers the slopes s
+    between its two tangents, ``|c - s d| = r sqrt(1 + s^2)``. A vector holds 32 geoms.
     """
     count = len(view.geom)
     kinds = [view.kind[view.geom.index(g)] for g in range(count)]
@@ -284,7 +264,6 @@ def _word(view: View, window: Window, kinds: Sequence[int], first: int) -> jax.A
 
 
 def _slopes(c: jax.Array, d: jax.Array, radius: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return the slopes of the two tangents, for a sphere that is not close."""
     inv = 1.0 / (d * d - radius * radius)
     root = radius * jnp.sqrt(at_least(c * c + d * d - radius * radius, 0.0))
     return (c * d - root) * inv, (c * d + root) * inv

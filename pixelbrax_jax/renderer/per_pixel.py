@@ -1,8 +1,4 @@
-"""Changes of an image that are made pixel by pixel, recognised by their program.
-
-A kernel makes such a change as it draws a pixel. Whatever the change computes that does not depend
-on the frame, as a random offset or an image to mix in, is computed before.
-"""
+"""Detection of pixelwise changes of an image, which a kernel applies when it renders a pixel."""
 
 from __future__ import annotations
 
@@ -24,7 +20,7 @@ abs add and ceil clamp convert_element_type cos copy copy_p div eq exp exp2 floo
 is_finite le log log1p logistic lt max min mul ne neg not or pow rsqrt select_n shift_left
 shift_right_arithmetic shift_right_logical sign sin sqrt square stop_gradient sub tanh xor
 """
-"""Primitives of JAX that a kernel has, too."""
+"""Primitives of JAX that a kernel supports."""
 
 _ELEMENTWISE = frozenset(_ELEMENTWISE_NAMES.split())
 
@@ -32,13 +28,13 @@ _DTYPES = ("float32", "int32", "uint32", "bool")
 
 
 class _Pixel(NamedTuple):
-    """What a change knows of each pixel, by its place: the frame's planes, then all results."""
+    """A value per pixel, by its index: the frame's channels, then all results."""
 
     place: int
 
 
 class _Given(NamedTuple):
-    """Something that is computed before: ``inputs[group][place]``, or a constant."""
+    """A value that is computed before: ``inputs[group][place]``, or a constant."""
 
     group: str
     place: Any
@@ -50,12 +46,12 @@ class _NotPerPixelError(Exception):
 
 @dataclass
 class PerPixel:
-    """A change of an image, pixel by pixel.
+    """A pixelwise change of an image.
 
     Attributes:
         shape: (H, W).
         numbers: () arrays that all pixels need.
-        images: (H, W) arrays of which a pixel needs the same pixel.
+        images: (H, W) arrays of which a pixel needs its own entry.
     """
 
     shape: tuple[int, ...]
@@ -63,7 +59,7 @@ class PerPixel:
     numbers: list[jax.Array] = field(default_factory=list)
     images: list[jax.Array] = field(default_factory=list)
     _steps: list[tuple[core.JaxprEqn, list[_Pixel | _Given]]] = field(default_factory=list)
-    # By the id of an array, with the array, so that no other one gets that id.
+    # By the id of an array. The entry keeps the array, so that no other one gets its id.
     _scalars: dict[int, tuple[Any, Any]] = field(default_factory=dict)
     _equations: dict[int, tuple[Any, core.JaxprEqn, list[Any]]] = field(default_factory=dict)
     _found: dict[int, tuple[Any, _Pixel | _Given]] = field(default_factory=dict)
@@ -82,7 +78,7 @@ class PerPixel:
         return known[-1]
 
     def read(self, closed: core.ClosedJaxpr, operands: Sequence[Any]) -> list[Any]:
-        """Take in a program: compute what does not depend on pixels, and note down the rest."""
+        """Read a program: compute what does not depend on pixels, and record the rest."""
         known = dict(zip(closed.jaxpr.constvars, closed.consts, strict=True))
         known |= dict(zip(closed.jaxpr.invars, operands, strict=True))
 
@@ -111,7 +107,7 @@ class PerPixel:
         if eqn.primitive.name == "broadcast_in_dim" and jnp.ndim(operands[0]) == 0:
             self._scalars[id(results[0])] = (results[0], operands[0])
         elif self._is_elementwise(eqn):
-            # Of an image, as its red: the kernel computes it if it is needed there.
+            # A part of an image, such as its red channel: the kernel computes it if needed.
             self._equations[id(results[0])] = (results[0], eqn, operands)
         return results
 
@@ -148,12 +144,7 @@ class PerPixel:
 
 
 def per_pixel(change: Callable[[Frame], jax.Array], frame: Frame) -> PerPixel | None:
-    """Return a change of a frame into an array of its size; None if it is not made pixel by pixel.
-
-    Args:
-        change: of a frame.
-        frame: shapes and dtypes of the frame's planes.
-    """
+    """Return a change of a frame into an array of its size; None if it is not pixelwise."""
     closed = jax.make_jaxpr(change)(frame)
     planes = [_Pixel(place) for place in range(len(closed.jaxpr.invars))]
     found = PerPixel(frame.r.shape, len(planes))

@@ -1,8 +1,7 @@
-"""The plain ray-caster: the oracle for every faster one, and the one that is differentiated.
+"""The reference renderer, against which others are tested, and which is differentiated.
 
-It works in the world frame with vectors as last axes, one geom after the other, and computes the
-full normal of every hit. Nothing here is clever; keep it so. A missed geom is at distance
-``inf``, and every root and quotient is guarded so that no gradient is ever NaN.
+It is simple on purpose: world frame, one geom after the other, full normals. A missed geom is at
+distance ``inf``, and every root and quotient is guarded so that no gradient is NaN.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from pixelbrax_jax.types import FAR, Camera, Frame, GeomKind, Lamp, Scene, for_e
 def render(
     scene: Scene, height: int, width: int, first_row: jax.Array | int, num_rows: int
 ) -> Frame:
-    """Return a band of rows of an image of the scene; see ``base.render``."""
+    """Render a band of rows of an image; see ``base.render``."""
     geoms, look, camera = scene.geoms, scene.look, scene.camera
     rays = pixel_rays(camera, height, width, first_row + jnp.arange(num_rows))
     distances, normals = [], []
@@ -86,7 +85,7 @@ def render(
 
 
 def pixel_rays(camera: Camera, height: int, width: int, rows: jax.Array) -> jax.Array:
-    """Return unit directions through the pixels' centers, world frame, (len(rows), W, 3)."""
+    """Return unit rays through the pixels' centers, world frame, (len(rows), W, 3)."""
     pixel = 2.0 * jnp.tan(jnp.deg2rad(camera.fovy) / 2.0) / height
     x = (jnp.arange(width) - 0.5 * (width - 1)) * pixel
     y = (0.5 * (height - 1) - rows) * pixel
@@ -97,7 +96,6 @@ def pixel_rays(camera: Camera, height: int, width: int, rows: jax.Array) -> jax.
 def _cast_geom(
     scene: Scene, g: int, origin: jax.Array, rays: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Return distances at which rays enter geom ``g`` (``inf`` if never), and normals."""
     geoms = scene.geoms
     t, normal = _cast(geoms.kind[g], origin, rays, scene.pos[g], scene.xmat[g], geoms.size[g])
     if geoms.is_bounded(g):
@@ -111,7 +109,7 @@ def _cast_geom(
 def _shaded(
     scene: Scene, origin: jax.Array, rays: jax.Array, until: jax.Array | float, nearest: jax.Array
 ) -> jax.Array:
-    """Return whether another geom than the ``nearest`` is on rays; planes never are."""
+    """Return whether rays hit another geom than the ``nearest``; planes cast no shadows."""
     shaded = jnp.zeros(nearest.shape, bool)
     for g, kind in enumerate(scene.geoms.kind):
         if kind != GeomKind.PLANE:
@@ -124,7 +122,7 @@ def _shaded(
 def _lamplight(
     scene: Scene, lamp: Lamp, points: jax.Array, normal: jax.Array, nearest: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Return what a lamp adds to the factor of colors, and to colors themselves, (H, W) each."""
+    """Return what a lamp adds to the factor of colors, and to the colors, (H, W) each."""
     away = points - lamp.pos
     ray = spatial.unit(away)
     along = ray @ lamp.axis
@@ -165,7 +163,7 @@ def _entry(a: jax.Array, b: jax.Array, c: jax.Array) -> jax.Array:
 
 
 def _at(o: jax.Array, d: jax.Array, t: jax.Array) -> jax.Array:
-    """Return points on the rays; the origin's neighbor where ``t`` is infinite."""
+    """Return points on the rays; points near the origin where ``t`` is infinite."""
     return o + jnp.where(jnp.isfinite(t), t, 1.0)[..., None] * d
 
 
@@ -252,7 +250,7 @@ _LOCAL = for_each_kind(
 
 
 def _ground_color(scene: Scene, g: int, rays: jax.Array, height: int) -> jax.Array:
-    """Return the pattern of plane ``g`` where the rays meet it, (H, W, 3)."""
+    """Return the pattern of plane ``g`` where rays hit it, (H, W, 3)."""
     look, camera, pos, xmat = scene.look, scene.camera, scene.pos[g], scene.xmat[g]
     o, d = (camera.pos - pos) @ xmat, rays @ xmat
     pixel = 2.0 * jnp.tan(jnp.deg2rad(camera.fovy) / 2.0) / height
@@ -269,7 +267,7 @@ def _ground_color(scene: Scene, g: int, rays: jax.Array, height: int) -> jax.Arr
         footprint += jnp.abs(moved)
     coords = o[:2] + s[..., None] * d[..., :2]
     if scene.geoms.is_bounded(g):
-        # MuJoCo's textures begin at the corner of least x and greatest y.
+        # MuJoCo's textures start at the corner of least x and largest y.
         coords = scene.geoms.size[g, :2] + coords * jnp.array([1.0, -1.0])
     coords /= look.ground_pitch
     footprint = footprint / look.ground_pitch

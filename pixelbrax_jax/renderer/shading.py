@@ -1,13 +1,4 @@
-"""Light, sky and the ground's pattern, for pixels of any shape.
-
-As in `intersect.py` a vector is a tuple of three components, each a scalar or an array over pixels,
-and all vectors of a call are in one frame: the camera's, or the world's.
-
-A plane carries a pattern that is a product of two one-dimensional ones, along its own x and y. A
-pixel sees a parallelogram of the plane; the pattern is averaged exactly over the smallest
-axis-aligned rectangle around it, from the pattern's integral, so that it never flickers. Towards
-the horizon the average tends to a constant, where point samples would alias.
-"""
+"""Light, sky and the ground's pattern for pixels of any shape; vectors as in `intersect.py`."""
 
 from __future__ import annotations
 
@@ -24,28 +15,28 @@ LINE_WIDTH = 1.0 / 84.0
 """Width of a grid line in grid pitches: one texel of the original's texture at 84 pixels."""
 
 SHADOW_BIAS = 1e-3
-"""Metres that a shadow ray must travel before a hit counts."""
+"""Least distance in metres of a shadow ray's hit."""
 
 
 def gloss(n_l: jax.Array, n_z: jax.Array, light_z: Any, shininess: int) -> jax.Array:
     """Return Phong's ``max(r_z, 0) ** shininess`` for a viewer at infinity, see ``Look``.
 
-    It takes the products of normal and direction to the light, of normal and the camera's back
-    axis, and of that direction and that axis.
+    The arguments are the products of normal and light, of normal and the camera's back axis, and of
+    light and that axis.
     """
     return at_least(2.0 * n_l * n_z - light_z, 0.0) ** shininess
 
 
 def beam(lamp: Lamp, pos: Vector, axis: Vector, points: Vector) -> tuple[Vector, Any, Any]:
-    """Return how a lamp at ``pos`` that shines along ``axis`` lights points.
+    """Return the light of a lamp at ``pos`` with direction ``axis`` at some points.
 
     Returns:
-        Unit directions from the lamp to the points; one over their distances in metres; how
-        strong the lamp is there, in [0, 1].
+        Unit directions from the lamp to the points, one over their distances in metres, and the
+        lamp's strength there, in [0, 1].
     """
     away = [p - c for p, c in zip(points, pos, strict=True)]
     square = dot(away, away)
-    # A choice, for XLA would keep the root itself in memory: it has several readers.
+    # A select, because XLA would store a root that has several readers.
     inv_distance = jnp.where(square > 0.0, jax.lax.rsqrt(square), 1.0)
     ray = tuple(component * inv_distance for component in away)
     along = dot(ray, axis)
@@ -54,7 +45,7 @@ def beam(lamp: Lamp, pos: Vector, axis: Vector, points: Vector) -> tuple[Vector,
 
 
 def sky(look: Look, rise: jax.Array, channel: int) -> jax.Array:
-    """Return one channel of the sky's color, given z of unit rays in the world frame."""
+    """Return one channel of the sky's color for the z component of unit rays in the world frame."""
     horizon, above, *below = (look.sky[row, channel] for row in range(look.sky.shape[0]))
     color = horizon + between(0.0, rise, 1.0) * (above - horizon)
     if below:
@@ -65,7 +56,7 @@ def sky(look: Look, rise: jax.Array, channel: int) -> jax.Array:
 def _average(
     integral: Callable[[jax.Array], jax.Array], center: jax.Array, width: jax.Array
 ) -> jax.Array:
-    """Return the mean of a periodic function of period 1 over a window, given its integral."""
+    """Return the mean of a function of period 1 over a window, given its integral."""
     width = at_least(width, 1e-4)
     return (integral(center + 0.5 * width) - integral(center - 0.5 * width)) / width
 
@@ -76,7 +67,7 @@ def _square_wave_integral(x: jax.Array) -> jax.Array:
 
 
 def _line_integral(x: jax.Array) -> jax.Array:
-    """Return the integral of what is 1 on [0, LINE_WIDTH) and 0 on the rest of [0, 1)."""
+    """Return the integral of 1 on [0, LINE_WIDTH) and 0 on the rest of [0, 1)."""
     whole = jnp.floor(x)
     return LINE_WIDTH * whole + at_most(x - whole, LINE_WIDTH)
 
@@ -84,13 +75,15 @@ def _line_integral(x: jax.Array) -> jax.Array:
 def second_color_fraction(
     pattern: str, x: jax.Array, y: jax.Array, width_x: jax.Array, width_y: jax.Array
 ) -> jax.Array:
-    """Return how much of the ground's second color a pixel sees, in [0, 1].
+    """Return the fraction of the ground's second color in a pixel, in [0, 1].
 
-    The pattern is ``"checker"`` or ``"grid"``. In pitches of it, (x, y) is the ground at the
-    pixel's center, and the widths are the positive extents of the ground that the pixel sees.
+    The pattern is ``"checker"`` or ``"grid"``, a product of two one-dimensional patterns. In units
+    of its pitch, (x, y) is the ground at the pixel's center, and the widths are the positive
+    extents of the ground that the pixel sees. The mean over this rectangle is exact, so nothing
+    flickers.
     """
     if pattern == "checker":
-        # A checker is the product of two waves whose period is two tiles.
+        # A checker is the product of two waves with a period of two tiles.
         wave_x = _average(_square_wave_integral, 0.5 * x, 0.5 * width_x)
         wave_y = _average(_square_wave_integral, 0.5 * y, 0.5 * width_y)
         return 0.5 - 0.5 * wave_x * wave_y

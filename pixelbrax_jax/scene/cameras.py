@@ -59,8 +59,7 @@ def make_rig(
         up: the world direction that is up in the image.
 
     Raises:
-        ValueError: eye and target coincide, ``up`` is parallel to the view, or ``fovy`` is outside
-            (0, 180).
+        ValueError: eye and target coincide, ``up`` is parallel to the view, or ``fovy`` is wrong.
     """
     if not 0.0 < fovy < 180.0:
         raise ValueError(f"fovy must lie between 0 and 180 degrees, got {fovy}.")

@@ -67,11 +67,7 @@ LOOKS: dict[str, Look] = {
 
 
 def make_look(look: str | Look = "default", *, shadows: bool | None = None) -> Look:
-    """Return a look by name, or the given one.
-
-    Args:
-        look: ``"default"``, ``"original"``, ``"dmc"`` or a ``Look``.
-        shadows: whether geoms cast shadows; None keeps the look's value.
+    """Return a look by name, or the given one; ``shadows`` other than None replaces its value.
 
     Raises:
         ValueError: the name is unknown.

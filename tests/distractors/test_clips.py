@@ -106,7 +106,9 @@ def test_links_to_the_folder_of_the_images(davis, tmp_path, linked):
 
 def test_images_without_their_lists_are_one_split(davis, tmp_path):
     images = shutil.copytree(davis / "JPEGImages" / "480p", tmp_path / "JPEGImages" / "480p")
-    with pytest.warns(distractors.OnlySplitWarning, match="'train' is split 'all' of .*480p"):
+    with pytest.warns(
+        distractors.OnlySplitWarning, match="'train' selects 'all', the only split of .*480p"
+    ):
         bank = load_clips(images, height=8, width=8)
     assert bank.names == tuple(sorted(LENGTHS | VAL))
     with pytest.raises(ValueError, match=r"no split 'test', only 'all'; .*train and test"):
@@ -125,7 +127,9 @@ def a_clip(folder):
 def test_the_only_split_is_taken_for_training(tmp_path, folders, only):
     for folder in folders:
         a_clip(tmp_path / "clips" / folder)
-    with pytest.warns(distractors.OnlySplitWarning, match=f"the only one.*split={only!r}") as told:
+    with pytest.warns(
+        distractors.OnlySplitWarning, match=f"the only split of.*split={only!r}"
+    ) as told:
         bank = load_clips(tmp_path / "clips", height=4, width=4)
     assert len(told) == 1
     assert told[0].filename == __file__
@@ -154,7 +158,7 @@ def test_a_file_or_a_single_clip_in_place_of_a_folder(tmp_path):
     a_clip(tmp_path / "clips" / "one")
     with pytest.raises(ValueError, match="it has images itself, so give the folder above it"):
         load_clips(tmp_path / "clips" / "one")
-    with pytest.raises(FileNotFoundError, match=r"0\.png is a file; give the folder"):
+    with pytest.raises(FileNotFoundError, match=r"0\.png is a file; give its folder"):
         load_clips(tmp_path / "clips" / "one" / "0.png")
 
 
@@ -430,11 +434,11 @@ def test_command(davis, tmp_path, capsys):
     assert cli.main(["clips", str(tmp_path / "nowhere")]) == 1
     assert "no folder of clips" in capsys.readouterr().err
     assert cli.main(["clips", str(davis), "--sheet", str(tmp_path / "sheet.pgn")]) == 1
-    assert "a contact sheet is an image" in capsys.readouterr().err
+    assert "a contact sheet must be a .png" in capsys.readouterr().err
     folder = str(davis / "JPEGImages" / "480p" / "bear" / "..")
     shutil.rmtree(davis / "ImageSets")
     assert cli.main(["clips", folder, "--size", "8"]) == 0
-    assert "pixelbrax clips: split='train' is split 'all' of" in capsys.readouterr().err
+    assert "pixelbrax clips: split='train' selects 'all'" in capsys.readouterr().err
     nowhere = str(tmp_path / "nowhere" / "sheet.png")
     assert cli.main(["clips", str(davis), "--size", "8", "--sheet", nowhere]) == 1
     assert "nowhere" in capsys.readouterr().err

@@ -26,10 +26,10 @@ from tests.gym.conftest import ID, TASK
         ({"obs_mode": "pixel"}, r"Did you mean 'pixels'\?"),
         ({"camera": "nowhere"}, "camera"),
         ({"look": "nice"}, "unknown look"),
-        ({"split": "test"}, "split='test' is given, but no distractor is: add"),
+        ({"split": "test"}, "split='test' is given without a distractor that has splits: add"),
         (
             {"backend": "mjx"},
-            "for Brax.s tasks alone, .* choose it where it was registered",
+            "only for Brax.s tasks, .* choose it where it was registered",
         ),
         ({"max_episode_steps": 0}, "max_episode_steps must be a positive integer"),
         ({"max_episode_steps": -2}, "max_episode_steps must be a positive integer"),

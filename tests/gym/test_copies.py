@@ -120,7 +120,7 @@ def test_environments_spread_over_devices():
     sharded = pixelbrax_jax.ShardedVectorEnv(env, 4, make_env_mesh(1))
     assert pickle.loads(pickle.dumps(sharded)) == sharded
     assert copy.deepcopy(sharded) == sharded
-    with pytest.raises(ValueError, match=r"need devices \[7\], which this process has not"):
+    with pytest.raises(ValueError, match=r"need devices \[7\], but this process has only"):
         sharded.__setstate__(sharded.__getstate__() | {"mesh": [0, 7]})
 
 

@@ -27,7 +27,7 @@ def plain(scene, height, width):
 def test_the_kernel_passes_its_check(interpreted):
     check = choice.compare(kernel.render)
     assert check.passed, check.text
-    assert check.text == "it draws 1920 pixels as the plain ray-caster does"
+    assert check.text == "it renders 1920 pixels like renderer='fused'"
 
 
 def test_the_images_of_the_check_are_far_from_rounding():
@@ -62,7 +62,7 @@ def test_every_kind_of_geom_the_sky_and_shadows_are_in_the_check():
 @pytest.mark.parametrize(
     ("plane", "value", "told"),
     [
-        ("r", 2.0, "1 of 1920 pixels differ from the plain ray-caster's, colors by up to"),
+        ("r", 2.0, "1 of 1920 pixels differ from those of renderer='fused', colors by up to"),
         ("g", float("nan"), "1 of 1920 pixels"),
         ("depth", 0.5, "depth by up to"),
         ("seg", 77, "1 of 1920 pixels"),
@@ -138,7 +138,7 @@ def test_the_kernel_is_checked_once_and_then_drawn_with(card, monkeypatch):
     assert len(calls) == 1
     name, why = choice.auto_renderer()
     assert name == "pallas"
-    assert why.startswith("by one kernel, on NVIDIA H100; it draws 1920 pixels as")
+    assert why.startswith("by one kernel, on NVIDIA H100; it renders 1920 pixels like")
     # Asked for by name, it is not checked.
     monkeypatch.setattr(choice, "kernel_check", fails)
     assert base.check_renderer("pallas") == "pallas"

@@ -14,8 +14,6 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 
 class _NumpyWithOldClip:
-    """``jax.numpy`` with a ``clip`` that accepts ``a_min`` and ``a_max``."""
-
     @staticmethod
     def clip(
         a: jax.Array,
@@ -29,17 +27,12 @@ class _NumpyWithOldClip:
 
 
 def accept_old_clip(module: ModuleType) -> None:
-    """Let a module call ``jp.clip(x, a_min=...)``, as Brax's fluid forces (the swimmer) do.
-
-    The name ``jp`` is replaced only in that module, and only if JAX lacks the argument.
-    """
+    """Let only this module call ``jp.clip(x, a_min=...)``, as Brax's fluid forces do."""
     if "a_min" not in inspect.signature(jnp.clip).parameters and vars(module)["jp"] is jnp:
         vars(module)["jp"] = _NumpyWithOldClip()
 
 
 class _JaxWithReplicated:
-    """``jax`` with ``device_put_replicated``."""
-
     @staticmethod
     def device_put_replicated(x: Any, devices: Sequence[jax.Device]) -> Any:
         """Return ``x`` with a new leading axis, one row on each device."""
@@ -56,9 +49,6 @@ class _JaxWithReplicated:
 
 
 def accept_device_put_replicated(module: ModuleType) -> None:
-    """Let a module call ``jax.device_put_replicated``, as Brax's trainers do.
-
-    The name ``jax`` is replaced only in that module, and only if JAX lacks the function.
-    """
+    """Let only this module call ``jax.device_put_replicated``, as Brax's trainers do."""
     if not hasattr(jax, "device_put_replicated") and vars(module)["jax"] is jax:
         vars(module)["jax"] = _JaxWithReplicated()

@@ -242,7 +242,6 @@ class BraxPhysics(GuardedPhysics):
         return jnp.concatenate([seen.xpos, com[None]]), jnp.concatenate([seen.xquat, upright])
 
     def _init(self, q: jax.Array, qd: jax.Array, *args: Any, **kwargs: Any) -> Any:
-        """Call the environment's ``pipeline_init`` with unit quaternions."""
         q = with_unit_rotations(self._model, q)
         return self._source.unwrapped.pipeline_init(q, qd, *args, **kwargs)
 
@@ -327,7 +326,6 @@ def _check_env(env: envs.Env) -> None:
 
 @contextlib.contextmanager
 def _explained(backend: str) -> Iterator[None]:
-    """Add the backend's name to errors about a feature that it lacks."""
     try:
         yield
     except (AssertionError, NotImplementedError, RuntimeError) as error:
@@ -348,12 +346,10 @@ def _changed(env: envs.Env, change: Callable[[envs.Env], None]) -> envs.Env:
 
 
 def _shorten(env: envs.Env) -> None:
-    """Convert an environment's system to 32 bits."""
     env.sys = jax.tree.map(as_by_default, env.sys)
 
 
 def _replace_init(env: envs.Env, init: Callable[..., Any]) -> envs.Env:
-    """Copy ``env`` with another ``pipeline_init``."""
     return _changed(env, lambda clone: setattr(clone, "pipeline_init", init))
 
 

@@ -40,16 +40,11 @@ def make_physics(
 ) -> BraxPhysics:
     """Make the physics of a Brax task. Equal arguments give equal objects.
 
-    Args:
-        task: a name in ``brax.tasks.TASKS``.
-        backend: a backend of the task; None for its default.
-        reward_preset: ``"brax"`` for the installed Brax's rewards, or ``"paper"`` for those of
-            arXiv 2502.00021 where they differ: walker2d's forward reward is ten times higher, the
-            swimmer's reward is its distance from the origin, and humanoid, humanoidstandup,
-            inverted_pendulum and pusher take actions unscaled. Dynamics are the same.
-
-    Raises:
-        ValueError: an option is unknown; the message lists what is allowed.
+    ``backend=None`` takes the task's default. ``reward_preset="paper"`` has the rewards of arXiv
+    2502.00021 where they differ from the installed Brax's: walker2d's forward reward is ten times
+    higher, the swimmer's reward is its distance from the origin, and humanoid, humanoidstandup,
+    inverted_pendulum and pusher take actions unscaled. Dynamics are the same. An unknown option
+    raises ValueError.
     """
     row = TASKS[task]
     check_choice("reward_preset", reward_preset, REWARD_PRESETS)

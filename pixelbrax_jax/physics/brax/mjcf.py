@@ -45,8 +45,6 @@ def joint_state(after: Kinematics) -> jax.Array:
 
 
 class _Task(NamedTuple):
-    """Arguments of ``mjcf_physics``."""
-
     reward: RewardFn
     terminated: Callable[[Kinematics], jax.Array]
     observation: Callable[[Kinematics], jax.Array]

@@ -1,8 +1,4 @@
-"""Features of a MuJoCo model that Brax's backends silently ignore.
-
-The list has what changes how ``mujoco.mj_step`` moves a model. It leaves out what hardly matters
-(see docs/howto/own-task.md) and what ``mujoco.mjx.put_model`` rejects itself.
-"""
+"""Features of a MuJoCo model that Brax's backends silently ignore and ``mj_step`` does not."""
 
 from __future__ import annotations
 
@@ -42,11 +38,7 @@ class Omission(NamedTuple):
 
 
 def check_simulated(model: mujoco.MjModel, backend: str) -> None:
-    """Raise an error that lists all features of a compiled model that a backend ignores.
-
-    Raises:
-        ValueError: the list is not empty; the message has the fix.
-    """
+    """Raise a ValueError with the fix if a backend ignores features of a compiled model."""
     missing = omissions(model, backend)
     if not missing:
         return
@@ -202,14 +194,12 @@ def _in_maximal(model: mujoco.MjModel) -> Iterator[str]:
 
 
 def _on_free_joint(model: mujoco.MjModel) -> np.ndarray:
-    """Return (actuators,) bool, whether an actuator acts on a free joint."""
     chosen = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
     chosen[chosen] = model.jnt_type[model.actuator_trnid[chosen, 0]] == _FREE
     return chosen
 
 
 def _joints(model: mujoco.MjModel, of_dofs: np.ndarray) -> np.ndarray:
-    """Return (joints,) bool, whether any dof of a joint has a value other than 0."""
     chosen = np.zeros(model.njnt, bool)
     chosen[model.dof_jntid[_any_by_row(of_dofs)]] = True
     return chosen
@@ -227,7 +217,6 @@ def _any_by_row(values: np.ndarray) -> np.ndarray:
 
 
 def _flags(model: mujoco.MjModel, *names: str) -> Iterator[str]:
-    """Yield those MuJoCo flags that the model disables."""
     for name in names:
         bit = int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name.upper()}"))
         if model.opt.disableflags & bit:

@@ -18,11 +18,7 @@ _Point = tuple[float, float, float]
 
 @dataclass(frozen=True, kw_only=True)
 class BraxOptions:
-    """Options of Brax's tasks.
-
-    Raises:
-        ValueError: an option is out of range; the message says what is allowed.
-    """
+    """Options of Brax's tasks; raises ValueError for one that is out of range."""
 
     backend: str | None = None
     """Physics backend of Brax's tasks: ``spring``, ``positional``, ``generalized`` or ``mjx``. None
@@ -31,7 +27,6 @@ class BraxOptions:
     """Rewards of Brax's tasks: ``brax``, or ``paper`` for those of arXiv 2502.00021."""
 
     def __post_init__(self) -> None:
-        """Check the options that do not depend on the task."""
         check_choice("reward_preset", self.reward_preset, REWARD_PRESETS)
 
 

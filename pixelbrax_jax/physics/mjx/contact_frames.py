@@ -25,8 +25,8 @@ def aligned_with_capsules(
     """Collide planes with capsules as MuJoCo XLA does, but with MuJoCo's contact frames.
 
     The friction cone is a pyramid, so the direction of its edges matters. MuJoCo points the first
-    edge along the capsule. MuJoCo XLA points it along a world axis if the capsule is steeper than
-    60 degrees, which changes single control steps of the humanoid by up to 0.3 rad/s.
+    edge along the capsule, MuJoCo XLA along a world axis if the capsule is steeper than 60 degrees;
+    this changes single control steps of the humanoid by up to 0.3 rad/s.
     """
     dist, pos, frame = _theirs(model, data, key, geom)
     normal = data.geom_xmat[geom[:, 0]][:, :, 2]

@@ -95,11 +95,7 @@ class Dynamics:
         )
 
     def step(self, state: MjxState, num_steps: int) -> tuple[MjxState, jax.Array]:
-        """Advance by physics steps under the state's controls.
-
-        Returns:
-            The next state, and all sensors as of the beginning of the last physics step.
-        """
+        """Advance by physics steps; return the state, and all sensors before the last step."""
 
         def one(state: MjxState) -> tuple[MjxState, jax.Array]:
             with substituted(self.model):
@@ -116,10 +112,9 @@ class Dynamics:
         return jax.lax.fori_loop(0, num_steps, lambda _, carry: one(carry[0]), (state, sensors))
 
     def at_rest(self, state: MjxState) -> tuple[MjxState, jax.Array]:
-        """Compute forces in a first state with actuators off, as DM Control's resets do.
+        """Return a first state with accelerations for the solver's start, and all sensors.
 
-        Returns:
-            The state with accelerations for the solver's start, and all sensors.
+        Actuators are off, as in DM Control's resets.
         """
         with substituted(self.model):
             data = mjx.forward(self._passive, self._data(state))
@@ -182,11 +177,7 @@ class Dynamics:
 
 
 def _simulated(model: mujoco.MjModel, out_of_reach: Iterable[str]) -> mujoco.MjModel:
-    """Return the model without what no step depends on.
-
-    It has no energy, which MuJoCo XLA rejects; no contacts if they are disabled, because MuJoCo XLA
-    still rejects unsupported pairs; and none of geoms out of reach, which take time.
-    """
+    """Return the model without energy (unsupported), disabled contacts and geoms out of reach."""
     model = copy.copy(model)
     model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_ENERGY)
     off = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT

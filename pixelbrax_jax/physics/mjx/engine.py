@@ -37,12 +37,7 @@ class MjxPhysics(GuardedPhysics):
 
     @default_flags()
     def __init__(self, formulas: Formulas, model: mujoco.MjModel, *, identity: Hashable):
-        """Put the model on the device and read its scene; compile nothing.
-
-        Args:
-            formulas: the task's formulas.
-            model: the compiled model of its domain; it is edited for the task.
-            identity: objects with equal identities are equal.
+        """Put the model on the device, edited for the task, and read its scene; compile nothing.
 
         Raises:
             ValueError: the renderer does not support something visible.
@@ -121,11 +116,7 @@ class MjxPhysics(GuardedPhysics):
         return state, sensors
 
     def move(self, state: MjxState, action: jax.Array) -> tuple[MjxState, jax.Array]:
-        """Advance by one control step; return the state and the sensors for ``observe``.
-
-        Raises:
-            ValueError: the action's shape is not ``(action_size,)``.
-        """
+        """Advance by one control step; return the state and the sensors for ``observe``."""
         action = jnp.asarray(action, jnp.float32)
         if action.shape != (self.action_size,):
             raise ValueError(f"action must have shape ({self.action_size},), got {action.shape}")

@@ -28,15 +28,10 @@ class Start(struct.PyTreeNode):
 class Snapshot:
     """What observations and rewards read of one environment's state, by the model's names.
 
-    Positions, velocities and their sensors are those of the current joint positions and velocities;
-    sensors of forces and accelerations those of the beginning of the last physics step. DM Control
-    reads the same values, after ``mj_step2`` and ``mj_step1``. Positions are metres in the world
+    Positions, velocities and their sensors are current; sensors of forces and accelerations are
+    from the beginning of the last physics step, as in DM Control. Positions are metres in the world
     frame; rotations are matrices with the axes as columns, or unit quaternions (w, x, y, z).
-
-    Attributes:
-        model: the compiled model.
-        data: ``mujoco.mjx.Data`` of the state.
-        target: this episode's target, as in ``MjxState``.
+    ``target`` is this episode's target, as in ``MjxState``.
     """
 
     model: mujoco.MjModel
@@ -130,19 +125,18 @@ def tolerance(
     sigmoid: str = "gaussian",
     value_at_margin: float = 0.1,
 ) -> jax.Array:
-    """Return 1 within bounds, and less with the distance outside.
+    """Return 1 within bounds (inclusive), and less with the distance outside.
 
     The formulas are those of section 4.3 of arXiv 1801.00690 and of
     ``dm_control.utils.rewards.tolerance``, with the sigmoids that the suite uses.
 
     Args:
         x: the quantity, of any shape.
-        bounds: lower and upper bound, inclusive; may be infinite.
+        bounds: lower and upper bound; may be infinite.
         margin: distance from the bounds at which the result is ``value_at_margin``; with 0 the
             result is 0 outside.
         sigmoid: ``gaussian``, ``long_tail``, ``linear`` or ``quadratic``.
-        value_at_margin: the result at that distance; in [0, 1) for ``linear`` and ``quadratic``, in
-            (0, 1) for the others, which never reach 0.
+        value_at_margin: in [0, 1), and not 0 for ``gaussian`` and ``long_tail``.
     """
     lower, upper = bounds
     inside = (x >= lower) & (x <= upper)

@@ -72,11 +72,7 @@ def load_model(domain: str, **options: float) -> mujoco.MjModel:
 
 
 def suite_folder() -> Path:
-    """Return the folder of the suite in the installed dm_control.
-
-    Raises:
-        ImportError: dm_control is not installed.
-    """
+    """Return the folder of the suite in dm_control; raise ImportError if it is not installed."""
     spec = find_spec("dm_control")
     folders = (
         [] if spec is None else [Path(place) for place in spec.submodule_search_locations or ()]
@@ -123,11 +119,7 @@ def _find(root: ElementTree.Element, path: str) -> ElementTree.Element:
 
 
 def _grow_swimmer(root: ElementTree.Element, *, num_bodies: int) -> None:
-    """Append equal bodies to the swimmer's head, as DM Control generates it.
-
-    Each has a hinge with a motor, and a site with a velocimeter and a gyroscope. Joints are limited
-    to 360 degrees over the number of bodies, and cameras are as far away as the chain is long.
-    """
+    """Append equal bodies with motors and sensors to the swimmer's head, as DM Control does."""
     parent = _find(root, "./worldbody/body")
     actuator = ElementTree.SubElement(root, "actuator")
     sensor = _find(root, "./sensor")

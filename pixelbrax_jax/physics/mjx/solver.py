@@ -34,11 +34,7 @@ _Carry = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
 
 
 def is_supported(model: mujoco.MjModel) -> bool:
-    """Return whether the solver supports the model.
-
-    It supports Newton's method with pyramids, or with elliptic cones if all contacts have one
-    condim.
-    """
+    """Return whether the solver supports the model: pyramids, or elliptic cones of one condim."""
     dimensions = {*model.geom_condim.tolist(), *model.pair_dim.tolist()}
     return bool(
         model.opt.solver == mujoco.mjtSolver.mjSOL_NEWTON
@@ -186,7 +182,6 @@ def solve(model: Any, data: Any) -> Any:
 
 
 def _cones(model: Any, data: Any) -> Cones | None:
-    """Return the contacts if their friction cones are elliptic; they are the last constraints."""
     contact = data._impl.contact
     if model.opt.cone != mujoco.mjtCone.mjCONE_ELLIPTIC or not len(contact.dim):
         return None
@@ -230,7 +225,6 @@ def _line_search(
     step: jax.Array,
     change: jax.Array,
 ) -> jax.Array:
-    """Return the factor of a step with the least cost."""
     inertia_step = problem.inertia @ step
     linear = inertia_step @ (acceleration - problem.smooth)
     quadratic = inertia_step @ step

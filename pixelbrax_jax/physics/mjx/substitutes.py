@@ -34,8 +34,7 @@ _lock = threading.RLock()
 def substituted(model: mujoco.MjModel) -> Iterator[None]:
     """Trace steps of a model with replacements for some functions of MuJoCo XLA.
 
-    Programs that are traced before and after the block are not affected. Programs of MuJoCo XLA
-    that another thread traces during the block also get the replacements.
+    Programs of MuJoCo XLA that another thread traces during the block also get the replacements.
     """
     changes: list[tuple[dict[Any, Any], Any, Any]] = [
         (collision_driver._COLLISION_FUNC, PAIR, aligned_with_capsules),

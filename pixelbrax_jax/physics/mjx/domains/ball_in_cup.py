@@ -30,7 +30,6 @@ def _observe(seen: Snapshot) -> jax.Array:
 
 
 def _reward(seen: Snapshot) -> jax.Array:
-    """Return 1 if all of the ball is inside the target, else 0."""
     offset = jnp.abs(seen.site_pos("target") - seen.xpos("ball"))
     size = seen.model.site("target").size - seen.model.geom("ball").size[0]
     return jnp.where((offset[0] < size[0]) & (offset[2] < size[2]), 1.0, 0.0)

@@ -10,13 +10,11 @@ from pixelbrax_jax.physics.mjx.formulas import Formulas, Snapshot, Start, joined
 
 
 def _start_hanging(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Sample a cart near the middle with its pole down."""
     noise = 0.01 * jax.random.normal(key, (2, dynamics.model.nq))
     return Start(jnp.array([0.0, jnp.pi]) + noise[0], noise[1])
 
 
 def _start_upright(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Sample a cart near the middle with its pole almost upright."""
     pose, speed = jax.random.split(key)
     reach = jnp.array([0.1, 0.034])
     qpos = jax.random.uniform(pose, (2,), minval=-reach, maxval=reach)
@@ -30,7 +28,6 @@ def _observe(seen: Snapshot) -> jax.Array:
 
 
 def _reward(seen: Snapshot) -> jax.Array:
-    """Return a product: upright pole, cart in the middle, little force, slow pole."""
     upright = (seen.xmat("pole_1")[2, 2] + 1) / 2
     centered = (1 + tolerance(seen.joint_pos("slider")[0], margin=2.0)) / 2
     small_control = tolerance(seen.ctrl[0], margin=1.0, value_at_margin=0.0, sigmoid="quadratic")
@@ -39,7 +36,6 @@ def _reward(seen: Snapshot) -> jax.Array:
 
 
 def _reward_sparse(seen: Snapshot) -> jax.Array:
-    """Return 1 with the pole upright and the cart in the middle, else 0."""
     centered = tolerance(seen.joint_pos("slider")[0], (-0.25, 0.25))
     return centered * tolerance(seen.xmat("pole_1")[2, 2], (0.995, 1.0))
 

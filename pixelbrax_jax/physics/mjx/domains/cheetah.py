@@ -16,10 +16,9 @@ _SETTLING_STEPS = 200
 
 
 def _start(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Sample limited joints uniformly, then let the body fall for 200 physics steps.
+    """Sample limited joints, then let the body fall for 200 physics steps.
 
-    DM Control samples joints after it has computed the forces of the model's default pose. The
-    first step uses these forces, and so has the same velocity in every episode.
+    As in DM Control, the first step uses the forces of the model's default pose.
     """
     model = dynamics.model
     data = mujoco.MjData(model)

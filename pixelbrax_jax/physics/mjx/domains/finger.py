@@ -40,7 +40,6 @@ def _in_plane(seen: Snapshot, place: jax.Array) -> jax.Array:
 
 
 def _observe_spin(seen: Snapshot) -> jax.Array:
-    """Return joint positions, position of the tip, velocities and touch."""
     return joined(
         seen.sensor("proximal", "distal"),
         _in_plane(seen, seen.sensor("tip")),
@@ -56,17 +55,14 @@ def _distance(seen: Snapshot) -> jax.Array:
 
 
 def _observe_turn(seen: Snapshot) -> jax.Array:
-    """Return the observation of spinning, position of the target and distance to it."""
     return joined(_observe_spin(seen), _in_plane(seen, seen.target), _distance(seen))
 
 
 def _reward_spin(seen: Snapshot) -> jax.Array:
-    """Return 1 from 15 rad/s on, else 0."""
     return jnp.where(seen.sensor("hinge_velocity")[0] <= -_SPIN_VELOCITY, 1.0, 0.0)
 
 
 def _reward_turn(seen: Snapshot) -> jax.Array:
-    """Return 1 with the tip in the target, else 0."""
     return jnp.where(_distance(seen) <= 0, 1.0, 0.0)
 
 

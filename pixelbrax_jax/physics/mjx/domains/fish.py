@@ -22,7 +22,6 @@ _JOINTS = (
 
 
 def _start_upright(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Sample any rotation, and joint positions within 0.2 rad."""
     rotation, joints = jax.random.split(key)
     model = dynamics.model
     bend = jax.random.uniform(joints, (model.nq - 7,), minval=-0.2, maxval=0.2)
@@ -31,7 +30,6 @@ def _start_upright(dynamics: Dynamics, key: jax.Array) -> Start:
 
 
 def _start_swim(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Sample the fish as for uprighting, and a target in a box."""
     fish, target = jax.random.split(key)
     low, high = jnp.array([-0.4, -0.4, 0.1]), jnp.array([0.4, 0.4, 0.3])
     place = jax.random.uniform(target, (3,), minval=low, maxval=high)
@@ -60,7 +58,6 @@ def _reward_upright(seen: Snapshot) -> jax.Array:
 
 
 def _reward_swim(seen: Snapshot) -> jax.Array:
-    """Return how near the mouth is to the target, and a little for being upright."""
     reach = sum(float(seen.model.geom(name).size[0]) for name in ("mouth", "target"))
     near = tolerance(jnp.linalg.norm(_to_target(seen)), (0.0, reach), margin=2 * reach)
     return (7 * near + 0.5 * (_upright(seen) + 1)) / 8

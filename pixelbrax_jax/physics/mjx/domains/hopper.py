@@ -21,25 +21,21 @@ def _start(dynamics: Dynamics, key: jax.Array) -> Start:
 
 
 def _observe(seen: Snapshot) -> jax.Array:
-    """Return joint positions without x, velocities and touch of the foot."""
     touch = jnp.log1p(seen.sensor("touch_toe", "touch_heel"))
     return joined(seen.qpos[1:], seen.qvel, touch)
 
 
 def _standing(seen: Snapshot) -> jax.Array:
-    """Return 1 with the torso high enough above the foot, else 0."""
     height = (seen.xipos("torso") - seen.xipos("foot"))[2]
     return tolerance(height, (_STAND_HEIGHT, 2.0))
 
 
 def _reward_stand(seen: Snapshot) -> jax.Array:
-    """Return 1 for standing, less for forces."""
     small = tolerance(seen.ctrl, margin=1.0, value_at_margin=0.0, sigmoid="quadratic")
     return _standing(seen) * (jnp.mean(small) + 4) / 5
 
 
 def _reward_hop(seen: Snapshot) -> jax.Array:
-    """Return 1 for standing at 2 m/s along x, less for slower."""
     speed = seen.sensor("torso_subtreelinvel")[0]
     return _standing(seen) * rising(speed, _HOP_SPEED, _HOP_SPEED / 2, value_at_margin=0.5)
 

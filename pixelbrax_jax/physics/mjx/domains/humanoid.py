@@ -15,12 +15,10 @@ _STAND_HEIGHT = 1.4
 
 
 def _start(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Sample contact-free joint positions and root rotation."""
     return free_of_contact(dynamics, key, lambda key, _: Start(random_joints(dynamics.model, key)))
 
 
 def _observe(seen: Snapshot) -> jax.Array:
-    """Return joint positions, height, hands and feet, uprightness and velocities."""
     torso, frame = seen.xpos("torso"), seen.xmat("torso")
     limbs = ("left_hand", "left_foot", "right_hand", "right_foot")
     extremities = [(seen.xpos(limb) - torso) @ frame for limb in limbs]
@@ -35,7 +33,6 @@ def _observe(seen: Snapshot) -> jax.Array:
 
 
 def _reward(seen: Snapshot, *, speed: float) -> jax.Array:
-    """Return a product: head high, torso upright, little force, and the wanted speed."""
     standing = tolerance(seen.xpos("head")[2], (_STAND_HEIGHT, jnp.inf), margin=_STAND_HEIGHT / 4)
     upright = rising(seen.xmat("torso")[2, 2], 0.9, margin=1.9)
     small = tolerance(seen.ctrl, margin=1.0, value_at_margin=0.0, sigmoid="quadratic")

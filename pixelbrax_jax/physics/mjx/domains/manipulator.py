@@ -77,7 +77,6 @@ def _positions(model: mujoco.MjModel, *joints: str) -> np.ndarray:
 
 
 def _arm(model: mujoco.MjModel, key: jax.Array) -> jax.Array:
-    """Sample the arm's joints uniformly in their range, or in [-pi, pi], radians."""
     rows = [model.joint(name).id for name in _ARM]
     limited = model.jnt_limited[rows].astype(bool)[:, None]
     low, high = np.where(limited, model.jnt_range[rows], [-np.pi, np.pi]).T.astype(np.float32)
@@ -97,7 +96,6 @@ def _in_plane(seen: Snapshot, body: str) -> jax.Array:
 
 
 def _observe(seen: Snapshot) -> jax.Array:
-    """Return sines and cosines of the arm, its velocities, touch, hand, ball and target."""
     arm = seen.joint_pos(*_ARM)
     return joined(
         jnp.stack([jnp.sin(arm), jnp.cos(arm)], axis=-1),

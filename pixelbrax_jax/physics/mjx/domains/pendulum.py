@@ -18,13 +18,11 @@ def _start(dynamics: Dynamics, key: jax.Array) -> Start:
 
 
 def _observe(seen: Snapshot) -> jax.Array:
-    """Return cosine and sine of the angle, and the velocity."""
     pole = seen.xmat("pole")
     return joined(pole[2, 2], pole[0, 2], seen.qvel)
 
 
 def _reward(seen: Snapshot) -> jax.Array:
-    """Return 1 within 8 degrees of upright, else 0."""
     return tolerance(seen.xmat("pole")[2, 2], (_COSINE_BOUND, 1.0))
 
 

@@ -19,7 +19,6 @@ def _observe(seen: Snapshot) -> jax.Array:
 
 
 def _reward(seen: Snapshot) -> jax.Array:
-    """Return how near the mass is to the target, less for forces."""
     distance = jnp.linalg.norm(seen.geom_pos("target") - seen.geom_pos("pointmass"))
     radius = float(seen.model.geom("target").size[0])
     near = tolerance(distance, (0.0, radius), margin=radius)

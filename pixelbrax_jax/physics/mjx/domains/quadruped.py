@@ -23,8 +23,7 @@ _EPISODE = 20.0
 def _start(dynamics: Dynamics, key: jax.Array) -> Start:
     """Sample any rotation, at the lowest contact-free height in whole centimetres.
 
-    DM Control starts at height 0 and lifts the body until there is no contact. All distances from
-    the floor grow with the height, so the height follows from the distances at height 0.
+    Distances from the floor grow with the height, so they need to be computed only at height 0.
     """
     model = dynamics.model
     rotation = random_rotation(key)
@@ -40,7 +39,6 @@ def _hinges(model: mujoco.MjModel) -> list[str]:
 
 
 def _observe(seen: Snapshot) -> jax.Array:
-    """Return hinges, activations, the torso's motion, and forces and torques at the toes."""
     kinds, hinges = mujoco.mjtSensor, _hinges(seen.model)
     return joined(
         seen.joint_pos(*hinges),
@@ -54,7 +52,6 @@ def _observe(seen: Snapshot) -> jax.Array:
 
 
 def _reward(seen: Snapshot, *, speed: float) -> jax.Array:
-    """Return uprightness times the speed along the torso's x axis, relative to the goal."""
     upright = rising(seen.xmat("torso")[2, 2], 1.0, margin=2.0)
     return upright * rising(seen.sensor("velocimeter")[0], speed, speed, value_at_margin=0.5)
 

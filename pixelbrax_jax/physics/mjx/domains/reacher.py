@@ -34,7 +34,6 @@ def _observe(seen: Snapshot) -> jax.Array:
 
 
 def _reward(seen: Snapshot) -> jax.Array:
-    """Return 1 if finger and target touch, else 0."""
     reach = sum(float(seen.model.geom(name).size[0]) for name in ("target", "finger"))
     return tolerance(jnp.linalg.norm(_to_target(seen)), (0.0, reach))
 

@@ -14,7 +14,6 @@ _FIRST_BODY_SENSOR = 12
 
 
 def _start(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Sample joint positions and heading, and a target that is near in one of five episodes."""
     joints, near, place = jax.random.split(key, 3)
     model = dynamics.model
     reach = jnp.where(jax.random.uniform(near) < 0.2, 0.3, 2.0)

@@ -20,13 +20,11 @@ def _start(dynamics: Dynamics, key: jax.Array) -> Start:
 
 
 def _observe(seen: Snapshot) -> jax.Array:
-    """Return x axes of all bodies in the plane, the torso's height, and velocities."""
     axes = seen.xmats()[:, 0][:, jnp.array([0, 2])]
     return joined(axes, seen.xpos("torso")[2], seen.qvel)
 
 
 def _reward(seen: Snapshot, *, speed: float) -> jax.Array:
-    """Return standing height and uprightness, times the speed along x relative to the goal."""
     standing = tolerance(seen.xpos("torso")[2], (_STAND_HEIGHT, jnp.inf), margin=_STAND_HEIGHT / 2)
     stand = (3 * standing + (1 + seen.xmat("torso")[2, 2]) / 2) / 4
     if speed == 0:
