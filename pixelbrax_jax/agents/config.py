@@ -110,7 +110,7 @@ class TrainConfig:
 
 
 def _check_env(env: EnvConfig) -> None:
-    """Reject an environment without pixels, or with options that JSON cannot store."""
+    """Reject options without pixels, and options that JSON cannot store."""
     if not isinstance(env, EnvConfig):
         raise TypeError(f"env must be an EnvConfig, got {env!r}.")
     for name, kind in (("camera", str), ("look", str), ("clips", (str, NoneType))):

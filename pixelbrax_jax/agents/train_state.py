@@ -45,8 +45,7 @@ class TrainState(struct.PyTreeNode):
     A subclass declares each further field with ``along_envs``, ``without_envs`` or ``as_declared``.
 
     Attributes:
-        networks: parameters by network name.
-        opt_state: optimiser state by network name.
+        networks, opt_state: parameters and optimiser state by network name.
         key: typed PRNG key of the run; constant.
         iteration: () uint32, iterations so far, of ``config.steps_per_iteration`` control steps.
     """

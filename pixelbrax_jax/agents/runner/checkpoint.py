@@ -69,9 +69,7 @@ def read_about(folder: str | Path, steps: int | None = None) -> dict[str, Any]:
 
 
 def read_networks(folder: str | Path, template: Tree, steps: int | None = None) -> Tree:
-    """Read only the parameters of a checkpoint, for any settings.
-
-    ``template`` has networks of the same shapes, or their ``jax.eval_shape``.
+    """Read only the parameters; ``template`` has the same shapes, or is their ``jax.eval_shape``.
 
     Raises:
         CheckpointError: there is no such checkpoint, or its networks have other shapes.

@@ -126,12 +126,8 @@ def evaluate(
 ) -> Iterator[dict[str, Any]]:
     """Evaluate an agent with mean actions; yield a row of JSON values after each split.
 
-    Args:
-        agent: the trained agent.
-        episodes: number of episodes per split.
-        splits: required splits; if empty, all available ones.
-        clips: folder of the clips; None uses the training's folder.
-        report: receives messages about missing splits and unknown clips.
+    ``episodes`` is the number per split. Without ``splits`` it evaluates all available ones.
+    ``clips`` is a folder; None uses the training's.
 
     Raises:
         ValueError: an option is out of range, or the run has no such split.

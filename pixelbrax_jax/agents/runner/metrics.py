@@ -99,7 +99,6 @@ class _Output:
 
 
 def _lines(path: Path) -> _Output:
-    """Open ``metrics.jsonl``."""
     file = AppendedFile(path)
 
     def write(steps: int, seconds: float, record: Mapping[str, float]) -> None:
@@ -136,7 +135,6 @@ def _tensorboard(folder: Path, first_step: int) -> _Output:
 
 
 def _wandb(project: str, config: dict[str, Any], folder: Path) -> _Output:
-    """Start a run of Weights & Biases."""
     try:
         import wandb
     except ImportError as error:

@@ -30,17 +30,11 @@ def write_video(
     num_frames: int = 300,
     seed: int = 0,
 ) -> Path:
-    """Write an MP4 or an animated GIF of ``grid`` x ``grid`` episodes with mean actions.
+    """Write a video of ``grid`` x ``grid`` episodes with mean actions, and return its path.
 
-    Args:
-        agent: the trained agent.
-        path: of the video; its suffix decides the format.
-        split: ``"clean"``, ``"train"`` or ``"test"``.
-        clips: folder of the clips; None uses the training's folder.
-        grid: number of episodes per row and column.
-        size: height and width of one episode in pixels.
-        num_frames: number of frames.
-        seed: of the episodes.
+    The suffix of ``path`` selects MP4 or animated GIF. ``split`` is ``"clean"``, ``"train"`` or
+    ``"test"``. ``clips`` is a folder; None uses the training's. ``size`` is height and width of one
+    episode in pixels.
 
     Raises:
         NoSplitError: the clips do not match the split.

@@ -56,14 +56,8 @@ class Checkpoints:
     ) -> None:
         """Create the folder, or raise a CheckpointError if it cannot be written.
 
-        Args:
-            folder: of the checkpoints.
-            about: result of ``describe_run``, stored with every checkpoint.
-            keep: see ``RunConfig.keep_checkpoints``.
-            former: values by name of settings that a stored run may lack.
-            every: see ``RunConfig.checkpoint_every``.
-            minutes: see ``RunConfig.checkpoint_minutes``.
-            report: receives messages about failed checkpoints.
+        Every checkpoint stores ``about``, the result of ``describe_run``. ``former`` has values of
+        settings that a stored run may lack. ``RunConfig`` describes the other options.
         """
         self.folder = Path(folder).absolute()
         self._about = {"format": FORMAT, **about, "versions": versions()}
@@ -103,13 +97,9 @@ class Checkpoints:
         return bool(self._every) and steps // self._every > self._last_steps // self._every
 
     def save(self, state: Any, steps: int, score: float | None, *, last: bool = False) -> None:
-        """Start to write a checkpoint in the background.
+        """Start to write a checkpoint of a pytree after ``steps`` control steps.
 
-        Args:
-            state: any pytree of arrays.
-            steps: control steps so far.
-            score: measure of quality, higher is better; None if unknown.
-            last: whether to wait for the checkpoint, because the run stops after it.
+        A higher ``score`` is better. With ``last`` it waits for the checkpoint.
 
         Raises:
             CheckpointError: the last checkpoint cannot be written, or only some processes fail.
@@ -245,7 +235,6 @@ class Checkpoints:
         return CheckpointError(f"cannot write a checkpoint to {self.folder}: {reason}.")
 
     def _check(self, about: dict[str, Any]) -> None:
-        """Reject a checkpoint of another format, algorithm or settings."""
         own = self._about
         if about["format"] != FORMAT:
             raise CheckpointError(
@@ -272,7 +261,6 @@ class Checkpoints:
             )
 
     def _check_arrays(self, about: dict[str, Any], wanted: dict[str, Any]) -> None:
-        """Reject a checkpoint with other arrays."""
         stored = shapes_of(self.folder / str(about["steps"]) / "state")
         shapes = {name: tuple(leaf.shape) for name, leaf in wanted.items()}
         other = [
@@ -291,7 +279,6 @@ class Checkpoints:
 
 
 def _check_writable(folder: Path) -> None:
-    """Reject a folder that cannot be created or written."""
     probe = folder / ".writable"
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -304,7 +291,6 @@ def _check_writable(folder: Path) -> None:
 
 
 def _bytes(number: float) -> str:
-    """Format a number of bytes."""
     return f"{number / 1e9:.2f} GB" if number >= 1e8 else f"{number / 1e6:.2f} MB"
 
 

@@ -44,11 +44,7 @@ def _on_terminal() -> bool:
 
 @dataclass(frozen=True)
 class RunConfig:
-    """Seeds, and settings of logs, checkpoints and evaluation, which do not affect the training.
-
-    Raises:
-        ValueError: a setting is out of range.
-    """
+    """Seeds, and settings of logs, checkpoints and evaluation, which do not affect the training."""
 
     output_dir: str = "runs/train"
     """Folder for logs, checkpoints and the policy."""

@@ -52,15 +52,9 @@ def make_splits(
     distractors with other clips: split ``test``, or ``paper-test`` if training uses
     ``paper-train``. ``train`` needs distractors, and ``test`` needs video distractors.
 
-    Args:
-        config: settings of the training, or the same settings with other clips.
-        names: required splits; if empty, all available ones.
-        shown: digests of the training's clips, from ``clip_digests``; None uses those of
-            ``config``.
-        report: receives messages about missing splits.
-
-    Raises:
-        ValueError, FileNotFoundError: see `make_split`.
+    Without ``names`` it yields all available splits and reports the missing ones. ``shown`` are
+    ``clip_digests`` of the training's clips; None uses the clips of ``config``. Errors are those of
+    `make_split`.
     """
     for name in names or splits_of(config):
         try:

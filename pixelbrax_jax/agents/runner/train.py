@@ -103,18 +103,11 @@ def run(
 
     After Ctrl-C or another signal of ``stop_signals``, the run finishes the current iterations,
     writes a checkpoint and returns. Errors of messages and logs do not affect the training.
-
-    Args:
-        algorithm: contains settings and environments.
-        env_params: of the environments.
-        options: seeds, logs, checkpoints and evaluation.
-        report: receives messages; it may raise.
-        splits: evaluation environments with their parameters, by name. ``"clean"`` is required and
-            selects the best checkpoint. None makes the environments of the settings.
+    ``splits`` are evaluation environments with their parameters, by name: ``"clean"`` is required
+    and selects the best checkpoint. None makes the environments of the settings.
 
     Raises:
-        CheckpointError: the folder cannot be written, or contains another or a longer run, or the
-            last checkpoint cannot be written.
+        CheckpointError: checkpoints cannot be written, or the folder has another or a longer run.
         OSError: a log or the policy cannot be written.
         MemoryError: state and frames do not fit into memory.
         TrainingDivergedError: a metric is not finite.
@@ -219,7 +212,7 @@ class _Run:
         self.is_first = jax.process_index() == 0
 
     def train(self, state: TrainState) -> Outcome:
-        """Train from ``state`` to the end, or until a signal."""
+        """Train from ``state`` to the end or to a signal."""
         began = steps = _steps(self.algorithm, state)
         self.writer = self.open_writer(steps)
         try:

@@ -74,12 +74,8 @@ class Pretrained:
 class Trained:
     """The networks of a run at one checkpoint, or a policy of the package.
 
-    Attributes:
-        algorithm: has the settings of the run and ``act``.
-        networks: parameters for ``act``, ``Evaluator`` and ``save_policy``.
-        steps: control steps of the checkpoint.
-        seed: of the run.
-        clips: digests of the training's clips; None if the run did not store them.
+    ``steps`` are the control steps of the checkpoint. ``clips`` are digests of the training's
+    clips, or None if the run did not store them.
     """
 
     algorithm: Player
@@ -117,13 +113,10 @@ def load_agent(
 def load_trained(
     folder: str | Path, *, steps: int | None = None, best: bool = False, run: int = 0
 ) -> Trained:
-    """Load the networks of a checkpoint.
+    """Load a checkpoint from the output folder of a training run.
 
-    Args:
-        folder: output folder of a training run.
-        steps: control steps of the checkpoint; None means the latest.
-        best: whether to load the best checkpoint instead.
-        run: index of the run, from 0, if several were trained together.
+    ``steps`` are the control steps of the checkpoint, None for the latest. ``run`` is the index of
+    the run, from 0, if several were trained together.
 
     Raises:
         CheckpointError: there is no such checkpoint, or its algorithm is unknown.
