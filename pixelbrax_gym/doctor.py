@@ -1,4 +1,4 @@
-"""Whether JAX and PyTorch work together on this machine, in plain words and with fixes."""
+"""Check that JAX and PyTorch work together on this machine, and suggest fixes."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ EXTRAS = {
     "stable-baselines3": "sb3",
     "dm-control": "dmc",
 }
-"""Package -> the extra that brings it."""
+"""Package -> the extra that installs it."""
 
 _JAX_ON_CUDA = install_extra("cuda12", "cuda13")
 _GPUS = ("gpu", "cuda", "rocm")
 _FRACTIONS = ("XLA_CLIENT_MEM_FRACTION", "XLA_PYTHON_CLIENT_MEM_FRACTION")
-"""Variables for JAX's share of a GPU's memory, the current one and the old one."""
-_PATIENCE = 120.0  # seconds; a GPU's driver takes tens of them
+"""Current and old variable for JAX's share of GPU memory."""
+_PATIENCE = 120.0  # seconds; a GPU driver may take tens of seconds to start
 
 
 class _Variable(NamedTuple):
-    """An environment variable that other tools leave behind."""
+    """An environment variable that other tools may have set."""
 
-    package: str  # that reads it
-    code: str  # fails if the package cannot work with the variable's value
+    package: str  # reads the variable
+    code: str  # fails if the value breaks the package
     level: str  # as in Finding
-    effect: str  # what no longer works
+    effect: str  # describes what fails
 
 
 VARIABLES = {
@@ -62,19 +62,19 @@ VARIABLES = {
         "matplotlib",
         "import matplotlib.pyplot",
         "note",
-        "matplotlib cannot be imported; PixelBrax's plots do not heed it",
+        "matplotlib cannot be imported; PixelBrax's plots ignore the variable",
     ),
 }
 
 
 @dataclass(frozen=True)
 class Machine:
-    """What ``inspect`` found out."""
+    """Facts about a machine, as ``inspect`` collects them."""
 
     versions: dict[str, str | None]
-    """Package -> installed release, None where there is none."""
+    """Package -> installed version, or None."""
     jax_device: str | None
-    """JAX's default device, as ``cuda:0``."""
+    """JAX's default device, such as ``cuda:0``."""
     jax_platform: str | None
     """``cpu``, ``gpu``, ``tpu``, ..."""
     jax_error: str | None
@@ -82,35 +82,35 @@ class Machine:
     has_nvidia: bool
     """Whether the system has an NVIDIA GPU."""
     torch_cuda: bool | str | None
-    """Whether torch can use CUDA; None without torch, or why it cannot be imported."""
+    """Whether torch can use CUDA, or the error of its import; None without torch."""
     to_torch: bool | str | None
-    """Whether an array became a tensor on the same memory; None without torch, or what failed."""
+    """Whether a tensor shares the memory of its array, or the error; None without torch."""
     to_jax: bool | str | None
-    """The same, from a tensor to an array."""
+    """Whether an array shares the memory of its tensor, or the error; None without torch."""
     renderer: tuple[str, str] | None
-    """What ``renderer="auto"`` stands for, and why; None where JAX has no device."""
+    """Renderer that ``renderer="auto"`` selects, and the reason; None if JAX has no device."""
     gl_libraries: tuple[str, ...] | None
-    """OpenGL libraries loaded into this process; None where that is unknown."""
+    """OpenGL libraries loaded in this process; None if unknown."""
     environ: dict[str, str]
     """Environment variables."""
     broken: dict[str, str]
-    """Of ``VARIABLES``, what fails because of them."""
+    """Name in ``VARIABLES`` -> the error that its value causes."""
     cache: str
-    """Why nothing can be kept in the cache; empty where it can."""
+    """Why the cache cannot be written; empty if it can."""
 
 
 class Finding(NamedTuple):
-    """One line of the report."""
+    """An entry of the report."""
 
     level: str
-    """``ok``, ``note`` (works, but could be better) or ``problem``."""
+    """``ok``, ``note`` (works, but can be improved) or ``problem``."""
     text: str
     fix: str = ""
-    """What to do, where there is something to do."""
+    """Suggested action; may be empty."""
 
 
 def diagnose(machine: Machine) -> list[Finding]:
-    """Return what the facts mean, the most basic first."""
+    """Return the findings for a machine, the most basic first."""
     return list(_findings(machine))
 
 
@@ -120,7 +120,7 @@ def _findings(m: Machine) -> Iterator[Finding]:
     yield ok(f"Python {platform.python_version()}, {here}")
     for name, extra in EXTRAS.items():
         if m.versions[name] is None:
-            yield note(f"{name} is not installed", f"{install_extra(extra)}, should you want it")
+            yield note(f"{name} is not installed", f"optional: {install_extra(extra)}")
 
     on_cpu, on_gpu = m.jax_platform == "cpu", m.jax_platform in _GPUS
     if m.jax_error is None:
@@ -128,8 +128,8 @@ def _findings(m: Machine) -> Iterator[Finding]:
         if on_cpu and m.has_nvidia:
             yield problem(
                 "there is an NVIDIA GPU, but JAX does not use it",
-                f"{_JAX_ON_CUDA}, as nvidia-smi tells the CUDA version; unset JAX_PLATFORMS; and "
-                "import jax before torch, whose CUDA libraries may hide JAX's",
+                f"{_JAX_ON_CUDA} (nvidia-smi shows the CUDA version), unset JAX_PLATFORMS, and "
+                "import jax before torch, because torch's CUDA libraries may hide JAX's",
             )
         yield from _about_torch(m, on_cpu, on_gpu)
     elif "XLA_FLAGS" not in m.broken:
@@ -137,53 +137,52 @@ def _findings(m: Machine) -> Iterator[Finding]:
         yield problem(
             f"JAX finds no device to compute on: {m.jax_error}"
             + (f" (JAX_PLATFORMS={platforms})" if platforms else ""),
-            "unset JAX_PLATFORMS, or install the jax release that goes with your driver: "
-            + _JAX_ON_CUDA,
+            f"unset JAX_PLATFORMS, or install the jax that matches your driver: {_JAX_ON_CUDA}",
         )
     if m.renderer is not None:
         name, why = m.renderer
         unexpected = on_gpu and m.has_nvidia and name != "pallas"
-        yield (note if unexpected else ok)(f"images are drawn by renderer={name!r}: {why}")
+        yield (note if unexpected else ok)(f"images are rendered by renderer={name!r}: {why}")
 
     for way, result in (("JAX to torch", m.to_torch), ("torch to JAX", m.to_jax)):
         if result is True:
-            yield ok(f"arrays cross from {way} without a copy")
+            yield ok(f"arrays pass from {way} without a copy")
         elif result is False:
             yield problem(
-                f"arrays are copied on their way from {way}",
-                "use a current torch and jax; the releases in constraints.txt do not copy",
+                f"arrays are copied from {way}",
+                "install current versions of torch and jax, such as those in constraints.txt",
             )
         elif result is not None:
             yield problem(
-                f"arrays do not cross from {way}: {result}",
-                "mend the devices first; else use output='numpy'",
+                f"arrays cannot pass from {way}: {result}",
+                "fix the problems with devices above, or use output='numpy'",
             )
 
     new, old = _FRACTIONS
     if new in m.environ and old in m.environ:
-        yield problem(f"{new} and {old} are both set, which JAX refuses", f"unset {old}")
+        yield problem(f"{new} and {old} are both set, which is an error in JAX", f"unset {old}")
     share = _memory_share(m.environ)
     if on_gpu and share <= 0.5:
-        yield ok("JAX leaves GPU memory for others")
+        yield ok("JAX leaves GPU memory for other libraries")
     elif on_gpu and m.torch_cuda:
         yield note(
-            f"JAX takes {share:.0%} of the GPU's memory at its start and leaves torch the rest",
+            f"JAX reserves {share:.0%} of the GPU's memory when it starts; torch gets the rest",
             f"export {new}=0.4, or XLA_PYTHON_CLIENT_PREALLOCATE=false, before Python starts",
         )
 
     if m.gl_libraries:
         names = ", ".join(m.gl_libraries)
-        yield note(f"images need no OpenGL, though something else has loaded {names}")
+        yield note(f"rendering needs no OpenGL, but another library has loaded {names}")
     else:
-        yield ok("images need no OpenGL and no display")
+        yield ok("rendering needs no OpenGL and no display")
     for name, why in m.broken.items():
         level, effect = VARIABLES[name].level, VARIABLES[name].effect
         text = f"with {name}={m.environ.get(name, '')}, {effect}: {why}"
-        yield Finding(level, text, f"unset {name}, or mend it")
+        yield Finding(level, text, f"unset {name}, or correct its value")
     if m.cache:
         yield note(
-            f"clips are read anew each time, as they cannot be cached: {m.cache}",
-            "export PIXELBRAX_CACHE=<a folder that can be written>",
+            f"clips cannot be cached, so every run reads them again: {m.cache}",
+            "export PIXELBRAX_CACHE=<a writable folder>",
         )
 
 
@@ -192,8 +191,8 @@ def _about_torch(m: Machine, on_cpu: bool, on_gpu: bool) -> Iterator[Finding]:
     if isinstance(m.torch_cuda, str):
         yield Finding(
             "problem",
-            f"torch is installed and cannot be imported: {m.torch_cuda}",
-            f"install it again, see {site}",
+            f"torch is installed but cannot be imported: {m.torch_cuda}",
+            f"reinstall it, see {site}",
         )
     elif m.torch_cuda is None:
         return
@@ -206,13 +205,13 @@ def _about_torch(m: Machine, on_cpu: bool, on_gpu: bool) -> Iterator[Finding]:
     elif on_cpu and m.torch_cuda:
         yield Finding(
             "problem",
-            "torch uses CUDA and JAX the CPU: frames are drawn slowly and must be copied",
+            "torch uses CUDA but JAX uses the CPU: rendering is slow and frames must be copied",
             _JAX_ON_CUDA,
         )
     elif on_gpu and not m.torch_cuda:
         yield Finding(
             "problem",
-            "JAX uses the GPU and torch cannot: output='torch' will not work",
+            "JAX uses the GPU but torch cannot: output='torch' will not work",
             f"install a torch built for CUDA, see {site}",
         )
     else:
@@ -220,7 +219,7 @@ def _about_torch(m: Machine, on_cpu: bool, on_gpu: bool) -> Iterator[Finding]:
 
 
 def _memory_share(environ: Mapping[str, str]) -> float:
-    """Return the share of a GPU's memory that JAX takes at its start, by JAX's own rules."""
+    """Return the fraction of GPU memory that JAX reserves when it starts."""
     if environ.get("XLA_PYTHON_CLIENT_PREALLOCATE") in ("false", "False", "0"):
         return 0.0
     if environ.get("XLA_PYTHON_CLIENT_ALLOCATOR", "").lower() in ("platform", "cuda_async"):
@@ -232,24 +231,24 @@ def _memory_share(environ: Mapping[str, str]) -> float:
 
 
 def report(findings: list[Finding]) -> str:
-    """Return the findings as text for a terminal."""
+    """Format the findings for a terminal."""
     lines = []
     for finding in findings:
         lines.append(f"{finding.level:>8}  {finding.text}")
         if finding.fix:
             lines.append(f"{'':>8}  -> {finding.fix}")
     problems = sum(finding.level == "problem" for finding in findings)
-    end = f"{problems} problem{'s' if problems > 1 else ''} found." if problems else "All is well."
+    end = f"{problems or 'No'} problem{'' if problems == 1 else 's'} found."
     return "\n".join([*lines, "", end])
 
 
 def inspect() -> Machine:
-    """Look at this machine. Starts JAX; takes a second or two."""
+    """Inspect this machine; starts JAX and takes a second or two."""
     versions = {name: installed_version(name) for name in (*_PACKAGES, *EXTRAS)}
     device = jax_platform = jax_error = renderer = None
     broken = broken_variables()
     try:
-        if "XLA_FLAGS" in broken:  # XLA would end this process
+        if "XLA_FLAGS" in broken:  # XLA would abort this process.
             raise RuntimeError(broken["XLA_FLAGS"])
         import jax
 
@@ -258,7 +257,7 @@ def inspect() -> Machine:
         first = jax.devices()[0]
         device, jax_platform = str(first), first.platform
         renderer = auto_renderer()
-    except Exception as error:  # whatever it is, it shall be reported and not raised
+    except Exception as error:  # Any error is reported, not raised.
         jax_error = f"{type(error).__name__}: {error}"
     torch_cuda: bool | str | None = None
     to_torch: bool | str | None = None
@@ -286,34 +285,34 @@ def inspect() -> Machine:
 
 
 def broken_variables() -> dict[str, str]:
-    """Try each variable that is set in a process of its own, which some of them end."""
+    """Test each variable that is set, in a separate process because some values abort it."""
     broken = {}
     for name, variable in VARIABLES.items():
         if not os.environ.get(name) or installed_version(variable.package) is None:
             continue
         without = {key: value for key, value in os.environ.items() if key != name}
         why = _why_it_fails(variable.code, dict(os.environ))
-        # What fails in the same way without it has another cause.
+        # The same error without the variable has another cause.
         if why and why != _why_it_fails(variable.code, without):
             broken[name] = why
     return broken
 
 
 def _why_it_fails(code: str, environ: dict[str, str]) -> str:
-    """Return the last line of what a program says of its failure; empty if it passes."""
+    """Return the last line of a program's error; empty if it succeeds."""
     command = [sys.executable, "-c", code]
     try:
         result = subprocess.run(
             command, env=environ, capture_output=True, text=True, check=False, timeout=_PATIENCE
         )
     except subprocess.TimeoutExpired:
-        return f"no end after {_PATIENCE:.0f} s"
+        return f"timeout after {_PATIENCE:.0f} s"
     last = result.stderr.strip().rpartition("\n")[2][:200]
     return (last or f"exit status {result.returncode}") if result.returncode else ""
 
 
 def why_no_cache() -> str:
-    """Return why nothing can be kept in the cache; empty where it can."""
+    """Return why the cache cannot be written; empty if it can."""
     try:
         folder = cache_folder().absolute()
         while not folder.exists():
@@ -326,7 +325,7 @@ def why_no_cache() -> str:
 def _attempt(check: Callable[[], bool]) -> bool | str:
     try:
         return bool(check())
-    except Exception as error:  # reported, not raised
+    except Exception as error:  # Any error is reported, not raised.
         return f"{type(error).__name__}: {error}"
 
 
@@ -352,14 +351,14 @@ def _shares_to_jax() -> bool:
 
     from pixelbrax_gym.interop.dlpack import default_torch_device
 
-    # Larger than any alignment asks for, as an allocator aligns what is large.
+    # A large tensor, because allocators align large memory.
     tensor = torch.zeros(1 << 16, device=default_torch_device())
     array = jax.block_until_ready(jax.dlpack.from_dlpack(tensor))
     return bool(array.unsafe_buffer_pointer() == tensor.data_ptr())
 
 
 def _gl_libraries() -> tuple[str, ...] | None:
-    """Return the OpenGL libraries in this process, which has imported all that draws a frame."""
+    """Return the OpenGL libraries in this process, after everything for rendering is imported."""
     maps = Path("/proc/self/maps")
     if not sys.platform.startswith("linux") or not maps.exists():
         return None

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from pixelbrax_jax.types import PhysicsState as PhysicsState
     from pixelbrax_jax.types import Timestep as Timestep
 
-# Loaded when they are first asked for: who wants the list of tasks need not wait for JAX.
+# Loaded at first use, so that the list of tasks does not wait for JAX.
 _PUBLIC = {
     "compilation": "compiler_options",
     "config": "EnvConfig",

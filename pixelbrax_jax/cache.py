@@ -1,4 +1,4 @@
-"""The folder in which PixelBrax keeps what it need not make twice."""
+"""The cache folder, and paths in the home folder."""
 
 from __future__ import annotations
 
@@ -10,30 +10,30 @@ def cache_folder(given: str | Path | None = None) -> Path:
     """Return the given folder, else ``$PIXELBRAX_CACHE``, else ``~/.cache/pixelbrax``.
 
     Raises:
-        FileNotFoundError: the user has no home folder, and it would be in it; with the fix.
+        FileNotFoundError: the home folder is needed but unknown; the message has the fix.
     """
     named = given or os.environ.get("PIXELBRAX_CACHE")
     if named:
         return in_home(Path(named))
     try:
         return Path.home() / ".cache" / "pixelbrax"
-    except RuntimeError as error:  # as of a container's user that has no entry anywhere
+    except RuntimeError as error:  # such as a container's user without an entry in passwd
         raise FileNotFoundError(
             "the user has no home folder; set HOME, or PIXELBRAX_CACHE to a folder"
         ) from error
 
 
 def whole_path(path: str | os.PathLike[str]) -> Path:
-    """Return a path from the root, with the home folder in place of ``~``.
+    """Return the absolute path, with ``~`` expanded.
 
     Raises:
-        FileNotFoundError: there is no such home folder; with the fix.
+        FileNotFoundError: the home folder is unknown; the message has the fix.
     """
     return in_home(Path(path)).absolute()
 
 
 def in_home(path: Path) -> Path:
-    """Return a path with the home folder in place of ``~``, or raise as ``whole_path`` does."""
+    """Expand ``~``; raise the same error as ``whole_path``."""
     try:
         return path.expanduser()
     except RuntimeError as error:

@@ -1,4 +1,4 @@
-"""How XLA is asked to compile programs that draw images."""
+"""XLA compiler options for environments."""
 
 from __future__ import annotations
 
@@ -21,49 +21,45 @@ _WIDTH = "xla_cpu_prefer_vector_width"
 _EMITTERS = "xla_cpu_use_fusion_emitters"
 _COMMANDS = "xla_gpu_enable_command_buffer"
 _CAPTURED = "FUSION,CUBLAS,CUBLASLT,CUDNN,CUSTOM_CALL,DYNAMIC_SLICE_FUSION,CONDITIONAL,WHILE"
-"""What a GPU may have in a CUDA graph: the default of JAX 0.10.2 and loops, without which a step is
-cut into parts that the host launches one after the other. XLA leaves out what a driver lacks."""
+"""Operations that a GPU may capture in a CUDA graph: JAX 0.10.2's default and loops. Without loops
+the host launches the parts of a step one by one. XLA ignores what a driver does not support."""
 
 _PLATFORMS = {"cpu": "cpu", "gpu": "gpu", "cuda": "gpu", "rocm": "gpu", "tpu": "tpu"}
-"""JAX's names of platforms, and those of its default backends."""
+"""Platform of each accepted name: JAX's platforms and default backends."""
 
 _MOST_INTERSECTIONS = 50
-"""Geoms times rays of a pixel, one to the camera and one to each of the model's lamps, which XLA's
-newer emitters still make one fast loop of."""
+"""Largest number of intersections per pixel (geoms times rays: one to the camera and one to each
+lamp) that XLA's newer emitters still compile to one fast loop."""
 
 
 def compiler_options(env: Any = None, platform: str | None = None) -> dict[str, Any]:
     """Return options of ``jax.jit`` that make an environment fast.
 
-    On a CPU: XLA holds back where there is AVX-512 and computes with vectors of 256 bits; with 512
-    the ray-caster is up to twice as fast. CPUs without such vectors are not affected. Some physics
-    is faster with options of its own, and scenes of many geoms are drawn faster with XLA's older
-    emitters. On a GPU: loops of which all parts can be are captured in CUDA graphs, so that the
-    host launches a step of Brax's tasks at once. A TPU needs none.
+    On a CPU with AVX-512 they enable vectors of 512 bits, with which the renderer is up to twice as
+    fast; some physics adds options, and scenes with many geoms use XLA's older emitters. On a GPU
+    they capture loops in CUDA graphs, so that the host launches a step of Brax's tasks at once. A
+    TPU needs none.
 
-    Whatever PixelBrax compiles by itself for the Gymnasium, TorchRL and Stable-Baselines3
-    environments and for its agents has these options. A program of your own gets them at its
-    outermost ``jax.jit``, the only one that takes options:
+    The Gymnasium, TorchRL and Stable-Baselines3 environments and the agents use these options. Pass
+    them to the outermost ``jax.jit`` of your own program, the only one that takes options:
 
         step = jax.jit(env.step, compiler_options=pixelbrax_jax.compiler_options(env))
 
-    Options change how XLA rounds: the same program with and without them agrees to rounding
-    errors, not to the bit.
+    Options change how XLA rounds, so results with and without them agree only to rounding errors.
 
     Args:
-        env: a ``PixelEnv`` or ``VectorPixelEnv``; None for the options of the renderer alone,
-            which are all that Brax's tasks have.
-        platform: ``cpu``, ``gpu`` (or ``cuda``, ``rocm``) or ``tpu``, which the program is compiled
-            for; None for that of the default device.
+        env: a ``PixelEnv`` or ``VectorPixelEnv``; None for the renderer's options, which are all
+            that Brax's tasks need.
+        platform: ``cpu``, ``gpu`` (or ``cuda``, ``rocm``) or ``tpu``; None for the platform of the
+            default device.
 
     Returns:
-        The options. None of them if ``XLA_FLAGS`` name the width of vectors on a CPU
-        (``xla_cpu_prefer_vector_width``; those of the physics are then yours to give too) or what
-        is captured on a GPU (``xla_gpu_enable_command_buffer``). What the installed XLA does not
-        know is left out.
+        The options that the installed XLA knows. The dictionary is empty if ``XLA_FLAGS`` sets
+        ``xla_cpu_prefer_vector_width`` (CPU) or ``xla_gpu_enable_command_buffer`` (GPU); set the
+        physics' options in ``XLA_FLAGS`` too in that case.
 
     Raises:
-        ValueError: there is no such platform.
+        ValueError: the platform is unknown.
     """
     return _options(_physics(env), platform)
 
@@ -71,10 +67,10 @@ def compiler_options(env: Any = None, platform: str | None = None) -> dict[str, 
 def jit(
     env_of: Callable[[Any], Any], **options: Any
 ) -> Callable[[Callable[_P, _T]], Callable[_P, _T]]:
-    """Decorate as ``jax.jit`` does, with ``compiler_options``.
+    """Decorate like ``jax.jit``, with ``compiler_options``.
 
-    ``env_of`` gives the environment of the function's first argument, which is static. The options
-    are asked for at the first call for a physics: importing a package must not start a device.
+    ``env_of`` returns the environment of the function's first argument, which is static. The
+    options are computed at the first call, because importing a package must not start a device.
     """
 
     def decorate(function: Callable[_P, _T]) -> Callable[_P, _T]:
@@ -96,10 +92,7 @@ def jit(
 
 
 def _put(leaf: Any) -> Any:
-    """Put a NumPy array on the device, in the way that ``jax.transfer_guard`` calls explicit.
-
-    A compiled program does so itself in a fifth of the time, but implicitly.
-    """
+    """Put a NumPy array on the device explicitly, as ``jax.transfer_guard`` requires; 5x slower."""
     return jax.device_put(leaf) if isinstance(leaf, np.ndarray | np.generic) else leaf
 
 
@@ -118,8 +111,8 @@ def _options(physics: Any, platform: str | None = None) -> dict[str, Any]:
     elif platform == "cpu" and _WIDTH not in flags:
         chosen = {_WIDTH: 512, **(physics.compiler_options if physics else {})}
         if physics is not None and _intersections(physics) > _MOST_INTERSECTIONS:
-            # The newer ones cut long loops up, and compute what the parts share again in each of
-            # them: drawing DM Control's swimmer15 takes 250 times as long.
+            # The newer ones split long loops and compute shared values again in each part:
+            # rendering DM Control's swimmer15 takes 250 times as long.
             chosen.setdefault(_EMITTERS, False)
     else:
         return {}

@@ -1,4 +1,4 @@
-"""Every option of an environment: once, with its default and its documentation."""
+"""Options of an environment, with their defaults and documentation."""
 
 from __future__ import annotations
 
@@ -30,29 +30,29 @@ class ProgramConfig:
 
     Raises:
         ValueError: an option is out of range; the message says what is allowed.
-        TypeError: an option is of another type, or an array or tracer.
+        TypeError: an option has another type, or is an array or tracer.
     """
 
     height: int = 84
-    """Pixels of a frame."""
+    """Height of a frame in pixels."""
     width: int = 84
-    """Pixels of a frame."""
+    """Width of a frame in pixels."""
     frame_stack: int = 3
-    """Frames in one observation."""
+    """Number of frames in one observation."""
     obs_mode: str = "pixels"
-    """What an observation is: ``pixels``, ``state`` (nothing is rendered) or ``both``."""
+    """Content of an observation: ``pixels``, ``state`` (nothing is rendered) or ``both``."""
     action_repeat: int = 1
-    """Control steps per step; one frame is drawn at their end."""
+    """Control steps per environment step. Only the last one is rendered."""
     renderer: str = "auto"
-    """``auto``, the fastest for the device; ``fused``, for all devices; ``pallas``, the kernel for
-    NVIDIA GPUs that ``auto`` takes there if it passes a check; or ``reference``, the slow one that
-    the others are tested against."""
+    """``auto`` chooses the fastest renderer for the device, ``fused`` runs on all devices,
+    ``pallas`` is a kernel for NVIDIA GPUs (``auto`` takes it there if it passes a check), and
+    ``reference`` is the slow renderer that the others are tested against."""
     distractors: Distractors = ()
-    """What changes the image: a distractor, the name of a preset, or several of them; as
-    everywhere, a dictionary of ``plain.to_plain`` in place of an object."""
+    """Changes of the image: a distractor, the name of a preset, or several of them. A dictionary of
+    ``plain.to_plain`` may stand for a distractor."""
 
     def __post_init__(self) -> None:
-        """Check the options, and store them as Python's own types."""
+        """Check the options and convert them to Python's own types."""
         for name in ("height", "width", "frame_stack", "action_repeat"):
             self._store(name, check_positive_int(name, self._static(name)))
         check_choice("obs_mode", self._static("obs_mode"), OBS_MODES)
@@ -60,11 +60,7 @@ class ProgramConfig:
         self._store("distractors", as_tuple(from_plain(self.distractors)))
 
     def _static(self, name: str) -> Any:
-        """Return an option that decides which program is compiled.
-
-        Raises:
-            TypeError: it is an array, or cannot be hashed.
-        """
+        """Return an option, or raise TypeError if it is an array or cannot be hashed."""
         value = getattr(self, name)
         if isinstance(value, jax.Array):
             raise TypeError(
@@ -92,29 +88,29 @@ class EnvConfig(BraxOptions, ProgramConfig):
 
     Raises:
         ValueError: an option is out of range; the message says what is allowed.
-        TypeError: an option is of another type, or an array or tracer.
+        TypeError: an option has another type, or is an array or tracer.
     """
 
     task: str = "ant"
-    """Task, one of ``pixelbrax_jax.list_envs()``; or ``module:name``, which imports the module that
-    registers it."""
+    """Name of the task, one of ``pixelbrax_jax.list_envs()``, or ``module:name``, which first
+    imports the module that registers it."""
     camera: str | CameraRig | Camera = "default"
     """Viewpoint: a name of ``named_rigs``, a ``CameraRig`` or a ``Camera``."""
     look: str | Look = "default"
     """Light, sky and ground: ``default``, ``original``, ``dmc`` or a ``Look``. For a task of the DM
-    Control Suite ``default`` is ``dmc``, with its model's own lights."""
+    Control Suite ``default`` is ``dmc`` with the lights of its model."""
     shadows: bool | None = None
-    """Whether geoms cast shadows; None keeps the look's own choice."""
+    """Whether geoms cast shadows. None keeps the choice of the look."""
     episode_length: int = 1000
     """Time limit in control steps."""
     clips: str | PathLike[str] | ClipBank | None = None
-    """What a video distractor plays: the folder of DAVIS-2017 or one with videos, a bank of
-    ``load_clips``, or ``procedural``; None means ``procedural`` with a warning."""
+    """Videos for the video distractors: a folder with DAVIS-2017 or with video files, a bank of
+    ``load_clips``, or ``procedural``. None means ``procedural`` with a warning."""
     split: str = "train"
-    """Which of the clips: ``train``, ``test`` or another of their splits; see ``load_clips``."""
+    """Split of the clips: ``train``, ``test`` or another one they have; see ``load_clips``."""
 
     def __post_init__(self) -> None:
-        """Check the options, and store them as Python's own types."""
+        """Check the options and convert them to Python's own types."""
         ProgramConfig.__post_init__(self)
         for name in ("task", "split", *(option.name for option in _SUITE_OPTIONS)):
             self._static(name)
@@ -132,7 +128,7 @@ class EnvConfig(BraxOptions, ProgramConfig):
             )
 
     def suite_options(self) -> dict[str, Any]:
-        """Return those options of single suites that are not at their defaults."""
+        """Return the options that belong to one suite and differ from their defaults."""
         values = {option.name: getattr(self, option.name) for option in _SUITE_OPTIONS}
         return {o.name: values[o.name] for o in _SUITE_OPTIONS if values[o.name] != o.default}
 
@@ -147,13 +143,13 @@ def env_config(
     """Return the options of an environment.
 
     Args:
-        base: a task, whose other options have their defaults; or options to start from, also as
-            a subclass, whose further fields are left out.
-        options: by name, those that differ.
-        also_allowed: names of the caller's own options, for the message about an unknown one.
+        base: a task, with default options; or options to start from. Fields that a subclass of
+            ``EnvConfig`` adds are ignored.
+        options: the options to change, by name.
+        also_allowed: names of the caller's other options, for the message about an unknown one.
 
     Raises:
-        TypeError: an option is unknown; the message lists those there are and names the nearest.
+        TypeError: an option is unknown; the message lists all options and the nearest name.
         ValueError: an option is out of range; the message says what is allowed.
     """
     names = [name for name in ENV_OPTIONS if name != "task"]

@@ -1,12 +1,8 @@
-"""How to get what PixelBrax does not install unasked."""
+"""Installation of optional dependencies."""
 
 from __future__ import annotations
 
 
 def install_extra(*names: str) -> str:
-    """Return the command that installs an extra, as the end of a message.
-
-    Args:
-        names: extras of ``pyproject.toml``, any of which will do.
-    """
+    """Return the command that installs one of the given extras, as the end of a message."""
     return " or ".join(f'pip install "pixelbrax[{name}]"' for name in names)

@@ -1,4 +1,4 @@
-"""FFmpeg as a process: frames into a file, frames out of a file, and its complaints in a line."""
+"""Encoding and decoding of videos with an FFmpeg process."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ _VARIABLE = "IMAGEIO_FFMPEG_EXE"
 
 
 def find_ffmpeg() -> str:
-    """Return the path of FFmpeg's program.
+    """Return the path of the FFmpeg program.
 
     Raises:
-        ImportError: imageio-ffmpeg, which brings it, is not installed.
-        OSError: there is none for this machine, it may not be started, or ``IMAGEIO_FFMPEG_EXE``
-            names none; with the fix.
+        ImportError: imageio-ffmpeg, which includes it, is not installed.
+        OSError: no FFmpeg exists for this machine, it cannot be started, or ``IMAGEIO_FFMPEG_EXE``
+            is not a program; the message has the fix.
     """
     import imageio_ffmpeg
 
@@ -32,27 +32,27 @@ def find_ffmpeg() -> str:
         program: str = imageio_ffmpeg.get_ffmpeg_exe()
     except RuntimeError as error:
         raise FileNotFoundError(
-            f"there is no FFmpeg for this machine; install it, or name it in {_VARIABLE}."
+            f"imageio-ffmpeg has no FFmpeg for this machine; install one and set {_VARIABLE} to it."
         ) from error
     if shutil.which(program) is None:
         if not os.environ.get(_VARIABLE):
             raise FileNotFoundError(
-                f"the FFmpeg that imageio-ffmpeg brings, {program}, cannot be started; install "
+                f"the FFmpeg of imageio-ffmpeg, {program}, cannot be started; install "
                 "imageio-ffmpeg again."
             )
         raise FileNotFoundError(
-            f"the environment variable {_VARIABLE} is {program!r}, which is no program; unset it "
-            "to use the FFmpeg that imageio-ffmpeg brings."
+            f"the environment variable {_VARIABLE} is {program!r}, which is not a program; unset "
+            "it to use the FFmpeg of imageio-ffmpeg."
         )
     return program
 
 
 def check_ffmpeg() -> None:
-    """Check that FFmpeg is found and starts.
+    """Check that FFmpeg exists and starts.
 
     Raises:
-        ImportError: imageio-ffmpeg, which brings it, is not installed.
-        OSError: it does not; with the reason.
+        ImportError: imageio-ffmpeg, which includes it, is not installed.
+        OSError: it does not start; with the reason.
     """
     command = [find_ffmpeg(), "-version"]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -61,21 +61,19 @@ def check_ffmpeg() -> None:
 
 
 class Encoder:
-    """Writes frames into an MP4 that every player plays: H.264, 4:2:0, as they come."""
+    """Writes frames to an MP4 file in H.264, 4:2:0, which every player supports."""
 
     def __init__(self, path: Path, fps: float) -> None:
-        """Start nothing yet; raise as ``find_ffmpeg`` does."""
+        """Find FFmpeg, with the errors of ``find_ffmpeg``; start no process."""
         self._program, self._path, self._fps = find_ffmpeg(), path, fps
         self._process: subprocess.Popen[bytes] | None = None
         self._log: IO[bytes] | None = None
 
     def append(self, frame: np.ndarray) -> None:
-        """Write a frame.
-
-        4:2:0 has one color for two by two pixels, so an odd side is repeated once at its end.
+        """Write a frame; repeat the last row or column of an odd side.
 
         Raises:
-            OSError: FFmpeg could not write it; with its reason.
+            OSError: FFmpeg could not write it; with the reason.
         """
         height, width = (side % 2 for side in frame.shape[:2])
         if height or width:
@@ -93,10 +91,10 @@ class Encoder:
 
     def _start(self, height: int, width: int) -> None:
         taken = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"]
-        # By name: an FFmpeg without it would write what few players play.
+        # Named explicitly: an FFmpeg without it would choose a codec that few players support.
         h264 = ["-c:v", "libx264", "-pix_fmt", "yuv420p"]
         given = ["-f", "mp4", *h264, str(self._path.absolute())]
-        # A file, as a pipe that nobody reads would stop FFmpeg once it is full.
+        # A file, because FFmpeg stops once a pipe that nobody reads is full.
         self._log = tempfile.TemporaryFile()  # noqa: SIM115
         self._process = _start(
             [self._program, "-y", "-v", "error", *taken, "-r", str(self._fps), "-i", "-", *given],
@@ -105,10 +103,10 @@ class Encoder:
         )
 
     def close(self) -> None:
-        """End the file, with the frames that were written.
+        """Finish the file.
 
         Raises:
-            OSError: FFmpeg could not write it; with its reason.
+            OSError: FFmpeg could not write it; with the reason.
         """
         process, log = self._process, self._log
         if process is None or log is None:
@@ -129,18 +127,18 @@ class Encoder:
 
 
 class Decoder:
-    """Reads the frames of a file's video, turned as a player turns them, at a constant rate.
+    """Reads the frames of a video file at a constant rate, rotated as a player rotates them.
 
     Attributes:
-        declared: after all frames, about how many of them the file says that it has; None where
-            it does not say.
-        of_file: whether that goes by the length of the whole file, whose sound may be longer than
-            its video.
-        complaint: what FFmpeg found wrong, in one line; empty if nothing.
+        declared: after all frames, the approximate number of frames the file declares; None if it
+            declares none.
+        of_file: whether that number comes from the length of the whole file, whose sound may be
+            longer than its video.
+        complaint: FFmpeg's error in one line; empty if none.
     """
 
     def __init__(self, path: Path) -> None:
-        """Start nothing yet; raise as ``find_ffmpeg`` does."""
+        """Find FFmpeg, with the errors of ``find_ffmpeg``; start no process."""
         self._program, self._path = find_ffmpeg(), path
         self.declared: int | None = None
         self.of_file = False
@@ -148,9 +146,9 @@ class Decoder:
 
     def __iter__(self) -> Iterator[np.ndarray]:
         """Yield (H, W, 3) uint8 frames."""
-        # A PPM says its own size, which a video may change on its way.
+        # Each PPM has its own size; a video may change its size.
         images = ["-f", "image2pipe", "-c:v", "ppm", "-pix_fmt", "rgb24", "-"]
-        # An absolute path: a colon in a name would make it the name of a protocol.
+        # An absolute path, because FFmpeg takes a name with a colon for a protocol.
         file = ["-nostdin", "-nostats", "-loglevel", "level+info", "-i", str(self._path.absolute())]
         with tempfile.TemporaryFile() as log:
             process = _start([self._program, *file, *images], stdout=subprocess.PIPE, stderr=log)
@@ -170,7 +168,7 @@ class Decoder:
         source = log.partition("Output #0")[0]
         self.complaint = reason(log) if "[error]" in log or "[fatal]" in log else ""
         if "Stream #0:" in source and "Video: " not in source:
-            self.complaint = "there is only sound in it"
+            self.complaint = "it has only sound"
         duration = re.search(r"Duration: (\d+):(\d+):([\d.]+)", source)
         rate = re.search(r"Video: .* ([\d.]+) fps", source)
         count = _frames_of_avi(self._path)
@@ -183,7 +181,7 @@ class Decoder:
 
 
 def reason(log: str) -> str:
-    """Return what FFmpeg's log says first of what is wrong, without its marks; empty if nothing."""
+    """Return the first error of FFmpeg's log, without its prefixes; empty if none."""
     lines = [line for line in log.splitlines() if line.strip()]
     wrong = [line for line in lines if "[error]" in line or "[fatal]" in line] or lines
     # "[mov,mp4 @ 0x55] [error] moov atom not found"
@@ -192,7 +190,7 @@ def reason(log: str) -> str:
 
 
 def _start(command: list[str], **pipes: Any) -> subprocess.Popen[bytes]:
-    # In a group of its own, so that Ctrl-C in a terminal does not end it before its file is whole.
+    # In a separate process group, so that Ctrl-C does not end it before its file is complete.
     return subprocess.Popen(command, process_group=0 if os.name == "posix" else None, **pipes)
 
 
@@ -209,7 +207,7 @@ def _read_ppm(pipe: IO[bytes]) -> np.ndarray | None:
 
 
 def _frames_of_avi(path: Path) -> int:
-    """Return the number in an AVI's main header, else 0; FFmpeg tells what the size allows."""
+    """Return the frame count of an AVI's main header, else 0; FFmpeg derives it from the size."""
     with path.open("rb") as file:
         head = file.read(52)
     if head[:4] != b"RIFF" or head[24:28] != b"avih":

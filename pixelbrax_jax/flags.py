@@ -1,4 +1,4 @@
-"""The flags of JAX under which programs are traced, whatever a process has set."""
+"""JAX flags under which programs are traced, whatever flags the process has set."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ _P = ParamSpec("_P")
 _T = TypeVar("_T")
 
 PRNG = "threefry2x32"
-"""The implementation of all random numbers: the one of JAX's own in which a key's numbers do not
-depend on the other keys of a batch."""
+"""Implementation of all random numbers. Of JAX's implementations it is the one in which the numbers
+of a key do not depend on the other keys of a batch."""
 
 _FLAGS = (
     partial(jax.enable_x64, False),
@@ -28,10 +28,10 @@ _FLAGS = (
     partial(jax.debug_infs, False),
     partial(jax.transfer_guard, "allow"),
 )
-"""Those that change what a program computes, or which programs JAX accepts, at JAX's defaults. The
-last three check what is within: jaxopt, which Brax steps with, leaks tracers, limits of joints are
-infinite, and models are made of Python's numbers. What a compiled program takes and returns is
-checked as a process has set it."""
+"""Flags that change a program's result or what JAX accepts, at their defaults. The last three
+checks must be off: jaxopt, used by Brax, leaks tracers, joint limits are infinite, and models
+contain Python numbers. Inputs and outputs of a compiled program are checked as the process has set
+it."""
 
 _SHORT = {
     np.dtype(long): np.dtype(short)
@@ -46,11 +46,11 @@ _SHORT = {
 
 @contextmanager
 def default_flags() -> Iterator[None]:
-    """Trace what is within as JAX does by default.
+    """Trace programs in this block under JAX's default flags.
 
-    Brax, MuJoCo XLA, flax and optax are written for JAX's defaults, and so is this package: with
-    ``jax_enable_x64`` or strict promotion some of their programs are others, or none. How precisely
-    an accelerator multiplies matrices stays as it is set.
+    Brax, MuJoCo XLA, flax, optax and this package need the defaults: ``jax_enable_x64`` or strict
+    promotion would change or break some programs. The precision of matrix products on an
+    accelerator stays as it is set.
     """
     with ExitStack() as flags:
         for flag in _FLAGS:
@@ -59,11 +59,11 @@ def default_flags() -> Iterator[None]:
 
 
 def under_default_flags(function: Callable[_P, _T]) -> Callable[_P, _T]:
-    """Decorate a function that is traced, so that it is traced under ``default_flags``.
+    """Decorate a function so that it is traced under ``default_flags``.
 
-    Within ``jax.jit``, so that a compiled program's call costs nothing. Arguments of 64 bits are
-    rounded to 32, and keys of another implementation than threefry become keys of it: those of
-    JAX's ``rbg`` and ``unsafe_rbg`` that equal seeds make become equal ones.
+    Use it inside ``jax.jit``, so that calls of the compiled program cost nothing. 64-bit arguments
+    are rounded to 32 bits, and keys of other implementations become threefry keys: ``rbg`` and
+    ``unsafe_rbg`` keys of equal seeds become equal keys.
     """
 
     @wraps(function)
@@ -81,13 +81,13 @@ def is_guarded(direction: str) -> bool:
 
 
 def as_by_default(leaf: Any) -> Any:
-    """Return an array of 32 bits, or keys of threefry; anything else as it is."""
+    """Return an array in 32 bits, or keys as threefry keys; anything else unchanged."""
     dtype = getattr(leaf, "dtype", None)
     if dtype is None:
         return leaf
     if jnp.issubdtype(dtype, jax.dtypes.prng_key):
         if jax.random.key_impl(leaf) == PRNG:
             return leaf
-        # The others of JAX keep a threefry key twice.
+        # JAX's other implementations hold a threefry key twice.
         return jax.random.wrap_key_data(jax.random.key_data(leaf)[..., :2], impl=PRNG)
     return leaf.astype(_SHORT[dtype]) if dtype in _SHORT else leaf

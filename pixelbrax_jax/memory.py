@@ -1,4 +1,4 @@
-"""How much memory there is, and sizes that do not fit, refused before anything is allocated."""
+"""Checks that arrays fit into memory, before they are allocated."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import jax
 
 
 def check_fits(what: str, num_bytes: float) -> None:
-    """Reject ``what``, options and their values, if it takes more bytes than the machine has.
+    """Raise an error if ``what``, options and their values, takes more bytes than main memory.
 
-    This finds mistyped numbers early. What the machine could hold but a device or other programs
-    leave no room for is found when it is allocated.
+    This finds mistyped numbers early. The allocation itself fails if the device or other programs
+    leave too little room.
 
     Raises:
-        MemoryError: it is more than this machine's main memory, naming both.
+        MemoryError: it does not fit; the message has both sizes.
     """
     limit = _main_memory()
     if num_bytes > limit:
@@ -26,7 +26,7 @@ def check_fits(what: str, num_bytes: float) -> None:
 
 
 def device_memory() -> float:
-    """Return the bytes that JAX may use on its first device; infinite where nobody tells."""
+    """Return the bytes that JAX may use on its first device; infinite if unknown."""
     statistics = jax.local_devices()[0].memory_stats() or {}
     if "bytes_limit" in statistics:
         return float(statistics["bytes_limit"])
@@ -38,7 +38,7 @@ def device_memory() -> float:
 
 
 def _main_memory() -> float:
-    """Return the bytes of main memory; infinite where the system has no number for it."""
+    """Return the bytes of main memory; infinite if unknown."""
     try:
         return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     except (AttributeError, OSError, ValueError):

@@ -1,4 +1,4 @@
-"""Options as what JSON has: numbers, text, lists and dictionaries."""
+"""Conversion of options to and from JSON types."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from pixelbrax_jax.types import Camera, CameraRig, Lamp, Look
 from pixelbrax_jax.validation import check_choice, check_options
 
 TYPE = "type"
-"""The entry of a dictionary that names what it describes."""
+"""Key of a dictionary's type."""
 
 _TYPES: dict[str, type] = {cls.__name__: cls for cls in (Camera, CameraRig, Lamp, Look)} | {
     cls.kind: cls for cls in (MovingCamera, Color, Video)
@@ -29,16 +29,13 @@ _NAMES = {cls: name for name, cls in _TYPES.items()}
 
 
 def to_plain(value: Any) -> Any:
-    """Return an option's value as what JSON has.
+    """Convert an option's value to JSON types.
 
-    A camera, look or distractor becomes a dictionary, which every option takes in its place: of
-    its fields, and its name under ``"type"``, of a class of your own ``"module:Class"``.
-
-    Args:
-        value: of an option of ``pixelbrax_jax.make`` or an environment of ``pixelbrax_gym``.
+    A camera, look or distractor becomes a dictionary with its fields and its ``"type"``: a name, or
+    ``"module:Class"`` for a class of your own. Every option also takes such a dictionary.
 
     Raises:
-        ValueError: JSON has nothing for it, such as a bank of clips or a class that no module has.
+        ValueError: JSON cannot represent the value, such as a bank of clips or a local class.
     """
     if isinstance(value, enum.Enum):
         return to_plain(value.value)
@@ -58,15 +55,17 @@ def to_plain(value: Any) -> Any:
         fields = [field.name for field in dataclasses.fields(value) if field.init]
         parts = {name: getattr(value, name) for name in fields}
         return {TYPE: name} | {name: to_plain(part) for name, part in parts.items()}
-    raise ValueError(f"JSON has nothing for a {cls.__name__}.")
+    raise ValueError(f"JSON cannot represent a {cls.__name__}.")
 
 
 def from_plain(value: Any) -> Any:
-    """Return what a dictionary of ``to_plain`` describes, or those in a list; all else as it is.
+    """Convert a dictionary of ``to_plain``, or each one of a list, to its object.
+
+    Other values are returned unchanged.
 
     Raises:
-        ValueError: the dictionary names no type, or one that there is not; the message lists them.
-        TypeError: there is no such field; the message lists them.
+        ValueError: the type is missing or unknown; the message lists the types.
+        TypeError: a field is unknown; the message lists the fields.
     """
     if isinstance(value, (tuple, list)):
         return tuple(map(from_plain, value))
@@ -86,9 +85,9 @@ def from_plain(value: Any) -> Any:
 
 def _name_in_module(cls: type) -> str:
     name = f"{cls.__module__}:{cls.__qualname__}"
-    # Another process has another `__main__`, and none has what a function has made.
+    # Another process cannot import `__main__` or a local class.
     if cls.__module__ == "__main__" or "<locals>" in name:
-        raise ValueError(f"JSON has nothing for a class that no module has, such as {name}.")
+        raise ValueError(f"JSON cannot represent {name}: only a class of a module can be imported.")
     return name
 
 
@@ -103,7 +102,7 @@ def _type_of(name: Any) -> Any:
     for part in path.split("."):
         cls = getattr(cls, part, None)
     if not (isinstance(cls, type) and issubclass(cls, Distractor)):
-        raise ValueError(f"{TYPE}={name!r} is no distractor, which is all that a module may give.")
+        raise ValueError(f"{TYPE}={name!r} must be a subclass of pixelbrax_jax.Distractor.")
     return cls
 
 

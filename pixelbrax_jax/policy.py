@@ -80,8 +80,8 @@ def load_policy(path: str | Path) -> Policy:
     if not path.is_file():
         if name not in (names := list_pretrained()):
             raise FileNotFoundError(
-                f"{name!r} is neither a file nor the name of a policy in the package; the names "
-                f"are: {', '.join(names)}.{suggest(name, names)}"
+                f"{name!r} is neither a file nor the name of a policy; pretrained policies: "
+                f"{', '.join(names)}.{suggest(name, names)}"
             )
         path, about = FOLDER / f"{name}.jax", read_pretrained(name)
     try:

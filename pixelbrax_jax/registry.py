@@ -1,4 +1,4 @@
-"""Tasks by name: those that are built in, and those that users register."""
+"""Built-in and registered tasks by name."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from pixelbrax_jax.validation import check_choice, suggest
 
 @dataclass
 class _OwnTask:
-    """A task of the user's."""
+    """A registered task."""
 
     make_physics: Callable[[], Physics]
     camera: CameraRig | Camera | None
@@ -36,11 +36,11 @@ def list_envs(suite: str | None = None) -> tuple[str, ...]:
     """Return the names that ``make`` accepts, sorted.
 
     Args:
-        suite: ``"brax"`` or ``"dmc"`` (the DM Control Suite) for the tasks of one; None for all,
-            also those that were registered.
+        suite: ``"brax"`` or ``"dmc"`` (the DM Control Suite); None for all tasks, including
+            registered ones.
 
     Raises:
-        ValueError: there is no such suite.
+        ValueError: the suite is unknown.
     """
     if suite is None:
         return tuple(sorted([*TASKS, *_OWN_TASKS]))
@@ -53,19 +53,19 @@ def register(
     *,
     camera: CameraRig | Camera | None = None,
 ) -> None:
-    """Add a task of your own, from a Brax environment, an MJCF file or your own ``Physics``.
+    """Register a task made of a Brax environment, an MJCF file or your own ``Physics``.
 
     Args:
-        name: what ``make`` shall call it; must be new.
-        make_physics: builds the physics, e.g. ``lambda: BraxPhysics(MyEnv())`` or
-            ``lambda: mjcf_physics("arm.xml", reward=my_reward)``. Called once, by the first
-            ``make``.
-        camera: default viewpoint; None is the physics' camera ``default``, or without it a look
-            from a corner at everything but the ground, following ``Physics.followed_link``.
+        name: new name of the task.
+        make_physics: builds the physics, e.g. ``lambda: BraxPhysics(MyEnv())`` or ``lambda:
+            mjcf_physics("arm.xml", reward=my_reward)``. The first ``make`` calls it once.
+        camera: default viewpoint. None takes the rig ``default`` of the physics; without one the
+            camera shows all geoms but the ground from a corner and follows
+            ``Physics.followed_link``.
 
     Raises:
         ValueError: the name is taken or empty.
-        TypeError: ``make_physics`` is not callable, or ``camera`` is of another type.
+        TypeError: ``make_physics`` is not callable, or ``camera`` has another type.
     """
     if not isinstance(name, str) or not name:
         raise ValueError(f"a task needs a name, got {name!r}.")
@@ -80,20 +80,17 @@ def register(
 
 @default_flags()
 def make_physics(task: str, **options: Any) -> Physics:
-    """Make the physics of a task.
+    """Make the physics of a task. Equal arguments give equal objects.
 
     Args:
         task: one of ``list_envs()``.
-        **options: those of its suite, such as ``backend`` of Brax's tasks.
-
-    Returns:
-        The physics; equal arguments give equal objects.
+        **options: options of its suite, such as ``backend`` for Brax's tasks.
 
     Raises:
-        ValueError: the task is unknown, or takes no such option.
-        ImportError: the task's models come from a package that is not installed; the message has
-            the line that installs it.
-        TypeError: what was registered returns no ``Physics``.
+        ValueError: the task is unknown, or does not take such an option.
+        ImportError: the package with the task's models is not installed; the message has the
+            command that installs it.
+        TypeError: the registered function does not return a ``Physics``.
     """
     check_choice("task", task, list_envs(), meant=_meant(task))
     own = _OWN_TASKS.get(task)
@@ -103,8 +100,8 @@ def make_physics(task: str, **options: Any) -> Physics:
             takers = [other.title for other in SUITES.values() if name in other.options]
             fix = "leave it out" if own is None else "choose it where it was registered"
             raise ValueError(
-                f"{name}={value!r} is for {' and '.join(takers) or 'no task'} alone, and task "
-                f"{task!r} is none of these: {fix}."
+                f"{name}={value!r} is only for {' and '.join(takers) or 'no task'}, not for task "
+                f"{task!r}: {fix}."
             )
     if own is not None:
         return own.physics
@@ -119,10 +116,10 @@ def registered_camera(task: str) -> CameraRig | Camera | None:
 
 
 def find_task(task: str) -> str:
-    """Return the name of a task, of which ``module:name`` imports the module that registers it.
+    """Return the name of a task; for ``module:name``, first import the module that registers it.
 
     Raises:
-        ValueError: the module's name is none, or it registers no task of that name.
+        ValueError: the module's name is invalid, or the module registers no such task.
         ImportError: the module cannot be imported.
     """
     if not isinstance(task, str) or ":" not in task or task in list_envs():
@@ -130,15 +127,15 @@ def find_task(task: str) -> str:
     module, _, name = task.partition(":")
     if not all(part.isidentifier() for part in module.split(".")):
         raise ValueError(
-            f"task {task!r} must be NAME or MODULE:NAME, with the module as 'import' has it, such "
-            "as my_tasks:my_swing for a file my_tasks.py."
+            f"task {task!r} must be NAME or MODULE:NAME, with the module's name as in 'import', "
+            "such as my_tasks:my_swing for a file my_tasks.py."
         )
     found = _import(module, task)
     if name not in _OWN_TASKS:
         own = ", ".join(sorted(_OWN_TASKS)) or "none"
         raise ValueError(
             f"module {module!r} ({found.__spec__ and found.__spec__.origin}) registers no task "
-            f"{name!r}; registered are: {own}.{suggest(name, _OWN_TASKS)}"
+            f"{name!r}; registered tasks: {own}.{suggest(name, _OWN_TASKS)}"
         )
     return name
 
@@ -154,14 +151,14 @@ def _import(module: str, task: str) -> ModuleType:
             ) from error
         here = sorted(path.stem for path in Path.cwd().glob("*.py"))
         raise ModuleNotFoundError(
-            f"there is no module {error.name!r}, which task {task!r} names: its folder must be the "
+            f"there is no module {error.name!r} for task {task!r}: its folder must be the "
             f"current one, {Path.cwd()}, or in PYTHONPATH.{suggest(module, here)}",
             name=error.name,
         ) from error
 
 
 def _meant(task: object) -> str | None:
-    """Return the one task that another library calls so."""
+    """Return the only task that another library calls by this name, if there is exactly one."""
     names = {own: map(_plain, row.other_names()) for own, row in TASKS.items()}
     found = [own for own, others in names.items() if _plain(task) in others]
     return found[0] if len(found) == 1 else None

@@ -1,4 +1,4 @@
-"""Rotations and frames, float32. Quaternions are ``(w, x, y, z)``, as in MuJoCo and Brax."""
+"""Rotations and frames in float32. Quaternions are ``(w, x, y, z)``, as in MuJoCo and Brax."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def quat_multiply(a: jax.Array, b: jax.Array) -> jax.Array:
 
 
 def quat_normalize(quat: jax.Array) -> jax.Array:
-    """Return the unit quaternion (..., 4) of the same rotation; of zero, the identity."""
+    """Return the unit quaternion (..., 4) of the same rotation; the identity for zero."""
     square = jnp.sum(quat * quat, axis=-1, keepdims=True)
     identity = jnp.array([1.0, 0.0, 0.0, 0.0], quat.dtype)
     # The inner `where` keeps the gradient finite at the zero quaternion.
@@ -42,28 +42,25 @@ def quat_to_mat(quat: jax.Array) -> jax.Array:
 
 
 def rotate(quat: jax.Array, vector: jax.Array) -> jax.Array:
-    """Return ``vector`` (..., 3) turned by the unit quaternion ``quat`` (..., 4)."""
+    """Rotate ``vector`` (..., 3) by the unit quaternion ``quat`` (..., 4)."""
     w, axis = quat[..., :1], quat[..., 1:]
     twice = 2 * jnp.cross(axis, vector)
     return vector + w * twice + jnp.cross(axis, twice)
 
 
 def unit(vector: jax.Array) -> jax.Array:
-    """Return ``vector`` (..., 3) scaled to length 1; zero stays zero, with a zero gradient."""
+    """Scale ``vector`` (..., 3) to length 1; zero stays zero, with a zero gradient."""
     square = jnp.sum(vector * vector, axis=-1, keepdims=True)
     return jnp.where(square > 0, vector * jax.lax.rsqrt(jnp.where(square > 0, square, 1.0)), 0.0)
 
 
 def look_at(eye: jax.Array, target: jax.Array, up: jax.Array) -> jax.Array:
-    """Return the orientation of a camera at ``eye`` that looks at ``target``.
+    """Return the orientation (3, 3) of a camera: columns are its right, up and back directions.
 
     Args:
         eye: (3,) metres.
         target: (3,) metres, different from ``eye``.
         up: (3,) not parallel to the viewing direction.
-
-    Returns:
-        (3, 3) float32; columns are the camera's right, up and back directions.
     """
     back = unit(eye - target)
     right = unit(jnp.cross(up, back))

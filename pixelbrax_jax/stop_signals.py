@@ -1,4 +1,4 @@
-"""Requests to stop: Ctrl-C, the signals of schedulers, the SIGHUP of a closed terminal."""
+"""Requests to stop: Ctrl-C, signals of schedulers, SIGHUP of a closed terminal."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ from contextlib import contextmanager, suppress
 from typing import Any
 
 _ALWAYS = ("SIGINT", "SIGTERM")
-"""Ctrl-C; and what ``kill``, systemd, Kubernetes, HTCondor and most schedulers send first."""
+"""Ctrl-C, and the first signal of ``kill``, systemd, Kubernetes, HTCondor and most schedulers."""
 
 _UNLESS_IN_USE = ("SIGHUP", "SIGUSR1", "SIGUSR2", "SIGXCPU")
-"""A closed terminal; the warnings of Slurm (``--signal``), LSF (``-wa``; SIGUSR2 at a run limit)
-and Grid Engine (``-notify``, soft limits); and those of the kernel, LSF and Grid Engine at a limit
-of processor time. SIGQUIT is not among them: no scheduler sends it by itself, and a person ends a
-process that hangs with it. Neither is SIGTSTP, after which a process may be continued."""
+"""A closed terminal; warnings of Slurm (``--signal``), LSF (``-wa``; SIGUSR2 at a run limit) and
+Grid Engine (``-notify``, soft limits); and limits of processor time. SIGQUIT is missing because it
+ends a hanging process and no scheduler sends it; SIGTSTP because a process may continue after
+it."""
 
 _APART = 1.0
-"""Seconds between two SIGINTs that a person means; a wrapper may pass one key press on twice."""
+"""Seconds between two intended SIGINTs; a wrapper may pass one key press on twice."""
 
 
 def stop_signals() -> list[signal.Signals]:
-    """Return the signals that a long command shall take for a request to stop.
+    """Return the signals that a long command handles as a request to stop.
 
-    Those besides SIGINT and SIGTERM are left alone where they are ignored, as ``nohup`` has it, and
-    where the program has a handler of its own, as launchers that requeue a job have one.
+    Signals other than SIGINT and SIGTERM are left out if they are ignored (``nohup``) or if the
+    program has its own handler (launchers that requeue a job).
     """
     # Windows has not all of them.
     numbers = {name: getattr(signal, name, None) for name in (*_ALWAYS, *_UNLESS_IN_USE)}
@@ -37,18 +37,18 @@ def stop_signals() -> list[signal.Signals]:
 
 
 def signal_name(number: int) -> str:
-    """Return what a signal is called, as SIGTERM."""
+    """Return the name of a signal, such as SIGTERM."""
     return signal.Signals(number).name
 
 
 class StopRequest:
-    """Records the signal by which somebody asks the process to stop.
+    """Records the signal that asks the process to stop.
 
-    The first signal is only recorded. A second Ctrl-C stops at once, by ``KeyboardInterrupt``. No
-    other signal does: a closing terminal and a scheduler send several of them for one request.
+    The first signal is only recorded. A second Ctrl-C raises ``KeyboardInterrupt``; other signals
+    never do, because closing terminals and schedulers send several of them for one request.
 
     Attributes:
-        signal: number of the first signal; 0 as long as there was none.
+        signal: number of the first signal; 0 before there is one.
     """
 
     def __init__(self, report: Callable[[str], object]) -> None:
@@ -57,7 +57,7 @@ class StopRequest:
         self._first_interrupt: float | None = None
 
     def ask(self, number: int, frame: Any) -> None:
-        """Handle a signal; raises KeyboardInterrupt for a second SIGINT."""
+        """Handle a signal; raise KeyboardInterrupt for a second SIGINT."""
         del frame
         if number == signal.SIGINT:
             now = time.monotonic()
@@ -80,10 +80,10 @@ class StopRequest:
 def stop_requests(report: Callable[[str], object]) -> Iterator[StopRequest]:
     """Handle the signals that ask a process to stop, until the end of the block.
 
-    Outside the main thread, where Python allows no handlers, the request stays empty.
+    Outside the main thread, where Python allows no handlers, no request is recorded.
 
     Args:
-        report: gets a line when the first signal comes; it may raise.
+        report: is called with one line at the first signal; it may raise.
     """
     request = StopRequest(report)
     before = {}
@@ -94,5 +94,5 @@ def stop_requests(report: Callable[[str], object]) -> Iterator[StopRequest]:
         yield request
     finally:
         for number, handler in before.items():
-            # None is a handler that was not installed from Python.
+            # None means that the handler was not installed from Python.
             signal.signal(number, signal.SIG_DFL if handler is None else handler)

@@ -1,4 +1,4 @@
-"""All built-in tasks, by suite; reading them loads neither JAX nor physics."""
+"""All built-in tasks by suite. Importing it loads neither JAX nor physics."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ class Suite:
     """Tasks that one engine simulates.
 
     Attributes:
-        title: what messages call its tasks.
-        tasks: by name.
+        title: name of the suite in messages.
+        tasks: tasks by name.
         loader: module with ``make_physics(task, **options)``.
-        options: names of the options of ``make`` that these tasks alone take.
+        options: names of the options that only these tasks take.
     """
 
     title: str
@@ -42,7 +42,7 @@ SUITES: Mapping[str, Suite] = MappingProxyType(
         ),
     }
 )
-"""Suites by name, as ``list_envs`` takes it."""
+"""Suites by the names that ``list_envs`` takes."""
 
 TASKS: Mapping[str, Task] = MappingProxyType(
     {name: task for suite in SUITES.values() for name, task in suite.tasks.items()}

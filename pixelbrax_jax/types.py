@@ -1,14 +1,12 @@
-"""Every value that crosses from one module of the package to the next.
+"""Values that the modules of the package exchange.
 
 Shapes are those of ONE environment; a batch has the same fields with a leading axis. Letters: G
 geoms, M materials, L links, S state features, A actions, H and W pixels, K stacked frames. Arrays
-are float32 where nothing else is said. Lengths are metres, angles degrees, quaternions ``(w, x, y,
-z)`` of length 1, colors linear in [0, 1]. The world is right-handed with z up. Row 0 of an image is
-its top.
+are float32 unless stated otherwise. Lengths are metres, angles degrees, quaternions unit ``(w, x,
+y, z)``, colors linear in [0, 1]. The world is right-handed with z up. Row 0 of an image is its top.
 
-Fields marked *static* are Python values: they decide which program is compiled, hence they are
-hashable and cannot be traced. All other fields are arrays and may be differentiated, batched or
-randomised.
+Fields marked *static* are hashable Python values that decide which program is compiled; they cannot
+be traced. All other fields are arrays and may be differentiated, batched or randomised.
 """
 
 from __future__ import annotations
@@ -22,23 +20,22 @@ import numpy as np
 from flax import struct
 
 FAR = float(np.finfo(np.float32).max)
-"""Metres, the depth where nothing is hit: the largest float32. Not infinity, which
-``jax_debug_infs`` takes for a mistake."""
+"""Depth in metres where the ray hits nothing: the largest float32. Infinity would be an error under
+``jax_debug_infs``."""
 
 
 class GeomKind(IntEnum):
-    """Shapes the renderer draws: one row each, beginning with MuJoCo's number (``mjtGeom``).
+    """Shapes that the renderer supports, one row each, starting with MuJoCo's number (``mjtGeom``).
 
-    All but the plane are convex. Their formulas are in ``renderer.intersect`` and, for the renderer
-    that others are tested against, in ``renderer.reference``.
+    All but the plane are convex. ``renderer.intersect`` and ``renderer.reference`` have the
+    formulas.
 
     Attributes:
-        num_sizes: how many of a geom's three size numbers mean something.
-        reach: which sphere around its center a geom is inside of: its radius is ``first``, the
-            first size number; ``largest``, that of the three; ``diagonal``, their norm; or ``all``,
-            for what has no end.
-        is_long: whether that sphere is around both ends of the z axis, at the second size number.
-        has_far_form: whether float32 needs a longer formula where the camera is far away.
+        num_sizes: number of entries of a geom's size that are used.
+        reach: radius of the bounding sphere: ``first`` or ``largest`` entry of the size,
+            ``diagonal`` (the norm of the size) or ``all`` (infinite).
+        is_long: whether the bounding sphere is swept along z by the second entry of the size.
+        has_far_form: whether float32 needs a longer formula when the camera is far away.
     """
 
     num_sizes: int
@@ -54,10 +51,10 @@ class GeomKind(IntEnum):
         is_long: bool = False,
         has_far_form: bool = False,
     ) -> GeomKind:
-        """Make a row, which is MuJoCo's number.
+        """Make a row.
 
         Raises:
-            TypeError: the number of sizes or the reach is missing or unknown.
+            TypeError: ``num_sizes`` or ``reach`` is missing or unknown.
         """
         if not 1 <= num_sizes <= 3 or reach not in ("first", "largest", "diagonal", "all"):
             raise TypeError(f"GeomKind {number} needs a number of sizes and a reach.")
@@ -81,15 +78,15 @@ _Formula = TypeVar("_Formula")
 def for_each_kind(
     what: str, formulas: Mapping[GeomKind, _Formula], kinds: Iterable[GeomKind] = GeomKind
 ) -> Mapping[GeomKind, _Formula]:
-    """Return a table with one entry for each kind of geom.
+    """Return ``formulas`` if it has exactly one entry for each kind of geom.
 
     Args:
-        what: what the table has, for the message.
+        what: name of the table in the message.
         formulas: the table.
-        kinds: those that it must have.
+        kinds: the required kinds.
 
     Raises:
-        TypeError: it lacks a kind, or has one that it must not.
+        TypeError: a kind is missing or superfluous.
     """
     wrong = set(kinds) ^ set(formulas)
     if wrong:
@@ -99,13 +96,13 @@ def for_each_kind(
 
 
 class String(struct.PyTreeNode):
-    """A thread between two points, drawn as a chain of capsules that hangs where it is slack.
+    """A string between two points, rendered as a chain of capsules; it sags when it is slack.
 
     Attributes:
-        geoms: static, rows of ``Geoms`` that are its pieces, in order; all capsules on no link.
-        link: (2,) static, indices of the links that carry its ends, -1 for the world.
+        geoms: static, rows of ``Geoms`` with its capsules, in order. Their link is -1.
+        link: (2,) static, indices of the links that hold its ends, -1 for the world.
         ends: (2, 3), its ends in the frames of these links.
-        length: (); a distance of the ends that is greater stretches it.
+        length: (), length of the slack string; ends that are farther apart stretch it.
     """
 
     geoms: tuple[int, ...] = struct.field(pytree_node=False)
@@ -119,22 +116,22 @@ class Geoms(struct.PyTreeNode):
 
     Attributes:
         kind: (G,) static, values of ``GeomKind``.
-        link: (G,) static, index of the carrying link, -1 for the world.
-        material: (G,) static, row of ``rgb`` that colors the geom.
-        name: (G,) static, the model's geom name, or ``kind/index`` where it has none.
-        size: (G, 3), with MuJoCo's meaning per kind: radius, half length, half extents.
+        link: (G,) static, index of the geom's link, -1 for the world.
+        material: (G,) static, row of ``rgb``.
+        name: (G,) static, the model's geom name, or ``kind/index`` without one.
+        size: (G, 3), MuJoCo's size of each kind: radius, half length, half extents.
         pos: (G, 3), in the link's frame.
         quat: (G, 4), in the link's frame.
         rgb: (M, 3), one color per material.
-        bounded: (G,) static, planes that end at their size along their x and y, where a size of
-            0 is no end. Empty where no plane ends, whatever its size.
-        patterned: (G,) static, planes that are ground: drawn with the look's pattern, others in
-            their own color. Empty where every plane is.
-        distant: static, whether the camera is so far away, a thousand radii of a sphere or capsule,
-            that float32 needs the longer formulas of ``renderer.intersect``.
-        strings: threads, the pieces of which are among the geoms.
-        material_name: (M,) static, the model's name for the material of the first geom of each
-            color. Empty where none is known.
+        bounded: (G,) static, planes that end at their size along their x and y; a size of 0 means
+            no end. Empty if all planes are infinite.
+        patterned: (G,) static, planes that are ground and show the look's pattern; other planes
+            show their own color. Empty if all planes are ground.
+        distant: static, whether the camera is more than a thousand radii of a sphere or capsule
+            away, so that float32 needs the longer formulas of ``renderer.intersect``.
+        strings: strings, whose capsules are among the geoms.
+        material_name: (M,) static, the model's material of the first geom of each color. Empty if
+            none is known.
     """
 
     kind: tuple[int, ...] = struct.field(pytree_node=False)
@@ -152,7 +149,7 @@ class Geoms(struct.PyTreeNode):
     material_name: tuple[str, ...] = struct.field(pytree_node=False, default=())
 
     def is_bounded(self, geom: int) -> bool:
-        """Return whether a geom is a plane that ends."""
+        """Return whether a geom is a finite plane."""
         return bool(self.bounded) and self.bounded[geom]
 
     def is_ground(self, geom: int) -> bool:
@@ -162,16 +159,16 @@ class Geoms(struct.PyTreeNode):
 
 
 class PhysicsState(struct.PyTreeNode):
-    """What physics hands to the rest of the package after a step.
+    """Result of a physics step.
 
     Attributes:
-        engine: the engine's own state, opaque to everyone else.
+        engine: the engine's own state, opaque to other modules.
         xpos: (L, 3), link origins in the world frame.
         xquat: (L, 4), link orientations in the world frame.
         obs: (S,), the task's state observation.
-        reward: (), of the step that led here, 0 after a reset.
+        reward: (), reward of the last step, 0 after a reset.
         terminated: () bool, the task ended (never a time limit).
-        non_finite: () bool, the step diverged; the pose shown is then the last finite one.
+        non_finite: () bool, the step diverged; the pose is then the last finite one.
     """
 
     engine: Any
@@ -201,13 +198,13 @@ class Camera(struct.PyTreeNode):
 class CameraRig(struct.PyTreeNode):
     """A camera that may follow a link.
 
-    Eye and target are ``offset + track * xpos[link]``; the orientation never follows.
+    Eye and target are ``offset + track * xpos[link]``; the orientation of the link has no effect.
 
     Attributes:
-        link: static, index of the followed link, -1 to follow nothing.
-        track: (3,), fraction of the link's position that is followed, per world axis.
+        link: static, index of the followed link, -1 for none.
+        track: (3,), fraction of the link's position to follow, per world axis.
         eye: (3,).
-        target: (3,), the point looked at.
+        target: (3,), the point the camera looks at.
         up: (3,), the world direction that is up in the image.
         fovy: (), vertical field of view.
     """
@@ -223,16 +220,16 @@ class CameraRig(struct.PyTreeNode):
 class Lamp(struct.PyTreeNode):
     """A spot light that may follow a link.
 
-    It stands at ``offset + xpos[link]`` and never turns. A point at direction d from it (unit
-    length) is lit by ``max(d.axis, 0) ** exponent`` of its strength, and not at all if the angle
-    between d and the axis exceeds the cutoff.
+    It is at ``offset + xpos[link]`` and never turns. It lights a point in direction d (unit length)
+    with ``max(d.axis, 0) ** exponent`` of its strength, and with 0 if the angle between d and the
+    axis exceeds the cutoff.
 
     Attributes:
-        link: static, index of the followed link, -1 for a lamp at rest.
+        link: static, index of the followed link, -1 for none.
         exponent: static int, at least 0.
-        pos: (3,), the offset; in a scene the place in the world.
-        axis: (3,), unit, world direction in which it shines.
-        cos_cutoff: (), cosine of the angle at which its light ends; -1 for none.
+        pos: (3,), the offset; in a scene the position in the world.
+        axis: (3,), unit, world direction of its light.
+        cos_cutoff: (), cosine of the cutoff angle, -1 for none.
         diffuse, highlight: () coefficients, as in ``Look``.
     """
 
@@ -248,31 +245,30 @@ class Lamp(struct.PyTreeNode):
 class Look(struct.PyTreeNode):
     """Light, sky and ground.
 
-    A surface of color ``c`` with normal ``n`` is shaded with Phong's model for a directional
-    light and a viewer at infinity (z is the camera's back axis, ``l`` points to the light,
-    ``r = 2 (n.l) n - l`` is the mirrored light)::
+    A surface of color ``c`` with normal ``n`` is shaded with Phong's model for a directional light
+    and a viewer at infinity (z is the camera's back axis, ``l`` points to the light, ``r = 2 (n.l)
+    n - l`` is the mirrored light)::
 
         c * (ambient + diffuse * max(n.l, 0) + specular * s) + highlight * s,
         s = max(r_z, 0) ** shininess
 
-    then clipped to [0, 1]. Lamps (each with its own l, s and strength a) add to that
-    ``a * (c * diffuse * max(n.l, 0) + highlight * s)``. With a ``headlight`` h the picture is
-    MuJoCo's: there is ``h * max(n_z, 0)`` more ambient light, the sum of both is at most 1 on the
-    ground, and highlights are multiplied by the ground's color.
+    then clipped to [0, 1]. Each lamp, with its own l, s and strength a, adds ``a * (c * diffuse *
+    max(n.l, 0) + highlight * s)``. A ``headlight`` h follows MuJoCo: it adds ``h * max(n_z, 0)`` to
+    the ambient light, limits the sum of both to 1 on the ground, and multiplies highlights by the
+    ground's color.
 
     Attributes:
-        ground: static, ``"checker"`` or ``"grid"`` (thin dark lines), drawn on planes that are
-            ground, from the corner of those that end and from the middle of others.
-        shadows: static, whether geoms cast shadows (diffuse and specular light vanish there).
+        ground: static, ``"checker"`` or ``"grid"`` (thin dark lines), the pattern of planes that
+            are ground. It starts at the corner of finite planes and in the middle of infinite ones.
+        shadows: static, whether geoms cast shadows (without diffuse and specular light).
         shininess: static positive int, the exponent.
-        light: (3,) float32, world direction from the scene TO the light, any length but 0; None
-            for no such light.
-        ambient, diffuse, specular, highlight: () float32 coefficients.
-        sky: (2, 3) float32, color at and below the horizon, and straight above; or (3, 3), and
-            straight below.
-        ground_rgb: (2, 3) float32, colors of the two checker tiles, or of tile and line.
-        ground_pitch: () float32, metres, edge of one tile or distance of two lines.
-        headlight: () float32, coefficient of diffuse light from the camera's side; None for none.
+        light: (3,), world direction TO the light, any length but 0; None for no such light.
+        ambient, diffuse, specular, highlight: () coefficients.
+        sky: (2, 3), colors at and below the horizon, and straight above; or (3, 3), where the last
+            one is straight below.
+        ground_rgb: (2, 3), colors of the two checker tiles, or of tile and line.
+        ground_pitch: (), metres, edge of a tile or distance between lines.
+        headlight: (), coefficient of diffuse light from the camera; None for none.
         lamps: spot lights.
     """
 
@@ -292,7 +288,7 @@ class Look(struct.PyTreeNode):
 
 
 class Scene(struct.PyTreeNode):
-    """Everything a renderer needs for one image, in the world frame.
+    """Input of a renderer for one image, in the world frame.
 
     Attributes:
         geoms: shapes, sizes and colors.
@@ -310,14 +306,13 @@ class Scene(struct.PyTreeNode):
 
 
 class Frame(struct.PyTreeNode):
-    """One image. Color channels stay apart: stacking them early costs a CPU dearly.
+    """One image. Its color channels are separate arrays: it is slow on a CPU to stack them early.
 
     Attributes:
         r, g, b: (H, W) in [0, 1].
-        depth: (H, W), along the camera's viewing axis (not along the ray), ``FAR`` where nothing is
-            hit.
-        seg: (H, W) int32, index of the geom seen, -1 for the sky.
-        ground: (H, W) bool, a plane that is ground is seen; cheaper to ask than ``seg``.
+        depth: (H, W), along the camera's viewing axis (not along the ray), ``FAR`` for the sky.
+        seg: (H, W) int32, index of the visible geom, -1 for the sky.
+        ground: (H, W) bool, whether a plane that is ground is visible; cheaper than ``seg``.
     """
 
     r: jax.Array
@@ -329,12 +324,12 @@ class Frame(struct.PyTreeNode):
 
 
 class Clips(struct.PyTreeNode):
-    """Video clips on the device, one after the other. C clips, T frames in all.
+    """Video clips on the device, in one array: C clips, T frames in all.
 
     Attributes:
         packed: (T, H, W) uint32, packed pixels: red in the low byte, then green, then blue.
         first: (C,) int32, index of a clip's first frame.
-        length: (C,) int32, frames of a clip, at least 1.
+        length: (C,) int32, number of a clip's frames, at least 1.
     """
 
     packed: jax.Array
@@ -343,13 +338,13 @@ class Clips(struct.PyTreeNode):
 
 
 class EnvParams(struct.PyTreeNode):
-    """The part of an environment that may be randomised; always a jit argument.
+    """Parameters of an environment that may be randomised; always an argument of jitted functions.
 
     Attributes:
         geoms: the shapes and their colors.
         rig: the camera rig.
         look: light, sky and ground.
-        clips: videos for the background; None where no distractor shows any.
+        clips: background videos; None if no distractor shows any.
         episode_length: () int32, time limit in control steps.
     """
 
@@ -361,17 +356,17 @@ class EnvParams(struct.PyTreeNode):
 
 
 class SimState(struct.PyTreeNode):
-    """What is simulated of one pixel environment.
+    """Simulated part of an environment's state.
 
     Attributes:
         physics: the state of the physics.
-        episode: () uint32, index of the current episode, 0 first.
-        step_count: () int32, control steps taken in this episode.
-        time_limit_offset: () int32, control steps by which the time limit comes early in this
-            episode; 0 unless somebody has set it.
+        episode: () uint32, index of the current episode, from 0.
+        step_count: () int32, control steps of this episode.
+        time_limit_offset: () int32, control steps by which the time limit of this episode is
+            shortened, 0 by default.
         episode_return: () float32, sum of rewards of this episode.
         done: () bool, the episode has ended and the next call must reset.
-        distractor_state: states of the distractors, a tuple.
+        distractor_state: tuple of the distractors' states.
     """
 
     physics: PhysicsState
@@ -387,7 +382,7 @@ class EnvState(struct.PyTreeNode):
     """State of one pixel environment.
 
     Attributes:
-        sim: what is simulated.
+        sim: the simulated part.
         frames: (H, W, 3K) uint8, the frame stack, oldest first; (0, 0, 0) without pixels.
         key: typed PRNG key of the environment; never changes.
     """
@@ -398,20 +393,20 @@ class EnvState(struct.PyTreeNode):
 
     @property
     def done(self) -> jax.Array:
-        """() bool, the episode has ended and the next call must reset."""
+        """() bool, whether the episode has ended and the next call must reset."""
         return self.sim.done
 
 
 class Timestep(struct.PyTreeNode):
-    """What an agent sees after a reset or a step.
+    """Result of a reset or step.
 
     Attributes:
-        obs: uint8 (H, W, 3K) pixels, oldest frame first; or (S,) state; or a dict of both under
-            ``"pixels"`` and ``"state"``, as ``obs_mode`` says.
+        obs: (H, W, 3K) uint8 pixels, oldest frame first; (S,) state; or a dictionary of both with
+            keys ``"pixels"`` and ``"state"``, according to ``obs_mode``.
         reward: (), 0 after a reset.
         terminated: () bool, the task ended.
         truncated: () bool, the time limit was reached; never together with ``terminated``.
-        info: dict with a fixed set of keys, see ``PixelEnv.step``.
+        info: dictionary with fixed keys, see ``PixelEnv.step``.
     """
 
     obs: Any

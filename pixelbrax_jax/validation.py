@@ -1,4 +1,4 @@
-"""One way each to reject unknown names and options, and values of the wrong kind."""
+"""Checks of names, options and values, with suggestions."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from numbers import Integral, Real
 import numpy as np
 
 _SIMILAR = 0.65
-"""Likeness, of at most 1, from which a name is suggested in place of an unknown one."""
+"""Least similarity, up to 1, of a name that is suggested for an unknown one."""
 
 _SIMILAR_OPTION = 0.75
-"""The same of options, whose names have parts such as ``render`` and ``mode`` in common."""
+"""The same for options, whose names share parts such as ``render`` and ``mode``."""
 
 _ELSEWHERE = {
     "batch_size": "num_envs",
@@ -24,7 +24,7 @@ _ELSEWHERE = {
     "num_stack": "frame_stack",
     "time_limit": "episode_length",
 }
-"""Options under the names that other libraries give them."""
+"""Names of options in other libraries."""
 
 _ADVICE = {
     "device": " Frames are where JAX computes: on an NVIDIA GPU with the extra cuda12 or cuda13.",
@@ -33,7 +33,7 @@ _ADVICE = {
         ("image_size", "img_size", "resolution", "size"), " Did you mean 'height' and 'width'?"
     ),
 }
-"""What to do in place of an option that there is not."""
+"""Advice for options that do not exist."""
 
 
 def check_choice(
@@ -42,13 +42,13 @@ def check_choice(
     """Return ``value`` if it is one of ``allowed``.
 
     Args:
-        what: what the value stands for, as the message should call it.
-        value: what the user gave.
+        what: name of the option in the message.
+        value: the user's value.
         allowed: every accepted name.
-        meant: the one that a wrong value surely stands for; None suggests the nearest one.
+        meant: the name to suggest; None suggests the nearest one.
 
     Raises:
-        ValueError: otherwise, naming the value, all allowed names and the nearest one.
+        ValueError: it is not; the message has the value, all allowed names and the nearest one.
     """
     names = sorted(allowed)
     if isinstance(value, str) and value in names:
@@ -61,8 +61,8 @@ def check_options(given: Iterable[str], allowed: Iterable[str]) -> None:
     """Check that keyword arguments are known.
 
     Raises:
-        TypeError: one is not, naming it, all allowed names and the nearest one. It is phrased as
-            Python's own message, by which some libraries find out which options there are.
+        TypeError: one is unknown; the message has all allowed names and the nearest one. It starts
+            like Python's own message, which some libraries parse to find the known options.
     """
     names = sorted(allowed)
     for name in given:
@@ -74,7 +74,7 @@ def check_options(given: Iterable[str], allowed: Iterable[str]) -> None:
 
 
 def suggest(value: object, names: Iterable[str], likeness: float = _SIMILAR) -> str:
-    """Return a question after a space: whether a similar name was meant. Empty if none is."""
+    """Return `` Did you mean 'name'?`` with the most similar name, or an empty string."""
     by_lower = {name.lower(): name for name in names}
     given = str(value).lower()
     nearest = difflib.get_close_matches(given, by_lower, n=1, cutoff=likeness)
@@ -85,7 +85,7 @@ def suggest(value: object, names: Iterable[str], likeness: float = _SIMILAR) -> 
 
 
 def check_bool(what: str, value: object) -> bool:
-    """Return ``value``, Python's or NumPy's truth value, as Python's.
+    """Return a bool of Python or NumPy as a Python bool.
 
     Raises:
         TypeError: it is something else.
@@ -96,10 +96,10 @@ def check_bool(what: str, value: object) -> bool:
 
 
 def check_positive_int(what: str, value: object) -> int:
-    """Return ``value``, Python's or NumPy's integer of at least 1, as Python's.
+    """Return an integer of Python or NumPy, at least 1, as a Python int.
 
     Raises:
-        ValueError: it is something else, or a truth value.
+        ValueError: it is something else, or a bool.
     """
     if isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= 1:
         return int(value)
@@ -110,7 +110,7 @@ def check_fraction(what: str, value: object) -> float:
     """Return ``value`` if it is a number in [0, 1].
 
     Raises:
-        ValueError: it is something else.
+        ValueError: it is not.
     """
     if isinstance(value, Real) and not isinstance(value, bool) and 0.0 <= float(value) <= 1.0:
         return float(value)

@@ -1,4 +1,4 @@
-"""Videos and animated images as files."""
+"""Video and GIF files."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from pixelbrax_jax.ffmpeg import Decoder, Encoder
 SUFFIXES = (".gif", ".mp4")
 
 _LONGEST = 655_350.0
-"""Milliseconds for which a GIF can show one image: hundredths of a second, in 16 bits."""
+"""Longest display time of a GIF's image in milliseconds: hundredths of a second, in 16 bits."""
 
 NO_WRITER = f"a video needs imageio-ffmpeg and Pillow; try: {install_extra('video')}"
 
 
 def write_frames(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> Path:
-    """Write frames as they come; what came before an error or Ctrl-C is kept.
+    """Write frames to a video file as they arrive, and read the file back to check it.
 
-    An MP4 has even sides: the last row or column of an odd one is repeated. What was written is
-    read back and compared with what was given.
+    An MP4 repeats the last row or column of an odd side. After an error or Ctrl-C the file keeps
+    the frames before it.
 
     Args:
-        path: of the file, ``.mp4``, or ``.gif``, which repeats for ever; folders are made.
+        path: the file, ``.mp4`` or ``.gif`` (which loops forever); folders are created.
         frames: (H, W, 3) uint8 each, all of one size.
         fps: frames per second.
 
@@ -37,10 +37,10 @@ def write_frames(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> 
         The path.
 
     Raises:
-        ValueError: the suffix is another, ``fps`` is not positive, there are no frames, one is
-            of another shape or dtype, or a GIF would stand still for more than 655 s.
-        ImportError: imageio-ffmpeg or Pillow is not installed, with the fix.
-        OSError: the file cannot be written, or is not what was given; with the reason.
+        ValueError: the suffix is unknown, ``fps`` is not positive, there are no frames, a frame has
+            another shape or dtype, or a GIF would show one image for more than 655 s.
+        ImportError: imageio-ffmpeg or Pillow is not installed; the message has the fix.
+        OSError: the file cannot be written, or differs from the frames; with the reason.
     """
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
@@ -74,7 +74,7 @@ def write_frames(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> 
 
 
 class _Gif:
-    """Collects frames, as ``Encoder`` writes them, into an animated image."""
+    """Writer of GIF files, with the interface of ``Encoder``."""
 
     def __init__(self, path: Path, fps: float) -> None:
         from PIL import Image
@@ -85,12 +85,12 @@ class _Gif:
 
     def append(self, frame: np.ndarray) -> None:
         image = self._from_array(frame)
-        # Older releases of Pillow lose the time of equal images; newer ones add it up, too.
+        # Older releases of Pillow lose the time of equal images; newer ones add it up.
         still = bool(self._images) and image == self._images[-1]
         time = self._milliseconds + (self._times[-1] if still else 0.0)
         if time > _LONGEST:
             raise ValueError(
-                f"{self._path} is not whole: a GIF shows an image for at most "
+                f"{self._path} is incomplete: a GIF shows an image for at most "
                 f"{_LONGEST / 1000:.0f} s, and equal frames last longer; write an .mp4, or raise "
                 "fps."
             )
@@ -110,7 +110,7 @@ class _Gif:
             first.save(self._path, format="GIF", append_images=others, **moving)
         except BaseException as error:
             self._path.unlink(missing_ok=True)  # a part of a file that nothing shows
-            # Of a side or a time that 16 bits cannot hold.
+            # A side or a time exceeds 16 bits.
             if isinstance(error, (OSError, struct.error)):
                 raise OSError(f"{self._path} was not written: {error}.") from error
             raise
@@ -131,8 +131,8 @@ def _check_mp4(path: Path, count: int, shape: tuple[int, int, int]) -> None:
     found = [frame.shape for frame in decoder]
     if found != [expected] * count:
         raise OSError(
-            f"{path} is not what was written: {count} frames of {expected}, and {len(found)} of "
-            f"{found[0] if found else 'no size'} come back"
+            f"{path} differs from what was written: {count} frames of {expected}, but it has "
+            f"{len(found)} of {found[0] if found else 'no size'}"
             + (f" ({decoder.complaint})." if decoder.complaint else ".")
         )
 
@@ -143,11 +143,11 @@ def _check_gif(path: Path, count: int, shape: tuple[int, int, int], fps: float) 
     shown = 1000.0 * count / fps
     with Image.open(path) as image:
         size = (image.height, image.width, 3)
-        # Equal frames that follow one another are one, which is shown for longer.
+        # Consecutive equal frames become one that is shown for longer.
         times = [frame.info.get("duration", 0) for frame in ImageSequence.Iterator(image)]
     # A GIF counts in hundredths of a second.
     if size != shape or abs(sum(times) - shown) > 10 * count:
         raise OSError(
-            f"{path} is not what was written: {shown:.0f} ms of {shape}, and {sum(times)} ms of "
-            f"{size} come back."
+            f"{path} differs from what was written: {shown:.0f} ms of {shape}, but it has "
+            f"{sum(times)} ms of {size}."
         )

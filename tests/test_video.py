@@ -83,7 +83,7 @@ def test_a_gif_that_stands_still_for_longer_than_it_can_say(tmp_path):
     dark, bright = np.zeros((8, 8, 3), np.uint8), np.full((8, 8, 3), 255, np.uint8)
     path = tmp_path / "a.gif"
     write_frames(path, [bright] + [dark] * 655 + [bright] * 655, 1)
-    with pytest.raises(ValueError, match=r"a\.gif is not whole: .* at most 655 s.*write an \.mp4"):
+    with pytest.raises(ValueError, match=r"a\.gif is incomplete: .* at most 655 s.*write an \.mp4"):
         write_frames(path, [bright] + [dark] * 656, 1)
     read = imageio.imread(path, index=None)
     assert read[:, 0, 0, 0].tolist() == [255, 0], "what came before is kept"

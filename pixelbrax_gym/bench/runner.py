@@ -120,10 +120,7 @@ def run_process(
         found = json.loads(output.strip().splitlines()[-1])
         return {"status": "ok", "values": found["values"], "peak_bytes": found.get("peak_bytes")}
     except (ValueError, TypeError, LookupError):
-        return {
-            "status": "failed",
-            "why": f"its last line is not a result: {output[-200:]!r}",
-        }
+        return {"status": "failed", "why": f"its last line is not a result: {output[-200:]!r}"}
 
 
 def _kill(child: subprocess.Popen[str]) -> None:

@@ -1,4 +1,4 @@
-"""What both of Gymnasium's environments have: a spec, and states that are taken and given back."""
+"""Share a spec and access to states between both of Gymnasium's environments."""
 
 from __future__ import annotations
 
@@ -20,12 +20,10 @@ class StatefulAdapter:
     _spec: EnvSpec | None = None
 
     def get_state(self) -> EnvState:
-        """Return the present state, of many environments with a leading axis N.
+        """Return the current ``EnvState``, with a leading axis N for many environments.
 
-        Returns:
-            An ``EnvState`` of arrays that nothing writes to, with all that decides how the episode
-            and the later ones go on, but for a ``TimeLimit`` around the environment. It can be
-            pickled, and ``reset(options={"state": state})`` goes on from it to the bit.
+        It can be pickled. ``reset(options={"state": state})`` continues from it bit for bit, except
+        for the count of a ``TimeLimit`` around the environment.
 
         Raises:
             ResetNeeded: before the first reset.
@@ -34,25 +32,22 @@ class StatefulAdapter:
         return self._stateful.get_state()
 
     def set_state(self, state: EnvState) -> None:
-        """Go on from a given state, as ``reset(options={"state": state})`` does.
+        """Continue from a state, as ``reset(options={"state": state})`` does.
 
         Args:
-            state: what ``get_state`` returned here or of another environment of the same options;
-                or, of one environment, what ``PixelEnv.reset`` or ``PixelEnv.step`` did.
+            state: from ``get_state`` of an environment with the same options; for one environment
+                also from ``PixelEnv.reset`` or ``PixelEnv.step``.
 
         Raises:
-            TypeError: it is no ``EnvState``.
-            ValueError: it is of another environment; the message names the first difference.
+            TypeError: ``state`` is not an ``EnvState``.
+            ValueError: ``state`` does not fit this environment.
             ClosedEnvironmentError: after ``close`` of many environments.
         """
         self._stateful.set_state(state)
 
     @property
     def spec(self) -> EnvSpec | None:
-        """What Gymnasium knows of the environment, from which an equal one can be made.
-
-        The time limit is in calls of ``step``, options are what JSON has.
-        """
+        """Spec of an equal environment, with the time limit in calls of ``step``."""
         return self._spec
 
     @spec.setter
@@ -65,7 +60,7 @@ class StatefulAdapter:
         spec.max_episode_steps = stateful.max_episode_steps
         spec.kwargs = dict(spec.kwargs)
         spec.kwargs.pop("max_episode_steps", None)
-        # `make_vec` hands the limit of a spec to the environments, `make` to a wrapper.
+        # `make_vec` passes the limit of a spec to the environments, `make` to a wrapper.
         if stateful.is_limited or not stateful.single:
             spec.kwargs["episode_length"] = stateful.episode_length
         if list(_unstorable(spec.kwargs)):
@@ -76,18 +71,14 @@ class StatefulAdapter:
 
 
 class _UnstorableSpec(EnvSpec):
-    """A spec with options that JSON has nothing for."""
+    """A spec with options that cannot be written as JSON."""
 
     def to_json(self) -> str:
-        """Refuse.
-
-        Raises:
-            ValueError: names the options.
-        """
+        """Raise a ValueError that names the options."""
         names = ", ".join(f"{name}={value!r:.60}" for name, value in _unstorable(self.kwargs))
         raise ValueError(
-            f"the spec of {self.id} does not go into JSON, for there is nothing there for {names}; "
-            "give a folder in place of clips, or the name of what is given as an object."
+            f"the spec of {self.id} cannot be written as JSON because of {names}; give clips as a "
+            "folder, and other objects by their names."
         )
 
 

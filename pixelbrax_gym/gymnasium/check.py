@@ -1,4 +1,4 @@
-"""The contract of ``gymnasium.vector.VectorEnv`` as a function that third parties can run."""
+"""Check that an environment follows the contract of ``gymnasium.vector.VectorEnv``."""
 
 from __future__ import annotations
 
@@ -12,46 +12,43 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 _REPLAYED_STEPS = 5
-"""Steps that are taken twice to see whether they repeat."""
+"""Number of steps that are replayed to check determinism."""
 
 
 class VectorEnvError(AssertionError):
-    """An environment breaks a rule that agents and wrappers rely on."""
+    """A broken rule that agents and wrappers rely on."""
 
 
 class VectorEnvWarning(UserWarning):
-    """A rule could not be checked, or is broken in a way that many environments share."""
+    """A rule that could not be checked, or that Gymnasium's own environments break too."""
 
 
 def check_vector_env(env: VectorEnv, *, seed: int = 0, num_steps: int = 200) -> None:
-    """Drive a vector environment with random actions, and check what others rely on.
+    """Run a vector environment with a random policy and check the rules that others rely on.
 
-    Checked are, in this order:
+    The rules, in this order:
 
-    * the four spaces, ``num_envs`` and ``metadata["autoreset_mode"]`` are there and agree;
+    * the four spaces, ``num_envs`` and ``metadata["autoreset_mode"]`` exist and agree;
     * observations lie in the space, rewards are (N,) finite floats, flags (N,) bools;
     * every info ``key`` has an (N,) bool mask ``_key``, and values have N entries;
     * the same seed gives the same episodes;
-    * what was returned is not overwritten by a later call;
-    * ended episodes are followed by new ones as the declared autoreset mode says;
+    * later calls do not overwrite results;
+    * episodes reset as the autoreset mode requires;
     * ``render()`` returns a tuple of N images;
-    * with autoreset disabled, ``reset_mask`` resets the masked environments and
-      neither shows nor changes anything in the others;
+    * with autoreset disabled, ``reset_mask`` resets only the masked environments;
     * ``close()`` may be called twice.
 
-    Arrays may be NumPy's, torch's on the CPU, or JAX's; actions are NumPy arrays.
-
-    Two things are warnings, not errors: a caller's ``options`` that is changed, since
-    Gymnasium 1.4's own ``SyncVectorEnv`` and ``AsyncVectorEnv`` remove ``reset_mask`` from it; and
-    a rule that could not be checked, e.g. since no episode ended.
+    Arrays may be NumPy's, torch's on the CPU, or JAX's; actions are NumPy arrays. The function
+    only warns if a rule could not be checked, e.g. because no episode ended, or if ``reset``
+    changes ``options``, because Gymnasium 1.4's ``SyncVectorEnv`` and ``AsyncVectorEnv`` do.
 
     Args:
-        env: the environment, in any autoreset mode; closed in the end.
-        seed: of the environment and the actions.
+        env: the environment, in any autoreset mode; it is closed at the end.
+        seed: seed of the environment and the actions.
         num_steps: calls of ``step`` in which an episode should end.
 
     Raises:
-        VectorEnvError: naming the rule that is broken.
+        VectorEnvError: a rule is broken.
     """
     check = _Check(env, seed)
     check.determinism()
@@ -65,7 +62,7 @@ def check_vector_env(env: VectorEnv, *, seed: int = 0, num_steps: int = 200) -> 
 
 
 class _Check:
-    """An environment under test; its attributes and spaces are checked at once."""
+    """An environment under test; the constructor checks attributes and spaces."""
 
     def __init__(self, env: VectorEnv, seed: int) -> None:
         _require(isinstance(env, VectorEnv), "the environment must be a gymnasium VectorEnv")
@@ -75,7 +72,7 @@ class _Check:
             f"num_envs must be a positive integer, is {num_envs!r}",
         )
         self.env, self.seed, self.num_envs = env, seed, int(num_envs)
-        # Whether each kind of reset has ever shown something else than the state before it.
+        # Rule -> whether a reset has ever changed an observation.
         self.changed: dict[str, bool] = {}
         for kind in ("observation", "action"):
             single: Any = getattr(env, f"single_{kind}_space", None)
@@ -106,7 +103,7 @@ class _Check:
             _warn("two different seeds give the same first observation")
 
     def reset_of_others(self) -> None:
-        """Check that only masked rows are reset: the others go on as if nothing had happened."""
+        """Check that a masked reset does not affect later steps of the other environments."""
         mask = np.arange(self.num_envs) == 0
         undisturbed, disturbed = self.replay(self.seed), self.replay(self.seed, mask)
         for one, other in zip(undisturbed, disturbed, strict=False):
@@ -116,7 +113,7 @@ class _Check:
             )
 
     def replay(self, seed: int, reset_mask: np.ndarray | None = None) -> list[Any]:
-        """Return copies of a short run; with a mask, some are reset after its first step."""
+        """Return copies of a short run's results; a mask resets some after the first step."""
         self.env.action_space.seed(self.seed)
         results = [_copy(self.check_reset(self.env.reset(seed=seed)))]
         for index in range(_REPLAYED_STEPS):
@@ -212,7 +209,7 @@ class _Check:
             self.changed[rule] = self.changed.get(rule, False) or not _equal(final, first)
 
     def reset_some(self, mask: np.ndarray, before: Any) -> None:
-        """Reset where ``mask``, and check that only that happened; ``before`` is the last obs."""
+        """Reset where ``mask`` is True and compare with ``before``, the last observations."""
         rule = "reset(options={'reset_mask': mask}) must"
         kept, given = _copy(before), mask.copy()
         options = {"reset_mask": given}
@@ -270,7 +267,7 @@ def _warn(message: str) -> None:
 
 
 def _copy(tree: Any) -> Any:
-    """Return copies in the host's memory."""
+    """Copy arrays to host memory."""
     return jax.tree.map(lambda x: np.array(np.asarray(x)), tree)
 
 
@@ -292,7 +289,7 @@ def _is_batch(single: spaces.Space, batched: spaces.Space, num_envs: int) -> boo
         )
     if not isinstance(single, spaces.Box):
         return batch_space(single, num_envs) == batched
-    # Compared by parts: a batched Box of many pixel environments takes gigabytes to build.
+    # Compare parts, because an ordinary batched Box of many pixel environments takes gigabytes.
     return (
         isinstance(batched, spaces.Box)
         and batched.shape == (num_envs, *single.shape)

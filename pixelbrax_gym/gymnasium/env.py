@@ -1,4 +1,4 @@
-"""One pixel environment as a ``gymnasium.Env``."""
+"""Provide one pixel environment as a ``gymnasium.Env``."""
 
 from __future__ import annotations
 
@@ -22,23 +22,18 @@ RENDER_MODES = ("human", "rgb_array")
 
 
 class GymnasiumEnv(StatefulAdapter, gymnasium.Env):
-    """A Brax task seen through a camera.
+    """A pixel task as a single environment.
 
-    Seeded with s it is bitwise environment 0 of a ``GymnasiumVectorEnv`` that is seeded with s,
-    as far as the two compiled programs agree in their last bit.
+    Seed s gives the episodes of environment 0 of a ``GymnasiumVectorEnv`` with seed s, except for
+    the last bit where the two compiled programs differ. ``reset()`` without a seed starts the
+    next episode, whose initial state depends only on the seed and the number of the episode.
 
-    ``reset()`` without a seed goes on to the next episode, whose initial state depends on nothing
-    but the seed and the number of the episode.
+    ``episode_length`` limits an episode in control steps, ``action_repeat`` of which make a call
+    of ``step``. ``max_episode_steps`` and Gymnasium's ``TimeLimit`` count calls of ``step``. The
+    limit reached first truncates the episode; without any it is 1000 control steps.
 
-    Time limits: the environment truncates after ``episode_length`` control steps, hence after
-    ``episode_length / action_repeat`` calls of ``step``. ``max_episode_steps`` counts calls of
-    ``step``, as everywhere in Gymnasium, and so does a ``TimeLimit``, which ``gymnasium.make``
-    makes of it. Of those that are given, the limit that is reached first truncates; if none is, it
-    is 1000 control steps.
-
-    Observations are never overwritten, and may be written to: nothing reads them again.
-
-    After ``close`` a ``reset`` opens the environment again.
+    Observations are never overwritten and may be written to. ``reset`` reopens the environment
+    after ``close``.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012  # as Gymnasium declares it
@@ -61,19 +56,17 @@ class GymnasiumEnv(StatefulAdapter, gymnasium.Env):
 
         Args:
             task: one of ``pixelbrax_jax.list_envs()``.
-            output: what observations are: ``"numpy"``, ``"torch"`` or ``"jax"`` arrays.
+            output: type of observations: ``"numpy"``, ``"torch"`` or ``"jax"`` arrays.
             render_mode: None, ``"rgb_array"``, or ``"human"`` for a window.
-            render_height: pixels of ``render()``.
-            render_width: pixels of ``render()``.
+            render_height: height of ``render()`` in pixels.
+            render_width: width of ``render()`` in pixels.
             max_episode_steps: time limit in calls of ``step``.
-            **options: everything else that ``pixelbrax_jax.make`` takes, such as ``backend``,
-                ``camera``, ``height``, ``width``, ``frame_stack``, ``obs_mode``,
-                ``action_repeat`` and ``episode_length``.
+            **options: other options of ``pixelbrax_jax.make``, such as ``camera``.
 
         Raises:
-            TypeError: an option is unknown; the message lists those there are.
-            ValueError: an option is out of range; the message lists what is allowed.
-            ImportError: a package is missing that ``output`` or ``render_mode`` needs.
+            TypeError: an option is unknown.
+            ValueError: an option is out of range.
+            ImportError: ``output`` or ``render_mode`` needs a package that is not installed.
             RuntimeError: this process is a fork that cannot run JAX.
         """
         if render_mode is not None:
@@ -99,21 +92,18 @@ class GymnasiumEnv(StatefulAdapter, gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Reset to an episode.
+        """Start an episode; return the observation and the info of ``step``.
 
         Args:
-            seed: s resets to episode 0 of ``jax.random.key(s)``; None goes on to the next, or
-                draws a seed if there was none yet.
-            options: ``{"state": state}`` goes on from a state of ``get_state``, and takes no
-                seed; there are no others.
-
-        Returns:
-            The observation and the info of ``step``.
+            seed: s starts episode 0 of ``jax.random.key(s)``; None starts the next episode, or
+                samples a seed at the first reset.
+            options: ``{"state": state}`` continues from a state of ``get_state``, without a seed.
 
         Raises:
-            TypeError: the seed is no integer, ``options`` no dict, or the state no ``EnvState``.
-            ValueError: the seed is out of range, or given beside a state; the state is of another
-                environment; or there are other options.
+            TypeError: ``seed`` is not an integer, ``options`` not a dict, or the state not an
+                ``EnvState``.
+            ValueError: ``seed`` is out of range or given with a state, the state does not fit this
+                environment, or another option is given.
             RuntimeError: this process is a fork that cannot run JAX.
         """
         given = read_options(options, seed)
@@ -126,26 +116,23 @@ class GymnasiumEnv(StatefulAdapter, gymnasium.Env):
         return self._export(outputs["obs"]), _plain(outputs["info"])
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Act for ``action_repeat`` control steps.
+        """Apply an action for ``action_repeat`` control steps.
 
         Args:
             action: (A,) floating point, a NumPy array, torch tensor or JAX array; rounded to
                 float32 and clipped to [-1, 1].
 
         Returns:
-            Observation, reward, terminated, truncated and an info of
-
-            * ``episode_return``: float, sum of this episode's rewards so far,
-            * ``episode_length``: int, control steps so far,
-            * ``non_finite``: bool, the physics diverged and ended the episode.
+            Observation, reward, terminated, truncated and info: ``episode_return`` (float, sum of
+            the episode's rewards), ``episode_length`` (int, control steps) and ``non_finite``
+            (bool, the physics diverged and ended the episode).
 
         Raises:
             ResetNeeded: before the first reset, after ``close``, or when the episode has ended.
             RuntimeError: this process is a fork that cannot run JAX.
             TypeError: the action is not floating point.
-            ValueError: the action has another shape, is on another device, or contains a NaN
-                (in a NumPy array or CPU tensor; elsewhere a NaN ends the episode with
-                ``non_finite``). Nothing was stepped.
+            ValueError: the action's shape or device is wrong, or a NumPy array or CPU tensor
+                contains NaN; nothing is stepped then. NaN elsewhere ends the episode.
         """
         outputs = self._stateful.step(action)
         self._show()
@@ -158,11 +145,9 @@ class GymnasiumEnv(StatefulAdapter, gymnasium.Env):
         )
 
     def render(self) -> np.ndarray | None:
-        """Return an image of the present state.
+        """Render a (render_height, render_width, 3) uint8 image of the current state.
 
-        Returns:
-            (render_height, render_width, 3) uint8 in mode ``"rgb_array"``; None in the other
-            modes. A window is drawn by ``reset`` and ``step`` already.
+        Returns None except in mode ``"rgb_array"``; ``reset`` and ``step`` update a window.
 
         Raises:
             ResetNeeded: before the first reset, or after ``close``.
@@ -172,13 +157,13 @@ class GymnasiumEnv(StatefulAdapter, gymnasium.Env):
         return self._picture()
 
     def close(self) -> None:
-        """Close the window and forget the state; the next ``reset`` opens both again."""
+        """Close the window and release the state; the next ``reset`` reopens both."""
         if self._window is not None:
             self._window.close()
         self._stateful.forget()
 
     def _take_time_limit(self) -> None:
-        """Let a ``TimeLimit`` around this environment have its way, unless a limit was given."""
+        """Adopt a longer limit of a ``TimeLimit`` around this environment unless one was given."""
         calls = None if self._stateful.is_limited else _time_limit_around(self)
         if calls is not None and calls > self._stateful.max_episode_steps:
             self._stateful.set_time_limit(calls * self._stateful.env.action_repeat)
@@ -195,15 +180,14 @@ class GymnasiumEnv(StatefulAdapter, gymnasium.Env):
 
 
 def _time_limit_around(env: gymnasium.Env) -> int | None:
-    """Return the least limit of the ``TimeLimit`` wrappers through which ``env`` is reset.
+    """Return the smallest limit of the ``TimeLimit`` wrappers through which ``env`` is reset.
 
-    ``gymnasium.make`` tells its ``max_episode_steps`` to such a wrapper alone, so that an
-    environment with a limit of its own cannot know otherwise that a longer one was asked for.
+    ``gymnasium.make`` passes ``max_episode_steps`` only to such a wrapper, not to the environment.
     """
     limits: list[int] = []
     frame: FrameType | None = sys._getframe(1)
     while frame is not None:
-        # Of no other frame: to look at its variables may keep them alive.
+        # Reading the variables of any other frame may keep them alive.
         if frame.f_code is TimeLimit.reset.__code__:
             wrapper = frame.f_locals["self"]
             if wrapper.unwrapped is env:
@@ -213,6 +197,6 @@ def _time_limit_around(env: gymnasium.Env) -> int | None:
 
 
 def _plain(info: dict[str, Any]) -> dict[str, Any]:
-    """Return scalars as Python's own numbers, arrays as NumPy's."""
+    """Convert scalars to Python's numbers and arrays to NumPy's."""
     arrays = {name: np.array(value) for name, value in info.items()}
     return {name: array if array.ndim else array.item() for name, array in arrays.items()}

@@ -1,4 +1,4 @@
-"""Gymnasium spaces of pixel environments, which take no more memory for many than for one."""
+"""Build the Gymnasium spaces of pixel environments."""
 
 from __future__ import annotations
 
@@ -13,16 +13,13 @@ _BOUNDS = ("low", "high", "bounded_below", "bounded_above")
 
 
 class BroadcastBox(gymnasium.spaces.Box):
-    """A ``Box`` of a batch, with one lower and one upper bound, kept once.
+    """A batched ``Box`` whose bounds are read-only views of one lower and one upper number.
 
-    An ordinary ``Box`` stores four arrays of its full shape: for 4096 stacks of 84x84 frames more
-    than a gigabyte, and seconds to fill it. Here they are views of a single number, also in
-    copies and after unpickling, and cannot be written to. It equals an ordinary ``Box`` of the
-    same bounds.
+    It equals an ordinary ``Box``, whose bounds for 4096 stacks of 84x84 frames take a gigabyte.
     """
 
     def __init__(self, low: float, high: float, shape: tuple[int, ...], dtype: Any) -> None:
-        """Make the space; each bound is that of every entry."""
+        """Build the space; all entries have the same bounds."""
         super().__init__(low, high, (1,), dtype)
         self._shape = tuple(shape)
         self.low_repr, self.high_repr = str(self.low[0]), str(self.high[0])
@@ -52,10 +49,10 @@ class BroadcastBox(gymnasium.spaces.Box):
             )
         return super().__eq__(other)
 
-    __hash__ = None  # type: ignore[assignment]  # as every Gymnasium space that can be compared
+    __hash__ = None  # type: ignore[assignment]  # as in Gymnasium's spaces
 
 
-# Gymnasium looks up the exact class in these, not its bases.
+# Gymnasium looks up the exact class, not its bases.
 batch_differing_spaces.register(BroadcastBox, batch_differing_spaces.dispatch(gymnasium.spaces.Box))
 iterate.register(BroadcastBox, iterate.dispatch(gymnasium.spaces.Box))
 
@@ -63,7 +60,7 @@ iterate.register(BroadcastBox, iterate.dispatch(gymnasium.spaces.Box))
 def observation_space(spec: Any, num_envs: int | None = None) -> gymnasium.Space:
     """Return the space of an observation, batched if ``num_envs`` is given.
 
-    uint8 boxes in [0, 255] for pixels, unbounded float32 boxes for state, a ``Dict`` for both.
+    Pixels are a uint8 box in [0, 255], state is an unbounded float32 box, both are a ``Dict``.
     """
     if isinstance(spec, dict):
         return gymnasium.spaces.Dict(
@@ -79,12 +76,12 @@ def _box(spec: jax.ShapeDtypeStruct, num_envs: int | None) -> gymnasium.spaces.B
 
 
 def action_space(action_size: int, num_envs: int | None = None) -> gymnasium.spaces.Box:
-    """Return the space of an action: float32 in [-1, 1], whatever the model's control range."""
+    """Return the space of an action, float32 in [-1, 1], batched if ``num_envs`` is given."""
     return _batched(-1.0, 1.0, (action_size,), np.float32, num_envs)
 
 
 def channels_first_space(space: gymnasium.Space) -> gymnasium.Space:
-    """Return the space of an observation whose pixels are (3K, H, W) instead of (H, W, 3K)."""
+    """Change pixels in an observation space from (H, W, 3K) to (3K, H, W)."""
     if isinstance(space, gymnasium.spaces.Dict):
         return gymnasium.spaces.Dict(
             {name: channels_first_space(part) for name, part in space.spaces.items()}

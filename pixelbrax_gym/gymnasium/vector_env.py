@@ -1,4 +1,4 @@
-"""Many pixel environments in one compiled program, as a ``gymnasium.vector.VectorEnv``."""
+"""Provide many pixel environments as a ``gymnasium.vector.VectorEnv``."""
 
 from __future__ import annotations
 
@@ -21,41 +21,33 @@ from pixelbrax_jax.validation import check_choice
 
 
 class GymnasiumVectorEnv(StatefulAdapter, gymnasium.vector.VectorEnv):
-    """``num_envs`` copies of a Brax task seen through a camera, stepped together.
+    """``num_envs`` copies of a pixel task, stepped together.
 
-    Environment i seeded with s is the same whatever ``num_envs`` is and whoever its neighbors.
+    Environment i depends only on its seed, not on ``num_envs`` or the other environments.
 
-    Autoreset, with Gymnasium's meanings:
+    Autoreset modes, as in Gymnasium:
 
     * ``"next_step"`` (default): the step that ends an episode returns its last observation. The
       next step ignores that environment's action and returns the first observation of the
       next episode, reward 0 and both flags False.
-    * ``"same_step"``: the step that ends an episode returns the first observation of the next.
-      The last one is in ``infos["final_obs"]``, the infos it came with in
-      ``infos["final_info"]``.
+    * ``"same_step"``: the step that ends an episode returns the first observation of the next;
+      ``infos["final_obs"]`` and ``infos["final_info"]`` have the last observation and its infos.
     * ``"disabled"``: the user calls ``reset(options={"reset_mask": mask})``.
 
     Infos are ``episode_return`` (sum of the episode's rewards), ``episode_length`` (control
     steps) and ``non_finite`` (the physics diverged and ended the episode), each (N,), with
-    masks ``_episode_return`` and so on that say which entries were set.
+    (N,) bool masks such as ``_episode_return`` of the entries that were set.
 
-    ``output`` decides what all of these are:
+    ``output`` selects the type of all results:
 
-    * ``"numpy"``: arrays that may be written to; observations share memory with what JAX has
-      computed on a CPU. ``final_obs`` is an object array with None where no episode ended,
-      absent when none did, as Gymnasium has it.
+    * ``"numpy"``: writable arrays; on a CPU observations share memory with JAX. ``final_obs`` is
+      an object array with None where no episode ended, and absent if none did.
     * ``"torch"`` and ``"jax"``: arrays on the environment's device. ``final_obs`` and
-      ``final_info`` are dense, present in every step, and mean something where the masks
-      ``_final_obs`` and ``_final_info`` are True: the host never waits to find out.
+      ``final_info`` are dense and present in every step, so the host never waits; entries are
+      valid where the masks ``_final_obs`` and ``_final_info`` are True.
 
-    Observations are never overwritten, and an in-place operation on an array or tensor reaches no
-    later result.
-
-    ``call``, ``get_attr`` and ``set_attr`` are those of Gymnasium's own vector environments; what
-    they address is a ``SubEnv`` that stands for one of the N.
-
-    Attributes:
-        autoreset_mode: an ``AutoresetMode``, also in ``metadata``.
+    Observations are never overwritten, and in-place operations on them change no later result.
+    ``call``, ``get_attr`` and ``set_attr`` address a ``SubEnv`` for each environment.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012  # as Gymnasium declares it
@@ -86,25 +78,22 @@ class GymnasiumVectorEnv(StatefulAdapter, gymnasium.vector.VectorEnv):
                 ``AutoresetMode`` or its value.
             output: ``"numpy"``, ``"torch"`` or ``"jax"`` arrays.
             render_mode: None or ``"rgb_array"``.
-            render_height: pixels of ``render()``.
-            render_width: pixels of ``render()``.
-            max_episode_steps: time limit in calls of ``step``; None keeps ``episode_length``,
-                1000 control steps by default. A first step that only resets is
-                not counted.
-            **options: everything else that ``pixelbrax_jax.make`` takes, such as ``backend``,
-                ``camera``, ``height``, ``width``, ``frame_stack``, ``obs_mode``,
-                ``action_repeat`` and ``episode_length``.
+            render_height: height of ``render()`` in pixels.
+            render_width: width of ``render()`` in pixels.
+            max_episode_steps: time limit in calls of ``step``, not counting a step that only
+                resets; None keeps ``episode_length``, 1000 control steps by default.
+            **options: other options of ``pixelbrax_jax.make``, such as ``camera``.
 
         Raises:
-            TypeError: an option is unknown; the message lists those there are.
-            ValueError: an option is out of range; the message lists what is allowed.
-            ImportError: torch is missing and wanted.
+            TypeError: an option is unknown.
+            ValueError: an option is out of range.
+            ImportError: ``output`` is ``"torch"``, and torch is not installed.
             RuntimeError: this process is a fork that cannot run JAX.
         """
         if render_mode == "human":
             raise ValueError(
-                "render_mode='human' shows one environment: gymnasium.make takes it; here there is "
-                "'rgb_array'."
+                "render_mode='human' shows only one environment: use gymnasium.make for it, or "
+                "'rgb_array' here."
             )
         if render_mode is not None:
             check_choice("render_mode", render_mode, ("rgb_array",))
@@ -138,26 +127,23 @@ class GymnasiumVectorEnv(StatefulAdapter, gymnasium.vector.VectorEnv):
         seed: Any = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Any, dict[str, Any]]:
-        """Reset to episodes.
+        """Start episodes; return observations and infos.
 
         Args:
-            seed: s seeds environment i with s + i; a list has a seed for each. A seeded
-                environment is reset to its episode 0; None goes on to its next episode,
-                or draws a seed if there was none yet.
-            options: ``{"reset_mask": mask}`` with an (N,) bool array or tensor, at least one
-                True, resets only those and repeats the observations of the others.
-                ``{"state": state}`` goes on from a state of ``get_state``, and takes no seed.
-                Both may be given. Never changed.
-
-        Returns:
-            Observations and infos.
+            seed: s seeds environment i with s + i; a list has one seed for each. A seeded
+                environment starts its episode 0; None starts the next episode, or samples a seed
+                at the first reset.
+            options: ``{"reset_mask": mask}`` with an (N,) bool array or tensor resets only those
+                environments, at least one, and repeats the observations of the others.
+                ``{"state": state}`` continues from a state of ``get_state``, without a seed.
+                Both may be given.
 
         Raises:
-            TypeError: the mask is no array or tensor of bool, a seed no integer, or the state no
-                ``EnvState``.
-            ValueError: the mask has another shape or no True; a seed is out of range, or given
-                beside a state; the state is of other environments; or there are other options.
-            ResetNeeded: the first reset has a mask that leaves environments out.
+            TypeError: the mask is not a bool array or tensor, a seed not an integer, or the state
+                not an ``EnvState``.
+            ValueError: the mask has another shape or no True, a seed is out of range or given with
+                a state, the state does not fit, or another option is given.
+            ResetNeeded: the first reset has a mask with a False.
             ClosedEnvironmentError: after ``close``.
             RuntimeError: this process is a fork that cannot run JAX.
         """
@@ -180,14 +166,13 @@ class GymnasiumVectorEnv(StatefulAdapter, gymnasium.vector.VectorEnv):
             Observations; rewards, (N,) float32; terminated and truncated, (N,) bool; infos.
 
         Raises:
-            ResetNeeded: before the first reset; or, with autoreset disabled, an episode has
-                ended and was not reset.
+            ResetNeeded: before the first reset; or autoreset is disabled and an ended episode
+                was not reset.
             ClosedEnvironmentError: after ``close``.
             RuntimeError: this process is a fork that cannot run JAX.
             TypeError: the actions are not floating point.
-            ValueError: the actions have another shape, are on another device, or contain a NaN
-                (in a NumPy array or CPU tensor; elsewhere a NaN ends that episode with
-                ``non_finite``). Nothing was stepped.
+            ValueError: the actions' shape or device is wrong, or a NumPy array or CPU tensor
+                contains NaN; nothing is stepped then. NaN elsewhere ends that episode.
         """
         outputs = self._stateful.step(actions)
         flags = (outputs["reward"], outputs["terminated"], outputs["truncated"])
@@ -197,10 +182,7 @@ class GymnasiumVectorEnv(StatefulAdapter, gymnasium.vector.VectorEnv):
         return self._export(outputs["obs"]), reward, terminated, truncated, self._infos(outputs)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """Draw the present states.
-
-        Returns:
-            N arrays (render_height, render_width, 3) of uint8; None without a render mode.
+        """Render N (render_height, render_width, 3) uint8 images; None without a render mode.
 
         Raises:
             ResetNeeded: before the first reset.
@@ -211,11 +193,11 @@ class GymnasiumVectorEnv(StatefulAdapter, gymnasium.vector.VectorEnv):
         return tuple(to_numpy(self._stateful.render()))
 
     def get_images(self) -> list[np.ndarray | None]:
-        """Return what ``render`` does as a list, N times None without a render mode."""
+        """Return the images of ``render`` as a list, or N times None without a render mode."""
         return list(self.render() or [None] * self.num_envs)
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """Return what a method of each environment returns, or the attribute of that name."""
+        """Call a method of each environment, or return the attribute of that name."""
         return tuple(call_sub_envs(self._sub_envs, name, *args, **kwargs))
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
@@ -223,14 +205,10 @@ class GymnasiumVectorEnv(StatefulAdapter, gymnasium.vector.VectorEnv):
         return self.call(name)
 
     def set_attr(self, name: str, values: Any) -> None:
-        """Set an attribute of the sub-environments.
-
-        Args:
-            name: of the attribute.
-            values: a list or tuple has one for each environment; anything else is for all.
+        """Set an attribute of the sub-environments to one value, or to N values of a list or tuple.
 
         Raises:
-            ValueError: there are not N values.
+            ValueError: the list has another length.
         """
         each = values if isinstance(values, (list, tuple)) else [values] * self.num_envs
         if len(each) != self.num_envs:
@@ -239,7 +217,7 @@ class GymnasiumVectorEnv(StatefulAdapter, gymnasium.vector.VectorEnv):
             sub_env.set_wrapper_attr(name, value)
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Forget the states."""
+        """Release the states."""
         del kwargs
         # Gymnasium also calls this on an environment whose construction failed.
         if hasattr(self, "_stateful"):
@@ -276,12 +254,12 @@ class GymnasiumVectorEnv(StatefulAdapter, gymnasium.vector.VectorEnv):
 
 
 def _with_masks(infos: dict[str, Any], mask: Any) -> dict[str, Any]:
-    """Add a mask ``_key`` for each ``key``, which says what environments it is about."""
+    """Add the mask ``_key`` of valid entries for each ``key``."""
     return infos | {f"_{name}": mask for name in infos}
 
 
 def as_autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:
-    """Return Gymnasium's name of an autoreset mode: ours, Gymnasium's, or the value of that."""
+    """Convert the name of an autoreset mode, or the value of a member, to Gymnasium's member."""
     if isinstance(mode, AutoresetMode):
         return mode
     by_value = {known.value: known for known in AutoresetMode}

@@ -1,4 +1,4 @@
-"""The window of ``render_mode="human"``."""
+"""Show images in the window of ``render_mode="human"``."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ _DRIVER = "SDL_VIDEODRIVER"
 
 
 class Window:
-    """Shows images on the screen, no faster than a given rate."""
+    """A window that shows at most ``fps`` images per second."""
 
     def __init__(self, title: str, fps: int) -> None:
-        """Open nothing yet; an ImportError has the fix if pygame is not installed."""
+        """Import pygame, or raise an ImportError; ``show`` opens the window."""
         try:
             import pygame
         except ImportError as error:
@@ -27,14 +27,14 @@ class Window:
         self._screen: Any = None
         self._clock: Any = None
         self.closed = False
-        """Whether the user has asked to close it."""
+        """Whether the user has closed the window."""
 
     def __reduce__(self) -> Any:
-        """Return what is pickled or copied: a window that is not open yet."""
+        """Pickle or copy as a window that is not open."""
         return Window, (self._title, self._fps)
 
     def show(self, image: np.ndarray) -> None:
-        """Show an image, (H, W, 3) uint8; an OSError has the reason if no window can be opened."""
+        """Show an (H, W, 3) uint8 image; raise an OSError if the window cannot be opened."""
         pygame = self._pygame
         if self._screen is None:
             try:
@@ -43,15 +43,15 @@ class Window:
                 self._screen = pygame.display.set_mode((image.shape[1], image.shape[0]))
             except pygame.error as error:
                 raise OSError(
-                    f"no window can be opened ({error}); mend or unset "
-                    f"{_DRIVER if _DRIVER in os.environ else 'DISPLAY'}, or draw into a "
-                    "file: pixelbrax play --gif FILE, or render_mode='rgb_array'."
+                    f"cannot open a window ({error}); correct or unset "
+                    f"{_DRIVER if _DRIVER in os.environ else 'DISPLAY'}, or write a file with "
+                    "pixelbrax play --gif FILE, or use render_mode='rgb_array'."
                 ) from error
             self._clock = pygame.time.Clock()
         # pygame counts columns first.
         pygame.surfarray.blit_array(self._screen, image.swapaxes(0, 1))
         pygame.event.pump()
-        # Looked at, not taken: events are whose program this is.
+        # Peek, because the events belong to the caller's program.
         self.closed = self.closed or bool(pygame.event.peek(pygame.QUIT))
         pygame.display.flip()
         self._clock.tick(self._fps)

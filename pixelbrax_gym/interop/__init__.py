@@ -1,1 +1,1 @@
-"""Arrays that cross between JAX, NumPy and torch, and processes that fork."""
+"""Exchange arrays between JAX, NumPy and torch, and detect forked processes."""

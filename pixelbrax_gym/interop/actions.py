@@ -1,4 +1,4 @@
-"""What a caller may hand to ``step``, made into what a jitted function takes."""
+"""Convert a caller's actions to arguments of a jitted function."""
 
 from __future__ import annotations
 
@@ -9,26 +9,20 @@ import jax.numpy as jnp
 import numpy as np
 
 _MANY = 8
-"""Environments named in a message at most."""
+"""Maximum number of environments named in a message."""
 
 
 def as_actions(action: Any, shape: tuple[int, ...], device: jax.Device) -> Any:
-    """Check and converts actions.
+    """Check actions and convert them to float32 of ``shape``, (A,) or (N, A).
 
-    Args:
-        action: floating point: a NumPy array or what NumPy makes one of, a torch tensor, or a JAX
-            array. Everything but float32 is rounded to float32.
-        shape: expected, (A,) or (N, A).
-        device: the environment's device.
-
-    Returns:
-        float32 of that shape, never sharing memory that the caller can write to.
+    ``action`` is a NumPy or JAX array, a torch tensor, or anything NumPy converts. The result
+    shares no memory that the caller can write to.
 
     Raises:
         TypeError: the action is not floating point.
-        ValueError: another shape; another device; or a NaN in host memory. Reading an
-            accelerator's memory would stop the pipeline, so a NaN in a JAX array or a GPU
-            tensor is not looked for: it ends the episode with ``info["non_finite"]``.
+        ValueError: the shape or device is wrong, or host memory contains NaN. JAX arrays and GPU
+            tensors are not searched for NaN, which would wait for the device; their NaN ends the
+            episode with ``info["non_finite"]``.
     """
     if type(action).__module__.partition(".")[0] == "torch":
         from pixelbrax_gym.interop import dlpack
@@ -85,6 +79,6 @@ def _check_nan(values: np.ndarray) -> None:
 
 
 def name_rows(mask: np.ndarray) -> str:
-    """Return the environments of an (N,) mask for a message; of many, the first ones."""
+    """List the environments of an (N,) bool mask for a message; omit all after the first few."""
     rows = np.flatnonzero(mask)
     return ", ".join(str(row) for row in rows[:_MANY]) + (", ..." if len(rows) > _MANY else "")

@@ -1,4 +1,4 @@
-"""JAX arrays as torch tensors and back: the one bridge of all adapters."""
+"""Convert JAX arrays to torch tensors and back."""
 
 from __future__ import annotations
 
@@ -17,25 +17,23 @@ except ImportError as error:
 
 
 def to_torch(tree: Any) -> Any:
-    """Return every array of a tree as a torch tensor on the same device, without a copy.
+    """Convert the arrays of a tree to torch tensors on the same device, without a copy.
 
-    A tensor and its array share memory, which torch may write to: hand over only arrays that
-    nobody reads again. Waits for a CPU array to be computed; on a GPU, torch's current stream
-    waits and the host does not.
+    Torch may write to the shared memory, so the arrays must not be read again. The call waits for
+    arrays on a CPU; on a GPU only torch's current stream waits.
     """
-    # The arrays themselves, not capsules of them: only so do the two agree on a stream.
+    # DLPack synchronises streams only if it gets the arrays themselves, not their capsules.
     return jax.tree.map(torch.utils.dlpack.from_dlpack, tree)
 
 
 def actions_to_jax(tensor: torch.Tensor, device: jax.Device) -> np.ndarray | jax.Array:
-    """Return a tensor of actions as float32 that a jitted function takes.
+    """Copy a tensor of actions to float32: a NumPy array from a CPU, else a JAX array.
 
-    It is copied: JAX computes in the background, and would otherwise read the caller's memory
-    after the caller has filled it with the next actions. A CPU tensor becomes a NumPy array.
+    The copy lets the caller overwrite the tensor while JAX computes in the background.
 
     Raises:
-        TypeError: the tensor is not floating point, or sparse.
-        ValueError: the tensor is on another device; the message names both.
+        TypeError: the tensor is sparse or not floating point.
+        ValueError: the tensor is on another device.
     """
     if tensor.layout != torch.strided:
         raise TypeError(f"action must be a dense tensor, got {tensor.layout}; try .to_dense().")
@@ -54,19 +52,19 @@ def actions_to_jax(tensor: torch.Tensor, device: jax.Device) -> np.ndarray | jax
 
 
 def as_device(device: torch.device | str) -> torch.device:
-    """Return a torch device; a ValueError, naming the argument, if it is not there."""
+    """Return a torch device; raise a ValueError if it is not available."""
     try:
         place = torch.device(device)
         torch.empty(0, device=place)
     # Torch without CUDA raises an AssertionError.
     except (RuntimeError, AssertionError, TypeError) as error:
         reason = str(error).partition("\n")[0]
-        raise ValueError(f"device={device!r} is not there: {reason}.") from error
+        raise ValueError(f"device={device!r} is not available: {reason}.") from error
     return place
 
 
 def torch_device(device: jax.Device) -> torch.device:
-    """Return the torch name of a JAX device; a ValueError if torch has none."""
+    """Return the torch device of a JAX device; raise a ValueError if torch has none."""
     if device.platform == "cpu":
         return torch.device("cpu")
     if device.platform in ("gpu", "cuda", "rocm"):
@@ -75,7 +73,7 @@ def torch_device(device: jax.Device) -> torch.device:
 
 
 def default_torch_device() -> torch.device:
-    """Return the torch name of the device on which JAX computes by default."""
-    # A small array has it, whatever the device was chosen by.
+    """Return the torch device of JAX's default device."""
+    # A new array is on the default device, however that was selected.
     (device,) = jax.device_put(np.float32(0)).devices()
     return torch_device(device)

@@ -1,4 +1,4 @@
-"""JAX outputs as the arrays that the user asked for."""
+"""Convert JAX outputs to the type of array that the user selected."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ OUTPUTS = ("jax", "numpy", "torch")
 
 
 def exporter(output: str) -> Callable[[Any], Any]:
-    """Return how to hand out a tree of JAX arrays that nobody reads again.
+    """Return a function that converts trees of JAX arrays that are not read again.
 
-    ``"numpy"`` gives arrays that may be written to, without a copy where they are on a CPU;
-    ``"torch"`` gives tensors on the environment's device, ``"jax"`` the arrays.
+    ``"numpy"`` gives writable arrays, without a copy on a CPU; ``"torch"`` gives tensors on the
+    environment's device; ``"jax"`` changes nothing.
     """
     check_choice("output", output, OUTPUTS)
     if output == "torch":
@@ -28,18 +28,18 @@ def exporter(output: str) -> Callable[[Any], Any]:
 
 
 def to_numpy(tree: Any) -> Any:
-    """Return every array of a tree as a NumPy array that may be written to.
+    """Convert the arrays of a tree to writable NumPy arrays.
 
-    Without a copy where the array is on a CPU: hand over only arrays that nobody reads again.
+    Arrays on a CPU are not copied, so they must not be read again.
     """
     return jax.tree.map(_writable, tree)
 
 
 class _Memory:
-    """The memory of a read-only array, offered to NumPy as one that may be written to."""
+    """The memory of a read-only array, offered to NumPy as writable."""
 
     def __init__(self, array: np.ndarray) -> None:
-        # NumPy keeps this object, and so the memory, as long as it has a view of it.
+        # NumPy keeps this object, and thus the memory, while a view exists.
         self._array = array
         self.__array_interface__ = {
             **array.__array_interface__,

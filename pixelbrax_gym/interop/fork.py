@@ -1,4 +1,4 @@
-"""A process forked after JAX has started threads hangs in its first computation: say so."""
+"""Detect forks of a process in which JAX runs, where JAX would hang."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import os
 import sys
 
 _FIX = (
-    "PixelBrax was forked: this process is a fork of one in which JAX was running already, and "
-    "JAX would hang here. Start workers with the 'spawn' or 'forkserver' method, e.g. "
-    "gymnasium.vector.AsyncVectorEnv(..., context='spawn'); or better, leave workers out: "
+    "PixelBrax was forked: JAX had started before this process was forked, and would hang here. "
+    "Start workers with the 'spawn' or 'forkserver' method, e.g. "
+    "gymnasium.vector.AsyncVectorEnv(..., context='spawn'); or better, use no workers: "
     "gymnasium.make_vec(id, num_envs=n) steps all environments in one process."
 )
 
@@ -21,7 +21,7 @@ def _jax_runs() -> bool:
     bridge = sys.modules.get("jax._src.xla_bridge")
     if bridge is None:
         return False
-    # There is no public function. Should this one be gone, assume the worse.
+    # JAX has no public function for this. Without this one, assume that JAX runs.
     started = getattr(bridge, "backends_are_initialized", None)
     return True if started is None else bool(started())
 
@@ -35,11 +35,11 @@ if hasattr(os, "register_at_fork"):  # not on Windows, which cannot fork
 
 
 def is_forked() -> bool:
-    """Return whether this process is a fork of one that had started JAX."""
+    """Return whether this process was forked after JAX had started."""
     return _Process.forked
 
 
 def check_not_forked() -> None:
-    """Stop a forked worker before it hangs, by a RuntimeError with the fix."""
+    """Raise a RuntimeError in a forked process in which JAX would hang."""
     if _Process.forked:
         raise RuntimeError(_FIX)

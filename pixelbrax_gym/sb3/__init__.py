@@ -1,1 +1,1 @@
-"""Stable-Baselines3: many environments in one program."""
+"""Adapt PixelBrax to Stable-Baselines3."""

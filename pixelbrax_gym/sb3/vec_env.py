@@ -1,4 +1,4 @@
-"""Many pixel environments in one compiled program, as a Stable-Baselines3 ``VecEnv``."""
+"""Provide many pixel environments as a Stable-Baselines3 ``VecEnv``."""
 
 from __future__ import annotations
 
@@ -28,37 +28,30 @@ from pixelbrax_jax.validation import check_bool, check_choice
 
 
 def check_channels(env: PixelEnv, channels_first: bool) -> None:
-    """Reject images of which Stable-Baselines3 would read another axis as channels.
-
-    It takes the shortest axis for them, the first of several.
-    """
+    """Reject images whose shortest axis, which Stable-Baselines3 reads as channels, is another."""
     channels = 3 * env.frame_stack
     shortest = min(env.height, env.width)
     misread = shortest < channels if channels_first else env.height <= min(env.width, channels)
     if env.obs_mode != "state" and misread:
         raise ValueError(
             f"height={env.height}, width={env.width} and frame_stack={env.frame_stack} make images "
-            f"with {channels} channels, and Stable-Baselines3 takes the shortest axis of an image "
-            f"for its channels: give more than {channels} pixels of height and width, or stack "
-            "fewer frames."
+            f"with {channels} channels, but Stable-Baselines3 takes the shortest axis of an image "
+            f"for its channels: use a height and width above {channels} pixels, or stack fewer "
+            "frames."
         )
 
 
 class SB3VecEnv(VecEnv):
-    """``num_envs`` copies of a Brax task seen through a camera, stepped together.
+    """``num_envs`` copies of a pixel task, stepped together.
 
-    What Stable-Baselines3 expects: NumPy arrays, autoreset in the same step, and for each
-    environment a dict ``infos[i]`` with ``TimeLimit.truncated``. Where an episode ended it also
-    has ``terminal_observation``, ``episode_return`` (sum of rewards), ``episode_length`` (control
-    steps) and ``non_finite`` (the physics diverged and ended the episode).
+    Results are NumPy arrays, with autoreset in the same step. ``infos[i]`` has
+    ``TimeLimit.truncated``; where an episode ended it also has ``terminal_observation``,
+    ``episode_return`` (sum of rewards), ``episode_length`` (control steps) and ``non_finite``
+    (the physics diverged and ended the episode).
 
-    Observations share memory with what JAX has computed on a CPU, and are copied to the host
-    from anywhere else, since Stable-Baselines3 takes NumPy arrays only. They may be written to:
-    nothing reads them again.
-
-    Environment i seeded with s draws what environment i of a ``GymnasiumVectorEnv`` seeded with
-    s draws. There is one environment object and not N: what ``get_attr``, ``set_attr`` and
-    ``env_method`` address is a ``SubEnv`` that stands for one of them.
+    Observations share memory with JAX on a CPU and are copied from other devices. They may be
+    written to. The same seed gives the same episodes as in a ``GymnasiumVectorEnv``. ``get_attr``,
+    ``set_attr`` and ``env_method`` address a ``SubEnv`` for each environment.
 
     Example:
         >>> env = VecMonitor(SB3VecEnv("inverted_pendulum", num_envs=64))
@@ -84,25 +77,22 @@ class SB3VecEnv(VecEnv):
             task: one of ``pixelbrax_jax.list_envs()``.
             num_envs: N, at least 1.
             render_mode: None or ``"rgb_array"``.
-            render_height: pixels of ``render()``.
-            render_width: pixels of ``render()``.
-            channels_first: whether pixels are (3K, H, W), as a view, and not (H, W, 3K), which
+            render_height: height of ``render()`` in pixels.
+            render_width: width of ``render()`` in pixels.
+            channels_first: whether pixels are (3K, H, W), as a view, instead of (H, W, 3K), which
                 Stable-Baselines3 transposes itself.
-            stagger: whether time limits are spread evenly over the steps. Environments that
-                start together otherwise reach theirs in one step, in which Stable-Baselines3
-                evaluates the value function once for each of them. Environment i's first episode
-                after a full reset is cut short by ``i / N`` of the limit.
+            stagger: whether to spread time limits evenly over the steps, because
+                Stable-Baselines3 evaluates the value function once for each truncated environment.
+                Environment i's first episode after a full reset is shorter by ``i / N`` of the
+                limit.
             max_episode_steps: time limit in calls of ``step``; None keeps ``episode_length``,
                 1000 control steps by default.
-            **options: everything else that ``pixelbrax_jax.make`` takes, such as ``backend``,
-                ``camera``, ``height``, ``width``, ``frame_stack``, ``obs_mode``,
-                ``action_repeat`` and ``episode_length``.
+            **options: other options of ``pixelbrax_jax.make``, such as ``camera``.
 
         Raises:
-            TypeError: an option is unknown; the message lists those there are.
-            ValueError: an option is out of range; the message lists what is allowed. Or there are
-                at least as many channels as rows or columns, so that Stable-Baselines3 would read
-                these as channels.
+            TypeError: an option is unknown.
+            ValueError: an option is out of range, or Stable-Baselines3 would read rows or columns
+                as channels because there are at least as many channels.
             RuntimeError: this process is a fork that cannot run JAX.
         """
         if render_mode is not None:
@@ -123,34 +113,31 @@ class SB3VecEnv(VecEnv):
         space = channels_first_space(space) if channels_first else space
         check_channels(env, channels_first)
         spaces = (space, action_space(env.action_size))
-        # Stable-Baselines3 asks them for their render mode while it makes the rest.
+        # Stable-Baselines3's constructor reads the render mode of the sub-environments.
         self.render_mode = render_mode
         self._sub_envs = [SubEnv(self, i, *spaces) for i in range(num_envs)]
         super().__init__(num_envs, *spaces)
-        # SB3's wrappers ask for a number here, beside its lists.
+        # SB3's wrappers read this number.
         self.metadata: dict[str, Any] = self.metadata | {"render_fps": self._stateful.fps}
         offsets = np.arange(num_envs) * self._stateful.episode_length // num_envs
         self._time_limit_offsets = offsets.astype(np.int32) if stagger else None
         self._actions: Any = None
 
     def reset(self) -> Any:
-        """Reset to the next episode everywhere, or episode 0 after ``seed``.
-
-        Returns:
-            Observations.
+        """Start the next episode everywhere, or episode 0 after ``seed``; return observations.
 
         Raises:
-            ValueError: there are options, of which no environment has any; they are dropped.
+            ValueError: ``set_options`` was called; no options exist. They are dropped.
             ClosedEnvironmentError: after ``close``.
             RuntimeError: this process is a fork that cannot run JAX.
         """
         given = self._options
-        # What is refused must not be refused again at the next reset.
+        # The next reset must not fail again.
         self._reset_options()
         for options in filter(None, given):
             raise ValueError(
-                f"reset() takes no options, got {', '.join(map(repr, options))}; seed() gives a "
-                "seed, everything else is given when the environment is made."
+                f"reset() takes no options, got {', '.join(map(repr, options))}; use seed() for a "
+                "seed and give other options when you make the environment."
             )
         outputs = self._stateful.reset(self._seeds, time_limit_offsets=self._time_limit_offsets)
         self._reset_seeds()
@@ -158,9 +145,9 @@ class SB3VecEnv(VecEnv):
         return self._observations(outputs["obs"])
 
     def seed(self, seed: int | None = None) -> Sequence[int]:
-        """Let environment i draw from ``seed + i`` from the next reset on; returns the N seeds.
+        """Seed environment i with ``seed + i`` modulo 2**32 at the next reset; return the N seeds.
 
-        Beyond 2**32 - 1 they go on at 0. NumPy's global generator draws one for None.
+        None samples a seed from NumPy's global generator.
         """
         if seed is None:
             seed = int(np.random.randint(SEEDS, dtype=np.uint64))  # noqa: NPY002  # as SB3 does
@@ -169,14 +156,11 @@ class SB3VecEnv(VecEnv):
         return seeds
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Take the actions, (N, A) floating point, clipped to [-1, 1] by ``step_wait``."""
+        """Store the actions, (N, A) floating point; ``step_wait`` clips them to [-1, 1]."""
         self._actions = actions
 
     def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Step all environments.
-
-        Returns:
-            Observations; rewards, (N,) float32; dones, (N,) bool; infos.
+        """Step all environments; return observations, (N,) float32 rewards, (N,) bool dones, infos.
 
         Raises:
             ResetNeeded: before the first reset.
@@ -211,7 +195,7 @@ class SB3VecEnv(VecEnv):
         return list(to_numpy(self._stateful.render()))
 
     def close(self) -> None:
-        """Forget the states."""
+        """Release the states."""
         self._stateful.close()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
@@ -219,21 +203,21 @@ class SB3VecEnv(VecEnv):
         return [getattr(sub_env, attr_name) for sub_env in self._selected(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Set an attribute of the sub-environments, which alone know of it."""
+        """Set an attribute of the sub-environments; the environments themselves ignore it."""
         for sub_env in self._selected(indices):
             setattr(sub_env, attr_name, value)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Return what a method of the sub-environments returns."""
+        """Call a method of the sub-environments and return its results."""
         sub_envs = self._selected(indices)
         return call_sub_envs(sub_envs, method_name, *method_args, **method_kwargs)
 
     def env_is_wrapped(
         self, wrapper_class: type[gymnasium.Wrapper], indices: Any = None
     ) -> list[bool]:
-        """Return False for all: there is nothing around them."""
+        """Return False for all, because sub-environments have no wrappers."""
         del wrapper_class
         return [False for _ in self._selected(indices)]
 

@@ -1,1 +1,1 @@
-"""TorchRL: many environments in one program."""
+"""Adapt PixelBrax to TorchRL."""

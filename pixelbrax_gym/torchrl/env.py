@@ -1,4 +1,4 @@
-"""Many pixel environments in one compiled program, as a TorchRL environment."""
+"""Provide many pixel environments as a TorchRL environment."""
 
 from __future__ import annotations
 
@@ -27,28 +27,23 @@ from pixelbrax_gym.torchrl.specs import action_spec, done_spec, observation_spec
 
 
 class TorchRLEnv(EnvBase):
-    """``num_envs`` copies of a Brax task seen through a camera, stepped together.
+    """``num_envs`` copies of a pixel task, stepped together.
 
     Batch size (N,). Keys: ``pixels``, (N, H, W, 3K) uint8, oldest frame first; ``observation``,
     (N, S) float32, with ``obs_mode="state"`` or ``"both"``; ``action``, (N, A) float32 in
     [-1, 1]; ``reward``, (N, 1) float32; ``done``, ``terminated`` and ``truncated``, (N, 1) bool.
 
-    The step that ends an episode returns its true last observation under ``"next"``. The same
-    compiled program has reset the environment by then and drawn the first frame, which
-    ``reset`` hands out for the rows that its ``"_reset"`` mask names; TorchRL's collectors and
-    rollouts do so by themselves. All other rows keep their state.
+    The step that ends an episode returns its last observation under ``"next"``. The same program
+    resets the environment; ``reset`` then returns the first observation for the rows of its
+    ``"_reset"`` mask, as TorchRL's collectors and rollouts request. Other rows keep their state.
 
-    Tensors share memory with what JAX has computed. Nothing reads that again, hence an in-place
-    operation changes nothing that comes later.
-
-    Environment i seeded with s draws what environment i of a ``GymnasiumVectorEnv`` seeded with
-    s draws.
+    Tensors share memory with JAX arrays that are not read again, so in-place operations are safe.
+    The same seed gives the same episodes as in a ``GymnasiumVectorEnv``.
 
     Attributes:
-        infos: after a step, a dict of tensors of leading axis N about the episodes that the
-            step belongs to: ``episode_return`` (sum of rewards), ``episode_length`` (control
-            steps), ``non_finite`` (the physics diverged and ended the episode), and what
-            distractors add.
+        infos: tensors with leading axis N about the episodes of the last step:
+            ``episode_return`` (sum of rewards), ``episode_length`` (control steps),
+            ``non_finite`` (the physics diverged and ended the episode) and those of distractors.
 
     Example:
         >>> env = TorchRLEnv("ant", num_envs=256)
@@ -71,17 +66,15 @@ class TorchRLEnv(EnvBase):
         Args:
             task: one of ``pixelbrax_jax.list_envs()``.
             num_envs: N, at least 1.
-            device: where tensors are. None means JAX's default device, from which nothing is
-                copied; tensors are copied to and from any other device.
-            render_height: pixels of ``render()``.
-            render_width: pixels of ``render()``.
-            **options: everything else that ``pixelbrax_jax.make`` takes, such as ``backend``,
-                ``camera``, ``height``, ``width``, ``frame_stack``, ``obs_mode``,
-                ``action_repeat`` and ``episode_length``.
+            device: device of the tensors; None means JAX's default device. Tensors are copied to
+                and from any other device.
+            render_height: height of ``render()`` in pixels.
+            render_width: width of ``render()`` in pixels.
+            **options: other options of ``pixelbrax_jax.make``, such as ``camera``.
 
         Raises:
-            TypeError: an option is unknown; the message lists those there are.
-            ValueError: an option is out of range; the message lists what is allowed.
+            TypeError: an option is unknown.
+            ValueError: an option is out of range.
             RuntimeError: this process is a fork that cannot run JAX.
         """
         check_not_forked()
@@ -99,7 +92,7 @@ class TorchRLEnv(EnvBase):
         self.is_closed = False
         self.infos: dict[str, torch.Tensor] = {}
         self._task, self._stateful, self._num_envs = task, stateful, stateful.num_envs
-        # Of environments whose next reset shall be to episode 0 of a seed; else None.
+        # Seeds of environments whose next reset starts episode 0 of a seed; None for the others.
         self._seeds: list[int | None] | None = None
         self._is_seeded = False
 
@@ -112,8 +105,8 @@ class TorchRLEnv(EnvBase):
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         if kwargs:
             raise TypeError(
-                f"reset() takes no {', '.join(kwargs)}; seeds are given by set_seed(), everything "
-                "else when the environment is made."
+                f"reset() takes no {', '.join(kwargs)}; give seeds to set_seed() and other options "
+                "when you make the environment."
             )
         mask = np.ones(self._num_envs, bool)
         given = None if tensordict is None else tensordict.get("_reset", None)
@@ -124,12 +117,12 @@ class TorchRLEnv(EnvBase):
         seeds = None
         first_obs, was_reset = self._begun
         left = was_reset & ~mask
-        # What was reset already is not reset twice, unless it shall have another seed.
+        # Rows that the last step reset are not reset again, unless they get a new seed.
         to_reset = mask & ~was_reset
         if self._seeds is not None:
             seeds = [seed if here else None for seed, here in zip(self._seeds, mask, strict=True)]
             to_reset |= np.array([seed is not None for seed in seeds])
-        # Handed out once, and so never shared by two who might write to it.
+        # Observations are handed out once, because the receiver may write to them.
         if to_reset.any() or first_obs is None:
             outputs = self._stateful.reset(seeds, mask=to_reset, keep=lambda _: (None, left))
             first_obs = outputs["obs"]
@@ -142,9 +135,9 @@ class TorchRLEnv(EnvBase):
 
     @property
     def _begun(self) -> tuple[Any, np.ndarray]:
-        """Of the last step: first observations of the episodes that it began; where it began any.
+        """Return the first observations of episodes that the last step began, and their (N,) mask.
 
-        Kept with the state, so that an exception at any time leaves the two in step.
+        Both are replaced together with the state, so an exception cannot separate them.
         """
         first_obs, where = self._stateful.extra or (None, np.zeros(self._num_envs, bool))
         return first_obs, np.asarray(where)
@@ -152,13 +145,9 @@ class TorchRLEnv(EnvBase):
     def _reset_proc_data(
         self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        """Do as TorchRL does, apart from observations.
+        """Take observations of all rows from ``_reset``, because TorchRL would copy every image.
 
-        `_reset` returns those of all environments, also of the ones that go on. TorchRL would
-        choose between old and new ones row by row, and copy every image for it. That is only
-        needed while some ended episode keeps its last observation. Rows that go on therefore show
-        what the environment shows, also if the caller had changed them. A ``TransformedEnv``
-        chooses, and copies, by itself.
+        TorchRL's row-wise choice is only needed while an ended episode keeps its last observation.
         """
         if tensordict is None or np.any(self._begun[1]):
             return super()._reset_proc_data(tensordict, tensordict_reset)
@@ -175,16 +164,16 @@ class TorchRLEnv(EnvBase):
         action = tensordict.get("action", None)
         if action is None:
             raise ValueError(
-                "step() needs an entry 'action' in its tensordict; a policy writes it, or "
-                "env.rand_action(tensordict)."
+                "step() needs an entry 'action' in its tensordict; a policy or "
+                "env.rand_action(tensordict) writes it."
             )
         began = self._begun[1]
         ended = began if mask is None else began & mask
         if ended.any():
             raise error.ResetNeeded(
                 f"the episode of environment {name_rows(ended)} has ended; call reset() with "
-                "their '_reset' True before the next step(). Should a transform step several "
-                "times in a row, use action_repeat instead."
+                "their '_reset' True before the next step(). If a transform steps several times "
+                "in a row, use action_repeat instead."
             )
 
         def begun(stepped: Stepped) -> tuple[Any, Any]:
@@ -209,17 +198,14 @@ class TorchRLEnv(EnvBase):
         return self._tensordict(values)
 
     def _set_seed(self, seed: int | None) -> None:
-        """Let environment i draw from ``seed + i`` from its next reset on; torch draws for None."""
+        """Seed environment i with ``seed + i`` at its next reset; torch samples a seed for None."""
         if seed is None:
             seed = int(torch.randint(SEEDS, ()))
         self._seeds = list(spread_seeds(seed, self._num_envs))
         self._is_seeded = True
 
     def render(self) -> torch.Tensor:
-        """Draw the present states, e.g. for TorchRL's ``PixelRenderTransform``.
-
-        Returns:
-            (N, render_height, render_width, 3) uint8, row 0 at the top.
+        """Render (N, render_height, render_width, 3) uint8 images, row 0 at the top.
 
         Raises:
             ResetNeeded: before the first reset.
@@ -228,7 +214,7 @@ class TorchRLEnv(EnvBase):
         return to_torch(self._stateful.render()).to(self.device)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
-        """Forget the states."""
+        """Release the states."""
         del raise_if_closed
         self.is_closed = True
         # TorchRL also closes an environment whose construction failed.
@@ -260,7 +246,7 @@ class TorchRLEnv(EnvBase):
 def _keep_unstepped(
     values: dict[str, torch.Tensor], before: TensorDictBase, where: torch.Tensor
 ) -> dict[str, torch.Tensor]:
-    """Return ``values``; what was before, and no reward, where nothing was stepped."""
+    """Return ``values``, with the previous values and reward 0 in rows that were not stepped."""
 
     def choose(name: str, value: torch.Tensor) -> torch.Tensor:
         old = before.get(name, None) if name != "reward" else None

@@ -1,4 +1,4 @@
-"""TorchRL specs of a pixel environment, which cost no memory however many environments."""
+"""Build the TorchRL specs of a pixel environment."""
 
 from __future__ import annotations
 
@@ -10,18 +10,16 @@ from torchrl.data.tensor_specs import TensorSpec, UnboundedDiscrete
 
 
 class _Itself(type(Unbounded)):  # type: ignore[misc]
-    # TorchRL's own metaclass replaces the class of what was made by one of two it knows.
+    # TorchRL's metaclass would replace the class of a new object by one of two that it knows.
     def __call__(cls, *args: Any, **kwargs: Any) -> Any:
         return type.__call__(cls, *args, **kwargs)
 
 
 class PixelSpec(UnboundedDiscrete, metaclass=_Itself):
-    """Pixels of any value, without tensors of bounds.
+    """Spec of uint8 pixels without tensors of bounds (``space`` is None).
 
-    TorchRL's specs keep a lower and an upper bound for every entry: for 4096 stacks of 84 x 84
-    frames they take 26 s and gigabytes to build, and as much again in every transform. The
-    bounds of uint8 are those of its type, so this one has none (``space`` is None). It equals an
-    ordinary ``Unbounded`` of the same shape, dtype and device.
+    It equals an ordinary ``Unbounded`` of the same shape, dtype and device, whose bounds for 4096
+    stacks of 84 x 84 frames take 26 s and gigabytes to build.
     """
 
     def __init__(
@@ -31,7 +29,7 @@ class PixelSpec(UnboundedDiscrete, metaclass=_Itself):
         dtype: torch.dtype = torch.uint8,
         **kwargs: Any,
     ) -> None:
-        """Make the spec of uint8, or of another dtype after a transform."""
+        """Build the spec; transforms may give another dtype."""
         kind = "continuous" if dtype.is_floating_point else "discrete"
         TensorSpec.__init__(
             self,
@@ -67,7 +65,7 @@ def observation_spec(spec: Any, num_envs: int, device: torch.device) -> Composit
 
 
 def action_spec(action_size: int, num_envs: int, device: torch.device) -> Bounded:
-    """Return the spec of an action: float32 in [-1, 1], whatever the model's control range."""
+    """Return the spec of an action, (N, A) float32 in [-1, 1]."""
     return Bounded(-1.0, 1.0, shape=(num_envs, action_size), device=device, dtype=torch.float32)
 
 

@@ -1,4 +1,4 @@
-"""What physics is to the rest of the package: the base class of every engine."""
+"""The base class of all physics."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pixelbrax_jax.types import CameraRig, Geoms, Look, PhysicsState
 
 
 class Kinematics(struct.PyTreeNode):
-    """The readable part of a simulator's state; what task formulas are written in.
+    """Poses and velocities, the input of task formulas.
 
     Attributes:
         q: (Q,) float32, joint positions in MuJoCo's order (metres, radians; a free joint is a
@@ -31,22 +31,22 @@ class Kinematics(struct.PyTreeNode):
 
 
 RewardFn = Callable[[Kinematics, Kinematics, jax.Array], jax.Array]
-"""A reward of the states before and after a step and the (A,) action; returns a scalar."""
+"""Maps the states before and after a step and the (A,) action to a scalar reward."""
 
 ResetFn = Callable[[jax.Array], tuple[jax.Array, jax.Array]]
-"""Of a PRNG key; returns joint positions (Q,) and velocities (V,), as in ``Kinematics``."""
+"""Maps a PRNG key to joint positions (Q,) and velocities (V,), as in ``Kinematics``."""
 
 
 class Physics(abc.ABC):
     """A task's dynamics for ONE environment, as pure functions.
 
-    ``reset`` and ``step`` may be jitted, vmapped and scanned; every state they return has the
-    same tree, shapes and dtypes, so a jitted ``step`` is traced once. The fields of a
-    ``PhysicsState`` other than ``engine`` are always finite, as ``divergence.GuardedPhysics`` sees
-    to. Environments over equal physics share compiled programs; it must hence be hashable, and
-    equal only to what computes the same.
+    ``reset`` and ``step`` may be jitted, vmapped and scanned; their states have the same tree,
+    shapes and dtypes, so that a jitted ``step`` is traced once. All fields of a ``PhysicsState``
+    but ``engine`` are always finite (``divergence.GuardedPhysics`` ensures it). Environments with
+    equal physics share compiled programs, so physics must be hashable, and equal only if it
+    computes the same.
 
-    A subclass has the first six attributes, ``reset`` and ``step``; the rest have defaults.
+    A subclass defines the first six attributes, ``reset`` and ``step``; the rest have defaults.
 
     Attributes:
         geoms: the visible shapes, each fixed in a link's frame.
@@ -54,15 +54,15 @@ class Physics(abc.ABC):
         action_size: A, number of actuators.
         state_size: S, length of ``PhysicsState.obs``.
         backend: name of the physics backend.
-        link_names: L names; ``link/index`` where the model has none. Row i of ``xpos`` and
-            ``xquat`` belongs to ``link_names[i]``.
-        rigs: cameras by name; ``default`` is the task's own. Without it a camera looks from a
-            corner at everything but the ground.
+        link_names: L names, of the rows of ``xpos`` and ``xquat``; ``link/index`` if the model has
+            none.
+        rigs: cameras by name; ``default`` is the task's. Without it the camera shows all geoms but
+            the ground from a corner.
         unfit_cameras: why other cameras of the model cannot be rigs, by name.
-        followed_link: the link that a camera follows if nothing else is said.
-        look: lights, sky and ground of the model, which are the looks ``default`` and ``dmc`` then.
-        batch_last: whether a CPU computes a batch faster with the environments as last axis.
-        compiler_options: what XLA needs on a CPU to make the programs fast.
+        followed_link: the link that a camera follows by default.
+        look: lights, sky and ground of the model, used as looks ``default`` and ``dmc``.
+        batch_last: whether a CPU is faster with the environments as last axis of a batch.
+        compiler_options: XLA options for fast programs on a CPU.
     """
 
     geoms: Geoms
@@ -80,47 +80,40 @@ class Physics(abc.ABC):
 
     @abc.abstractmethod
     def reset(self, key: jax.Array) -> PhysicsState:
-        """Sample the task's initial state.
-
-        Args:
-            key: PRNG key, the only source of randomness.
+        """Sample the task's initial state, with ``key`` as the only source of randomness.
 
         Returns:
-            The first state of an episode, with reward 0 and ``terminated`` false. Should the
-            sample itself be non-finite, ``non_finite`` and ``terminated`` are true, the links
-            are at the world's origin and the observation is 0.
+            The first state of an episode, with reward 0 and ``terminated`` false. If the sample is
+            not finite, ``non_finite`` and ``terminated`` are true, links are at the world's origin
+            and the observation is 0.
         """
 
     @abc.abstractmethod
     def step(self, state: PhysicsState, action: jax.Array) -> PhysicsState:
-        """Advance by one control step.
-
-        Args:
-            state: what ``reset`` or ``step`` returned.
-            action: (A,) float32. Tasks are written for [-1, 1]; the caller clips.
+        """Advance by one control step under an (A,) float32 action. The caller clips it to [-1, 1].
 
         Returns:
-            The next state. If the step diverged (see ``PhysicsState.non_finite``) it is the
-            given state with reward 0 and ``terminated`` and ``non_finite`` true. Stepping on
-            after a termination is allowed and continues the dynamics.
+            The next state. If the step diverged, it is the given state with reward 0, and
+            ``terminated`` and ``non_finite`` true. A step after a termination continues the
+            dynamics.
         """
 
     def from_qpos(
         self, q: jax.Array, qd: jax.Array | None = None, *, key: jax.Array | None = None
     ) -> PhysicsState:
-        """Return the first state of an episode, in a chosen pose.
+        """Return the first state of an episode in a chosen pose.
 
         Args:
             q: (Q,) float32, joint positions in MuJoCo's order; quaternions of any length.
-            qd: (V,) float32, joint velocities, 0 if not given.
-            key: decides what the task samples besides, such as a target.
+            qd: (V,) float32, joint velocities, 0 by default.
+            key: PRNG key for what else the task samples, such as a target.
 
         Returns:
-            A state that ``step`` accepts. ``terminated`` is false even if the task would end in
-            this pose; the next step says so.
+            A state for ``step``. ``terminated`` is false even in a pose that ends the task; the
+            next step sets it.
 
         Raises:
-            ValueError: for a wrong shape.
+            ValueError: a shape is wrong.
             TypeError: this physics has no such function.
         """
         del q, qd, key

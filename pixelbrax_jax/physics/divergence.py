@@ -1,4 +1,4 @@
-"""The guard against diverging physics, and equality of physics, which every engine gets."""
+"""Protection from diverging physics, and equality of physics."""
 
 from __future__ import annotations
 
@@ -15,28 +15,27 @@ from pixelbrax_jax.physics.base import Physics
 from pixelbrax_jax.spatial import quat_normalize
 from pixelbrax_jax.types import PhysicsState
 
-# MuJoCo calls a number bad beyond this magnitude (``mju_isBad``). It is well inside float32, so
-# that an image of the scene can still be computed from it.
+# MuJoCo's limit for bad numbers (``mju_isBad``). It is small enough for float32 to render a scene.
 _LARGEST = 1e10
 
 
 class Recipe(NamedTuple):
-    """A function of a module and its hashable arguments that give the physics."""
+    """A module's function and its hashable arguments that make the physics."""
 
     make: Callable[..., Any]
     arguments: tuple[Any, ...]
 
 
 class GuardedPhysics(Physics):
-    """Base of a ``Physics`` that ends an episode cleanly where its simulation diverges.
+    """Base of a ``Physics`` that ends an episode cleanly when its simulation diverges.
 
-    A step counts as diverged if a watched number is not finite or larger than 1e10 in magnitude.
-    It returns the state before it, with reward 0 and ``terminated`` and ``non_finite`` true.
+    A step has diverged if a watched number is not finite or exceeds 1e10 in magnitude. It returns
+    the state before it, with reward 0 and ``terminated`` and ``non_finite`` true.
     """
 
     _identity: Hashable = None
-    """Objects of one class and identity are equal; with None, to themselves alone. A pickle keeps
-    nothing else of the physics if it is a ``Recipe``."""
+    """Objects of one class and identity are equal; with None an object equals only itself. If it is
+    a ``Recipe``, a pickle contains nothing else."""
 
     @abc.abstractmethod
     def _reset(self, key: jax.Array) -> PhysicsState:
@@ -48,7 +47,7 @@ class GuardedPhysics(Physics):
 
     @abc.abstractmethod
     def _watched(self, state: PhysicsState) -> Any:
-        """Return a tree of what must be finite besides observation and reward."""
+        """Return a tree of values that must be finite, besides observation and reward."""
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, GuardedPhysics) or self._identity is None:
@@ -59,16 +58,14 @@ class GuardedPhysics(Physics):
         return object.__hash__(self) if self._identity is None else hash(self._identity)
 
     def __reduce_ex__(self, protocol: Any) -> Any:
-        """Return what is pickled: of a task of the package, how it is made."""
         if isinstance(self._identity, Recipe):
             return self._identity.make, self._identity.arguments
         return super().__reduce_ex__(protocol)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> GuardedPhysics:
-        """Return the object itself, which nothing changes."""
         return self
 
-    # Traced once for equal objects, however many programs they are part of.
+    # Traced once for equal objects in all programs.
 
     @partial(jax.jit, static_argnums=0, inline=True)
     @under_default_flags

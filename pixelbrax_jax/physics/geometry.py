@@ -20,7 +20,7 @@ _DEFAULT_RGBA = np.array([0.5, 0.5, 0.5, 1.0], np.float32)
 
 
 class Shape(NamedTuple):
-    """One visible shape; fields as in ``Geoms``, with its color and the name of its material."""
+    """One visible shape; fields as in ``Geoms``, with its color and its material's name."""
 
     kind: GeomKind
     link: int
@@ -37,8 +37,8 @@ class Shape(NamedTuple):
 def as_geoms(shapes: Sequence[Shape]) -> Geoms:
     """Return shapes as ``Geoms``.
 
-    Those of equal color share a material, except that planes never share one with other kinds, so
-    that a ground can be recolored alone.
+    Shapes of equal color share a material. Planes never share one with other kinds, so that the
+    ground can be recolored separately.
     """
     materials: dict[tuple[bool, tuple[float, ...]], str] = {}
     keys = []
@@ -73,22 +73,21 @@ def geom_shapes(
     drawn_radius: Mapping[str, float] | None = None,
     geom_groups: Collection[int] = VISIBLE_GROUPS,
 ) -> list[Shape]:
-    """Return the geoms MuJoCo's viewer would show, without textures, in the model's order.
+    """Return the geoms that MuJoCo's viewer shows, without textures, in the model's order.
 
-    A geom is left out if its group is not shown or its alpha is 0; any other alpha counts as
-    opaque. Planes are without end, and ground.
+    Geoms of hidden groups or with alpha 0 are left out; any other alpha is opaque. Planes are
+    infinite, and ground.
 
     Args:
         model: a compiled model; link i is its body i + 1.
         colors: replacements by geom name, red, green, blue in [0, 1].
-        drawn_radius: metres, by name of a sphere that is drawn larger than it is, because it
-            would be lost in a small image. Physics does not see it.
-        geom_groups: the groups shown.
+        drawn_radius: metres, by name of a sphere to render larger than it is, so that it is visible
+            in small images. Physics ignores it.
+        geom_groups: the visible groups.
 
     Raises:
-        ValueError: for an unknown name or a bad value in ``colors`` or ``drawn_radius``, for a
-            visible geom, flex or skin that the renderer has no formula for, or if nothing is
-            visible.
+        ValueError: a name or value in ``colors`` or ``drawn_radius`` is wrong, the renderer does
+            not support a visible geom, flex or skin, or nothing is visible.
     """
     names = [_name(model, i) for i in range(model.ngeom)]
     colors, drawn_radius = dict(colors or {}), dict(drawn_radius or {})
@@ -115,7 +114,7 @@ def geom_shapes(
         shapes.append(
             Shape(
                 kind=kind,
-                # Link 0 is MuJoCo's body 1, because the world is no link.
+                # Link 0 is MuJoCo's body 1, because the world is not a link.
                 link=int(model.geom_bodyid[i]) - 1,
                 name=name,
                 size=size,
@@ -133,7 +132,7 @@ def geom_shapes(
 
 
 def site_shapes(model: mujoco.MjModel, groups: Collection[int] = VISIBLE_GROUPS) -> Iterator[Shape]:
-    """Yield the sites that MuJoCo's viewer would show, as ``site/<name>``."""
+    """Yield the sites that MuJoCo's viewer shows, as ``site/<name>``."""
     for i in range(model.nsite):
         rgba = resolve_rgba(model, model.site_rgba[i], model.site_matid[i])
         if model.site_group[i] not in groups or not rgba[3] > 0:
@@ -152,7 +151,7 @@ def site_shapes(model: mujoco.MjModel, groups: Collection[int] = VISIBLE_GROUPS)
 
 
 def sizes(kind: GeomKind, numbers: np.ndarray) -> np.ndarray:
-    """Return (3,) float32 size numbers, 0 where they mean nothing."""
+    """Return (3,) float32 sizes, with 0 for unused entries."""
     size = np.array(numbers, np.float32)
     size[kind.num_sizes :] = 0
     return size
@@ -175,7 +174,7 @@ def _kind(model: mujoco.MjModel, index: int, name: str) -> GeomKind:
     kind = _kind_name(model, index)
     if kind.upper() not in GeomKind.__members__:
         raise ValueError(
-            f"geom {name!r} is a {kind}, which cannot be drawn; supported: "
+            f"geom {name!r} is a {kind}, which cannot be rendered; supported: "
             f"{', '.join(k.name.lower() for k in GeomKind)}. Replace it by these primitives, "
             f"hide it with alpha 0, or leave its group ({int(model.geom_group[index])}) out of "
             "geom_groups."
@@ -184,7 +183,6 @@ def _kind(model: mujoco.MjModel, index: int, name: str) -> GeomKind:
 
 
 def _check_surfaces(model: mujoco.MjModel, groups: Collection[int]) -> None:
-    """Raise an error for a visible flex or skin."""
     flexes = (mujoco.mjtObj.mjOBJ_FLEX, model.nflex, model.flex_group, model.flex_rgba)
     skins = (mujoco.mjtObj.mjOBJ_SKIN, model.nskin, model.skin_group, model.skin_rgba)
     for element, count, group, rgba in (flexes, skins):
@@ -193,7 +191,7 @@ def _check_surfaces(model: mujoco.MjModel, groups: Collection[int]) -> None:
             if group[i] in groups and rgba[i, 3] > 0:
                 name = mujoco.mj_id2name(model, element, i) or f"{kind}/{i}"
                 raise ValueError(
-                    f"{kind} {name!r} cannot be drawn: hide it with alpha 0, leave its group "
+                    f"{kind} {name!r} cannot be rendered: hide it with alpha 0, leave its group "
                     f"({int(group[i])}) out of geom_groups, or remove it from the model."
                 )
 
@@ -212,5 +210,5 @@ def geom_rgba(model: mujoco.MjModel, index: int) -> np.ndarray:
 
 
 def resolve_rgba(model: mujoco.MjModel, own: np.ndarray, material: int) -> np.ndarray:
-    """Return (4,) float32: a material colors what has MuJoCo's default rgba itself."""
+    """Return (4,) float32: the material's color if the element has MuJoCo's default rgba."""
     return model.mat_rgba[material] if material >= 0 and (own == _DEFAULT_RGBA).all() else own

@@ -23,11 +23,11 @@ _TRACKCOM = int(mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM)
 _RGB = int(mujoco.mjtTextureRole.mjTEXROLE_RGB)
 
 _SPECULAR = 0.5
-"""What MuJoCo's default material reflects of a light's specular part."""
+"""Specular reflection of MuJoCo's default material."""
 
 _SHININESS = 16
-"""A default material's exponent of 0.5 * 128 belongs to the half vector between light and viewer;
-Phong's mirrored vector turns twice as far, for which a quarter of it is as wide."""
+"""A quarter of the default material's 0.5 * 128: that exponent is for the half vector between light
+and viewer, and Phong's mirrored vector turns twice as fast."""
 
 
 def read_look(
@@ -38,25 +38,25 @@ def read_look(
     target_link: int = -1,
     anchor: np.ndarray | None = None,
 ) -> Look:
-    """Return the look of a model's own picture.
+    """Return the look of a model.
 
-    Colors of lights become shades of grey, a lamp on a body follows but does not turn, and the
-    sky's texture becomes its best fit by three colors. Lamps that follow another center of mass
-    than the camera does are left out; so are, with a warning, directional lights after the first.
+    Lights become grey, a lamp on a body follows but does not turn, and the sky's texture becomes
+    its best fit by three colors. Lamps that follow another center of mass than the camera are left
+    out, and so are, with a warning, directional lights after the first.
 
     Args:
         model: the compiled model; link i is its body i + 1.
-        com_link: index of the link at the tracked center of mass, -1 if there is none.
-        movable: names of lamps that move along with the target.
-        target_link: index of the target's link, -1 if there is none.
-        anchor: (3,) metres, where the target is in the model.
+        com_link: index of the link at the tracked center of mass, -1 for none.
+        movable: names of lamps that move with the target.
+        target_link: index of the target's link, -1 for none.
+        anchor: (3,) metres, position of the target in the model.
     """
     active = [i for i in range(model.nlight) if model.light_active[i]]
     suns = [i for i in active if model.light_type[i] == _DIRECTIONAL]
     if len(suns) > 1:
         warnings.warn(
             f"of {len(suns)} directional lights only the first, "
-            f"{model.light(suns[0]).name or suns[0]!r}, is drawn.",
+            f"{model.light(suns[0]).name or suns[0]!r}, is rendered.",
             stacklevel=2,
         )
     headlight = model.vis.headlight
@@ -105,7 +105,7 @@ def checker(model: mujoco.MjModel, geom: int) -> np.ndarray | None:
     if texture < 0 or model.tex_type[texture] != int(mujoco.mjtTexture.mjTEXTURE_2D):
         return None
     pixels = _pixels(model, texture)
-    # Quarters: first and last of one color, the others of another; only their edges may differ.
+    # One pixel of each quarter: the first and last have one color, the others another.
     rows, columns = (np.arange(1, 4, 2) * size // 4 for size in pixels.shape[:2])
     (a, b), (c, d) = pixels[np.ix_(rows, columns)]
     if not ((a == d).all() and (b == c).all() and (a != b).any()):
@@ -116,8 +116,8 @@ def checker(model: mujoco.MjModel, geom: int) -> np.ndarray | None:
 def mean_color(model: mujoco.MjModel, geom: int) -> tuple[float, float, float] | None:
     """Return the mean color of a geom's texture, red, green, blue in [0, 1]; None for none.
 
-    MuJoCo's light on a texture is never more than 1. The color is darker by what ambience and
-    headlight cast beyond that on what faces the camera.
+    MuJoCo limits the light on a texture to 1. The color is darkened by the excess of ambient light
+    and headlight on a surface that faces the camera.
     """
     texture = _texture(model, geom)
     if texture < 0:
@@ -131,7 +131,6 @@ def mean_color(model: mujoco.MjModel, geom: int) -> tuple[float, float, float] |
 
 
 def _texture(model: mujoco.MjModel, geom: int) -> int:
-    """Return the index of a geom's texture, -1 for none."""
     material = int(model.geom_matid[geom])
     return int(model.mat_texid[material, _RGB]) if material >= 0 else -1
 
@@ -140,7 +139,7 @@ def _lamp(model: mujoco.MjModel, light: int, com_link: int) -> Lamp | None:
     mode, body = int(model.light_mode[light]), int(model.light_bodyid[light])
     link, pos, axis = body - 1, model.light_pos0[light], model.light_dir0[light]
     if body == 0:
-        # Of a model that was edited since it was compiled these are up to date.
+        # These are up to date even if the model was edited after it was compiled.
         pos, axis = model.light_pos[light], model.light_dir[light]
     if mode == _TRACKCOM:
         if not follows_tracked(model, body):
@@ -161,7 +160,7 @@ def _lamp(model: mujoco.MjModel, light: int, com_link: int) -> Lamp | None:
 
 
 def _ground(model: mujoco.MjModel) -> tuple[Any, Any]:
-    """Return pitch and colors of the first checkered plane; MuJoCo puts two tiles in a texture."""
+    """Return pitch and colors of the first checkered plane; a texture has two tiles per edge."""
     for geom in range(model.ngeom):
         colors = checker(model, geom) if model.geom_type[geom] == 0 else None
         if colors is not None:
@@ -174,7 +173,7 @@ def _ground(model: mujoco.MjModel) -> tuple[Any, Any]:
 
 
 def _sky(model: mujoco.MjModel) -> Any:
-    """Return (3, 3): horizon, above and below, of which the sky's texture is nearest to a mix."""
+    """Return (3, 3), colors at the horizon, above and below that fit the sky's texture best."""
     skies = np.flatnonzero(model.tex_type == int(mujoco.mjtTexture.mjTEXTURE_SKYBOX))
     if not len(skies):
         return _f32(np.zeros((3, 3)))

@@ -1,4 +1,4 @@
-"""All that a MuJoCo model says about its own picture: shapes, cameras, lights."""
+"""Shapes, cameras and lights of a MuJoCo model."""
 
 from __future__ import annotations
 
@@ -30,24 +30,24 @@ COM_LINK = "camera/com"
 TARGET_LINK = "target"
 
 _PIECES = 6
-"""Capsules of a string that hangs."""
+"""Capsules of a hanging string."""
 
 _SITE = int(mujoco.mjtWrap.mjWRAP_SITE)
 _JOINT = int(mujoco.mjtWrap.mjWRAP_JOINT)
 
 
 class ModelScene(NamedTuple):
-    """What there is to draw, and from where.
+    """What to render, and from where.
 
     Attributes:
         geoms: geoms, visible sites (``site/<name>``) and the pieces of visible tendons
             (``tendon/<name>/<piece>``).
         rig: the chosen camera.
         rigs: all cameras that can be rigs, by name.
-        look: the model's own lights, sky and ground.
-        links: names of links after those of the bodies: ``camera/com``, at the center of mass of
-            the subtree of ``tracked_body(model)``, and ``target``, of what is movable and visible,
-            where there are such. Neither turns.
+        look: the model's lights, sky and ground.
+        links: names of the links after those of the bodies, if the model needs them: ``camera/com``
+            at the center of mass of the subtree of ``tracked_body(model)``, and ``target`` for what
+            is movable and visible. Neither turns.
     """
 
     geoms: Geoms
@@ -60,17 +60,18 @@ class ModelScene(NamedTuple):
 def read_scene(
     model: mujoco.MjModel, camera: int | str = 0, *, movable: Collection[str] = ()
 ) -> ModelScene:
-    """Read what MuJoCo's own renderer would show of a model by default.
+    """Read what MuJoCo's renderer shows of a model by default.
 
     Args:
         model: a compiled model; link i is its body i + 1.
         camera: name of a camera, or index in the model.
-        movable: names of geoms, sites and lamps of the world that move together, with the link
-            ``target``; the first visible geom or site is at that link's origin.
+        movable: names of geoms, sites and lamps of the world that move together with the link
+            ``target``, whose origin is the first visible geom or site.
 
     Raises:
         ValueError: there is no such camera, or its orientation follows a body; a name of
-            ``movable`` is unknown or not of the world; something visible cannot be drawn.
+            ``movable`` is unknown or not of the world; the renderer does not support something
+            visible.
     """
     _check_movable(model, movable)
     links = [COM_LINK] if tracked_body(model) >= 0 else []
@@ -122,10 +123,7 @@ def _check_movable(model: mujoco.MjModel, movable: Collection[str]) -> None:
 
 
 def _textured_geoms(model: mujoco.MjModel) -> Iterator[Shape]:
-    """Yield the geoms, with ends of planes and whether they are checkered.
-
-    Any other texture, and that of another shape, becomes its mean color.
-    """
+    """Yield the geoms with finite planes and checkers; other textures become their mean color."""
     for i, shape in zip(shown_geoms(model), geom_shapes(model), strict=True):
         is_plane = shape.kind == GeomKind.PLANE
         yield shape._replace(
@@ -150,8 +148,8 @@ def _strings(model: mujoco.MjModel, first_geom: int) -> tuple[list[Shape], list[
         name = model.tendon(tendon).name or str(tendon)
         if (kinds != _SITE).any():
             raise ValueError(
-                f"tendon {name!r} runs over geoms or pulleys, which cannot be drawn; hide it with "
-                "alpha 0 or group 3, or lead it over sites alone."
+                f"tendon {name!r} runs over geoms or pulleys, which cannot be rendered; hide it "
+                "with alpha 0 or group 3, or route it only over sites."
             )
         sites = model.wrap_objid[first : first + count]
         slack = float(model.tendon_range[tendon, 1]) if _hangs(model, tendon) else 0.0

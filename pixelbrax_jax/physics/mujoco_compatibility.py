@@ -1,4 +1,4 @@
-"""What loading MuJoCo models and MuJoCo XLA says and does that nobody needs, for every engine."""
+"""Silenced warnings and prints of MuJoCo, MuJoCo XLA and Brax."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _KNOWN_WARNINGS: tuple[tuple[str, type[Warning]], ...] = (
     # Brax reads MJX fields that moved; MJX still serves them.
     (r"Accessing `\w+` directly from `(Data|Model)` is deprecated", DeprecationWarning),
 )
-# Both suites' cheetahs say settotalmass; the mass it gives is still the one MuJoCo uses.
+# Both suites' cheetahs use settotalmass, which MuJoCo still applies.
 _KNOWN_MUJOCO_WARNING = "compiler attribute 'settotalmass' is deprecated"
 # MJX prints a line when an optional dependency, Warp, is not installed.
 _KNOWN_PRINT = "Failed to import "
@@ -30,7 +30,7 @@ _KNOWN_PRINT = "Failed to import "
 
 @contextlib.contextmanager
 def known_warnings_silenced() -> Iterator[None]:
-    """Hide known warnings of Brax and its parts, and no others, while the block runs."""
+    """Hide known warnings of Brax and its dependencies in this block."""
     with warnings.catch_warnings():
         for message, category in _KNOWN_WARNINGS:
             warnings.filterwarnings("ignore", message=message, category=category)
@@ -39,7 +39,7 @@ def known_warnings_silenced() -> Iterator[None]:
 
 @contextlib.contextmanager
 def import_silenced() -> Iterator[None]:
-    """Hide the known noise of importing Brax and MuJoCo XLA; print anything else afterwards."""
+    """Hide known output of importing Brax and MuJoCo XLA; print everything else afterwards."""
     printed = io.StringIO()
     with known_warnings_silenced(), contextlib.redirect_stdout(printed):
         yield
@@ -50,10 +50,10 @@ def import_silenced() -> Iterator[None]:
 
 @contextlib.contextmanager
 def loading_silenced() -> Iterator[None]:
-    """Hide the known noise of compiling a model; MuJoCo's other warnings become Python's.
+    """Hide known warnings of compiling a model; turn MuJoCo's others into Python warnings.
 
-    Without a handler MuJoCo appends its warnings to ``MUJOCO_LOG.TXT`` in the working
-    directory. A handler installed before is called as before.
+    Without a handler MuJoCo appends its warnings to ``MUJOCO_LOG.TXT`` in the working directory. A
+    handler that was installed before is still called.
     """
     previous = mujoco.get_mju_user_warning()
     messages: list[str] = []
@@ -63,7 +63,7 @@ def loading_silenced() -> Iterator[None]:
             yield
     finally:
         mujoco.set_mju_user_warning(previous)
-    # Only now: an exception (a warning made an error) must not cross MuJoCo's C code.
+    # After the block, because an exception (a warning as error) must not cross MuJoCo's C code.
     for message in messages:
         if _KNOWN_MUJOCO_WARNING in message:
             continue
@@ -83,10 +83,10 @@ class _JaxOfThisProcess:
 
 
 def load_onto_own_device(module: ModuleType) -> None:
-    """Let a module that knows JAX as ``jax`` put arrays on a device of this process.
+    """Let a module that uses ``jax`` put arrays on a device of this process.
 
-    MuJoCo XLA puts models on ``jax.devices()[0]``, which in a run of several processes is a device
-    of the first one, where no other process can read it.
+    MuJoCo XLA puts models on ``jax.devices()[0]``, which in a run of several processes belongs to
+    the first one; others cannot read it.
     """
     if jax.process_count() > 1 and vars(module)["jax"] is jax:
         vars(module)["jax"] = _JaxOfThisProcess()

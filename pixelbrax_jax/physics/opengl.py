@@ -1,9 +1,7 @@
-"""MuJoCo without OpenGL, which nothing here needs, until somebody asks MuJoCo to draw.
+"""Import of MuJoCo without OpenGL: ``from pixelbrax_jax.physics.opengl import mujoco``.
 
-MuJoCo decides about OpenGL once, while it is imported; imported without, it would have no
-``GLContext`` for the rest of the process, and a user's own ``mujoco.Renderer`` would fail. So its
-modules are given a ``__getattr__``, which loads the context when it is first asked for. Physics
-takes MuJoCo from here: ``from pixelbrax_jax.physics.opengl import mujoco``.
+MuJoCo loads OpenGL while it is imported, and never later, so that ``mujoco.Renderer`` would fail
+without it. A ``__getattr__`` in its modules therefore loads ``GLContext`` at its first use.
 """
 
 from __future__ import annotations
@@ -20,16 +18,15 @@ from typing import Any
 _VARIABLE = "MUJOCO_GL"
 _CONTEXT = "GLContext"
 _HOME = "mujoco.rendering.classic.gl_context"
-"""MuJoCo's module that loads OpenGL as ``MUJOCO_GL`` says, while it is imported."""
+"""MuJoCo's module that loads OpenGL according to ``MUJOCO_GL`` at import."""
 
 
 def import_mujoco() -> None:
-    """Import MuJoCo, if nobody has, without the OpenGL that ``MUJOCO_GL`` names.
+    """Import MuJoCo without the OpenGL of ``MUJOCO_GL``, unless it is already imported.
 
-    MuJoCo cannot be imported where that is missing, or is no name that it knows. What it draws
-    with, ``mujoco.GLContext``, is loaded when it is first used, by ``mujoco.Renderer`` too, as the
-    variable says then; it fails then as MuJoCo's import would have. A MuJoCo that loads OpenGL
-    elsewhere is left to be imported as it is.
+    MuJoCo cannot be imported if that OpenGL is missing or unknown. ``mujoco.GLContext`` is loaded
+    at its first use, also by ``mujoco.Renderer``, with the value of the variable and the errors of
+    MuJoCo's import at that time. A MuJoCo that loads OpenGL elsewhere is not changed.
     """
     if "mujoco" in sys.modules or not _is_there():
         return
@@ -51,7 +48,7 @@ def import_mujoco() -> None:
 
 
 def _is_there() -> bool:
-    """Return whether MuJoCo has the module that loads OpenGL, without importing anything."""
+    """Return whether MuJoCo has the module that loads OpenGL, without importing it."""
     spec = importlib.util.find_spec("mujoco")
     folders = (spec and spec.submodule_search_locations) or ()
     place = Path(*_HOME.split(".")[1:]).with_suffix(".py")

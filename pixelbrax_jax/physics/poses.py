@@ -1,4 +1,4 @@
-"""Poses of a MuJoCo model, as joint positions and velocities."""
+"""Joint positions and velocities of a MuJoCo model."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from pixelbrax_jax.spatial import quat_normalize
 def check_pose(
     model: mujoco.MjModel, q: jax.Array, qd: jax.Array | None
 ) -> tuple[jax.Array, jax.Array]:
-    """Return joint positions (Q,) and velocities (V,) in float32; the latter 0 if not given.
+    """Return joint positions (Q,) and velocities (V,) in float32; the latter 0 by default.
 
     Raises:
-        ValueError: for a wrong shape.
+        ValueError: a shape is wrong.
     """
     q = jnp.asarray(q, jnp.float32)
     qd = jnp.asarray(jnp.zeros(model.nv) if qd is None else qd, jnp.float32)
@@ -28,7 +28,7 @@ def check_pose(
 
 
 def with_unit_rotations(model: mujoco.MjModel, q: jax.Array) -> jax.Array:
-    """Return joint positions (Q,) with the quaternions of free and ball joints normalized."""
+    """Return joint positions (Q,) with normalized quaternions of free and ball joints."""
     for kind, address in zip(model.jnt_type, model.jnt_qposadr, strict=True):
         if kind == mujoco.mjtJoint.mjJNT_FREE:
             rotation = slice(address + 3, address + 7)

@@ -1,4 +1,4 @@
-"""What there is to know about a task before its physics is loaded."""
+"""Tables of tasks."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ class Task:
     """One row of a suite's table.
 
     Attributes:
-        name: what ``make`` calls it.
-        gymnasium_id: what Gymnasium calls it.
+        name: name for ``make``.
+        gymnasium_id: id in Gymnasium.
         summary: one sentence: the goal, and what ends an episode before the time limit.
     """
 
@@ -26,7 +26,7 @@ class Task:
     summary: str
 
     def other_names(self) -> tuple[str, ...]:
-        """Return what other libraries call the task, for the message about an unknown one."""
+        """Return other libraries' names of the task, for the message about an unknown one."""
         return (self.gymnasium_id,)
 
 
@@ -34,5 +34,5 @@ _Task = TypeVar("_Task", bound=Task)
 
 
 def by_name(rows: Iterable[_Task]) -> Mapping[str, _Task]:
-    """Return rows by the names of their tasks."""
+    """Return rows by task name."""
     return MappingProxyType({row.name: row for row in rows})

@@ -1,4 +1,4 @@
-"""Cameras of a MuJoCo model, as camera rigs."""
+"""Cameras of a MuJoCo model as camera rigs."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ _PERSPECTIVE = int(mujoco.mjtProjection.mjPROJ_PERSPECTIVE)
 
 
 def tracked_body(model: mujoco.MjModel) -> int:
-    """Return the body whose subtree's center of mass cameras and lamps of mode trackcom follow.
+    """Return the body of the first camera, else lamp, of mode trackcom; -1 for none.
 
-    That is the first such camera's or else lamp's; -1 if there is none. Others follow it if their
-    subtrees have the same mass, which a model's one robot sees to.
+    Cameras and lamps of that mode follow the center of mass of its subtree, if the subtrees of
+    their own bodies have the same mass.
     """
     for modes, bodies in (
         (model.cam_mode, model.cam_bodyid),
@@ -32,16 +32,16 @@ def tracked_body(model: mujoco.MjModel) -> int:
 
 
 def follows_tracked(model: mujoco.MjModel, body: int) -> bool:
-    """Return whether a body's subtree has the center of mass of the tracked one's."""
+    """Return whether a body's subtree has the same mass as that of the tracked body."""
     mass = model.body_subtreemass
     return bool(np.isclose(mass[body], mass[tracked_body(model)], rtol=1e-6))
 
 
 def followed_body(model: mujoco.MjModel) -> int:
-    """Return the body that a view follows if nothing else is said.
+    """Return the body that a view follows by default.
 
-    That is the first that moves of the first kinematic tree on which an actuator acts, not a goal;
-    without such a tree the first that moves; 0 if none does.
+    It is the first moving body of the first kinematic tree with an actuator (not a goal), else the
+    first moving body, else 0.
     """
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -52,15 +52,14 @@ def followed_body(model: mujoco.MjModel) -> int:
 
 
 def read_rigs(model: mujoco.MjModel, com_link: int) -> dict[str, CameraRig]:
-    """Return rigs of a model's cameras, but those of ``unfit_cameras``, by name in its order.
+    """Return rigs of a model's cameras by name, without ``unfit_cameras``, in the model's order.
 
-    A camera without a name is ``camera/<index>``. A rig's target is on the camera's axis as deep as
-    what it shows, the tracked point or the model's center of mass, so that a camera distractor
-    turns about that.
+    A camera without a name is ``camera/<index>``. A rig's target lies on the camera's axis, at the
+    depth of the tracked point or of the model's center of mass: camera distractors turn about it.
 
     Args:
         model: the compiled model; link i is its body i + 1.
-        com_link: index of the link at the tracked center of mass, -1 if there is none.
+        com_link: index of the link at the tracked center of mass, -1 for none.
     """
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -85,7 +84,7 @@ def read_rigs(model: mujoco.MjModel, com_link: int) -> dict[str, CameraRig]:
 
 
 def unfit_cameras(model: mujoco.MjModel) -> dict[str, str]:
-    """Return why cameras cannot be rigs, by their names, for those that cannot."""
+    """Return the reasons why some cameras cannot be rigs, by name."""
     reasons = {}
     for camera in range(model.ncam):
         mode, body = int(model.cam_mode[camera]), int(model.cam_bodyid[camera])
@@ -119,7 +118,7 @@ def _rig(
         link=link,
         track=_f32([float(link >= 0)] * 3),
         eye=_f32(eye),
-        # A camera that looks away from the subject still needs a point to look at.
+        # A camera that looks away from the subject also needs a target.
         target=_f32(eye + (depth if depth > 1e-3 else 1.0) * forward),
         up=_f32(axes[:, 1]),
         fovy=_f32(fovy),

@@ -1,1 +1,1 @@
-"""Poses -> scene: geoms in the world, a camera, and how it all looks."""
+"""Scenes: geoms in the world frame, a camera and a look."""

@@ -1,4 +1,4 @@
-"""Camera rigs: views that every task has, and how a rig becomes a camera."""
+"""Camera rigs, and the cameras they give."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ from pixelbrax_jax.types import Camera, CameraRig, GeomKind, Geoms
 from pixelbrax_jax.validation import check_choice
 
 _DISTANT = 1000
-"""Radii of a sphere or capsule: farther away, float32 moves its edge by some hundredths of one."""
+"""Radii of a sphere or capsule beyond which float32 moves its edge by some hundredths of a
+radius."""
 
 
 class _Side(NamedTuple):
-    """A view of the default's target, at its distance: the direction to the eye, and what is up."""
+    """A view of the default's target from the default's distance: direction to the eye, and up."""
 
     direction: tuple[float, float, float]
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)
@@ -30,7 +31,7 @@ SIDES: Mapping[str, _Side] = {
     "front": _Side((1.0, 0.0, 0.15)),
     "top": _Side((0.0, 0.0, 1.0), up=(0.0, 1.0, 0.0)),
 }
-"""Views that every task has beside its ``default``."""
+"""Views that every task has besides ``default``."""
 
 
 def _f32(values: Any) -> Any:
@@ -50,15 +51,15 @@ def make_rig(
     """Make a camera rig from plain numbers.
 
     Args:
-        eye: metres; relative to the tracked link along tracked axes, absolute along others.
-        target: metres, likewise; the point looked at.
+        eye: metres; relative to the followed link along tracked axes, absolute along others.
+        target: metres, likewise; the point the camera looks at.
         fovy: vertical field of view, degrees, between 0 and 180.
-        link: index of the followed link, -1 for a camera at rest.
-        track: how much of the link's position is followed, per world axis.
+        link: index of the followed link, -1 for none.
+        track: fraction of the link's position to follow, per world axis.
         up: the world direction that is up in the image.
 
     Raises:
-        ValueError: eye and target coincide, ``up`` is along the view, or ``fovy`` is outside
+        ValueError: eye and target coincide, ``up`` is parallel to the view, or ``fovy`` is outside
             (0, 180).
     """
     if not 0.0 < fovy < 180.0:
@@ -80,7 +81,7 @@ def make_rig(
 
 
 def with_sides(rigs: Mapping[str, CameraRig]) -> dict[str, CameraRig]:
-    """Return a task's ``default``, ``SIDES``, and its other rigs, which come before ``SIDES``."""
+    """Return a task's ``default``, ``SIDES`` and its other rigs, which override ``SIDES``."""
     default = rigs["default"]
     sides = {name: _seen_from_side(default, side) for name, side in SIDES.items()}
     return {"default": default, **sides, **rigs}
@@ -96,11 +97,11 @@ def _seen_from_side(base: CameraRig, side: _Side) -> CameraRig:
 def choose_rig(
     task: str, camera: str | CameraRig | Camera, rigs: Mapping[str, CameraRig]
 ) -> CameraRig:
-    """Return a rig by name, the given one, or one that holds a camera at rest.
+    """Return a rig by name, the given rig, or a rig for a fixed camera.
 
     Raises:
-        ValueError: ``rigs``, those of the task, have no such name.
-        TypeError: ``camera`` is of another type.
+        ValueError: the task has no rig of that name.
+        TypeError: ``camera`` has another type.
     """
     if isinstance(camera, CameraRig):
         return camera
@@ -115,7 +116,7 @@ def choose_rig(
 
 
 def rig_at_rest(camera: Camera) -> CameraRig:
-    """Return the rig that always yields ``camera``."""
+    """Return the rig of a fixed camera."""
     pos = _f32(camera.pos)
     xmat = _f32(camera.xmat)
     return CameraRig(
@@ -129,14 +130,14 @@ def rig_at_rest(camera: Camera) -> CameraRig:
 
 
 def aim(rig: CameraRig, xpos: jax.Array) -> Camera:
-    """Return the world's camera of a rig, for link origins ``xpos`` (L, 3) in metres."""
+    """Return the camera of a rig in the world frame, for link origins ``xpos`` (L, 3) in metres."""
     follow = rig.track * xpos[rig.link] if rig.link >= 0 else jnp.zeros(3)
     eye, target = rig.eye + follow, rig.target + follow
     return Camera(pos=eye, xmat=spatial.look_at(eye, target, rig.up), fovy=jnp.asarray(rig.fovy))
 
 
 def seen_from(geoms: Geoms, rig: CameraRig) -> Geoms:
-    """Return the geoms as a rig needs them, which may be very far away: see ``Geoms.distant``."""
+    """Return the geoms with ``Geoms.distant`` set for the position of a rig."""
     with_far_form = [GeomKind(kind).has_far_form for kind in geoms.kind]
     radii = np.asarray(geoms.size)[with_far_form, 0]
     away = np.linalg.norm(np.asarray(rig.eye))
@@ -144,13 +145,10 @@ def seen_from(geoms: Geoms, rig: CameraRig) -> Geoms:
 
 
 def rig_from_corner(geoms: Geoms, xpos: np.ndarray, xquat: np.ndarray, link: int = 0) -> CameraRig:
-    """Make a rig that has all geoms but planes in view, from a corner and slightly from above.
+    """Make a rig that shows all geoms but planes, from a corner and slightly from above.
 
-    Args:
-        geoms: the shapes.
-        xpos: (L, 3) metres, link origins in the world frame.
-        xquat: (L, 4) unit, link orientations.
-        link: index of the link whose x and y are followed.
+    It follows ``link`` in x and y. ``xpos`` (L, 3) in metres and unit ``xquat`` (L, 4) are the
+    poses of the links in the world frame.
     """
     points = [
         geoms.pos[g] if of < 0 else xpos[of] + spatial.rotate(xquat[of], geoms.pos[g])

@@ -1,4 +1,4 @@
-"""The looks: ``default``, made to be read; ``original``, as in the paper; ``dmc``, DM Control's."""
+"""Looks: PixelBrax's ``default``, the paper's ``original``, and DM Control's ``dmc``."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ LOOKS: dict[str, Look] = {
         ground_pitch=_f32(2000 / 2048),
     ),
     # Headlight, checker and sky of the DM Control Suite (common/visual.xml, materials.xml,
-    # skybox.xml), and the light from above that its models have. Tasks of the suite bring their
-    # own of this look, with the lights of their models.
+    # skybox.xml), and its models' light from above. Tasks of the suite have a variant of this look
+    # with the lights of their models.
     "dmc": Look(
         ground="checker",
         shadows=True,
@@ -71,11 +71,11 @@ def make_look(look: str | Look = "default", *, shadows: bool | None = None) -> L
 
     Args:
         look: ``"default"``, ``"original"``, ``"dmc"`` or a ``Look``.
-        shadows: whether geoms cast shadows; None keeps the look's own choice.
+        shadows: whether geoms cast shadows; None keeps the look's value.
 
     Raises:
         ValueError: the name is unknown.
-        TypeError: ``look`` is neither a string nor a ``Look``; ``shadows`` is no truth value.
+        TypeError: ``look`` is neither a string nor a ``Look``, or ``shadows`` is not a bool.
     """
     if isinstance(look, str):
         look = LOOKS[check_choice("look", look, LOOKS)]

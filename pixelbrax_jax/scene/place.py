@@ -1,4 +1,4 @@
-"""Poses of links -> a scene in the world frame."""
+"""Scenes from the poses of links."""
 
 from __future__ import annotations
 
@@ -15,18 +15,14 @@ from pixelbrax_jax.types import CameraRig, Geoms, Look, Scene
 
 @under_default_flags
 def place(geoms: Geoms, rig: CameraRig, look: Look, xpos: jax.Array, xquat: jax.Array) -> Scene:
-    """Carry every geom and lamp along with its link, stretch the strings, and aim the camera.
+    """Move geoms and lamps with their links, hang the strings and aim the camera.
 
-    Args:
-        geoms: shapes in their links' frames.
-        rig: the camera rig.
-        look: light, sky and ground.
-        xpos: (L, 3) float32, metres, link origins in the world frame.
-        xquat: (L, 4) float32, unit, link orientations in the world frame.
+    Link origins ``xpos`` (L, 3) float32 are in metres, and orientations ``xquat`` (L, 4) float32
+    are unit quaternions, both in the world frame.
     """
     link = np.array(geoms.link, np.int32)
     if len(xpos):
-        # Not by one more row that stands for the world: a GPU would write the rows anew.
+        # No extra row for the world, because a GPU would copy the rows.
         in_world = (link < 0)[:, None]
         link_pos = jnp.where(in_world, 0.0, xpos[link])
         link_quat = jnp.where(in_world, jnp.array([1.0, 0.0, 0.0, 0.0]), xquat[link])

@@ -1,4 +1,4 @@
-"""Threads between two points: straight where they are stretched, else hanging."""
+"""Strings between two points: straight if stretched, else catenaries."""
 
 from __future__ import annotations
 
@@ -12,21 +12,16 @@ _NEWTON_STEPS = 8
 
 
 def pieces(string: String, ends: jax.Array, num: int) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return capsules that cover a thread.
-
-    Args:
-        string: the thread.
-        ends: (2, 3) float32, metres, its ends in the world frame.
-        num: how many capsules.
+    """Return ``num`` capsules that cover a string with ends (2, 3) in metres in the world frame.
 
     Returns:
-        (num, 3) centers, (num, 3, 3) orientations whose third columns are along the thread,
+        (num, 3) centers, (num, 3, 3) orientations whose third columns point along the string,
         (num,) half lengths.
     """
     points = hang(ends, string.length, num)
     along = points[1:] - points[:-1]
     z = spatial.unit(along)
-    # Any direction across will do; this one is never parallel.
+    # Any direction that is not parallel.
     aside = jnp.where(jnp.abs(z[:, :1]) < 0.9, jnp.eye(3)[0], jnp.eye(3)[1])
     x = spatial.unit(jnp.cross(aside, z))
     half = 0.5 * jnp.sqrt(jnp.maximum(jnp.sum(along * along, -1), 1e-12))
@@ -34,16 +29,12 @@ def pieces(string: String, ends: jax.Array, num: int) -> tuple[jax.Array, jax.Ar
 
 
 def hang(ends: jax.Array, length: jax.Array, num: int) -> jax.Array:
-    """Return points (num + 1, 3) on a thread under gravity along -z, at equal distances along it.
+    """Return (num + 1, 3) points at equal distances along a string under gravity in -z.
 
-    A hanging thread is a catenary, z = a cosh(x / a) + const. With h and v its horizontal and
-    vertical extent and u = h / 2a, its length obeys ``sqrt(length^2 - v^2) / h = sinh(u) / u``, and
-    the parameter x / a at the middle between the ends is ``artanh(v / length)``.
-
-    Args:
-        ends: (2, 3) float32, metres.
-        length: () float32, metres; the line is straight where it is too short.
-        num: pieces.
+    A catenary is z = a cosh(x / a) + const. With h and v the horizontal and vertical distance of
+    its ends and u = h / 2a, its length obeys ``sqrt(length^2 - v^2) / h = sinh(u) / u``, and x / a
+    in the middle between the ends is ``artanh(v / length)``. Ends (2, 3) and length () are in
+    metres; a string shorter than the distance of its ends is straight.
     """
     start, end = ends[0], ends[1]
     way = end - start
@@ -51,7 +42,7 @@ def hang(ends: jax.Array, length: jax.Array, num: int) -> jax.Array:
     straight = start + fraction[:, None] * way
     distance = jnp.sqrt(jnp.maximum(jnp.sum(way * way), 1e-12))
     slack = distance < 0.999 * length
-    # Of a stretched thread any numbers that give finite derivatives.
+    # For a stretched string: any values with finite derivatives.
     length = jnp.where(slack, length, 1.01 * distance)
 
     flat = way * jnp.array([1.0, 1.0, 0.0])

@@ -370,7 +370,7 @@ def test_a_policy_in_a_file_acts_as_in_training(whole):
 
 
 def test_no_policy_is_told(tmp_path):
-    with pytest.raises(FileNotFoundError, match="neither a file nor the name of a policy"):
+    with pytest.raises(FileNotFoundError, match="nor the name of a policy"):
         load_policy(tmp_path / "policy.jax")
     (tmp_path / "policy.jax").write_bytes(b"nonsense")
     with pytest.raises(ValueError, match="as an exported policy"):

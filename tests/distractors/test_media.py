@@ -261,7 +261,7 @@ def test_a_transparent_gif(tmp_path):
         ("a.gif", b"<html>", "it is a web page"),
         ("a.mp4", b"this is no video" * 99, ".+"),
         ("a.gif", b"this is no video", "it is no image"),
-        ("a.mp4", None, "there is only sound in it"),
+        ("a.mp4", None, "it has only sound"),
     ],
 )
 def test_what_is_no_video_is_told_in_a_line(tmp_path, name, content, why):

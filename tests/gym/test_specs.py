@@ -133,7 +133,7 @@ def test_what_json_has_nothing_for_is_named():
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [
-        ({"look": {"ground": "grid"}}, ValueError, "needs an entry 'type', one of MovingCamera,"),
+        ({"look": {"ground": "grid"}}, ValueError, "needs an entry 'type', one of Camera,"),
         ({"look": {"type": "Lok"}}, ValueError, "unknown entry 'type': 'Lok'.*'Look'"),
         ({"distractors": {"type": "color", "scal": 1}}, TypeError, "'scal'.*'scale'"),
         ({"distractors": [{"type": "no_such:Path"}]}, ValueError, "no_such:Path.*No module named"),

@@ -446,7 +446,7 @@ def test_masks_are_bool(make_torchrl, name, dtype):
 @pytest.mark.parametrize("device", ["gpu", "cuda:77", "cuda"])
 @pytest.mark.skipif(torch.cuda.is_available(), reason="the last one is there")
 def test_device_that_is_not_there(device):
-    with pytest.raises(ValueError, match=f"device='{device}' is not there"):
+    with pytest.raises(ValueError, match=f"device='{device}' is not available"):
         pixelbrax_gym.TorchRLEnv(TASK, 2, device=device)
 
 

@@ -150,12 +150,12 @@ CLOTH = """
     [
         (
             MESH.format(more=""),
-            r"geom 'shell' is a mesh, which cannot be drawn; supported: plane, sphere, capsule, "
-            r"ellipsoid, cylinder, box\. Replace it by these primitives, .* alpha 0",
+            r"geom 'shell' is a mesh, which cannot be rendered; supported: plane, sphere, "
+            r"capsule, ellipsoid, cylinder, box\. Replace it by these primitives, .* alpha 0",
         ),
-        (HILLS, "geom 'hfield/0' is a hfield, which cannot be drawn"),
-        (SKIN.format(more='group="2"'), r"skin 'hide' cannot be drawn: hide it with alpha 0, .*2"),
-        (CLOTH, "flex 'cloth' cannot be drawn"),
+        (HILLS, "geom 'hfield/0' is a hfield, which cannot be rendered"),
+        (SKIN.format(more='group="2"'), r"skin 'hide' cannot be rendered: .* alpha 0, .*2"),
+        (CLOTH, "flex 'cloth' cannot be rendered"),
     ],
 )
 def test_what_cannot_be_drawn_is_named(xml, message):

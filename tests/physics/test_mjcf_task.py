@@ -182,7 +182,7 @@ MESH = """<asset><mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset>
         ("<mujoco><wrldbody/></mujoco>", r"MuJoCo cannot compile the given XML: (.|\n)*wrldbody"),
         (CART[: CART.index("<actuator>")] + "</mujoco>", "the model has no actuator"),
         ('<mujoco><worldbody><geom size=".1"/></worldbody></mujoco>', "the model has no joint"),
-        (CART.replace("<worldbody>", MESH), "geom 'statue' is a mesh, which cannot be drawn"),
+        (CART.replace("<worldbody>", MESH), "geom 'statue' is a mesh, which cannot be rendered"),
     ],
 )
 def test_models_that_are_no_task(xml, message):

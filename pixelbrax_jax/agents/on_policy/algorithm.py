@@ -169,7 +169,7 @@ class OnPolicy(Algorithm):
         pixels = observations(rollout.frames, times, self.config.random_shift)
         rows = (rollout.frames.state, *rollout.choice, advantage, returns, rollout.valid)
         *samples, valid = jax.tree.map(lambda rows: at_times(rows, times), rows)
-        return Batch(pixels, *samples, valid.astype(jnp.float32))
+        return Batch._make((pixels, *samples, valid.astype(jnp.float32)))
 
     def update(
         self,

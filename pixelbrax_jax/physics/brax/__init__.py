@@ -1,1 +1,1 @@
-"""Brax's tasks and backends, and tasks made of an MJCF file."""
+"""Brax's tasks and backends, and tasks from MJCF files."""

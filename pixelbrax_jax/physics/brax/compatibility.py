@@ -1,8 +1,4 @@
-"""Where Brax and the current releases of JAX and MuJoCo disagree, and how we live with it.
-
-Nothing here imports Brax. Each function states the disagreement it covers; when a release
-ends one, its lines can go.
-"""
+"""Functions that Brax needs and current releases of JAX lack. Importing it does not load Brax."""
 
 from __future__ import annotations
 
@@ -18,7 +14,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 
 class _NumpyWithOldClip:
-    """``jax.numpy`` whose ``clip`` still takes ``a_min`` and ``a_max``."""
+    """``jax.numpy`` with a ``clip`` that accepts ``a_min`` and ``a_max``."""
 
     @staticmethod
     def clip(
@@ -33,17 +29,16 @@ class _NumpyWithOldClip:
 
 
 def accept_old_clip(module: ModuleType) -> None:
-    """Let a module that knows ``jax.numpy`` as ``jp`` call ``jp.clip(x, a_min=...)``.
+    """Let a module call ``jp.clip(x, a_min=...)``, as Brax's fluid forces (the swimmer) do.
 
-    Brax's fluid forces (the swimmer) do, and JAX no longer accepts it. Only the name inside that
-    module is replaced, and only where JAX lacks the argument.
+    The name ``jp`` is replaced only in that module, and only if JAX lacks the argument.
     """
     if "a_min" not in inspect.signature(jnp.clip).parameters and vars(module)["jp"] is jnp:
         vars(module)["jp"] = _NumpyWithOldClip()
 
 
 class _JaxWithReplicated:
-    """``jax`` that still has ``device_put_replicated``."""
+    """``jax`` with ``device_put_replicated``."""
 
     @staticmethod
     def device_put_replicated(x: Any, devices: Sequence[jax.Device]) -> Any:
@@ -61,10 +56,9 @@ class _JaxWithReplicated:
 
 
 def accept_device_put_replicated(module: ModuleType) -> None:
-    """Let a module that knows JAX as ``jax`` call ``jax.device_put_replicated``.
+    """Let a module call ``jax.device_put_replicated``, as Brax's trainers do.
 
-    Brax's trainers do, and JAX no longer has it. Only the name inside that module is replaced, and
-    only where JAX lacks the function.
+    The name ``jax`` is replaced only in that module, and only if JAX lacks the function.
     """
     if not hasattr(jax, "device_put_replicated") and vars(module)["jax"] is jax:
         vars(module)["jax"] = _JaxWithReplicated()

@@ -1,4 +1,4 @@
-"""Brax's environments behind the ``Physics`` interface."""
+"""Brax's environments as ``Physics``."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ with import_silenced():
     from brax import envs, fluid
     from brax.envs.wrappers import training
 
-# These decide on batches, time limits and resets, which is the caller's business here.
+# These handle batches, time limits and resets, which the caller handles here.
 _TRAINING_WRAPPERS = (
     training.AutoResetWrapper,
     training.DomainRandomizationVmapWrapper,
@@ -45,7 +45,7 @@ _TRAINING_WRAPPERS = (
 
 @struct.dataclass
 class BraxCarry:
-    """What Brax needs for the next step and ``PhysicsState`` does not hold already."""
+    """Brax's state besides what ``PhysicsState`` holds."""
 
     pipeline: Any
     metrics: dict[str, Any]
@@ -55,16 +55,15 @@ class BraxCarry:
 class BraxPhysics(GuardedPhysics):
     """A Brax environment as ``Physics``. The given environment is never modified.
 
-    Two things differ from the environment itself. Quaternions of free and ball joints are
-    normalized before the first state is computed: Brax adds its reset noise to each of their
-    numbers. And a diverging step ends the episode instead of returning NaN; watched are joint and
-    link positions and velocities, the observation, the reward and the done flag.
+    It differs from the environment in two points. Quaternions of free and ball joints are
+    normalized before the first state is computed, because Brax adds reset noise to their entries. A
+    diverging step ends the episode instead of returning NaN; joint and link positions and
+    velocities, observation, reward and done flag are watched.
 
     On the ``"mjx"`` backend link poses are one physics step older than joint positions after a
-    ``step`` (never after a ``reset``), because MuJoCo computes them before it integrates.
+    ``step`` (not after a ``reset``), because MuJoCo computes them before it integrates.
 
-    If one of the model's cameras follows a center of mass, there is a link ``camera/com`` after
-    those of the bodies.
+    If a camera of the model follows a center of mass, the last link is ``camera/com``.
     """
 
     @default_flags()
@@ -80,27 +79,27 @@ class BraxPhysics(GuardedPhysics):
         reward: RewardFn | None = None,
         identity: Hashable | None = None,
     ):
-        """Read the model and check that the environment fits; compile nothing.
+        """Read the model and check the environment; compile nothing.
 
         Args:
             env: a bare environment, such as ``brax.envs.get_environment("ant")``.
             colors: replacements for colors by geom name, see ``geom_shapes``.
-            drawn_radius: metres by name of a sphere to draw larger, see ``geom_shapes``.
-            geom_groups: MuJoCo's groups of geoms and sites that are visible.
-            rigs: the task's viewpoints by name, in a picture without the model's sites; None draws
-                the sites and has the model's cameras as viewpoints.
-            unscale_actions: for environments that map actions from [-1, 1] to the control
-                range: undo that map, so that costs and actuators see the action as given.
-            reward: replaces the environment's reward; called with the state before the step,
-                the state after it and the action, returns a scalar.
-            identity: objects of one identity are equal, and environments over them share compiled
-                programs; None makes the object equal to itself and its pickles alone. A pickle
-                keeps nothing but it if it is a ``Recipe``.
+            drawn_radius: metres by name of a sphere to render larger, see ``geom_shapes``.
+            geom_groups: MuJoCo's groups of visible geoms and sites.
+            rigs: the task's viewpoints by name, and no sites; None takes the model's cameras, and
+                renders its sites.
+            unscale_actions: undo the environment's map of actions from [-1, 1] to the control
+                range, so that costs and actuators use the given action.
+            reward: replaces the environment's reward; maps the states before and after the step and
+                the action to a scalar.
+            identity: objects with equal identities are equal, and share compiled programs; with
+                None an object equals only itself and its pickles. If it is a ``Recipe``, a pickle
+                contains nothing else.
 
         Raises:
             ValueError: ``env`` is wrapped for training, has no MuJoCo model, does not observe one
                 flat array, changes the tree of its state in ``step``, uses features its backend
-                lacks, or has geoms that cannot be drawn.
+                lacks, or has geoms that the renderer does not support.
         """
         _check_env(env)
         env = _changed(env, _shorten)
@@ -109,7 +108,7 @@ class BraxPhysics(GuardedPhysics):
         shapes = geom_shapes(
             model, colors=colors, drawn_radius=drawn_radius, geom_groups=geom_groups
         )
-        # Brax keeps the time step in float32; six digits give back the model's own number.
+        # Brax rounds the time step to float32; six digits restore the model's number.
         self.dt = float(f"{float(env.dt):.6g}")
         self.action_size = int(env.action_size)
         self.backend: str = env.backend
@@ -120,7 +119,7 @@ class BraxPhysics(GuardedPhysics):
         if rigs is not None:
             self.rigs = rigs
         else:
-            # Their materials have no names here, as those of geoms have none.
+            # Without material names, like the geoms.
             shapes += [site._replace(material="") for site in site_shapes(model, geom_groups)]
             self.followed_link = max(followed_body(model) - 1, 0)
             self._read_cameras(model)
@@ -143,7 +142,6 @@ class BraxPhysics(GuardedPhysics):
         self._check_shapes()
 
     def __reduce_ex__(self, protocol: Any) -> Any:
-        """Return what is pickled: how it is made, or of which environment."""
         if isinstance(self._identity, Recipe):
             return super().__reduce_ex__(protocol)
         env = _replace(self._source, ModuleType, lambda module: _Module(module.__name__))
@@ -157,7 +155,7 @@ class BraxPhysics(GuardedPhysics):
             self._com_masses = _masses_below(model, tracked_body(model))
 
     def _reset(self, key: jax.Array) -> PhysicsState:
-        """See ``Physics.reset``. ``key`` may be typed, or uint32 as Brax's own are."""
+        """See ``Physics.reset``. ``key`` may be typed, or uint32 like Brax's."""
         return self._first_state(self._env, key)
 
     @under_default_flags
@@ -166,9 +164,8 @@ class BraxPhysics(GuardedPhysics):
     ) -> PhysicsState:
         """See ``Physics.from_qpos``.
 
-        The environment's reset runs with its joint positions and velocities replaced, so that the
-        observation and everything else agree with the pose. None of the built-in tasks samples
-        anything besides.
+        It runs the environment's reset with these joint positions and velocities, so that
+        observation and pose agree. None of the built-in tasks samples anything else.
         """
         q, qd = check_pose(self._model, q, qd)
 
@@ -179,7 +176,6 @@ class BraxPhysics(GuardedPhysics):
         return self._guard_first(self._first_state(_replace_init(self._source, init), key))
 
     def _step(self, state: PhysicsState, action: jax.Array) -> PhysicsState:
-        """See ``Physics.step``."""
         action = jnp.asarray(action, jnp.float32)
         if action.shape != (self.action_size,):
             raise ValueError(f"action must have shape ({self.action_size},), got {action.shape}")
@@ -203,7 +199,7 @@ class BraxPhysics(GuardedPhysics):
             now = kinematics(after.pipeline_state)
             reward = self._reward(kinematics(carry.pipeline), now, action)
         done = jnp.asarray(after.done)
-        # The guard watches the reward, and so a done flag that is not a number.
+        # A NaN in the done flag makes the reward NaN, which the guard watches.
         reward = jnp.where(jnp.abs(done) < jnp.inf, jnp.asarray(reward, jnp.float32), jnp.nan)
         return self._state(after, reward, done > 0.5)
 
@@ -222,8 +218,8 @@ class BraxPhysics(GuardedPhysics):
         carry = _carry(brax_state)
         if jax.tree.structure(carry) != self._tree:
             raise ValueError("step changes the tree of the environment's state")
-        # Brax writes Python numbers into some fields. Fixed dtypes keep a jitted step from
-        # being traced again for its own output.
+        # Brax writes Python numbers into some fields. With fixed dtypes a jitted step is not
+        # traced again for its own output.
         carry = jax.tree.map(_as_dtype, carry, self._dtypes)
         xpos, xquat = self._links(kinematics(brax_state.pipeline_state))
         return PhysicsState(
@@ -246,7 +242,7 @@ class BraxPhysics(GuardedPhysics):
         return jnp.concatenate([seen.xpos, com[None]]), jnp.concatenate([seen.xquat, upright])
 
     def _init(self, q: jax.Array, qd: jax.Array, *args: Any, **kwargs: Any) -> Any:
-        """Call the environment's ``pipeline_init`` at a proper rotation."""
+        """Call the environment's ``pipeline_init`` with unit quaternions."""
         q = with_unit_rotations(self._model, q)
         return self._source.unwrapped.pipeline_init(q, qd, *args, **kwargs)
 
@@ -283,13 +279,13 @@ class BraxPhysics(GuardedPhysics):
 
 
 class _Module(NamedTuple):
-    """Stands in a pickle for a module: environments hold that of their backend."""
+    """Stands for a module in a pickle: an environment holds its backend's."""
 
     name: str
 
 
 def _replace(env: envs.Env, kind: type, by: Callable[[Any], Any]) -> envs.Env:
-    """Copy an environment and its wrappers, with other objects in place of those of a kind."""
+    """Copy an environment and its wrappers, and replace all values of a type."""
     changed = copy.copy(env)
     for name, value in vars(env).items():
         if isinstance(value, kind):
@@ -304,7 +300,7 @@ def _restore(cls: type[BraxPhysics], env: envs.Env, options: dict[str, Any]) -> 
 
 
 def kinematics(pipeline_state: Any) -> Kinematics:
-    """Return the readable part of a Brax backend's state."""
+    """Return poses and velocities of a Brax backend's state."""
     return Kinematics(
         q=jnp.asarray(pipeline_state.q, jnp.float32),
         qd=jnp.asarray(pipeline_state.qd, jnp.float32),
@@ -325,13 +321,13 @@ def _check_env(env: envs.Env) -> None:
     if getattr(getattr(layer, "sys", None), "mj_model", None) is None:
         raise ValueError(
             f"{type(layer).__name__} has no MuJoCo model in env.sys.mj_model, so there is "
-            "nothing to draw"
+            "nothing to render"
         )
 
 
 @contextlib.contextmanager
 def _explained(backend: str) -> Iterator[None]:
-    """Say which backend it is that lacks a feature of the model."""
+    """Add the backend's name to errors about a feature that it lacks."""
     try:
         yield
     except (AssertionError, NotImplementedError, RuntimeError) as error:
@@ -342,7 +338,7 @@ def _explained(backend: str) -> Iterator[None]:
 
 
 def _changed(env: envs.Env, change: Callable[[envs.Env], None]) -> envs.Env:
-    """Copy ``env``, down through its wrappers, and change what they wrap."""
+    """Copy ``env`` with all wrappers, and change the innermost copy."""
     clone = copy.copy(env)
     if isinstance(env, envs.Wrapper):
         clone.env = _changed(env.env, change)
@@ -352,7 +348,7 @@ def _changed(env: envs.Env, change: Callable[[envs.Env], None]) -> envs.Env:
 
 
 def _shorten(env: envs.Env) -> None:
-    """Give an environment a system of 32 bits, whatever made it."""
+    """Convert an environment's system to 32 bits."""
     env.sys = jax.tree.map(as_by_default, env.sys)
 
 
@@ -362,7 +358,7 @@ def _replace_init(env: envs.Env, init: Callable[..., Any]) -> envs.Env:
 
 
 def _as_dtype(leaf: Any, dtype: Any) -> jax.Array:
-    # A key in Brax's info is typed or uint32, as the one given to reset was.
+    # A key in Brax's info is typed or uint32, like the key of reset.
     is_key = jnp.issubdtype(dtype, jax.dtypes.prng_key)
     return leaf if is_key else jnp.asarray(leaf, dtype)
 

@@ -1,4 +1,4 @@
-"""The physics of Brax's tasks."""
+"""Loading of Brax's tasks."""
 
 from __future__ import annotations
 
@@ -38,16 +38,15 @@ _PAPER_REWARDS = {"distance_swum": distance_swum}
 def make_physics(
     task: str, *, backend: str | None = None, reward_preset: str = "brax"
 ) -> BraxPhysics:
-    """Make the physics of one of Brax's tasks: equal objects for equal arguments.
+    """Make the physics of a Brax task. Equal arguments give equal objects.
 
     Args:
         task: a name in ``brax.tasks.TASKS``.
-        backend: a backend that the task supports; None for its default.
-        reward_preset: ``"brax"`` for the rewards of the installed Brax, or ``"paper"`` for
-            those of arXiv 2502.00021 where they differ: walker2d weighs forward speed ten
-            times, the swimmer earns its distance from the origin, and humanoid,
-            humanoidstandup, inverted_pendulum and pusher take actions unscaled. Dynamics are
-            the installed Brax's with either.
+        backend: a backend of the task; None for its default.
+        reward_preset: ``"brax"`` for the installed Brax's rewards, or ``"paper"`` for those of
+            arXiv 2502.00021 where they differ: walker2d's forward reward is ten times higher, the
+            swimmer's reward is its distance from the origin, and humanoid, humanoidstandup,
+            inverted_pendulum and pusher take actions unscaled. Dynamics are the same.
 
     Raises:
         ValueError: an option is unknown; the message lists what is allowed.
@@ -59,7 +58,7 @@ def make_physics(
     return _load(task, backend, reward_preset)
 
 
-# Loading a model takes a second. One that is dropped and loaded again equals the first.
+# Loading a model takes a second. A model that is loaded again equals the first one.
 @lru_cache(maxsize=16)
 def _load(task: str, backend: str, reward_preset: str) -> BraxPhysics:
     row, paper = TASKS[task], reward_preset == "paper"
@@ -75,7 +74,7 @@ def _load(task: str, backend: str, reward_preset: str) -> BraxPhysics:
 
 
 def rigs_of(task: BraxTask) -> dict[str, CameraRig]:
-    """Return a task's viewpoints by name: ``default``, and ``original`` where the paper has it."""
+    """Return a task's viewpoints by name: ``default``, and ``original`` if the paper has one."""
     views = {"default": task.camera, "original": task.original_camera}
     return {name: _rig(view) for name, view in views.items() if view is not None}
 
@@ -95,7 +94,7 @@ def _rig(view: Viewpoint) -> CameraRig:
 
 
 def load_brax_env(name: str, backend: str, **options: Any) -> envs.Env:
-    """Load one of Brax's environments by its name, bare, without its known warnings."""
+    """Load a bare Brax environment by name, without its known warnings."""
     load_onto_own_device(mjx_io)
     with loading_silenced():
         return envs.get_environment(name, backend=backend, **options)

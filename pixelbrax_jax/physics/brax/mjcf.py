@@ -1,4 +1,4 @@
-"""A task of your own from an MJCF file and three formulas, without writing a Brax class."""
+"""Tasks from an MJCF file and a few functions."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ from pixelbrax_jax.validation import check_choice
 
 _NO_REFSAFE = int(mujoco.mjtDisableBit.mjDSBL_REFSAFE)
 
-# Brax's approximate inverse of the mass matrix makes damping explicit, which diverges where it is
-# strong; and with fewer searches for a step size, forces on light links diverge.
+# Brax's approximate inverse of the mass matrix makes damping explicit, and strong damping diverges.
+# Forces on light links diverge with fewer line searches.
 _EXACT_SOLUTIONS = {"matrix_inv_iterations": 0, "solver_maxls": 40}
 
 
 def never(after: Kinematics) -> jax.Array:
-    """Return False: the task has no end of its own."""
+    """Return False: the task never ends early."""
     del after
     return jnp.zeros((), bool)
 
@@ -45,7 +45,7 @@ def joint_state(after: Kinematics) -> jax.Array:
 
 
 class _Task(NamedTuple):
-    """What a model needs to become a task; see ``mjcf_physics``."""
+    """Arguments of ``mjcf_physics``."""
 
     reward: RewardFn
     terminated: Callable[[Kinematics], jax.Array]
@@ -65,17 +65,17 @@ class MjcfEnv(envs.PipelineEnv):
         self._task = task
         self._model = model
         limited = model.actuator_ctrllimited.astype(bool)
-        # An unlimited actuator takes the action as it is: the map from [-1, 1] to [-1, 1].
+        # An unlimited actuator takes the action unchanged.
         self._low = np.where(limited, model.actuator_ctrlrange[:, 0], -1).astype(np.float32)
         self._high = np.where(limited, model.actuator_ctrlrange[:, 1], 1).astype(np.float32)
 
     @property
     def action_size(self) -> int:
-        """Return the number of actuators; Brax itself counts only those that act on joints."""
+        """Return the number of actuators; Brax counts only those on joints."""
         return int(self._model.nu)
 
     def reset(self, rng: jax.Array) -> envs.State:
-        """Sample joint positions and velocities, by the task's own function if it has one."""
+        """Sample joint positions and velocities, with the task's ``reset`` if it has one."""
         if self._task.reset is None:
             q, qd = self._around_initial_pose(rng)
         else:
@@ -92,7 +92,7 @@ class MjcfEnv(envs.PipelineEnv):
         return q, jax.random.uniform(qd_key, (self._model.nv,), minval=-noise, maxval=noise)
 
     def step(self, state: envs.State, action: jax.Array) -> envs.State:
-        """Advance by one control step, with the task's formulas."""
+        """Advance by one control step and apply the task's functions."""
         control = self._low + (action + 1) * 0.5 * (self._high - self._low)
         pipeline = self.pipeline_step(state.pipeline_state, control)
         before, after = kinematics(state.pipeline_state), kinematics(pipeline)
@@ -121,37 +121,34 @@ def mjcf_physics(
 ) -> BraxPhysics:
     """Make physics of a model in MuJoCo's MJCF (or URDF) format.
 
-    An action in [-1, 1] is mapped linearly to an actuator's control range, or passed as it is
-    if the actuator has none. Bodies without joints are fused with their parents, because links
-    are what moves. The model starts at ``qpos0``, or at its custom numeric ``init_qpos``. Sites are
-    drawn as geoms are, named ``site/<name>``. Cameras of the model are viewpoints by their names,
-    see ``named_rigs``.
+    An action in [-1, 1] is mapped linearly to an actuator's control range, or passed unchanged if
+    the actuator has none. Bodies without joints are fused with their parents. The model starts at
+    ``qpos0``, or at its custom numeric ``init_qpos``. Sites are rendered like geoms, as
+    ``site/<name>``. The model's cameras are viewpoints by name, see ``named_rigs``.
 
-    The functions are pure and see ONE environment.
+    The functions are pure and take ONE environment.
 
     Args:
         source: a file, or the XML itself.
-        reward: of the state before a step, the state after it and the (A,) action in [-1, 1];
-            returns a scalar.
-        terminated: of the state after a step; returns a () bool, true when the task ended.
-        observation: of a state; returns the (S,) float state observation.
-        reset_noise: joint positions and velocities start within plus or minus this of
-            ``init_q`` and 0, uniformly (metres, radians, per second); 0.01 by default.
+        reward: maps the states before and after a step and the (A,) action in [-1, 1] to a scalar.
+        terminated: maps the state after a step to a () bool, true when the task ended.
+        observation: maps a state to the (S,) float state observation.
+        reset_noise: joint positions and velocities are sampled uniformly within plus or minus this
+            of ``init_q`` and 0 (metres, radians, per second); 0.01 by default.
         n_frames: the model's time steps per control step.
-        init_q: (Q,) joint positions to start from; None for the model's own.
-        reset: samples the joint positions and velocities that an episode starts from, of a PRNG
-            key; a goal for each episode is a body with joints that no actuator moves. In place of
-            ``init_q`` and ``reset_noise``.
-        backend: ``"mjx"`` simulates most of MuJoCo; the others are Brax's own backends for
-            trees of hinges, slides and free joints.
+        init_q: (Q,) initial joint positions; None for the model's.
+        reset: samples initial joint positions and velocities from a PRNG key, in place of
+            ``init_q`` and ``reset_noise``. It can set a goal: a body with joints but no actuator.
+        backend: ``"mjx"`` simulates most of MuJoCo; the others are Brax's backends for trees of
+            hinges, slides and free joints.
         colors: replacements for the model's colors by geom name, red, green, blue in [0, 1].
-        geom_groups: MuJoCo's groups of geoms and sites that are visible.
+        geom_groups: MuJoCo's groups of visible geoms and sites.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the model cannot be compiled, simulated or drawn, has no joint or no
-            actuator, has what the backend would leave out, ``reset`` is given with ``init_q`` or
-            ``reset_noise``, or a function returns the wrong shape or dtype.
+        FileNotFoundError: the file does not exist.
+        ValueError: the model cannot be compiled, simulated or rendered, has no joint or no
+            actuator, or has features that the backend ignores; ``reset`` is given with ``init_q``
+            or ``reset_noise``; or a function returns a wrong shape or dtype.
     """
     check_choice("backend", backend, BACKENDS)
     if reset is not None and (reset_noise is not None or init_q is not None):
@@ -170,7 +167,7 @@ def mjcf_physics(
     if model.nu == 0:
         raise ValueError("the model has no actuator, so an agent could not act on it")
     check_simulated(model, backend)
-    # A geom that cannot be drawn should be reported before anything slow is loaded.
+    # Reports unsupported geoms before anything slow is loaded.
     geom_shapes(model, colors=colors, geom_groups=geom_groups)
     if init_q is not None:
         init_q = np.asarray(init_q, np.float32)
@@ -194,8 +191,8 @@ def _compile(source: str | Path) -> mujoco.MjModel:
                 if is_xml
                 else mujoco.MjSpec.from_file(str(source))
             )
-            # Every body is then a link that moves. Brax's own loader also fuses, but on the
-            # XML text, where it misses rotations that are not given as quaternions.
+            # Then every body is a moving link. Brax's loader fuses in the XML text, where it
+            # misses rotations that are not quaternions.
             spec.compiler.fusestatic = True
             return spec.compile()
     except ValueError as error:
@@ -203,11 +200,11 @@ def _compile(source: str | Path) -> mujoco.MjModel:
 
 
 def _load(model: mujoco.MjModel, backend: str) -> mjcf.System:
-    """Return the model as Brax knows it, changed so that Brax's backends move it as MuJoCo does."""
-    # MuJoCo XLA refuses models with this flag, though energies are only reported.
+    """Load the model for Brax, changed so that Brax's backends move it as MuJoCo does."""
+    # MuJoCo XLA rejects models with this flag, which only reports energies.
     model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_ENERGY)
     if backend != "mjx":
-        # A limit with a margin is one without that comes earlier, and Brax reads no margins.
+        # A limit with a margin acts like an earlier one without; Brax ignores margins.
         model.jnt_range += np.outer(model.jnt_margin, [1, -1])
         model.jnt_margin[:] = 0
     if backend == "generalized" and not model.opt.disableflags & _NO_REFSAFE:

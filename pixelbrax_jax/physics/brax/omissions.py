@@ -1,8 +1,7 @@
-"""What Brax's backends leave out of a MuJoCo model, by name.
+"""Features of a MuJoCo model that Brax's backends silently ignore.
 
-They read some attributes of a model and ignore the others without a word. What is listed here
-decides how ``mujoco.mj_step`` moves a model, and not how they do. Not listed is what hardly
-matters, which docs/howto/own-task.md names, and what ``mujoco.mjx.put_model`` refuses itself.
+The list has what changes how ``mujoco.mj_step`` moves a model. It leaves out what hardly matters
+(see docs/howto/own-task.md) and what ``mujoco.mjx.put_model`` rejects itself.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ _BRAX_NUMERICS = {
     "constraint_ang_damping",
     "constraint_vel_damping",
 }
-"""What stands for stiffness and damping in models that were written for Brax's own backends."""
+"""Stand for stiffness and damping in models written for Brax's backends."""
 
 _MOST_NAMES = 5
 
@@ -43,10 +42,10 @@ class Omission(NamedTuple):
 
 
 def check_simulated(model: mujoco.MjModel, backend: str) -> None:
-    """Raise an error that names all that a backend would leave out of a compiled model.
+    """Raise an error that lists all features of a compiled model that a backend ignores.
 
     Raises:
-        ValueError: there is something; the message says what to do about it.
+        ValueError: the list is not empty; the message has the fix.
     """
     missing = omissions(model, backend)
     if not missing:
@@ -64,7 +63,7 @@ def check_simulated(model: mujoco.MjModel, backend: str) -> None:
 
 
 def omissions(model: mujoco.MjModel, backend: str) -> list[Omission]:
-    """Return what a backend leaves out of a compiled model."""
+    """Return the features of a compiled model that a backend ignores."""
     found = [Omission(feature, True) for feature in _in_all(model)]
     if backend != "mjx":
         found += [Omission(feature, False) for feature in _in_brax(model)]
@@ -74,7 +73,7 @@ def omissions(model: mujoco.MjModel, backend: str) -> list[Omission]:
 
 
 def _in_all(model: mujoco.MjModel) -> Iterator[str]:
-    """Yield what MuJoCo XLA leaves out, and Brax with it."""
+    """Yield features that MuJoCo XLA ignores, and therefore Brax."""
     yield from _of(model, "polynomial damping", "joint", _joints(model, model.dof_dampingpoly))
     yield from _of(model, "polynomial stiffness", "joint", model.jnt_stiffnesspoly)
     yield from _of(model, "armature", "actuator", model.actuator_armature)
@@ -91,7 +90,7 @@ def _in_all(model: mujoco.MjModel) -> Iterator[str]:
 
 
 def _in_brax(model: mujoco.MjModel) -> Iterator[str]:
-    """Yield what each of Brax's own backends leaves out."""
+    """Yield features that each of Brax's own backends ignores."""
     options = model.opt
     kind, free = model.jnt_type, model.jnt_type == _FREE
     yield from _of(model, "equality constraints", "equality", np.ones(model.neq, bool))
@@ -178,7 +177,7 @@ def _of_contacts(model: mujoco.MjModel) -> Iterator[str]:
 
 
 def _in_maximal(model: mujoco.MjModel) -> Iterator[str]:
-    """Yield what the backends that hold joints by springs or corrections leave out besides."""
+    """Yield features that only the backends with springs or corrections for joints ignore."""
     numerics = {model.numeric(i).name for i in range(model.nnumeric)}
     if not numerics & _BRAX_NUMERICS:
         yield from _of(model, "damping", "joint", _joints(model, model.dof_damping))
@@ -203,21 +202,21 @@ def _in_maximal(model: mujoco.MjModel) -> Iterator[str]:
 
 
 def _on_free_joint(model: mujoco.MjModel) -> np.ndarray:
-    """Return (actuators,) bool; what an actuator has hold of may also be a site or a tendon."""
+    """Return (actuators,) bool, whether an actuator acts on a free joint."""
     chosen = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
     chosen[chosen] = model.jnt_type[model.actuator_trnid[chosen, 0]] == _FREE
     return chosen
 
 
 def _joints(model: mujoco.MjModel, of_dofs: np.ndarray) -> np.ndarray:
-    """Return (joints,) bool, where any of a joint's dofs has a number other than 0."""
+    """Return (joints,) bool, whether any dof of a joint has a value other than 0."""
     chosen = np.zeros(model.njnt, bool)
     chosen[model.dof_jntid[_any_by_row(of_dofs)]] = True
     return chosen
 
 
 def _of(model: mujoco.MjModel, feature: str, kind: str, where: Any) -> Iterator[str]:
-    """Yield the feature with the names of those elements whose entries are not all 0."""
+    """Yield the feature with the names of the elements whose entries are not all 0."""
     rows = np.flatnonzero(_any_by_row(np.asarray(where)))
     if len(rows):
         yield f"{feature} ({kind} {_some([_name(model, kind, int(i)) for i in rows])})"
@@ -228,7 +227,7 @@ def _any_by_row(values: np.ndarray) -> np.ndarray:
 
 
 def _flags(model: mujoco.MjModel, *names: str) -> Iterator[str]:
-    """Yield those of MuJoCo's flags that the model disables."""
+    """Yield those MuJoCo flags that the model disables."""
     for name in names:
         bit = int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name.upper()}"))
         if model.opt.disableflags & bit:

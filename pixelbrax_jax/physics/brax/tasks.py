@@ -1,7 +1,4 @@
-"""The tasks that Brax simulates, one row each, and the options that they alone have.
-
-Plain names and numbers, so that reading them loads nothing.
-"""
+"""Brax's tasks, one row each, and their options. Importing it loads no physics."""
 
 from __future__ import annotations
 
@@ -21,32 +18,32 @@ _Point = tuple[float, float, float]
 
 @dataclass(frozen=True, kw_only=True)
 class BraxOptions:
-    """Options of Brax's tasks alone.
+    """Options of Brax's tasks.
 
     Raises:
         ValueError: an option is out of range; the message says what is allowed.
     """
 
     backend: str | None = None
-    """Physics backend: ``spring``, ``positional``, ``generalized`` or ``mjx``; None means the
-    task's own. For Brax's tasks alone."""
+    """Physics backend of Brax's tasks: ``spring``, ``positional``, ``generalized`` or ``mjx``. None
+    takes the default of the task."""
     reward_preset: str = "brax"
-    """``brax``, or ``paper`` for the rewards of arXiv 2502.00021; for Brax's tasks alone."""
+    """Rewards of Brax's tasks: ``brax``, or ``paper`` for those of arXiv 2502.00021."""
 
     def __post_init__(self) -> None:
-        """Check what is the same for all tasks."""
+        """Check the options that do not depend on the task."""
         check_choice("reward_preset", self.reward_preset, REWARD_PRESETS)
 
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """Where a task is seen from.
+    """Camera of a task.
 
     Attributes:
         eye: metres; relative to the followed link in x and y.
-        target: metres, likewise; the point looked at.
+        target: metres, likewise; the point the camera looks at.
         fovy: vertical field of view, degrees.
-        link: index of the followed link, -1 for a camera at rest.
+        link: index of the followed link, -1 for none.
         up: the world direction that is up in the image.
     """
 
@@ -59,19 +56,18 @@ class Viewpoint:
 
 @dataclass(frozen=True, eq=False)
 class BraxTask(Task):
-    """A task of Brax's; its name is Brax's too.
+    """A task of Brax, with Brax's name.
 
     Attributes:
-        default_backend: the physics backend used by default.
+        default_backend: the default physics backend.
         camera: the default viewpoint.
-        original_camera: that of the paper, None where it has none.
-        backends: those that simulate the task sanely, sorted.
+        original_camera: the paper's viewpoint, None if it has none.
+        backends: backends that simulate the task correctly, sorted.
         colors: colors by geom name that replace the model's.
-        drawn_radius: metres, spheres by name that are drawn larger than they are.
+        drawn_radius: metres, by name of a sphere that is rendered larger than it is.
         paper_options: arguments of Brax's environment for the "paper" reward preset.
-        paper_unscaled: whether that preset hands actions to costs and actuators as they are,
-            where Brax first maps them from [-1, 1] to the control range. The actuators still clip
-            to that range.
+        paper_unscaled: whether that preset passes actions unchanged to costs and actuators, where
+            Brax first maps them from [-1, 1] to the control range. Actuators still clip to it.
         paper_reward: name of that preset's reward in ``loading``, None for Brax's.
     """
 
@@ -92,8 +88,8 @@ _YELLOW = (0.941, 0.894, 0.259)
 _VERMILLION = (0.835, 0.369, 0.0)
 _RED = (1.0, 0.0, 0.0)
 
-# Viewpoints of the original renderer (arXiv 2502.00021). It gives a horizontal field of view; at
-# its square images that is the vertical one too.
+# Viewpoints of the original renderer (arXiv 2502.00021). Its field of view is horizontal, which for
+# square images equals the vertical one.
 _ANT = Viewpoint((1.6, -1.6, 3.5), (0.0, 0.0, 0.0), 40.0, link=0)
 _PLANAR = Viewpoint((0.0, -2.1, 0.8), (0.0, 0.0, 0.6), 55.0, link=0)
 _HUMANOID = Viewpoint((1.7, -1.7, 1.5), (0.0, 0.0, 1.1), 50.0, link=0)
@@ -104,8 +100,8 @@ _SWIMMER = Viewpoint((2.4, 2.4, 1.25), (0.0, 0.0, 0.0), 50.0, link=1)
 # The original aims above the lying torso, which then sits at the lower edge.
 _LYING = Viewpoint((2.2, -2.2, 1.7), (0.0, 0.0, 0.55), 50.0, link=0)
 
-# Default backends are those of the paper, which leaves the choice open for ant, humanoid and
-# humanoidstandup and lacks the double pendulum.
+# Default backends are the paper's, which names none for ant, humanoid and humanoidstandup and lacks
+# the double pendulum.
 TASKS = by_name(
     [
         BraxTask(
@@ -115,8 +111,8 @@ TASKS = by_name(
             "spring",
             _ANT,
             _ANT,
-            # Brax's reset noise puts feet below the ground. The positional backend throws such an
-            # ant into the air: a quarter of the episodes ends within four steps.
+            # Brax's reset noise puts feet below the ground, and the positional backend then throws
+            # the ant into the air: a quarter of the episodes ends within four steps.
             backends=("generalized", "mjx", "spring"),
         ),
         BraxTask(
@@ -178,7 +174,7 @@ TASKS = by_name(
             "generalized",
             _PUSHER,
             _PUSHER,
-            # The goal disc has no name in Brax's model, only its place in the list.
+            # The goal disc has no name in Brax's model, so it is capsule/20.
             colors={"object_geom": _SKY_BLUE, "capsule/20": _VERMILLION},
             paper_unscaled=True,
         ),
@@ -200,7 +196,7 @@ TASKS = by_name(
             "generalized",
             _SWIMMER,
             _SWIMMER,
-            # Brax itself refuses the swimmer on other backends.
+            # Brax rejects the swimmer on other backends.
             backends=("generalized",),
             paper_reward="distance_swum",
         ),

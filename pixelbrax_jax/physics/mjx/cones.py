@@ -1,9 +1,9 @@
-"""Costs of contacts whose friction stays within an elliptic cone.
+"""Costs of contacts with elliptic friction cones.
 
-The formulas are those of MuJoCo's documentation, "Computation", section "Constraint model": of the
-normal and tangential parts N and T of a scaled residual, contacts with N >= mu T are free, those
-with mu N + T <= 0 stick, where the cost is quadratic, and the others slip, where it is that of the
-distance to the cone, D_0 (N - mu T)^2 / (2 mu^2 (1 + mu^2)).
+The formulas are from MuJoCo's documentation, "Computation", section "Constraint model". N and T are
+the normal and tangential parts of a scaled residual. Contacts with N >= mu T are free. Those with
+mu N + T <= 0 stick, with a quadratic cost. The others slip, with the cost of the distance to the
+cone, D_0 (N - mu T)^2 / (2 mu^2 (1 + mu^2)).
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from pixelbrax_jax.physics.opengl import mujoco
 FREE, STICKING, SLIPPING = range(3)
 
 _NEGLECTED = 1e-5
-"""Part of a contact's force by which Newton's last step may be wrong."""
+"""Accepted error of Newton's last step, as a fraction of a contact's force."""
 
 
 class Cones(NamedTuple):
-    """C contacts of k constraints each: one along the normal, then tangential ones.
+    """C contacts of k constraints each: the normal, then tangential ones.
 
     Attributes:
         stiffness: (C, k) float32, D of each constraint.
-        scale: (C, k) float32, what turns the elliptic cone into a round one: mu, then friction.
+        scale: (C, k) float32, mu, then friction; they make the elliptic cone round.
     """
 
     stiffness: jax.Array
@@ -50,13 +50,13 @@ class Cones(NamedTuple):
         return self.stiffness[:, 0] / jnp.maximum(square * (1 + square), mujoco.mjMINVAL)
 
     def zone(self, residual: jax.Array) -> jax.Array:
-        """Return (C,) int32: ``FREE``, ``STICKING`` or ``SLIPPING``, of residuals (C, k)."""
+        """Return (C,) int32, ``FREE``, ``STICKING`` or ``SLIPPING``, for residuals (C, k)."""
         normal, length, _ = self._parts(residual)
         slips = jnp.where(self._mu * normal + length <= 0, STICKING, SLIPPING)
         return jnp.where(normal >= self._mu * length, FREE, slips).astype(jnp.int32)
 
     def cost(self, residual: jax.Array) -> jax.Array:
-        """Return the sum of all costs at residuals (C, k)."""
+        """Return the sum of all costs for residuals (C, k)."""
         normal, length, _ = self._parts(residual)
         sticking = 0.5 * jnp.sum(self.stiffness * residual**2, axis=1)
         slipping = 0.5 * self._slip_stiffness * (normal - self._mu * length) ** 2
@@ -90,7 +90,7 @@ class Cones(NamedTuple):
         )
 
     def stay(self, residual: jax.Array, change: jax.Array) -> jax.Array:
-        """Return () bool, whether slopes change from residuals (C, k) on as curvatures say."""
+        """Return () bool, whether a change of residuals (C, k) changes slopes as predicted."""
         before, after = self.slope(residual), self.slope(residual + change)
         expected = before + self.curvature_times(residual, change[..., None])[..., 0]
         largest = jnp.max(jnp.abs(after), axis=1)

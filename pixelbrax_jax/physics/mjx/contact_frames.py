@@ -1,4 +1,4 @@
-"""Friction of steep capsules on planes, as MuJoCo has it."""
+"""Friction of steep capsules on planes, in MuJoCo's contact frames."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ with import_silenced():
     from mujoco.mjx._src.types import GeomType
 
 PAIR = (GeomType.PLANE, GeomType.CAPSULE)
-"""Of shapes, by which MuJoCo XLA finds its function."""
+"""Key of MuJoCo XLA's collision function for these shapes."""
 
 _theirs = collision_driver._COLLISION_FUNC[PAIR]
 
@@ -22,12 +22,11 @@ _theirs = collision_driver._COLLISION_FUNC[PAIR]
 def aligned_with_capsules(
     model: Any, data: Any, key: Any, geom: jax.Array
 ) -> tuple[jax.Array, ...]:
-    """Collide planes with capsules as MuJoCo XLA does, in the frames that MuJoCo has.
+    """Collide planes with capsules as MuJoCo XLA does, but with MuJoCo's contact frames.
 
-    The cone of friction is a pyramid, and so it matters which way its edges point. MuJoCo points
-    the first along the capsule, however steep that is; MuJoCo XLA along an axis of the world where
-    the capsule is steeper than 60 degrees, which changes single control steps of the humanoid by up
-    to 0.3 rad/s.
+    The friction cone is a pyramid, so the direction of its edges matters. MuJoCo points the first
+    edge along the capsule. MuJoCo XLA points it along a world axis if the capsule is steeper than
+    60 degrees, which changes single control steps of the humanoid by up to 0.3 rad/s.
     """
     dist, pos, frame = _theirs(model, data, key, geom)
     normal = data.geom_xmat[geom[:, 0]][:, :, 2]
@@ -36,7 +35,7 @@ def aligned_with_capsules(
     length = jnp.linalg.norm(along, axis=-1, keepdims=True)
     along = along / jnp.maximum(length, 1e-6)
     ours = jnp.stack([normal, along, jnp.cross(normal, along)], axis=1)
-    # A capsule that stands upright has no direction. Both of its ends have the same frame.
+    # An upright capsule has no direction. Both of its ends have the same frame.
     ours = jnp.where(length[:, :, None] > 1e-6, ours, frame[::2])
     return dist, pos, jnp.repeat(ours, 2, axis=0)
 

@@ -1,4 +1,4 @@
-"""MuJoCo XLA's steps between states that have no more than what the next step needs."""
+"""MuJoCo XLA's steps on a minimal state."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ with import_silenced():
 
 
 class MjxState(struct.PyTreeNode):
-    """The integration state: everything that the next step depends on.
+    """The integration state: all that the next step depends on.
 
     Attributes:
         qpos: (Q,) float32, joint positions: metres, radians, unit quaternions.
         qvel: (V,) float32, joint velocities, per second.
-        act: activations of actuators that have a state.
+        act: activations of actuators with a state.
         qacc_warmstart: (V,) float32, accelerations from which the solver starts.
-        ctrl: (A,) float32, the last controls, which rewards read.
-        target: (3,) float32, metres, this episode's target; (7,) with its unit quaternion, where it
-            is a body; (0,) for tasks without.
+        ctrl: (A,) float32, the last controls, for rewards.
+        target: metres, this episode's target: (3,) float32; (7,) with a unit quaternion if it is a
+            body; (0,) for tasks without one.
     """
 
     qpos: jax.Array
@@ -41,7 +41,7 @@ class MjxState(struct.PyTreeNode):
 
 
 class Dynamics:
-    """A model's motion, for one environment."""
+    """A model's dynamics, for one environment."""
 
     def __init__(
         self,
@@ -56,8 +56,8 @@ class Dynamics:
         Args:
             model: a compiled model.
             reads_forces: whether to compute sensors of forces and accelerations.
-            out_of_reach: names of geoms that nothing ever touches, which are not tried.
-            target_body: name of a body, fixed to the world, that is where the target is.
+            out_of_reach: names of geoms that never touch anything; their contacts are skipped.
+            target_body: name of a body, fixed to the world, that is at the target.
 
         Raises:
             NotImplementedError: the model has features that MuJoCo XLA lacks.
@@ -83,7 +83,7 @@ class Dynamics:
         qvel: jax.Array | None = None,
         target: jax.Array | None = None,
     ) -> MjxState:
-        """Return a state at rest if there are no velocities, without control or activation."""
+        """Return a state without control or activation; without velocities it is at rest."""
         model = self.model
         return MjxState(
             qpos=jnp.asarray(qpos, jnp.float32),
@@ -98,7 +98,7 @@ class Dynamics:
         """Advance by physics steps under the state's controls.
 
         Returns:
-            The state afterwards, and all sensors as the last step read them before it moved.
+            The next state, and all sensors as of the beginning of the last physics step.
         """
 
         def one(state: MjxState) -> tuple[MjxState, jax.Array]:
@@ -112,14 +112,14 @@ class Dynamics:
         if num_steps == 1:
             return one(state)
         sensors = jnp.zeros(self.model.nsensordata)
-        # One copy of the step in the program, however many there are.
+        # A loop, so that the program has one copy of the step.
         return jax.lax.fori_loop(0, num_steps, lambda _, carry: one(carry[0]), (state, sensors))
 
     def at_rest(self, state: MjxState) -> tuple[MjxState, jax.Array]:
-        """Find the forces in a first state, with actuators off, as DM Control's resets do.
+        """Compute forces in a first state with actuators off, as DM Control's resets do.
 
         Returns:
-            The state with accelerations to start the solver from, and all sensors.
+            The state with accelerations for the solver's start, and all sensors.
         """
         with substituted(self.model):
             data = mjx.forward(self._passive, self._data(state))
@@ -128,12 +128,8 @@ class Dynamics:
     def refresh(self, state: MjxState, sensors: jax.Array) -> Any:
         """Compute positions, velocities and their sensors, as ``mj_step1`` does.
 
-        Args:
-            state: a state.
-            sensors: all sensors, of which those of forces and accelerations are kept.
-
-        Returns:
-            ``mujoco.mjx.Data``, of which forces and accelerations mean nothing.
+        The readings of force and acceleration sensors are taken from ``sensors``. The returned
+        ``mujoco.mjx.Data`` has no valid forces and accelerations.
         """
         mx = self._mx
         if self._target_body is not None:
@@ -158,14 +154,14 @@ class Dynamics:
         return jnp.any(contact.dist < contact.includemargin)
 
     def site(self, qpos: jax.Array, name: str) -> tuple[jax.Array, jax.Array]:
-        """Return (3,) metres and (3, 3), place and axes of a site at joint positions (Q,)."""
+        """Return (3,) metres and (3, 3), position and axes of a site at joint positions (Q,)."""
         with substituted(self.model):
             data = mjx.kinematics(self._mx, self._data(self.state(qpos)))
         row = self.model.site(name).id
         return data.site_xpos[row], data.site_xmat[row]
 
     def clearance(self, qpos: jax.Array, geom: str) -> jax.Array:
-        """Return () metres between a geom and the nearest one, negative where they overlap."""
+        """Return () metres between a geom and the nearest other one, negative if they overlap."""
         contact = self._contact(qpos)
         is_of_it = jnp.any(contact.geom == self.model.geom(geom).id, axis=-1)
         return jnp.min(jnp.where(is_of_it, contact.dist, jnp.inf))
@@ -188,9 +184,8 @@ class Dynamics:
 def _simulated(model: mujoco.MjModel, out_of_reach: Iterable[str]) -> mujoco.MjModel:
     """Return the model without what no step depends on.
 
-    That is the energy, which is only reported, and which MuJoCo XLA refuses; contacts where they
-    are off, for it refuses pairs of shapes that it cannot collide all the same; and those out of
-    reach, for which it takes as long as for others.
+    It has no energy, which MuJoCo XLA rejects; no contacts if they are disabled, because MuJoCo XLA
+    still rejects unsupported pairs; and none of geoms out of reach, which take time.
     """
     model = copy.copy(model)
     model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_ENERGY)

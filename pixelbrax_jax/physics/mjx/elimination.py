@@ -1,4 +1,4 @@
-"""Linear equations of a few unknowns, in steps that a batch on a CPU takes together."""
+"""Small linear systems, in operations that a CPU does for a whole batch."""
 
 from __future__ import annotations
 
@@ -8,18 +8,14 @@ import jax.numpy as jnp
 from pixelbrax_jax._platform.lowering import by_platform
 
 LARGEST = 17
-"""Unknowns up to which elimination takes less time on a CPU than LAPACK, matrix by matrix."""
+"""Largest number of unknowns for which elimination is faster on a CPU than LAPACK per matrix."""
 
 
 def solve(matrix: jax.Array, right: jax.Array) -> jax.Array:
-    """Solve ``matrix @ x = right``: few unknowns on a CPU by elimination, else by factors.
+    """Solve ``matrix @ x = right``: by elimination for few unknowns on a CPU, else by factors.
 
-    Args:
-        matrix: (V, V) float32, symmetric and positive definite, so that no rows need exchanging.
-        right: (V,) float32.
-
-    Returns:
-        x, (V,) float32; NaN for a matrix of another kind.
+    ``matrix`` is (V, V) float32, symmetric and positive definite, so that no pivoting is needed;
+    other matrices give NaN. ``right`` and ``x`` are (V,) float32.
     """
     if len(matrix) > LARGEST:
         return _by_factors(matrix, right)
@@ -31,10 +27,10 @@ def _by_factors(matrix: jax.Array, right: jax.Array) -> jax.Array:
 
 
 def eliminate(matrix: jax.Array, right: jax.Array) -> jax.Array:
-    """Solve as ``solve`` does, by elimination."""
+    """Solve by elimination; see ``solve``."""
 
     def turn(i: jax.Array, rows: jax.Array) -> jax.Array:
-        # As Cholesky's factors are: a state that has diverged shall be seen as such.
+        # NaN like Cholesky's factors, so that a diverged state is noticed.
         pivot = rows[i] / jnp.where(rows[i, i] > 0, rows[i, i], jnp.nan)
         is_pivot = (jnp.arange(len(rows)) == i)[:, None]
         return jnp.where(is_pivot, pivot, rows - rows[:, i][:, None] * pivot)

@@ -1,4 +1,4 @@
-"""Tasks of the DM Control Suite behind the ``Physics`` interface."""
+"""Tasks of the DM Control Suite as ``Physics``."""
 
 from __future__ import annotations
 
@@ -24,28 +24,28 @@ _UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 
 
 class MjxPhysics(GuardedPhysics):
-    """A task of the DM Control Suite as ``Physics``, simulated by MuJoCo XLA.
+    """A task of the DM Control Suite, simulated by MuJoCo XLA.
 
-    Links are the model's bodies without the world; then ``camera/com``, the centre of mass that
-    cameras and lights follow, and ``target``, this episode's target, where a task has them.
+    Links are the model's bodies without the world, then, if the task has them, ``camera/com``, the
+    center of mass that cameras and lights follow, and ``target``, this episode's target.
     """
 
     backend = "mjx"
-    # XLA's library for sums and products on a CPU, YNNPACK, takes longer for the small ones of
-    # these models than the loops that XLA writes itself.
+    # XLA's CPU library YNNPACK is slower than XLA's own loops for the small sums and products of
+    # these models.
     compiler_options = MappingProxyType({"xla_cpu_experimental_ynn_fusion_type": ""})
 
     @default_flags()
     def __init__(self, formulas: Formulas, model: mujoco.MjModel, *, identity: Hashable):
-        """Put the model on the device and read what is drawn; compile nothing.
+        """Put the model on the device and read its scene; compile nothing.
 
         Args:
-            formulas: those of the task.
-            model: the compiled model of its domain; changed as the task wants it.
-            identity: objects of one identity are equal.
+            formulas: the task's formulas.
+            model: the compiled model of its domain; it is edited for the task.
+            identity: objects with equal identities are equal.
 
         Raises:
-            ValueError: the model has something visible that cannot be drawn.
+            ValueError: the renderer does not support something visible.
             NotImplementedError: the model has features that MuJoCo XLA lacks.
         """
         formulas.edit(model)
@@ -61,7 +61,7 @@ class MjxPhysics(GuardedPhysics):
             out_of_reach=formulas.out_of_reach,
             target_body=formulas.target_body,
         )
-        # The product of decimals is not the decimal: 0.0025 * 10 shall be 0.025.
+        # Rounded, so that 0.0025 * 10 is 0.025.
         self.dt = float(f"{model.opt.timestep * formulas.substeps:.6g}")
         self.action_size = int(model.nu)
         self.batch_last = formulas.batch_last
@@ -77,11 +77,7 @@ class MjxPhysics(GuardedPhysics):
         self.state_size = int(first.obs.shape[0])
 
     def control(self, action: jax.Array) -> jax.Array:
-        """Return the controls that an action (A,) stands for.
-
-        [-1, 1] is mapped to the control range of each actuator, which is [-1, 1] too but for the
-        quadruped.
-        """
+        """Map an action (A,) from [-1, 1] to the control range of each actuator."""
         action = jnp.asarray(action, jnp.float32)
         if self._is_unit_range:
             return action
@@ -89,13 +85,7 @@ class MjxPhysics(GuardedPhysics):
         return low + 0.5 * (action + 1) * (high - low)
 
     def observe(self, state: MjxState, sensors: jax.Array) -> PhysicsState:
-        """Return what is known of a state, without a step.
-
-        Args:
-            state: joint positions and velocities, controls and target.
-            sensors: readings of all sensors, of which those of forces and accelerations are
-                taken as they are and the others computed.
-        """
+        """Return poses, observation and reward; force sensors are read from ``sensors``."""
         data = self.dynamics.refresh(state, sensors)
         seen = Snapshot(self._model, data, state.target)
         xpos, xquat = self._links(data, state.target)
@@ -110,14 +100,14 @@ class MjxPhysics(GuardedPhysics):
         )
 
     def first(self, key: jax.Array) -> tuple[MjxState, jax.Array]:
-        """Sample an initial state; return it and the sensors as ``observe`` takes them."""
+        """Sample an initial state; return it and the sensors for ``observe``."""
         return self._settle(self._formulas.start(self.dynamics, key))
 
     @under_default_flags
     def from_qpos(
         self, q: jax.Array, qd: jax.Array | None = None, *, key: jax.Array | None = None
     ) -> PhysicsState:
-        """See ``Physics.from_qpos``; ``key`` decides a target that is no joint."""
+        """See ``Physics.from_qpos``; ``key`` samples a target that is not a joint."""
         q, qd = check_pose(self._model, q, qd)
         start = self._formulas.start(self.dynamics, jax.random.key(0) if key is None else key)
         start = start.replace(qpos=with_unit_rotations(self._model, q), qvel=qd)
@@ -131,10 +121,10 @@ class MjxPhysics(GuardedPhysics):
         return state, sensors
 
     def move(self, state: MjxState, action: jax.Array) -> tuple[MjxState, jax.Array]:
-        """Advance by one control step; return the state and the sensors as ``observe`` takes them.
+        """Advance by one control step; return the state and the sensors for ``observe``.
 
         Raises:
-            ValueError: when traced, if the action's shape is not ``(action_size,)``.
+            ValueError: the action's shape is not ``(action_size,)``.
         """
         action = jnp.asarray(action, jnp.float32)
         if action.shape != (self.action_size,):
@@ -142,11 +132,9 @@ class MjxPhysics(GuardedPhysics):
         return self.dynamics.step(state.replace(ctrl=self.control(action)), self._formulas.substeps)
 
     def _reset(self, key: jax.Array) -> PhysicsState:
-        """See ``Physics.reset``."""
         return self.observe(*self.first(key))
 
     def _step(self, state: PhysicsState, action: jax.Array) -> PhysicsState:
-        """See ``Physics.step``."""
         return self.observe(*self.move(state.engine, action))
 
     def _watched(self, state: PhysicsState) -> Any:

@@ -1,4 +1,4 @@
-"""What a task of the DM Control Suite consists of, and what its formulas are made of."""
+"""Building blocks of the DM Control Suite's tasks."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pixelbrax_jax.physics.opengl import mujoco
 
 
 class Start(struct.PyTreeNode):
-    """An initial state; the fields are those of ``MjxState``, and None is rest or no target."""
+    """An initial state with fields of ``MjxState``; None means at rest or without a target."""
 
     qpos: jax.Array
     qvel: jax.Array | None = None
@@ -26,12 +26,12 @@ class Start(struct.PyTreeNode):
 
 @dataclass(frozen=True)
 class Snapshot:
-    """What observations and rewards read of one environment's state, by the names of the model.
+    """What observations and rewards read of one environment's state, by the model's names.
 
-    Positions, velocities and their sensors belong to the present joint positions and velocities;
-    sensors of forces and accelerations to the last step, before it moved anything. These are the
-    values that DM Control reads, after ``mj_step2`` and ``mj_step1``. Places are metres in the
-    world frame, rotations are matrices with the axes as columns, or unit quaternions (w, x, y, z).
+    Positions, velocities and their sensors are those of the current joint positions and velocities;
+    sensors of forces and accelerations those of the beginning of the last physics step. DM Control
+    reads the same values, after ``mj_step2`` and ``mj_step1``. Positions are metres in the world
+    frame; rotations are matrices with the axes as columns, or unit quaternions (w, x, y, z).
 
     Attributes:
         model: the compiled model.
@@ -55,7 +55,7 @@ class Snapshot:
 
     @property
     def act(self) -> jax.Array:
-        """Activations of actuators that have a state."""
+        """Activations of actuators with a state."""
         return self.data.act
 
     @property
@@ -64,15 +64,15 @@ class Snapshot:
         return self.data.ctrl
 
     def joint_pos(self, *names: str) -> jax.Array:
-        """Return the positions of hinges and sliders."""
+        """Return the positions of hinges and slides."""
         return self.qpos[np.array([self.model.joint(name).qposadr[0] for name in names])]
 
     def joint_vel(self, *names: str) -> jax.Array:
-        """Return the velocities of hinges and sliders."""
+        """Return the velocities of hinges and slides."""
         return self.qvel[np.array([self.model.joint(name).dofadr[0] for name in names])]
 
     def sensor(self, *names: str) -> jax.Array:
-        """Return the readings of sensors, one after the other."""
+        """Return the readings of sensors, concatenated."""
         rows: list[int] = []
         for name in names:
             sensor = self.model.sensor(name)
@@ -80,7 +80,7 @@ class Snapshot:
         return self.data.sensordata[np.array(rows)]
 
     def sensors_of(self, *kinds: mujoco.mjtSensor) -> jax.Array:
-        """Return the readings of all sensors of some kinds, in the model's order."""
+        """Return the readings of all sensors of some types, in the model's order."""
         wanted = {int(kind) for kind in kinds}
         rows = [i for i, kind in enumerate(self.model.sensor_type) if int(kind) in wanted]
         return self.sensor(*(self.model.sensor(i).name for i in rows))
@@ -90,7 +90,7 @@ class Snapshot:
         return self.data.xpos[self.model.body(body).id]
 
     def xipos(self, body: str) -> jax.Array:
-        """Return (3,), the centre of mass of a body."""
+        """Return (3,), the center of mass of a body."""
         return self.data.xipos[self.model.body(body).id]
 
     def xmat(self, body: str) -> jax.Array:
@@ -106,7 +106,7 @@ class Snapshot:
         return self.data.xmat[1:]
 
     def geom_pos(self, name: str) -> jax.Array:
-        """Return (3,), the centre of a geom."""
+        """Return (3,), the center of a geom."""
         return self.data.geom_xpos[self.model.geom(name).id]
 
     def geom_mat(self, name: str) -> jax.Array:
@@ -114,12 +114,12 @@ class Snapshot:
         return self.data.geom_xmat[self.model.geom(name).id]
 
     def site_pos(self, name: str) -> jax.Array:
-        """Return (3,), the centre of a site."""
+        """Return (3,), the center of a site."""
         return self.data.site_xpos[self.model.site(name).id]
 
 
 def joined(*parts: jax.Array | float) -> jax.Array:
-    """Return arrays and scalars one after the other, flattened."""
+    """Return arrays and scalars, flattened and concatenated."""
     return jnp.concatenate([jnp.ravel(jnp.asarray(part)) for part in parts])
 
 
@@ -130,25 +130,25 @@ def tolerance(
     sigmoid: str = "gaussian",
     value_at_margin: float = 0.1,
 ) -> jax.Array:
-    """Return 1 within bounds, and less the farther outside.
+    """Return 1 within bounds, and less with the distance outside.
 
     The formulas are those of section 4.3 of arXiv 1801.00690 and of
-    ``dm_control.utils.rewards.tolerance``; of its sigmoids those that the suite's tasks use.
+    ``dm_control.utils.rewards.tolerance``, with the sigmoids that the suite uses.
 
     Args:
         x: the quantity, of any shape.
         bounds: lower and upper bound, inclusive; may be infinite.
         margin: distance from the bounds at which the result is ``value_at_margin``; with 0 the
             result is 0 outside.
-        sigmoid: how the result falls: ``gaussian``, ``long_tail``, ``linear`` or ``quadratic``.
-        value_at_margin: the result at that distance; in [0, 1) for ``linear`` and ``quadratic``,
-            in (0, 1) for the others, which reach 0 nowhere.
+        sigmoid: ``gaussian``, ``long_tail``, ``linear`` or ``quadratic``.
+        value_at_margin: the result at that distance; in [0, 1) for ``linear`` and ``quadratic``, in
+            (0, 1) for the others, which never reach 0.
     """
     lower, upper = bounds
     inside = (x >= lower) & (x <= upper)
     if margin == 0:
         return jnp.where(inside, 1.0, 0.0)
-    # Nothing is above an infinite bound, and the distance to it would be infinite.
+    # The distance to an infinite bound would be infinite.
     distance = lower - x if upper == math.inf else jnp.where(x < lower, lower - x, x - upper)
     return jnp.where(inside, 1.0, _SIGMOIDS[sigmoid](distance / margin, value_at_margin))
 
@@ -190,7 +190,7 @@ def _unchanged(model: mujoco.MjModel) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Formulas:
-    """How a task's episodes begin, what is observed and rewarded, and what is special about it.
+    """Initial states, observation and reward of a task.
 
     Attributes:
         start: samples an initial state from a key.
@@ -199,13 +199,13 @@ class Formulas:
         substeps: physics steps per control step.
         edit: changes the compiled model as DM Control's task does.
         options: arguments of the model's generator.
-        camera: index of the model's camera that is the task's own.
+        camera: index of the task's camera in the model.
         movable: names of the geoms, sites and lights that ``Start.target`` moves.
         target_body: name of the body, fixed to the world, that it moves; empty for none.
-        reads_forces: whether observations have sensors of forces or accelerations.
-        starts_with_forces: whether these read something else than 0 in an initial state.
-        out_of_reach: names of the geoms that nothing ever touches, in any pose.
-        batch_last: whether a CPU computes a batch faster with the environments as last axis.
+        reads_forces: whether observations use sensors of forces or accelerations.
+        starts_with_forces: whether these sensors are not 0 in an initial state.
+        out_of_reach: names of the geoms that never touch anything.
+        batch_last: whether a CPU is faster with the environments as last axis of a batch.
     """
 
     start: Callable[[Dynamics, jax.Array], Start]

@@ -1,4 +1,4 @@
-"""The physics of the DM Control Suite's tasks."""
+"""Loading of the DM Control Suite's tasks."""
 
 from __future__ import annotations
 
@@ -13,29 +13,23 @@ from pixelbrax_jax.physics.mjx.tasks import TASKS
 
 
 def make_physics(task: str) -> MjxPhysics:
-    """Make the physics of a task of the DM Control Suite.
-
-    Args:
-        task: a name in ``mjx.tasks.TASKS``.
-
-    Returns:
-        The physics: equal ones for a task, and the same one as long as few others are asked for.
+    """Make the physics of a task in ``mjx.tasks.TASKS``; equal and usually the same for one task.
 
     Raises:
-        ImportError: dm_control is not installed; the message has the line that installs it.
+        ImportError: dm_control is not installed; the message has the command that installs it.
     """
     return _load(task)
 
 
 def formulas_of(task: str) -> Formulas:
-    """Return the model, initial states, observation and reward of a task."""
+    """Return the formulas of a task."""
     row = TASKS[task]
     module = import_module(f"pixelbrax_jax.physics.mjx.domains.{row.domain}")
     formulas: Formulas = module.TASKS[row.task]
     return formulas
 
 
-# Loading a model takes a second. One that is dropped and loaded again equals the first.
+# Loading a model takes a second. A model that is loaded again equals the first one.
 @lru_cache(maxsize=16)
 def _load(task: str) -> MjxPhysics:
     formulas = formulas_of(task)

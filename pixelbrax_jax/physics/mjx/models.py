@@ -1,4 +1,4 @@
-"""DM Control's own models, read from the installed package without importing it."""
+"""DM Control's models, read from the installed package without importing it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pixelbrax_jax.physics.mujoco_compatibility import loading_silenced
 from pixelbrax_jax.physics.opengl import mujoco
 
 KNOWN_VERSION = "1.0.50"
-"""The release of dm_control whose models the tests compare with."""
+"""Release of dm_control whose models the tests compare with."""
 
 KNOWN_MODELS = {
     "acrobot": "318565bb75f5587f",
@@ -35,30 +35,28 @@ KNOWN_MODELS = {
     "swimmer": "aab420a1503b7e2c",
     "walker": "e5efd523aa043683",
 }
-"""Domain -> start of the SHA-256 of its XML file and those that it includes, in that release."""
+"""Domain -> start of the SHA-256 of its XML file and included files in that release."""
 
 _NO_WHEELS = (3, 13)
-"""The first Python without wheels of what dm_control requires; its models are read all the same."""
+"""First Python without wheels for dm_control's requirements; its models can still be read."""
 
 _INCLUDED = ("common/materials.xml", "common/skybox.xml", "common/visual.xml")
 
 _TO_MAKE = 8
-"""Calls from a warning here up to the caller of ``pixelbrax_jax.make``."""
+"""Stack level from a warning here to the caller of ``pixelbrax_jax.make``."""
 
 _warned: list[str] = []
-"""Warnings given in this process: one at most."""
+"""Domain of the only warning given in this process."""
 
 
 def load_model(domain: str, **options: float) -> mujoco.MjModel:
     """Compile the model of a domain.
 
-    Args:
-        domain: file name in DM Control's suite, without ending.
-        **options: what the domain's generator takes: ``max_contacts`` of the manipulator,
-            ``num_bodies`` of the swimmer, ``floor_size`` of the quadruped, metres.
+    Options of the domain's generator are ``max_contacts`` (manipulator), ``num_bodies`` (swimmer)
+    and ``floor_size`` in metres (quadruped).
 
     Raises:
-        ImportError: dm_control is not installed; the message has the line that installs it.
+        ImportError: dm_control is not installed; the message has the command that installs it.
     """
     folder = suite_folder()
     files = {name: (folder / name).read_bytes() for name in (f"{domain}.xml", *_INCLUDED)}
@@ -77,7 +75,7 @@ def suite_folder() -> Path:
     """Return the folder of the suite in the installed dm_control.
 
     Raises:
-        ImportError: there is none.
+        ImportError: dm_control is not installed.
     """
     spec = find_spec("dm_control")
     folders = (
@@ -94,7 +92,7 @@ def suite_folder() -> Path:
 
 
 def digest(files: dict[str, bytes]) -> str:
-    """Return the start of the SHA-256 of files, whatever their line ends."""
+    """Return the start of the SHA-256 of files, independent of line ends."""
     content = b"".join(files[name].replace(b"\r\n", b"\n") for name in sorted(files))
     return hashlib.sha256(content).hexdigest()[:16]
 
@@ -125,10 +123,10 @@ def _find(root: ElementTree.Element, path: str) -> ElementTree.Element:
 
 
 def _grow_swimmer(root: ElementTree.Element, *, num_bodies: int) -> None:
-    """Append a chain of equal bodies to the swimmer's head, as DM Control generates it.
+    """Append equal bodies to the swimmer's head, as DM Control generates it.
 
-    Each has a hinge with a motor, and a site with a velocimeter and a gyroscope. Joints bend up to
-    360 degrees by the number of bodies, and cameras stand as far away as the chain is long.
+    Each has a hinge with a motor, and a site with a velocimeter and a gyroscope. Joints are limited
+    to 360 degrees over the number of bodies, and cameras are as far away as the chain is long.
     """
     parent = _find(root, "./worldbody/body")
     actuator = ElementTree.SubElement(root, "actuator")
@@ -151,7 +149,7 @@ def _grow_swimmer(root: ElementTree.Element, *, num_bodies: int) -> None:
 
 
 def _strip_quadruped(root: ElementTree.Element, *, floor_size: float) -> None:
-    """Take away what walking does not need; half an edge of the floor is ``floor_size`` metres."""
+    """Remove what walking does not need; half an edge of the floor is ``floor_size`` metres."""
     _find(root, ".//geom[@name='floor']").set("size", f"{floor_size} {floor_size} .5")
     walls = [f"geom[@name='wall_{side}']" for side in ("px", "py", "nx", "ny")]
     unused = [*walls, "geom[@name='terrain']", "site[@name='target']", "body[@name='ball']"]
@@ -164,7 +162,7 @@ def _strip_quadruped(root: ElementTree.Element, *, floor_size: float) -> None:
 
 
 def _keep_ball(root: ElementTree.Element, *, max_contacts: int) -> None:
-    """Take away what the ball does not need; MuJoCo XLA takes the deepest ``max_contacts``."""
+    """Remove all props but the ball; MuJoCo XLA uses the deepest ``max_contacts``."""
     world = _find(root, "./worldbody")
     for name in ("cup", "peg", "slot", "target_peg"):
         world.remove(_find(world, f"body[@name='{name}']"))
@@ -177,4 +175,4 @@ _GENERATORS: dict[str, Callable[..., None]] = {
     "quadruped": _strip_quadruped,
     "swimmer": _grow_swimmer,
 }
-"""Domain -> what its XML undergoes before it is compiled."""
+"""Domain -> changes of its XML before it is compiled."""

@@ -1,4 +1,4 @@
-"""How initial states are sampled."""
+"""Sampling of initial states."""
 
 from __future__ import annotations
 
@@ -13,16 +13,15 @@ from pixelbrax_jax.physics.mjx.formulas import Start
 from pixelbrax_jax.physics.opengl import mujoco
 
 MAX_ATTEMPTS = 1000
-"""Samples of a pose after which one that touches something is taken."""
+"""Largest number of sampled poses."""
 
 
 def random_joints(model: mujoco.MjModel, key: jax.Array) -> jax.Array:
     """Sample joint positions (Q,) as DM Control's ``randomize_limited_and_rotational_joints`` does.
 
-    Limited hinges and sliders are uniform in their range, other hinges in [-pi, pi]. A free joint
-    keeps its place, and its quaternion is sampled uniformly from [0, 1]^4 and normalised, which is
-    not uniform over rotations: DM Control keeps it so for the sake of its results. The suite's
-    tasks that ask for it have no ball joints.
+    Limited hinges and slides are uniform in their range, other hinges in [-pi, pi]. A free joint
+    keeps its position; its quaternion is sampled uniformly from [0, 1]^4 and normalised, which is
+    not uniform over rotations but is what DM Control does. There are no ball joints.
     """
     low, high = np.array(model.qpos0), np.array(model.qpos0)
     rotations = []
@@ -53,15 +52,10 @@ def random_rotation(key: jax.Array) -> jax.Array:
 def free_of_contact(
     dynamics: Dynamics, key: jax.Array, sample: Callable[[jax.Array, Start], Start]
 ) -> Start:
-    """Sample initial states until no geoms touch.
+    """Sample initial states until no geoms touch, at most ``MAX_ATTEMPTS`` times.
 
-    Args:
-        dynamics: the model's motion.
-        key: PRNG key.
-        sample: returns an initial state for a key and the sample before, at first all zeros.
-
-    Returns:
-        The state; after ``MAX_ATTEMPTS`` samples the last one, whatever it touches.
+    ``sample`` maps a key and the previous sample, at first all zeros, to an initial state. The last
+    one is returned even if geoms touch.
     """
 
     def again(carry: tuple[jax.Array, Start, jax.Array]) -> jax.Array:

@@ -1,4 +1,4 @@
-"""Constraint forces by Newton's method, in fewer and cheaper iterations than MuJoCo XLA's."""
+"""Constraint forces by Newton's method, with fewer and cheaper iterations than MuJoCo XLA's."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ with import_silenced():
     from mujoco.mjx._src import support
 
 ITERATIONS = 16
-"""Newton's steps at most; one after which costs are what it took them for is the last."""
+"""Largest number of Newton's steps; the loop stops earlier after an exact step."""
 
 LINE_SEARCH_ITERATIONS = 6
-"""Steps along a direction at most, of those that change active constraints."""
+"""Largest number of steps of a line search."""
 
 CONE_LINE_SEARCH_ITERATIONS = 8
 """The same with elliptic cones."""
 
 _ROWS = 16
-"""Rows of a product of matrices that are added up at a time, if it has no more columns."""
+"""Rows of a matrix product that are added at a time, if it has at most as many columns."""
 
 _EQUALITY, _FRICTION, _ONE_SIDED, _CONE = range(4)
 
@@ -34,9 +34,10 @@ _Carry = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
 
 
 def is_supported(model: mujoco.MjModel) -> bool:
-    """Return whether the model asks for what this solver does.
+    """Return whether the solver supports the model.
 
-    That is Newton's method, with pyramids or with elliptic cones if all contacts have one condim.
+    It supports Newton's method with pyramids, or with elliptic cones if all contacts have one
+    condim.
     """
     dimensions = {*model.geom_condim.tolist(), *model.pair_dim.tolist()}
     return bool(
@@ -48,9 +49,9 @@ def is_supported(model: mujoco.MjModel) -> bool:
 class _Problem(NamedTuple):
     """Minimise ``(a - smooth) M (a - smooth) / 2 + sum(cost(J a - reference))`` over ``a``.
 
-    The derivative of a constraint's cost is ``clip(stiffness * x, low, high)``: of an equality
-    without bounds, of dry friction with those of its force, of limits and contacts at most 0. The
-    constraints of ``cones``, from row ``first`` on, have a stiffness of 0 and costs of their own.
+    The derivative of a constraint's cost is ``clip(stiffness * x, low, high)``. Equalities have no
+    bounds, dry friction has those of its force, limits and contacts are at most 0. The constraints
+    of ``cones``, from row ``first`` on, have stiffness 0 here and separate costs.
     """
 
     inertia: jax.Array
@@ -73,7 +74,7 @@ class _Problem(NamedTuple):
         return self._with_cones(slope, self.cones.slope(self._of_cones(residual)))
 
     def piece(self, residual: jax.Array) -> jax.Array:
-        """Return where costs are: 0 where they are quadratic, -1 and 1 at bounds of the slope."""
+        """Return 0 where costs are quadratic, -1 and 1 at bounds of the slope."""
         slope = self.stiffness * residual
         return (slope >= self.high).astype(jnp.int32) - (slope <= self.low).astype(jnp.int32)
 
@@ -89,7 +90,7 @@ class _Problem(NamedTuple):
         return self._with_cones(weighted, own)
 
     def stays(self, residual: jax.Array, change: jax.Array) -> jax.Array:
-        """Return whether costs are, up to the end of a step, what Newton took them for."""
+        """Return whether costs up to the end of a step are as Newton's method assumed."""
         same = jnp.all(self.piece(residual + change) == self.piece(residual))
         if self.cones is None:
             return same
@@ -123,9 +124,9 @@ class _Problem(NamedTuple):
 def solve(model: Any, data: Any) -> Any:
     """Find accelerations and constraint forces, as ``mujoco.mjx._src.solver.solve`` does.
 
-    Costs are quadratic between kinks, so that Newton's step is exact once the right constraints are
-    active: the loop ends where a whole step leaves them as they are. Those of elliptic cones are
-    not where contacts slip: there it ends where forces are as expected after a whole step.
+    Costs are piecewise quadratic, so Newton's step is exact once the right constraints are active:
+    the loop ends when a whole step does not change them. Costs of slipping contacts with elliptic
+    cones are not quadratic: the loop ends when the forces after a whole step are as predicted.
     """
     impl = data._impl
     # MuJoCo's order: equalities, dry friction, then limits and contacts.
@@ -185,7 +186,7 @@ def solve(model: Any, data: Any) -> Any:
 
 
 def _cones(model: Any, data: Any) -> Cones | None:
-    """Return the contacts, if their friction cones are elliptic; they are the last constraints."""
+    """Return the contacts if their friction cones are elliptic; they are the last constraints."""
     contact = data._impl.contact
     if model.opt.cone != mujoco.mjtCone.mjCONE_ELLIPTIC or not len(contact.dim):
         return None
@@ -200,7 +201,7 @@ def _cones(model: Any, data: Any) -> Cones | None:
 
 
 def _once(value: jax.Array) -> jax.Array:
-    """Have XLA compute a value once: a copy may round differently, and so decide otherwise."""
+    """Make XLA compute a value once: a copy may round differently and decide otherwise."""
     return jax.lax.optimization_barrier(value)
 
 
@@ -210,7 +211,7 @@ def _rows(jacobian: jax.Array) -> int:
 
 
 def _over_rows(left: jax.Array, right: jax.Array) -> jax.Array:
-    """Return ``left.T @ right``, some rows at a time: CPUs write short products out as sums."""
+    """Return ``left.T @ right``, some rows at a time: CPUs unroll short products into sums."""
 
     def add(total: jax.Array, pieces: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
         return total + pieces[0].T @ pieces[1], None
@@ -229,7 +230,7 @@ def _line_search(
     step: jax.Array,
     change: jax.Array,
 ) -> jax.Array:
-    """Return the factor of a step at which the cost is least."""
+    """Return the factor of a step with the least cost."""
     inertia_step = problem.inertia @ step
     linear = inertia_step @ (acceleration - problem.smooth)
     quadratic = inertia_step @ step
@@ -241,14 +242,14 @@ def _line_search(
         return first, quadratic + second
 
     def narrow(_: Any, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-        """Newton's step between bounds, where the derivative is -, and +; else halfway."""
+        """Take Newton's step if it lies between the bounds, else bisect."""
         factor, low, high = carry
         first, second = derivatives(factor)
         low = jnp.where(first < 0, factor, low)
         high = jnp.where(first > 0, factor, high)
         next_factor = factor - first / second
         halfway = jnp.where(jnp.isfinite(high), 0.5 * (low + high), 2 * factor)
-        # Bounds included: at the least cost Newton's step is zero, and the factor stays.
+        # Bounds are included: at the least cost Newton's step is zero.
         inside = (next_factor >= low) & (next_factor <= high)
         return jnp.where(inside, next_factor, halfway), low, high
 

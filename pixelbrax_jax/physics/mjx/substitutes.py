@@ -1,4 +1,4 @@
-"""What stands in for functions of MuJoCo XLA while our programs are traced."""
+"""Replacements for functions of MuJoCo XLA."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ _factor_m, _solve_m = smooth.factor_m, smooth.solve_m
 _body_tree = scan.body_tree
 
 _SHORT = 5
-"""Most bodies in a row whose positions XLA may compute in one loop."""
+"""Longest chain of bodies whose positions XLA may compute in one loop."""
 
 _lock = threading.RLock()
 
 
 @contextmanager
 def substituted(model: mujoco.MjModel) -> Iterator[None]:
-    """Trace steps of a model with functions of our own in place of some of MuJoCo XLA's.
+    """Trace steps of a model with replacements for some functions of MuJoCo XLA.
 
-    What is traced elsewhere before and after is not affected; what another thread traces with
-    MuJoCo XLA in the meantime, without this block, has them too.
+    Programs that are traced before and after the block are not affected. Programs of MuJoCo XLA
+    that another thread traces during the block also get the replacements.
     """
     changes: list[tuple[dict[Any, Any], Any, Any]] = [
         (collision_driver._COLLISION_FUNC, PAIR, aligned_with_capsules),
@@ -58,10 +58,10 @@ def substituted(model: mujoco.MjModel) -> Iterator[None]:
 
 
 def body_tree(model: Any, of_body: Any, *args: Any, **options: Any) -> Any:
-    """Scan bodies as ``mujoco.mjx._src.scan.body_tree`` does, one level of the tree after another.
+    """Scan bodies like ``mujoco.mjx._src.scan.body_tree``, one level of the tree at a time.
 
-    XLA on a CPU would fuse the levels into one loop, in which each body's parents are computed
-    anew, several times over: of fifteen bodies in a row that takes ten thousand times as long.
+    XLA on a CPU fuses the levels into one loop, which computes each body's parents several times:
+    for a chain of fifteen bodies that takes ten thousand times as long.
     """
 
     def level(*values: Any) -> Any:
@@ -72,7 +72,6 @@ def body_tree(model: Any, of_body: Any, *args: Any, **options: Any) -> Any:
 
 
 def _longest_chain(model: mujoco.MjModel) -> int:
-    """Return the number of bodies in the longest chain that hangs on the world."""
     depth = [0]
     for parent in model.body_parentid[1:]:
         depth.append(depth[parent] + 1)
@@ -80,11 +79,11 @@ def _longest_chain(model: mujoco.MjModel) -> int:
 
 
 def factor_m(model: Any, data: Any) -> Any:
-    """Factorise inertia as ``mujoco.mjx._src.smooth.factor_m`` does, after what came before it.
+    """Factorise inertia like ``mujoco.mjx._src.smooth.factor_m``, after the solver has finished.
 
-    On a CPU jaxlib 0.10.0 to 0.11.0 share a batch of factorisations out among the threads of XLA,
-    and wait for ever once as many batches are at it as there are threads. Euler's method factorises
-    inertia with damping, which XLA would do beside the solver's; here it needs its accelerations.
+    On a CPU jaxlib 0.10.0 to 0.11.0 distribute a batch of factorisations among XLA's threads, and
+    hang if as many batches as threads run at once. Euler's method factorises inertia with damping,
+    which XLA would do in parallel to the solver; here it depends on the solver's accelerations.
     """
     inertia = data._impl.M
 
@@ -93,7 +92,7 @@ def factor_m(model: Any, data: Any) -> Any:
         return _factor_m(model, data.tree_replace({"_impl.M": inertia + nothing}))._impl.qLD
 
     def no_factors(inertia: jax.Array, acceleration: jax.Array) -> jax.Array:
-        # What another thread traces meanwhile might read factors: not those of another state.
+        # NaN, in case a program that another thread traces in the meantime reads the factors.
         del acceleration
         return jnp.full_like(inertia, jnp.nan)
 
@@ -105,7 +104,7 @@ def factor_m(model: Any, data: Any) -> Any:
 
 
 def solve_m(model: Any, data: Any, right: Any) -> Any:
-    """Solve for inertia as ``mujoco.mjx._src.smooth.solve_m`` does, on a CPU without factors."""
+    """Solve for inertia like ``mujoco.mjx._src.smooth.solve_m``, without factors on a CPU."""
     if not _is_small(model):
         return _solve_m(model, data, right)
 

@@ -1,4 +1,4 @@
-"""The tasks of the DM Control Suite, one row each; reading them loads nothing."""
+"""Tasks of the DM Control Suite, one row each. Importing it loads no physics."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ class DmcTask(Task):
     """A task of the DM Control Suite.
 
     Attributes:
-        domain: the suite's name of its domain, which is its module in ``domains``.
-        task: the suite's name of the task, under which that module has its formulas.
+        domain: the suite's name of the domain, and the name of its module in ``domains``.
+        task: the suite's name of the task, the key of its formulas in that module.
     """
 
     domain: str
     task: str
 
     def other_names(self) -> tuple[str, ...]:
-        """Return DM Control's names of it, with and without the domain."""
+        """Return DM Control's names of the task, with and without the domain."""
         return (*super().other_names(), self.name, f"{self.domain}_{self.task}", self.task)
 
 
@@ -30,16 +30,16 @@ def _dmc(domain: str, task: str, summary: str) -> DmcTask:
     return DmcTask(f"dmc_{domain}_{task}", f"PixelBrax/DMC-{camel}-v0", summary, domain, task)
 
 
-# None of them ends before the time limit.
+# All of them last until the time limit.
 TASKS = by_name(
     [
         _dmc("acrobot", "swingup", "Two poles in a row swing up, moved at the elbow."),
-        _dmc("acrobot", "swingup_sparse", "The same, rewarded at the target alone."),
+        _dmc("acrobot", "swingup_sparse", "The same, rewarded only at the target."),
         _dmc("ball_in_cup", "catch", "A cup on springs catches a ball on a string."),
         _dmc("cartpole", "balance", "A cart balances a pole that begins upright."),
-        _dmc("cartpole", "balance_sparse", "The same, rewarded near upright alone."),
+        _dmc("cartpole", "balance_sparse", "The same, rewarded only near upright."),
         _dmc("cartpole", "swingup", "A cart swings up a pole and balances it."),
-        _dmc("cartpole", "swingup_sparse", "The same, rewarded near upright alone."),
+        _dmc("cartpole", "swingup_sparse", "The same, rewarded only near upright."),
         _dmc("cheetah", "run", "A planar two-legged body runs along x."),
         _dmc("finger", "spin", "A finger spins a body on a hinge."),
         _dmc("finger", "turn_easy", "A finger turns a body's tip into a large target."),
@@ -52,7 +52,7 @@ TASKS = by_name(
         _dmc("humanoid", "walk", "A humanoid walks in any direction."),
         _dmc("humanoid", "run", "A humanoid runs in any direction."),
         _dmc("manipulator", "bring_ball", "An arm with two fingers brings a ball to a target."),
-        _dmc("pendulum", "swingup", "A pendulum swings up, rewarded near upright alone."),
+        _dmc("pendulum", "swingup", "A pendulum swings up, rewarded only near upright."),
         _dmc("point_mass", "easy", "A point is pushed to the middle of an arena."),
         _dmc("quadruped", "walk", "A four-legged body walks forward."),
         _dmc("quadruped", "run", "A four-legged body runs forward."),

@@ -106,7 +106,7 @@ def test_every_domains_models_are_known():
 @pytest.mark.parametrize("option", [{"reward_preset": "paper"}, {"backend": "mjx"}])
 def test_options_of_braxs_tasks_are_refused_by_name(option):
     ((name, value),) = option.items()
-    message = f"{name}='{value}' is for Brax's tasks alone, and task 'dmc_cartpole_swingup' is none"
+    message = f"{name}='{value}' is only for Brax's tasks, not for task 'dmc_cartpole_swingup'"
     with pytest.raises(ValueError, match=message):
         pb.make("dmc_cartpole_swingup", **option)
 

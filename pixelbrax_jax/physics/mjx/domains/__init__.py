@@ -1,1 +1,1 @@
-"""The domains of the DM Control Suite: initial states, observations and rewards of their tasks."""
+"""Domains of the DM Control Suite: initial states, observations and rewards of their tasks."""

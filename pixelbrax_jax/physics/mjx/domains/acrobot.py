@@ -1,4 +1,4 @@
-"""Two poles in a row, of which only the elbow is actuated."""
+"""Two poles in a row with an actuated elbow."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from pixelbrax_jax.physics.mjx.formulas import Formulas, Snapshot, Start, joined
 
 
 def _start(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Sample both angles uniformly."""
     return Start(jax.random.uniform(key, (dynamics.model.nq,), minval=-jnp.pi, maxval=jnp.pi))
 
 
@@ -23,7 +22,6 @@ def _observe(seen: Snapshot) -> jax.Array:
 
 
 def _reward(seen: Snapshot, *, margin: float) -> jax.Array:
-    """Return how near the tip is to the target above."""
     distance = jnp.linalg.norm(seen.site_pos("target") - seen.site_pos("tip"))
     radius = float(seen.model.site("target").size[0])
     return tolerance(distance, (0.0, radius), margin=margin)

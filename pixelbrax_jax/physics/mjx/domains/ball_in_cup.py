@@ -11,7 +11,7 @@ from pixelbrax_jax.physics.mjx.resets import free_of_contact
 
 
 def _start(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Sample a place of the ball where it touches nothing; the cup is at rest in its middle."""
+    """Sample a contact-free position of the ball; the cup is at rest in the middle."""
     model = dynamics.model
     x, z = (int(model.joint(name).qposadr[0]) for name in ("ball_x", "ball_z"))
 
@@ -30,7 +30,7 @@ def _observe(seen: Snapshot) -> jax.Array:
 
 
 def _reward(seen: Snapshot) -> jax.Array:
-    """Return 1 with all of the ball inside the target, else 0."""
+    """Return 1 if all of the ball is inside the target, else 0."""
     offset = jnp.abs(seen.site_pos("target") - seen.xpos("ball"))
     size = seen.model.site("target").size - seen.model.geom("ball").size[0]
     return jnp.where((offset[0] < size[0]) & (offset[2] < size[2]), 1.0, 0.0)

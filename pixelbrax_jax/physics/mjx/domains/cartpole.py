@@ -24,7 +24,7 @@ def _start_upright(dynamics: Dynamics, key: jax.Array) -> Start:
 
 
 def _observe(seen: Snapshot) -> jax.Array:
-    """Return the cart's place, cosine and sine of the pole's angle, and velocities."""
+    """Return the cart's position, cosine and sine of the pole's angle, and velocities."""
     pole = seen.xmat("pole_1")
     return joined(seen.joint_pos("slider"), pole[2, 2], pole[0, 2], seen.qvel)
 

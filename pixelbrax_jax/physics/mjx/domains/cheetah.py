@@ -18,14 +18,14 @@ _SETTLING_STEPS = 200
 def _start(dynamics: Dynamics, key: jax.Array) -> Start:
     """Sample limited joints uniformly, then let the body fall for 200 physics steps.
 
-    DM Control samples joint positions after the forces of the model's own pose are known. The first
-    of these steps moves by them, and so by the same velocity in every episode.
+    DM Control samples joints after it has computed the forces of the model's default pose. The
+    first step uses these forces, and so has the same velocity in every episode.
     """
     model = dynamics.model
     data = mujoco.MjData(model)
     mujoco.mj_step(model, data)
     joints = random_joints(model, key)
-    # The root's hinge has no limit, and so stays where it is.
+    # The root's hinge has no limit, so it is not sampled.
     limited = np.zeros(model.nq, bool)
     limited[model.jnt_qposadr[model.jnt_limited == 1]] = True
     qpos = jnp.where(limited, joints, model.qpos0) + (data.qpos - model.qpos0)
@@ -35,12 +35,11 @@ def _start(dynamics: Dynamics, key: jax.Array) -> Start:
 
 
 def _observe(seen: Snapshot) -> jax.Array:
-    """Return joint positions without the place along x, and velocities."""
+    """Return joint positions without x, and velocities."""
     return joined(seen.qpos[1:], seen.qvel)
 
 
 def _reward(seen: Snapshot) -> jax.Array:
-    """Return the speed along x as a fraction of 10 m/s."""
     return rising(seen.sensor("torso_subtreelinvel")[0], _RUN_SPEED, margin=_RUN_SPEED)
 
 

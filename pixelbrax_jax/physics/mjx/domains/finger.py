@@ -15,17 +15,16 @@ from pixelbrax_jax.physics.opengl import mujoco
 _SPIN_VELOCITY = 15.0
 
 _OUT_OF_REACH = ("ground", "proximal_decoration", "proximal", "spinner_decoration")
-"""The finger is 37.1 cm long, and its hinge 40 cm from the ground and from the spinner's: all that
-meets is the fingertip and the spinner's caps."""
+"""The finger is 37.1 cm long, and its hinge is 40 cm from the ground and from the spinner's: only
+the fingertip and the spinner's caps can touch."""
 
 
 def _start_spin(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Sample joints that let nothing touch."""
     return free_of_contact(dynamics, key, lambda key, _: Start(random_joints(dynamics.model, key)))
 
 
 def _start_turn(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Sample joints, and a target on the circle that the body's tip can reach."""
+    """Sample joint positions, and a target on the circle that the body's tip can reach."""
     model = dynamics.model
     angle_key, pose_key = jax.random.split(key)
     angle = jax.random.uniform(angle_key, (), minval=-jnp.pi, maxval=jnp.pi)
@@ -36,12 +35,12 @@ def _start_turn(dynamics: Dynamics, key: jax.Array) -> Start:
 
 
 def _in_plane(seen: Snapshot, place: jax.Array) -> jax.Array:
-    """Return (2,) metres, x and z of a place relative to the hinge."""
+    """Return (2,) metres, x and z of a position relative to the hinge."""
     return (place - seen.sensor("spinner"))[jnp.array([0, 2])]
 
 
 def _observe_spin(seen: Snapshot) -> jax.Array:
-    """Return joints, place of the tip, velocities and touch."""
+    """Return joint positions, position of the tip, velocities and touch."""
     return joined(
         seen.sensor("proximal", "distal"),
         _in_plane(seen, seen.sensor("tip")),
@@ -57,7 +56,7 @@ def _distance(seen: Snapshot) -> jax.Array:
 
 
 def _observe_turn(seen: Snapshot) -> jax.Array:
-    """Return what spinning observes, place of the target and distance to it."""
+    """Return the observation of spinning, position of the target and distance to it."""
     return joined(_observe_spin(seen), _in_plane(seen, seen.target), _distance(seen))
 
 

@@ -22,7 +22,7 @@ _JOINTS = (
 
 
 def _start_upright(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Sample any rotation, and joints within 0.2 rad."""
+    """Sample any rotation, and joint positions within 0.2 rad."""
     rotation, joints = jax.random.split(key)
     model = dynamics.model
     bend = jax.random.uniform(joints, (model.nq - 7,), minval=-0.2, maxval=0.2)
@@ -31,7 +31,7 @@ def _start_upright(dynamics: Dynamics, key: jax.Array) -> Start:
 
 
 def _start_swim(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Sample what uprighting samples, and a target in a box."""
+    """Sample the fish as for uprighting, and a target in a box."""
     fish, target = jax.random.split(key)
     low, high = jnp.array([-0.4, -0.4, 0.1]), jnp.array([0.4, 0.4, 0.3])
     place = jax.random.uniform(target, (3,), minval=low, maxval=high)
@@ -43,7 +43,7 @@ def _upright(seen: Snapshot) -> jax.Array:
 
 
 def _to_target(seen: Snapshot) -> jax.Array:
-    """Return (3,) metres, the way from the mouth to the target in the mouth's frame."""
+    """Return (3,) metres, the vector from the mouth to the target in the mouth's frame."""
     return (seen.target - seen.geom_pos("mouth")) @ seen.geom_mat("mouth")
 
 
@@ -56,7 +56,6 @@ def _observe_swim(seen: Snapshot) -> jax.Array:
 
 
 def _reward_upright(seen: Snapshot) -> jax.Array:
-    """Return how upright the torso is."""
     return tolerance(_upright(seen), (1.0, 1.0), margin=1.0)
 
 

@@ -16,12 +16,12 @@ _HOP_SPEED = 2.0
 
 
 def _start(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Sample joints and the root's angle; contacts are not looked for."""
+    """Sample joint positions and the root's angle, without a check for contacts."""
     return Start(random_joints(dynamics.model, key))
 
 
 def _observe(seen: Snapshot) -> jax.Array:
-    """Return joint positions without the place along x, velocities and touch of the foot."""
+    """Return joint positions without x, velocities and touch of the foot."""
     touch = jnp.log1p(seen.sensor("touch_toe", "touch_heel"))
     return joined(seen.qpos[1:], seen.qvel, touch)
 

@@ -15,12 +15,12 @@ _STAND_HEIGHT = 1.4
 
 
 def _start(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Sample joints and the root's rotation that let nothing touch."""
+    """Sample contact-free joint positions and root rotation."""
     return free_of_contact(dynamics, key, lambda key, _: Start(random_joints(dynamics.model, key)))
 
 
 def _observe(seen: Snapshot) -> jax.Array:
-    """Return joints, height, hands and feet, uprightness and velocities."""
+    """Return joint positions, height, hands and feet, uprightness and velocities."""
     torso, frame = seen.xpos("torso"), seen.xmat("torso")
     limbs = ("left_hand", "left_foot", "right_hand", "right_foot")
     extremities = [(seen.xpos(limb) - torso) @ frame for limb in limbs]

@@ -1,4 +1,4 @@
-"""A planar arm with a hand of two fingers that brings a ball to a target."""
+"""A planar arm with two fingers that brings a ball to a target."""
 
 from __future__ import annotations
 
@@ -28,25 +28,24 @@ _TOUCH = ("palm_touch", "finger_touch", "thumb_touch", "fingertip_touch", "thumb
 _TARGET = "target_ball"
 
 _IN_HAND, _AT_TARGET = 0.1, 0.1
-"""Probabilities of where the ball is in a sample; else it is anywhere."""
+"""Probabilities that a sample has the ball in the hand, and at the target; else it is anywhere."""
 
 _MAX_CONTACTS = 24
-"""Of 148 that there can be: random actions make 10 at most, and all take three times as long."""
+"""Of 148 possible contacts random actions make at most 10; all 148 take three times as long."""
 
 _NEAR = 0.01
-"""Metres between ball and target that are as good as none."""
+"""Largest distance in metres between ball and target with full reward."""
 
 
 def _start(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Sample joints, target and ball until nothing touches."""
     return free_of_contact(dynamics, key, partial(_sample, dynamics))
 
 
 def _sample(dynamics: Dynamics, key: jax.Array, before: Start) -> Start:
-    """Sample the arm, a target, and a ball in the hand, at the target or anywhere, and then moving.
+    """Sample the arm, a target, and the ball: in the hand, at the target, or anywhere and moving.
 
-    A ball in the hand or at the target is as fast as the one of the sample ``before``: DM Control
-    starts again without stopping it.
+    A ball in the hand or at the target has the velocity of the sample ``before``, because DM
+    Control samples again without resetting it.
     """
     model = dynamics.model
     keys = jax.random.split(key, 5)
@@ -78,7 +77,7 @@ def _positions(model: mujoco.MjModel, *joints: str) -> np.ndarray:
 
 
 def _arm(model: mujoco.MjModel, key: jax.Array) -> jax.Array:
-    """Sample the arm's joints, uniformly in their range or all round, radians."""
+    """Sample the arm's joints uniformly in their range, or in [-pi, pi], radians."""
     rows = [model.joint(name).id for name in _ARM]
     limited = model.jnt_limited[rows].astype(bool)[:, None]
     low, high = np.where(limited, model.jnt_range[rows], [-np.pi, np.pi]).T.astype(np.float32)
@@ -86,7 +85,7 @@ def _arm(model: mujoco.MjModel, key: jax.Array) -> jax.Array:
 
 
 def _pose(model: mujoco.MjModel, planar: jax.Array) -> jax.Array:
-    """Return (7,), place and quaternion of the target for its x, z and angle about y."""
+    """Return (7,), position and quaternion of the target for its x, z and angle about y."""
     x, z, angle = planar
     depth = float(model.body(_TARGET).pos[1])
     return jnp.stack([x, depth, z, jnp.cos(angle / 2), 0.0, jnp.sin(angle / 2), 0.0])
@@ -112,7 +111,6 @@ def _observe(seen: Snapshot) -> jax.Array:
 
 
 def _reward(seen: Snapshot) -> jax.Array:
-    """Return how near the ball is to the target."""
     apart = jnp.linalg.norm(seen.site_pos("ball") - seen.site_pos(_TARGET))
     return tolerance(apart, (0.0, _NEAR), margin=2 * _NEAR)
 
@@ -126,7 +124,7 @@ TASKS = {
         options={"max_contacts": _MAX_CONTACTS},
         target_body=_TARGET,
         reads_forces=True,
-        # All moves in the plane y = 0, and this is the wall behind it.
+        # Everything moves in the plane y = 0; this is the wall behind it.
         out_of_reach=("background",),
     )
 }

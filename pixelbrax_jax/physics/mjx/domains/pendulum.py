@@ -1,4 +1,4 @@
-"""A pendulum whose motor is too weak to lift it at once."""
+"""A pendulum with a weak motor."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ _COSINE_BOUND = math.cos(math.radians(8))
 
 
 def _start(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Sample any angle."""
     return Start(jax.random.uniform(key, (dynamics.model.nq,), minval=-jnp.pi, maxval=jnp.pi))
 
 

@@ -11,7 +11,6 @@ from pixelbrax_jax.physics.mjx.resets import random_joints
 
 
 def _start(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Sample a place in the arena."""
     return Start(random_joints(dynamics.model, key))
 
 

@@ -14,17 +14,17 @@ from pixelbrax_jax.physics.mjx.resets import random_rotation
 from pixelbrax_jax.physics.opengl import mujoco
 
 _LIFT = 0.01
-"""Metres between two heights that are tried."""
+"""Metres between two tested heights."""
 
 _EPISODE = 20.0
-"""Seconds of an episode, for which the floor is large enough."""
+"""Seconds of an episode; sets the size of the floor."""
 
 
 def _start(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Sample any rotation, at the lowest height, in whole centimetres, where nothing touches.
+    """Sample any rotation, at the lowest contact-free height in whole centimetres.
 
-    DM Control begins at height 0 and lifts until there is no contact. All distances from the floor
-    grow by what the body is lifted, so that the height is known from those at height 0.
+    DM Control starts at height 0 and lifts the body until there is no contact. All distances from
+    the floor grow with the height, so the height follows from the distances at height 0.
     """
     model = dynamics.model
     rotation = random_rotation(key)
@@ -54,7 +54,7 @@ def _observe(seen: Snapshot) -> jax.Array:
 
 
 def _reward(seen: Snapshot, *, speed: float) -> jax.Array:
-    """Return uprightness times the wanted speed along the torso's x axis."""
+    """Return uprightness times the speed along the torso's x axis, relative to the goal."""
     upright = rising(seen.xmat("torso")[2, 2], 1.0, margin=2.0)
     return upright * rising(seen.sensor("velocimeter")[0], speed, speed, value_at_margin=0.5)
 

@@ -14,7 +14,7 @@ from pixelbrax_jax.physics.opengl import mujoco
 
 
 def _start(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Sample joints, and a target from 5 to 20 cm away from the shoulder."""
+    """Sample joint positions, and a target 5 to 20 cm away from the shoulder."""
     joints, angle, radius = jax.random.split(key, 3)
     model = dynamics.model
     angle = jax.random.uniform(angle, (), minval=0.0, maxval=2 * jnp.pi)
@@ -25,7 +25,7 @@ def _start(dynamics: Dynamics, key: jax.Array) -> Start:
 
 
 def _to_target(seen: Snapshot) -> jax.Array:
-    """Return (2,) metres, the way from the finger to the target in the plane."""
+    """Return (2,) metres, the vector from the finger to the target in the plane."""
     return (seen.target - seen.geom_pos("finger"))[:2]
 
 
@@ -34,7 +34,7 @@ def _observe(seen: Snapshot) -> jax.Array:
 
 
 def _reward(seen: Snapshot) -> jax.Array:
-    """Return 1 where finger and target touch, else 0."""
+    """Return 1 if finger and target touch, else 0."""
     reach = sum(float(seen.model.geom(name).size[0]) for name in ("target", "finger"))
     return tolerance(jnp.linalg.norm(_to_target(seen)), (0.0, reach))
 

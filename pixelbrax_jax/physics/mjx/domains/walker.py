@@ -15,7 +15,7 @@ _STAND_HEIGHT = 1.2
 
 
 def _start(dynamics: Dynamics, key: jax.Array) -> Start:
-    """Sample joints and the root's angle; contacts are not looked for."""
+    """Sample joint positions and the root's angle, without a check for contacts."""
     return Start(random_joints(dynamics.model, key))
 
 
@@ -26,7 +26,7 @@ def _observe(seen: Snapshot) -> jax.Array:
 
 
 def _reward(seen: Snapshot, *, speed: float) -> jax.Array:
-    """Return standing height and uprightness, times the wanted speed along x."""
+    """Return standing height and uprightness, times the speed along x relative to the goal."""
     standing = tolerance(seen.xpos("torso")[2], (_STAND_HEIGHT, jnp.inf), margin=_STAND_HEIGHT / 2)
     stand = (3 * standing + (1 + seen.xmat("torso")[2, 2]) / 2) / 4
     if speed == 0:
