@@ -57,7 +57,7 @@ class TrainConfig:
     max_grad_norm: float = 0.5
     """Clips the gradient of each network to this global norm; 0 disables clipping."""
     memory_budget_gb: float | None = None
-    """Memory limit of the training state in GB (10^9 bytes); None uses the device's memory."""
+    """Memory limit of stored frames and state in GB (10^9 bytes); None uses the device's memory."""
 
     def __post_init__(self) -> None:
         """Check the settings."""
@@ -75,8 +75,8 @@ class TrainConfig:
         if min(self.env.height, self.env.width) < smallest:
             raise ValueError(
                 f"encoder {self.encoder!r} needs images of at least {smallest} x {smallest} "
-                f"pixels, got {self.env.height} x {self.env.width}; another encoder takes smaller "
-                "ones."
+                f"pixels, got {self.env.height} x {self.env.width}; raise height and width, or "
+                "choose another encoder."
             )
 
     @property
@@ -95,7 +95,7 @@ class TrainConfig:
         return 0
 
     def replace(self, **settings: Any) -> Self:
-        """Return a copy with changed settings; options of the environment, as ``height``, go to it.
+        """Return a copy with changed settings, also of the environment, such as ``height=64``.
 
         Raises:
             TypeError: a name is unknown.

@@ -22,7 +22,7 @@ _ENVS, _NETWORKS, _ACTIONS, _UPDATES, _AUXILIARY = range(5)
 
 
 def along_envs(axis: int, *, kept: bool = True) -> Any:
-    """Declare a field whose arrays have the environments along ``axis``; devices share that axis.
+    """Declare a field whose arrays have environments along ``axis``, which is split over devices.
 
     Checkpoints skip a field with ``kept=False``; a resumed run takes its value from ``init``.
     """

@@ -29,8 +29,8 @@ def summarize(records: list[Mapping[str, Any]]) -> dict[str, float]:
     """Combine the metrics of several iterations, whose names may differ, into one record.
 
     All episodes have the same weight; other metrics are averaged over iterations. Return and length
-    are missing if no episode ended. With several runs, a leading axis, the record averages over
-    them and has each run's return.
+    are missing if no episode ended. Metrics of several runs have a leading axis; the record
+    averages over it and adds each run's return.
     """
     names = {name: None for record in records for name in record}
     values = {

@@ -77,7 +77,6 @@ class Runs:
         return [jax.tree.map(lambda x, i=i: x[i], tree) for i in range(self.num_seeds)]
 
     def _each(self, function: Callable[..., Any], first: Any, *others: Any) -> Any:
-        """Apply ``function`` to each run of its first argument."""
         if self.num_seeds == 1:
             return function(first, *others)
 

@@ -1,4 +1,4 @@
-"""Messages and a progress bar, neither of which can stop a run by failing."""
+"""Messages and a progress bar; their errors do not stop a run."""
 
 from __future__ import annotations
 

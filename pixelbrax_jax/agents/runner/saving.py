@@ -203,7 +203,6 @@ class Checkpoints:
         self._writing = True
 
     def _wait(self) -> None:
-        """Wait for the current checkpoint, or raise a CheckpointError."""
         self._writing = False
         try:
             self._manager.wait_until_finished()

@@ -19,8 +19,8 @@ from pixelbrax_jax.validation import check_choice
 SPLITS = ("clean", "train", "test")
 
 HELD_OUT = {"train": "test", "paper-train": "paper-test"}
-"""Split of the clips for tests, by split of the training. Other splits are used for both, with
-clips from another folder for tests."""
+"""Test split of each training split. Other splits serve for both, with test clips from another
+folder."""
 
 WITHOUT_DISTRACTORS: dict[str, Any] = {"distractors": (), "clips": None, "split": "train"}
 """Options that remove all distractors from an environment."""

@@ -212,7 +212,6 @@ class _Run:
         self.is_first = jax.process_index() == 0
 
     def train(self, state: TrainState) -> Outcome:
-        """Train from ``state`` to the end or to a signal."""
         began = steps = _steps(self.algorithm, state)
         self.writer = self.open_writer(steps)
         try:
@@ -302,7 +301,6 @@ class _Run:
         return state, steps, stopped_by
 
     def iterate(self, state: TrainState, number: int) -> TrainState:
-        """Run iteration ``number`` and the auxiliary phase if it is due."""
         state, metrics = self.runs.iterate(state, self.env_params)
         phases = self.algorithm.auxiliary_every
         if phases and number % phases == 0:
@@ -354,7 +352,6 @@ class _Run:
         )
 
     def evaluate(self, state: TrainState, steps: int) -> None:
-        """Evaluate each run in each split and log the results."""
         record: dict[str, float] = {}
         policies = self.runs.split(jax.device_get(state.networks))
         for split, evaluator in self.evaluators.items():
@@ -375,7 +372,6 @@ class _Run:
         return self.record.get("episode/return")
 
     def export(self, state: TrainState, steps: int) -> None:
-        """Write the policies, or raise an OSError."""
         for i, networks in enumerate(self.runs.split(jax.device_get(state.networks))):
             several = self.runs.num_seeds > 1
             name = f"policy_seed{self.options.seed + i}.jax" if several else "policy.jax"
