@@ -24,11 +24,7 @@ from pixelbrax_jax.validation import (
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Settings of every algorithm.
-
-    Raises:
-        ValueError: a setting is out of range.
-    """
+    """Settings of every algorithm; a setting out of range is a ValueError."""
 
     env: EnvConfig = EnvConfig()  # noqa: RUF009 (it is frozen)
     """Sets the environment's options; camera, look, clips and distractors are names."""

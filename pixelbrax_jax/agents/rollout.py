@@ -175,9 +175,9 @@ def split_obs(obs: Any) -> tuple[Any, Any]:
 
 
 def shifted(pixels: jax.Array, shift: jax.Array, at_most: int) -> jax.Array:
-    """Shift (N, H, W, C) images by (N, 2) int32 pixels down and right, and repeat their edges.
+    """Shift (N, H, W, C) images by (N, 2) pixels down and right (Yarats et al., arXiv 2004.13649).
 
-    Follows Yarats et al., arXiv 2004.13649. ``at_most`` is a static bound of the shifts.
+    Edges repeat. ``at_most`` is a static bound of the shifts.
     """
     if not at_most:
         return pixels

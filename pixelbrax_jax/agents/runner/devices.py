@@ -25,11 +25,7 @@ def mesh_of(algorithm: Algorithm) -> Mesh | None:
 
 
 def state_shardings(mesh: Mesh, template: Any, num_seeds: int = 1) -> Any:
-    """Return the sharding of each leaf of a ``TrainState`` or of its ``jax.eval_shape``.
-
-    Environments are split over the mesh axis ``"envs"``; other leaves are replicated. With several
-    seeds, every leaf has a leading axis.
-    """
+    """Return the shardings of a ``TrainState``: environments over the mesh, the rest replicated."""
 
     def sharding(axis: int) -> NamedSharding:
         if axis < 0:

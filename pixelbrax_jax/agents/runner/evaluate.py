@@ -25,12 +25,7 @@ from pixelbrax_jax.validation import check_positive_int
 
 @dataclass(frozen=True)
 class Result:
-    """Results of E episodes.
-
-    Attributes:
-        returns: (E,) float64.
-        lengths: (E,) int, control steps.
-    """
+    """The (E,) float64 returns and (E,) int lengths, in control steps, of E episodes."""
 
     returns: np.ndarray
     lengths: np.ndarray

@@ -49,10 +49,7 @@ def summarize(records: list[Mapping[str, Any]]) -> dict[str, float]:
 
 
 class AppendedFile:
-    """A file for appending, which keeps bytes in memory while the disk is full.
-
-    The file never has gaps or duplicates; only its end can be missing.
-    """
+    """An append-only file without gaps, which keeps bytes in memory while the disk is full."""
 
     def __init__(self, path: Path) -> None:
         """Open or create the file."""
@@ -61,10 +58,7 @@ class AppendedFile:
         self._ended = False
 
     def append(self, block: bytes = b"") -> None:
-        """Write the waiting bytes and a block; raise an OSError if some bytes still wait.
-
-        The file accepts no further blocks once more than 64 MiB would wait.
-        """
+        """Write the waiting bytes and a block; raise an OSError if some bytes still wait."""
         self._ended = self._ended or len(self._waiting) + len(block) > _MAX_WAITING
         if not self._ended:
             self._waiting += block
@@ -219,12 +213,8 @@ def open_metrics(
 ) -> MetricsWriter:
     """Open ``metrics.jsonl``, TensorBoard's file and, with a project, Weights & Biases.
 
-    Writes ``config`` to ``config.json`` and drops records of an earlier attempt after
-    ``first_step``.
-
-    Raises:
-        ImportError: wandb is not installed.
-        OSError: a file cannot be opened.
+    Writes ``config`` to ``config.json``, and drops records of an earlier attempt after
+    ``first_step``. Raises an OSError, or an ImportError if wandb is not installed.
     """
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "config.json").write_text(json.dumps(config, indent=2) + "\n", "utf-8")

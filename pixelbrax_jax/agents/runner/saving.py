@@ -139,9 +139,7 @@ class Checkpoints:
             self._report(f"the checkpoint of {self._last_steps} steps is written")
 
     def restore(self, template: Tree) -> Tree:
-        """Restore the state of the latest checkpoint bit-exactly.
-
-        ``template`` is a state with the same shapes, or its ``jax.eval_shape``.
+        """Restore the latest checkpoint; ``template`` is a state or its ``jax.eval_shape``.
 
         Raises:
             CheckpointError: the checkpoint has another format, other settings or other arrays.

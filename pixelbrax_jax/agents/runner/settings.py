@@ -138,10 +138,7 @@ def unknown_settings(about: Mapping[str, Any], known: Mapping[str, Any]) -> str:
 
 
 def differences(about: Mapping[str, Any], own: Mapping[str, Any]) -> list[str]:
-    """List the differences that prevent a run ``own`` from continuing the stored run ``about``.
-
-    Both come from ``describe_run``.
-    """
+    """List what prevents a run ``own`` from continuing ``about``, both from ``describe_run``."""
     old, new = about["config"], own["config"]
     free = {name for name in _FREE if name != "total_steps" or not new.get("anneal")}
     found = []

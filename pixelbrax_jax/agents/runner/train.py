@@ -58,10 +58,9 @@ class Outcome:
     """The result of a run.
 
     Attributes:
-        metrics: the last record of the training; empty if none was logged.
+        metrics: the last record of the training, or empty.
         evaluations: the last results by split.
-        interrupted: whether a signal stopped the run before its end.
-        signal: number of that signal, or 0.
+        interrupted, signal: whether a signal stopped the run, and its number or 0.
         incomplete: lines about messages and records that could not be written.
     """
 
