@@ -1,8 +1,4 @@
-"""PixelBrax for Gymnasium and PyTorch.
-
-Importing registers ``PixelBrax/Ant-v0`` and the other tasks; nothing heavy is loaded before
-the first environment is made, and torch only if tensors are wanted.
-"""
+"""Provide PixelBrax for Gymnasium and PyTorch; importing it registers ``PixelBrax/Ant-v0`` etc."""
 
 from __future__ import annotations
 
@@ -22,7 +18,7 @@ if TYPE_CHECKING:
     from pixelbrax_gym.sb3.vec_env import SB3VecEnv as SB3VecEnv
     from pixelbrax_gym.torchrl.env import TorchRLEnv as TorchRLEnv
 
-# What needs an extra is not here, lest a star import fail without it.
+# Names that need an extra are missing, so that a star import works without it.
 __all__ = ["GymnasiumEnv", "GymnasiumVectorEnv", "check_vector_env", "register"]
 
 _LAZY = {
@@ -38,17 +34,14 @@ _ENV = "pixelbrax_gym.gymnasium.env:GymnasiumEnv"
 
 
 def register(task: str, id: str | None = None) -> str:  # noqa: A002  # Gymnasium's name for it
-    """Make a task available to ``gymnasium.make`` and ``gymnasium.make_vec``.
+    """Register a task for ``gymnasium.make`` and ``gymnasium.make_vec``, and return its id.
 
     Args:
-        task: the name under which ``pixelbrax_jax.register`` knows it.
-        id: Gymnasium's name for it; ``"my_arm"`` becomes ``"PixelBrax/MyArm-v0"`` by default.
-
-    Returns:
-        The id.
+        task: name of the task in ``pixelbrax_jax.register``.
+        id: Gymnasium id; by default ``"my_arm"`` becomes ``"PixelBrax/MyArm-v0"``.
 
     Raises:
-        ValueError: there is no such task, or the id stands for something else.
+        ValueError: the task is unknown, or the id belongs to another environment.
     """
     from pixelbrax_jax.registry import list_envs
     from pixelbrax_jax.validation import check_choice
@@ -62,13 +55,13 @@ def register(task: str, id: str | None = None) -> str:  # noqa: A002  # Gymnasiu
     if known is None:
         _register(task, id)
     elif (known.entry_point, known.kwargs) != (_ENV, {"task": task}):
-        raise ValueError(f"Gymnasium id {id!r} is registered already; choose another.")
+        raise ValueError(f"Gymnasium id {id!r} is already registered; choose another.")
     return id
 
 
 def _register(task: str, name: str) -> None:
-    # No `max_episode_steps`: the environments count control steps themselves, and Gymnasium's
-    # TimeLimit on top would count calls of step(), which are fewer under action repeat.
+    # No `max_episode_steps`: the environments count control steps themselves, whereas Gymnasium's
+    # TimeLimit would count calls of step(), which are fewer with action repeat.
     gym.register(
         id=name,
         entry_point=_ENV,

@@ -12,11 +12,10 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-from pixelbrax_gym.bench.machine import installed_version
+from pixelbrax_gym.bench.machine import PACKAGES, installed_version
 from pixelbrax_jax.cache import cache_folder
 from pixelbrax_jax.extras import install_extra
 
-_PACKAGES = ("pixelbrax", "jax", "jaxlib", "brax", "mujoco", "gymnasium", "numpy")
 EXTRAS = {
     "torch": "torch",
     "torchrl": "torchrl",
@@ -244,7 +243,7 @@ def report(findings: list[Finding]) -> str:
 
 def inspect() -> Machine:
     """Inspect this machine; starts JAX and takes a second or two."""
-    versions = {name: installed_version(name) for name in (*_PACKAGES, *EXTRAS)}
+    versions = {name: installed_version(name) for name in (*PACKAGES, *EXTRAS)}
     device = jax_platform = jax_error = renderer = None
     broken = broken_variables()
     try:

@@ -1,4 +1,4 @@
-"""A trained JAX policy that takes and gives torch tensors."""
+"""Call a trained JAX policy with torch tensors."""
 
 from __future__ import annotations
 
@@ -7,9 +7,7 @@ from typing import TYPE_CHECKING
 
 import jax
 
-from pixelbrax_gym.interop.dlpack import (
-    to_torch,
-)  # Where torch is missing, its message has the fix.
+from pixelbrax_gym.interop.dlpack import to_torch
 from pixelbrax_jax.policy import load_policy
 
 if TYPE_CHECKING:
@@ -17,10 +15,9 @@ if TYPE_CHECKING:
 
 
 class TorchPolicy:
-    """The policy of a ``policy.jax``, called with tensors.
+    """The policy of a ``policy.jax``, called with tensors on any device, without a copy.
 
-    Tensors cross by DLPack, without a copy, on whatever device they are. The policy is compiled
-    once for each number of observations. It has no gradient.
+    It compiles once for each number of observations, and has no gradient.
 
     Example:
         ``action = TorchPolicy("runs/ppo/policy.jax")(obs)``
@@ -30,23 +27,17 @@ class TorchPolicy:
         """Load the file that ``pixelbrax train`` wrote.
 
         Raises:
-            FileNotFoundError: there is no such file.
-            ValueError: it is no policy.
-            ImportError: what reads it is not installed, with the fix.
+            FileNotFoundError: the file does not exist.
+            ValueError: the file is not a policy.
+            ImportError: a package that reads the file is not installed.
         """
         self._act = load_policy(path)
 
     def __call__(self, pixels: torch.Tensor) -> torch.Tensor:
-        """Return the mean actions of observations.
-
-        Args:
-            pixels: (B, H, W, 3 K) uint8, oldest frame first, as environments give them.
-
-        Returns:
-            (B, A) float32 on the same device.
+        """Return mean actions, (B, A) float32, of pixels, (B, H, W, 3K) uint8, oldest frame first.
 
         Raises:
-            ValueError: another dtype or shape than that of training.
+            ValueError: the dtype or shape differs from training.
         """
         action: torch.Tensor = to_torch(self._act(jax.dlpack.from_dlpack(pixels.contiguous())))
         return action

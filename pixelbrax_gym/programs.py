@@ -1,4 +1,4 @@
-"""The compiled programs behind an environment that keeps its state, and how it is kept."""
+"""Compile the programs of a stateful environment, and pack its state."""
 
 from __future__ import annotations
 
@@ -14,24 +14,21 @@ from pixelbrax_jax import PixelEnv, VectorPixelEnv, compilation
 from pixelbrax_jax.types import EnvParams, EnvState, Timestep
 
 _FEW = 32
-"""Environments up to which it is faster to put the parts of a state together than to pass them."""
+"""Up to this number of environments, joining the parts of a state is faster than passing them."""
 
 _MANY_PROGRAMS = 64
-"""Sets of options whose programs are kept when no environment has them any more."""
+"""Number of sets of options whose programs stay in memory."""
 
 Array = jax.Array | np.ndarray
 
 
 class Packed(NamedTuple):
-    """An ``EnvState`` as arrays.
-
-    The arguments and results of a compiled program cost a fixed time each. With the 40 or so parts
-    of a state, one environment spends a tenth of its step on them.
+    """An ``EnvState`` as few arrays, because each argument of a program costs a fixed time.
 
     Attributes:
         frames: (N, H, W, 3K) uint8, as in the state.
-        rest: of few environments one array, (W,) uint32, the bits of all else, one part after the
-            other; of many the parts, keys as what ``jax.random.key_data`` makes of them.
+        rest: for few environments one (W,) uint32 array with the bits of all other parts; for many
+            the parts themselves, with keys as ``jax.random.key_data``.
     """
 
     frames: jax.Array
@@ -39,15 +36,14 @@ class Packed(NamedTuple):
 
 
 class Stepped(NamedTuple):
-    """What a program returns.
+    """The result of a program.
 
     Attributes:
         packed: the states.
         ended: () or (N,) bool, whether a step has ended the episode.
-        outputs: arrays that may be handed out. ``obs``, ``reward``, ``terminated``,
-            ``truncated`` and ``info`` are those of a ``Timestep``. Of many environments there are
-            also ``done``, (N,) bool, and ``reported``, (N,) bool, which environments ``info``
-            is about.
+        outputs: arrays that may be handed out: ``obs``, ``reward``, ``terminated``, ``truncated``
+            and ``info`` of a ``Timestep``; for many environments also ``done``, (N,) bool, and
+            ``reported``, (N,) bool, the environments that ``info`` describes.
     """
 
     packed: Packed
@@ -59,42 +55,33 @@ def _env(programs: Programs) -> PixelEnv:
     return programs.vector.env
 
 
-# A `spare` is read by nothing; `keep_unused` lets it be written to all the same.
+# No program reads `spare`; `keep_unused` still lets its memory be reused.
 _into_spare = compilation.jit(_env, static_argnums=0, donate_argnames="spare", keep_unused=True)
 
 
 class Programs:
-    """The compiled programs of one set of options, which all environments with equal ones share.
+    """The compiled programs that all environments with equal options share.
 
-    States go in and come out packed, and stay as they are: an exception that arrives at any time
-    leaves the state before a step or the one after. Frames are written into ``spare``, the
-    memory of frames that nothing reads any more, or memory would be asked for in each step.
-    Outputs are never read again, which is why they can be given away.
+    Programs take and return packed states and do not modify their arguments, so an exception
+    leaves the state before or after a step. New frames reuse the memory of ``spare``, frames
+    that are not read again. Outputs are not read again and can be handed out.
 
-    Objects are made by ``programs_of`` and equal to themselves alone. JAX compares them in every
-    call, and an exception out of a comparison in Python would arrive as one of JAX's own.
-
-    Attributes:
-        vector: the environments.
-        single: whether actions and outputs lack the leading axis; there is one environment then.
+    ``programs_of`` makes one object per set of options, compared by identity, because JAX compares
+    it in every call. With ``single``, actions and outputs lack the leading axis.
     """
 
     def __init__(self, vector: VectorPixelEnv, single: bool) -> None:
-        """Compile nothing yet."""
+        """Store the arguments; the first call of each program compiles it."""
         self.vector, self.single = vector, single
         self._specs: dict[Any, EnvState] = {}
 
     def __reduce__(self) -> Any:
-        """Return what is pickled or copied: the options."""
+        """Pickle or copy the options."""
         return programs_of, (self.vector, self.single)
 
     @compilation.jit(_env, static_argnums=0)
     def reset(self, seeds: Array, params: EnvParams, offsets: Array | None) -> Stepped:
-        """Reset all environments to episode 0 of their (N,) uint32 seeds.
-
-        ``offsets``, (N,) int32, are new ``time_limit_offset`` of all; None keeps what a reset
-        makes.
-        """
+        """Start episode 0 of (N,) uint32 seeds, with (N,) int32 ``time_limit_offset``."""
         state, timestep = self.vector.reset(jax.vmap(jax.random.key)(seeds), params)
         return self._stepped(_with_offsets(state, offsets), timestep)
 
@@ -109,7 +96,7 @@ class Programs:
         offsets: Array | None,
         spare: Array,
     ) -> Stepped:
-        """Reset some environments; infos are about those that ``reported`` names, (N,) bool."""
+        """Reset environments where ``mask``; infos describe those where ``reported``, (N,) bool."""
         del spare
         key = None if seeds is None else jax.vmap(jax.random.key)(seeds)
         state = self._state(packed, params)
@@ -126,7 +113,7 @@ class Programs:
     def step_where(
         self, packed: Packed, mask: Array, action: Array, params: EnvParams, spare: Array
     ) -> Stepped:
-        """Step some environments; the others repeat their observation, with ``done`` False."""
+        """Step environments where ``mask``; others repeat their observation with ``done`` False."""
         del spare
         state = self._state(packed, params)
         stepped, timestep = self._step(state, action, params)
@@ -136,13 +123,13 @@ class Programs:
 
     @compilation.jit(_env, static_argnums=0)
     def state(self, packed: Packed, params: EnvParams) -> EnvState:
-        """Return the states, without the leading axis of a single environment."""
+        """Return the states, without the leading axis for a single environment."""
         state = self._state(packed, params)
         return jax.tree.map(lambda x: x[0], state) if self.single else state
 
     @compilation.jit(_env, static_argnums=0)
     def start(self, state: EnvState, params: EnvParams) -> Stepped:
-        """Go on from given states, which lack the leading axis of a single environment."""
+        """Continue from states, without the leading axis for a single environment."""
         if self.single:
             state = jax.tree.map(lambda x: x[None], state)
         return self._started(state, params)
@@ -151,29 +138,29 @@ class Programs:
     def start_where(
         self, packed: Packed, mask: Array, state: EnvState, params: EnvParams
     ) -> Stepped:
-        """Go on from given states where (N,) ``mask``; the others stay as they are."""
+        """Continue from states where ``mask``, (N,) bool; the others stay."""
         return self._started(_where(mask, state, self._state(packed, params)), params)
 
     @compilation.jit(_env, static_argnums=(0, 3, 4))
     def images(self, packed: Packed, params: EnvParams, height: int, width: int) -> jax.Array:
-        """Draw the states, (N, height, width, 3) uint8."""
+        """Render (N, height, width, 3) uint8 images of the states."""
         env, state = self.vector.env, self._state(packed, params)
         images: jax.Array = jax.vmap(lambda row: env.image(row, params, height, width))(state)
         return images
 
     def check_state(self, state: Any, params: EnvParams) -> None:
-        """Reject what ``start`` cannot take; the message names the first difference."""
+        """Reject a state that does not fit; the message names the first difference."""
         if not isinstance(state, EnvState):
             raise TypeError(
-                f"a state must be an EnvState, as get_state() returns, got {type(state).__name__}."
+                f"a state must be an EnvState from get_state(), got {type(state).__name__}."
             )
         wanted: Any = jax.tree_util.tree_flatten_with_path(self._spec(params))
         given: Any = jax.tree.flatten(state)
         if given[1] != wanted[1]:
             raise ValueError(
-                f"the state has other parts than those of this environment, {len(given[0])} arrays "
-                f"and not {len(wanted[0])}, or others: take it from an environment of the same "
-                "task, physics backend, distractors and obs_mode."
+                f"the state does not have the structure of this environment's state (it has "
+                f"{len(given[0])} arrays, expected {len(wanted[0])}): use a state of an "
+                "environment with the same task, physics backend, distractors and obs_mode."
             )
         for value, (path, spec) in zip(given[0], wanted[0], strict=True):
             shape, dtype = np.shape(value), getattr(value, "dtype", type(value).__name__)
@@ -185,7 +172,7 @@ class Programs:
                 )
 
     def _spec(self, params: EnvParams) -> EnvState:
-        """Return shapes and dtypes of the states, with their leading axis."""
+        """Return the shapes and dtypes of the states, with their leading axis."""
         leaves, tree = jax.tree.flatten(params)
         key = tree, tuple((np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
         if key not in self._specs:
@@ -225,22 +212,22 @@ class Programs:
 
 @lru_cache(_MANY_PROGRAMS)
 def programs_of(vector: VectorPixelEnv, single: bool) -> Programs:
-    """Return the programs of environments, the same object for equal ones."""
+    """Return the programs of environments, the same object for equal environments."""
     return Programs(vector, single)
 
 
 def pack(state: EnvState) -> Packed:
-    """Return a state, with a leading axis N, as arrays."""
+    """Pack a state with a leading axis N."""
     parts = jax.tree.leaves(state.replace(frames=None))
     if len(state.frames) > _FEW:
         return Packed(state.frames, tuple(map(_data, parts)))
-    # Without a barrier, what computes the parts is compiled into the loop that writes them.
+    # Without a barrier, XLA would fuse the computation of the parts into the loop that writes them.
     parts = jax.lax.optimization_barrier(parts)
     return Packed(state.frames, (jnp.concatenate([_words(part) for part in parts]),))
 
 
 def unpack(packed: Packed, like: EnvState) -> EnvState:
-    """Return the state that ``pack`` was given, to the bit; ``like`` has its shapes and types."""
+    """Invert ``pack`` exactly; ``like`` has the shapes and dtypes of the state."""
     parts, tree = jax.tree.flatten(like.replace(frames=None))
     if like.frames.shape[0] > _FEW:
         restored = list(map(_from_data, packed.rest, parts))
@@ -284,7 +271,7 @@ def _from_data(data: jax.Array, like: Any) -> jax.Array:
 
 
 def _words(part: jax.Array) -> jax.Array:
-    """Return the bits of an array, (W,) uint32; of a narrow type, one number a word."""
+    """Return the bits of an array as (W,) uint32, one word per element of a narrow dtype."""
     part = _data(part)
     if part.dtype == bool:
         part = part.astype(jnp.uint8)
@@ -295,7 +282,7 @@ def _words(part: jax.Array) -> jax.Array:
 
 
 def _from_words(words: jax.Array, like: Any) -> jax.Array:
-    """Return what ``_words`` was given, of the shape and type of ``like``."""
+    """Invert ``_words`` for an array with the shape and dtype of ``like``."""
     if _is_key(like):
         data = jax.eval_shape(jax.random.key_data, like)
         return _from_data(words.reshape(data.shape), like)

@@ -1,4 +1,4 @@
-"""What ``reset`` takes: seeds, options and masks."""
+"""Check the arguments of ``reset``: seeds, options and masks."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import numpy as np
 from pixelbrax_jax.validation import check_choice
 
 SEEDS = 2**32
-"""Number of seeds there are: 0 to one less than this."""
+"""Number of seeds; they start at 0."""
 
 
 def as_seed(seed: Any) -> int:
-    """Return a seed as Python's own integer; a TypeError if it is no integer of any library."""
+    """Convert a seed to a Python integer; raise a TypeError if it is not an integer."""
     if not isinstance(seed, (bool, np.bool_)):
         try:
             return operator.index(seed)
@@ -25,7 +25,7 @@ def as_seed(seed: Any) -> int:
 
 
 def check_seed(seed: Any) -> int:
-    """Return a seed as Python's own integer; a ValueError if it is out of range."""
+    """Convert a seed to a Python integer; raise a ValueError if it is out of range."""
     seed = as_seed(seed)
     if not 0 <= seed < SEEDS:
         raise ValueError(f"seeds must lie in [0, 2**32), got {seed}.")
@@ -33,11 +33,7 @@ def check_seed(seed: Any) -> int:
 
 
 def seeds_of(seed: Any, num_envs: int) -> list[int | None]:
-    """Return a seed for each of N environments.
-
-    s gives environment i the seed s + i; a list, array or tensor has one for each, or None. None
-    gives None to all.
-    """
+    """Return a seed for each of N environments: ``seed + i``, entry i of a sequence, or None."""
     if seed is None:
         return [None] * num_envs
     if np.ndim(seed):
@@ -55,21 +51,15 @@ def seeds_of(seed: Any, num_envs: int) -> list[int | None]:
 
 
 def spread_seeds(seed: Any, num_envs: int) -> list[int]:
-    """Return ``seed + i`` for environment i, going on at 0 beyond 2**32 - 1.
-
-    For frameworks that hand seeds of any size from one environment to the next.
-    """
+    """Return ``seed + i`` modulo 2**32 for environment i, for frameworks with seeds of any size."""
     first = as_seed(seed)
     return [(first + i) % SEEDS for i in range(num_envs)]
 
 
 def read_options(options: Any, seed: Any, num_envs: int | None = None) -> dict[str, Any]:
-    """Return ``state`` and ``mask``, as far as Gymnasium's ``options`` of ``reset`` have them.
+    """Return those of ``state`` and ``mask`` that are in the ``options`` of ``reset``.
 
-    Args:
-        options: what the caller gave; never changed.
-        seed: the one that is given beside them.
-        num_envs: N; None for a single environment, which takes no mask.
+    ``num_envs`` is None for a single environment, which accepts no mask.
     """
     if options is None:
         return {}
@@ -86,15 +76,15 @@ def read_options(options: Any, seed: Any, num_envs: int | None = None) -> dict[s
     if "state" in options:
         if seed is not None:
             raise ValueError(
-                f"reset() takes a seed or options['state'], got both (seed={seed!r}): a state has "
-                "the random numbers of its own episodes; leave one out."
+                f"reset() takes a seed or options['state'], got both (seed={seed!r}): a state "
+                "contains its own random keys; omit one of them."
             )
         read["state"] = options["state"]
     return read
 
 
 def as_mask(what: str, given: Any, shape: tuple[int | None, ...]) -> np.ndarray:
-    """Return an array or tensor of bool, on any device, as a NumPy array of that shape."""
+    """Convert a bool array or tensor on any device to NumPy, and check its shape."""
     dtype = str(getattr(given, "dtype", "")).removeprefix("torch.")
     if dtype != "bool":
         kind = f"{dtype} array" if dtype else type(given).__name__

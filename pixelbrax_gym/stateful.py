@@ -1,4 +1,4 @@
-"""An environment that keeps its state: what every adapter is built on."""
+"""Provide the stateful environment on which every adapter is built."""
 
 from __future__ import annotations
 
@@ -26,58 +26,41 @@ from pixelbrax_jax.types import EnvParams, EnvState
 from pixelbrax_jax.validation import check_positive_int
 
 Keep = Callable[[Stepped], Any]
-"""Makes of what a program returned what an adapter keeps beside the state."""
+"""Maps a program's result to the value that an adapter stores with the state."""
 
-# Compiled, so that nothing is sent from the host.
+# Compiled, so that the host sends nothing.
 _new_frames = jax.jit(partial(jnp.zeros, dtype=jnp.uint8), static_argnums=0)
 
 _made: deque[tuple[EnvConfig, PixelEnv, EnvParams]] = deque(maxlen=64)
-"""Options of the latest environments, so that forks of this process can name them."""
+"""The latest environments, which forks of this process can use without JAX."""
 
 
 @dataclass(frozen=True)
 class _Snapshot:
-    """What is kept between two calls, replaced as a whole or not at all.
-
-    Attributes:
-        packed: the states.
-        ended: () or (N,) bool, whether episodes have ended.
-        spare: frames that nothing reads any more; None if there are none.
-        shared: whether somebody else may read ``packed``.
-        extra: what the adapter keeps beside them.
-    """
+    """Data stored between two calls; it is replaced only as a whole."""
 
     packed: Packed
-    ended: Any
-    spare: jax.Array | None = None
-    shared: bool = False
-    extra: Any = None
+    ended: Any  # () or (N,) bool, whether episodes have ended
+    spare: jax.Array | None = None  # frames that are not read again
+    shared: bool = False  # whether a copy or the caller may read `packed`
+    extra: Any = None  # data of the adapter
 
 
 class StatefulEnv:
-    """``num_envs`` pixel environments and their present states.
+    """``num_envs`` pixel environments and their current states.
 
-    An exception that arrives during a call, such as a ``KeyboardInterrupt``, leaves the states
-    before it or those after it. Copies and pickles go on as the original does; a copy shares its
-    compiled programs and its arrays, which nothing writes to.
+    An exception during a call, such as a ``KeyboardInterrupt``, leaves the states before or after
+    the call. Copies and pickles continue as the original does.
 
-    ``reset`` and ``step`` return the ``outputs`` of ``programs.Stepped``: JAX arrays that nothing
-    reads again. They may be handed out without a copy.
+    ``reset`` and ``step`` return the ``outputs`` of ``programs.Stepped``: JAX arrays that are not
+    read again and may be handed out without a copy. An environment seeded with s uses only
+    ``jax.random.key(s)``, whatever its index and ``num_envs``.
 
-    Environment i that was seeded with s draws everything from ``jax.random.key(s)``; neither
-    i nor ``num_envs`` matters.
+    Methods that compute raise ``ClosedEnvironmentError`` after ``close`` and ``RuntimeError`` in a
+    fork that cannot run JAX; all but ``reset`` raise ``ResetNeeded`` before the first reset.
 
-    Every method that computes raises a ``ClosedEnvironmentError`` after ``close``, and a
-    ``RuntimeError`` in a fork that cannot run JAX; all but ``reset`` also ``ResetNeeded`` before
-    the first reset.
-
-    Attributes:
-        env: the pixel environment.
-        params: its parameters.
-        num_envs: N.
-        single: whether outputs lack the leading axis; N is then 1.
-        episode_length: time limit in control steps.
-        is_limited: whether the caller has given it.
+    With ``single``, outputs lack the leading axis. ``episode_length`` is the time limit in control
+    steps, and ``is_limited`` tells whether the caller gave it.
     """
 
     def __init__(
@@ -92,29 +75,20 @@ class StatefulEnv:
         max_episode_steps: int | None = None,
         render_size: tuple[Any, Any],
     ) -> None:
-        """Build the environment; nothing is compiled yet.
+        """Build the environment without compiling it.
 
-        Args:
-            adapter: the class of which an object is made; the message about an unknown option
-                lists the arguments of its ``__init__`` too.
-            task: one of ``pixelbrax_jax.list_envs()``.
-            options: fields of ``pixelbrax_jax.EnvConfig``.
-            num_envs: N.
-            autoreset_mode: as in ``VectorPixelEnv``.
-            single: whether outputs lack the leading axis.
-            max_episode_steps: time limit in calls of ``step``; None or -1 keeps
-                ``options["episode_length"]``, which counts control steps. Of two limits the one
-                that is reached first holds.
-            render_size: ``render_height`` and ``render_width``, pixels of ``render()``.
+        Errors about unknown ``options`` also list the arguments of ``adapter``. The limit
+        ``max_episode_steps`` counts calls of ``step`` (None or -1: no limit), and
+        ``options["episode_length"]`` counts control steps. The shorter of the two holds.
         """
-        # Without `self` and `task` in front, and `options` at the end.
+        # Without `self` and `task` at the start and `options` at the end.
         own = list(inspect.signature(vars(adapter)["__init__"]).parameters)[2:-1]
         config = env_config(task, options, own)
         self.is_limited = "episode_length" in options
         if max_episode_steps not in (None, -1):
             calls = check_positive_int("max_episode_steps", max_episode_steps)
             limit = calls * config.action_repeat
-            # Whichever is reached first, as with Gymnasium's own TimeLimit around an environment.
+            # The shorter one, as with Gymnasium's own TimeLimit around an environment.
             limit = min(limit, config.episode_length) if self.is_limited else limit
             config = env_config(config, {"episode_length": limit})
             self.is_limited = True
@@ -134,7 +108,7 @@ class StatefulEnv:
 
     @property
     def fps(self) -> int:
-        """Frames per second of simulated time, at least 1."""
+        """Frames per simulated second, at least 1."""
         return max(1, round(1.0 / self.env.dt))
 
     def reset(
@@ -146,21 +120,12 @@ class StatefulEnv:
         time_limit_offsets: np.ndarray | None = None,
         keep: Keep | None = None,
     ) -> dict[str, Any]:
-        """Reset environments.
+        """Reset environments where ``mask``, (N,) bool, or all; ``state`` as in ``set_state``.
 
-        Args:
-            seed: s seeds environment i with s + i; a sequence has one seed for each. A seeded
-                environment is reset to its episode 0. None goes on to the next episode of an
-                environment, or draws a seed if there was none yet.
-            rng: where seeds are drawn from; by default from the operating system.
-            mask: (N,) bool, which ones to reset; None means all.
-            state: goes on from this state, as ``set_state`` does.
-            time_limit_offsets: (N,) int32, control steps by which the time limits of the episodes
-                come early, at least 0 and less than the limit; None means 0.
-            keep: see ``step``.
-
-        Returns:
-            Outputs with reward 0; unmasked environments repeat their observation and flags.
+        Environments with a seed, ``seed + i`` or entry i of a sequence, start their episode 0. The
+        others start their next episode, or sample a seed from ``rng`` at the first reset.
+        ``time_limit_offsets``, (N,) int32 in [0, limit), shorten the time limits. Outputs have
+        reward 0; environments that are not reset repeat their observation and flags.
         """
         self._check_usable()
         if state is not None:
@@ -181,7 +146,7 @@ class StatefulEnv:
         before = self._latest
         parts: list[tuple[np.ndarray, np.ndarray | None]] = [(where & ~given, None)]
         if given.any():
-            # Two calls where some environments are seeded and others are not.
+            # Two calls if some environments are seeded and others are not.
             parts = [part for part in parts if part[0].any()] + [(given, numbers)]
         for part, new_seeds in parts:
             spare = self._spare(before)
@@ -194,18 +159,11 @@ class StatefulEnv:
     def step(
         self, action: Any, mask: np.ndarray | None = None, keep: Keep | None = None
     ) -> dict[str, Any]:
-        """Step all environments, or some.
+        """Step environments where ``mask``, (N,) bool, or all; a single one takes no mask.
 
-        Args:
-            action: (N, A) or, of a single environment, (A,); see ``as_actions``.
-            mask: (N,) bool, which ones to step; None means all. The others stay as they are.
-                Not for a single environment.
-            keep: makes of what the program returned what ``extra`` returns until the next call;
-                it and the states are replaced at once.
-
-        Returns:
-            Outputs. Environments that were not stepped repeat their observation, with ``done``
-            False; the rest of theirs means nothing.
+        ``action`` is (N, A), or (A,) for a single environment. ``keep`` computes ``extra`` from the
+        program's result. Environments that are not stepped repeat their observation with ``done``
+        False; their other outputs are undefined.
         """
         self._check_ready("step")
         if self._must_reset:
@@ -221,26 +179,23 @@ class StatefulEnv:
 
     @property
     def extra(self) -> Any:
-        """What ``keep`` made of the last call's results; None if there was none."""
+        """Result of ``keep`` in the last call; None without it."""
         return None if self._snapshot is None else self._snapshot.extra
 
     def replace_extra(self, extra: Any) -> None:
-        """Replace ``extra``, and nothing else."""
+        """Replace ``extra`` only."""
         self._snapshot = replace(self._latest, extra=extra)
 
     def get_state(self) -> EnvState:
-        """Return the present states, with which ``set_state`` goes on to the bit."""
+        """Return the current states; ``set_state`` continues from them bit for bit."""
         self._check_ready("get_state")
         self._snapshot = replace(self._latest, shared=True)
         return self._programs.state(self._latest.packed, self.params)
 
     def set_state(self, state: Any, mask: np.ndarray | None = None) -> dict[str, Any]:
-        """Go on from given states; outputs are as of ``reset``.
+        """Continue from states where ``mask``, (N,) bool, or all; return outputs as ``reset`` does.
 
-        Args:
-            state: what ``get_state`` returned here or of another environment of the same options,
-                or ``PixelEnv.reset`` and ``PixelEnv.step`` did; also of NumPy arrays.
-            mask: (N,) bool, which environments; None means all. Not for a single environment.
+        Arrays may be NumPy's. A single environment takes no mask.
         """
         self._check_usable()
         self._programs.check_state(state, self.params)
@@ -252,7 +207,7 @@ class StatefulEnv:
         return self._replace(self._programs.start_where(packed, mask, state, self.params))
 
     def set_time_limit(self, control_steps: int) -> None:
-        """Set the time limit of all episodes, the present ones too; at least 1."""
+        """Set the time limit of current and later episodes, at least 1."""
         if control_steps == self.episode_length:
             return
         limit: Any = np.int32(control_steps)
@@ -263,11 +218,11 @@ class StatefulEnv:
 
     @property
     def max_episode_steps(self) -> int:
-        """Time limit in calls of ``step``, of which the last may make fewer control steps."""
+        """Time limit in calls of ``step``; the last call may take fewer control steps."""
         return -(-self.episode_length // self.env.action_repeat)
 
     def render(self) -> jax.Array:
-        """Draw the present states: (N, render_height, render_width, 3) uint8, row 0 at the top."""
+        """Render (N, render_height, render_width, 3) uint8 images, row 0 at the top."""
         self._check_ready("render")
         height, width = self._render_size
         what = f"images of num_envs={self.num_envs}, height={height}, width={width}"
@@ -275,35 +230,35 @@ class StatefulEnv:
         return self._programs.images(self._latest.packed, self.params, height, width)
 
     def forget(self) -> None:
-        """Let go of the states; a ``reset`` comes next."""
+        """Release the states; ``reset`` makes new ones."""
         self._snapshot = None
 
     def close(self) -> None:
-        """Let go of the states; only another ``close`` may follow."""
+        """Release the states; all later calls but ``close`` raise an error."""
         self.forget()
         self._closed = True
 
     @property
     def device(self) -> jax.Device:
-        """Where outputs are; known after the first reset."""
+        """Device of the outputs, known after the first reset."""
         if self._device is None:
             raise error.ResetNeeded("call reset() first.")
         return self._device
 
     def __deepcopy__(self, memo: dict[int, Any]) -> StatefulEnv:
-        """Return an environment that goes on by itself, and shares what neither writes to."""
+        """Return an independent environment that shares arrays which neither writes to."""
         copied = memo[id(self)] = object.__new__(type(self))
         if self._snapshot is not None:
             self._snapshot = replace(self._snapshot, shared=True, spare=None)
         copied.__dict__.update(self.__dict__)
         if self._snapshot is not None:
-            # It may be handed out, and written to then.
+            # The receiver may write to it.
             extra = jax.tree.map(lambda x: x.copy(), self._snapshot.extra)
             copied._snapshot = replace(self._snapshot, extra=extra)
         return copied
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what is pickled: arrays in the host's memory, no device."""
+        """Pickle arrays in host memory, without a device."""
         snapshot = self._snapshot
         if snapshot is not None:
             arrays = jax.device_get((snapshot.packed, snapshot.ended, snapshot.extra))
@@ -323,12 +278,12 @@ class StatefulEnv:
         return self._snapshot
 
     def _replace(self, stepped: Stepped, keep: Keep | None = None) -> dict[str, Any]:
-        """Take the states after a call in place of those before it, and return the outputs."""
+        """Replace the states by those of a program's result, and return the outputs."""
         before, outputs = self._snapshot, stepped.outputs
         spare = None if before is None or before.shared else before.packed.frames
         if is_guarded("device_to_host"):
-            # `jax.transfer_guard` watches what is read. JAX keeps what it has read explicitly, so
-            # that `float(x)` and `np.asarray(x)` transfer nothing then.
+            # `jax.transfer_guard` rejects implicit reads. JAX caches explicit reads, after which
+            # `float(x)` and `np.asarray(x)` transfer nothing.
             read = {name: x for name, x in outputs.items() if name != "obs"}
             jax.device_get((stepped.ended, read))
         extra = None if keep is None else keep(stepped)
@@ -338,13 +293,13 @@ class StatefulEnv:
     @staticmethod
     def _spare(snapshot: _Snapshot) -> jax.Array:
         """Return memory for the next frames."""
-        # An interrupted call has taken the spare and left nothing in its place.
+        # An interrupted call may have deleted the spare frames.
         if snapshot.spare is None or snapshot.spare.is_deleted():
             return _new_frames(snapshot.packed.frames.shape)
         return snapshot.spare
 
     def _place(self) -> None:
-        """Put what a pickle has brought on the device, and find out which one it is."""
+        """Put unpickled arrays on the default device and store that device."""
         if self._device is not None:
             return
         snapshot = self._snapshot
@@ -373,18 +328,16 @@ class StatefulEnv:
 
 
 def _make(config: EnvConfig) -> tuple[PixelEnv, EnvParams]:
-    """Make an environment; in a fork that cannot run JAX, only one that was made before it.
-
-    A worker then fails in ``reset``, where Gymnasium's ``AsyncVectorEnv`` passes errors on; from
-    here it would only see a lost pipe.
-    """
+    """Make an environment, or return a known one in a fork that cannot run JAX."""
+    # The fork fails in `reset`, whose errors Gymnasium's AsyncVectorEnv reports; an error in the
+    # constructor would only close a pipe.
     known = [made for made in _made if _is_equal(made[0], config)]
     if is_forked():
         if not known:
             check_not_forked()
         return known[0][1:]
     env, params = make(config)
-    # Clips take 100 MB, which this list would keep.
+    # This list would keep the 100 MB of clips in memory.
     if params.clips is None and not known:
         _made.append((config, env, params))
     return env, params

@@ -23,11 +23,8 @@ FOLDER = Path(__file__).parent / "pretrained"
 class Policy:
     """A policy that maps pixels to actions: ``policy(pixels)``.
 
-    Attributes:
-        program: computes the actions.
-        shape: (H, W, 3 K) of the pixels.
-        env_options: options of the training environment, for ``pixelbrax_jax.make(**env_options)``;
-            None for a policy from a file.
+    ``shape`` is (H, W, 3 K). ``pixelbrax_jax.make(**policy.env_options)`` makes the environment of
+    a pretrained policy; the options are None for a policy from a file.
     """
 
     program: Callable[[jax.Array], jax.Array]
@@ -35,7 +32,7 @@ class Policy:
     env_options: dict[str, Any] | None = None
 
     def __call__(self, pixels: jax.Array) -> jax.Array:
-        """Map (B, H, W, 3 K) uint8 pixels to (B, A) float32 actions; others raise ValueError."""
+        """Map (B, H, W, 3 K) uint8 pixels to (B, A) float32; others raise a ValueError."""
         if pixels.ndim != 4 or pixels.shape[1:] != self.shape or pixels.dtype != jnp.uint8:
             raise ValueError(
                 f"the policy takes (B, {', '.join(map(str, self.shape))}) uint8 pixels, got "
@@ -76,8 +73,8 @@ def load_policy(path: str | Path) -> Policy:
     if not path.is_file():
         if name not in (names := list_pretrained()):
             raise FileNotFoundError(
-                f"{name!r} is neither a file nor the name of a policy in the package; the names "
-                f"are: {', '.join(names)}.{suggest(name, names)}"
+                f"{name!r} is neither a file nor the name of a policy; pretrained policies: "
+                f"{', '.join(names)}.{suggest(name, names)}"
             )
         path, about = FOLDER / f"{name}.jax", read_pretrained(name)
     try:

@@ -80,10 +80,8 @@ def commands() -> list[str]:
 def parse(command: str, kind: type[Options], arguments: Sequence[str]) -> Options:
     """Parse the arguments after a command's name into the dataclass ``kind``.
 
-    The docstring of ``kind`` describes the command, and each field is an option.
-
-    Raises:
-        SystemExit: an option or its value is unknown, or help is requested.
+    The docstring of ``kind`` describes the command, and each field is an option. Errors and help
+    end in a SystemExit.
     """
     import tyro
 

@@ -69,12 +69,7 @@ def run(arguments: Sequence[str]) -> int:
 
 
 def load(options: AgentOptions) -> Trained:
-    """Load the agent that the options select.
-
-    Raises:
-        CommandError: the checkpoint does not exist.
-        ValueError: options cannot be combined or are out of range.
-    """
+    """Load the agent that the options select; raise a CommandError if its checkpoint is missing."""
     with needs_extra("train"):
         from pixelbrax_jax.agents.runner.checkpoint import CheckpointError
         from pixelbrax_jax.agents.runner.trained import load_agent

@@ -36,12 +36,7 @@ class Launch:
     """Index of this process, from 0."""
 
     def start(self) -> None:
-        """Configure JAX's devices and processes.
-
-        Raises:
-            UsageError: options for several processes are incomplete.
-            ValueError: ``cpu_devices`` is not positive, or JAX has already started.
-        """
+        """Configure JAX's devices and processes."""
         import jax
 
         if self.cpu_devices is not None:
@@ -125,12 +120,7 @@ def _report(line: str) -> None:
 
 
 def parse(algorithm: str, arguments: Sequence[str]) -> tuple[Launch, TrainConfig, RunConfig]:
-    """Parse the options of an algorithm, such as ``--preset cpu --num-envs 64``.
-
-    Raises:
-        ValueError: a setting is out of range.
-        SystemExit: an option is unknown.
-    """
+    """Parse the options of an algorithm; raise a ValueError if a setting is out of range."""
     from pixelbrax_jax.agents.on_policy.presets import PRESETS, preset
     from pixelbrax_jax.agents.runner.settings import RunConfig
 

@@ -27,21 +27,17 @@ class StatefulAdapter:
 
         Raises:
             ResetNeeded: before the first reset.
-            ClosedEnvironmentError: after ``close`` of many environments.
         """
         return self._stateful.get_state()
 
     def set_state(self, state: EnvState) -> None:
-        """Continue from a state, as ``reset(options={"state": state})`` does.
+        """Continue from a state of ``get_state`` of an environment with the same options.
 
-        Args:
-            state: from ``get_state`` of an environment with the same options; for one environment
-                also from ``PixelEnv.reset`` or ``PixelEnv.step``.
+        A single environment also takes the states of ``PixelEnv``.
 
         Raises:
             TypeError: ``state`` is not an ``EnvState``.
             ValueError: ``state`` does not fit this environment.
-            ClosedEnvironmentError: after ``close`` of many environments.
         """
         self._stateful.set_state(state)
 

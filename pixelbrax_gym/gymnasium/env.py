@@ -33,7 +33,7 @@ class GymnasiumEnv(StatefulAdapter, gymnasium.Env):
     limit reached first truncates the episode; without any it is 1000 control steps.
 
     Observations are never overwritten and may be written to. ``reset`` reopens the environment
-    after ``close``.
+    after ``close``. Methods raise a ``RuntimeError`` in a fork that cannot run JAX.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012  # as Gymnasium declares it
@@ -67,7 +67,6 @@ class GymnasiumEnv(StatefulAdapter, gymnasium.Env):
             TypeError: an option is unknown.
             ValueError: an option is out of range.
             ImportError: ``output`` or ``render_mode`` needs a package that is not installed.
-            RuntimeError: this process is a fork that cannot run JAX.
         """
         if render_mode is not None:
             check_choice("render_mode", render_mode, RENDER_MODES)
@@ -104,7 +103,6 @@ class GymnasiumEnv(StatefulAdapter, gymnasium.Env):
                 ``EnvState``.
             ValueError: ``seed`` is out of range or given with a state, the state does not fit this
                 environment, or another option is given.
-            RuntimeError: this process is a fork that cannot run JAX.
         """
         given = read_options(options, seed)
         self._take_time_limit()
@@ -129,7 +127,6 @@ class GymnasiumEnv(StatefulAdapter, gymnasium.Env):
 
         Raises:
             ResetNeeded: before the first reset, after ``close``, or when the episode has ended.
-            RuntimeError: this process is a fork that cannot run JAX.
             TypeError: the action is not floating point.
             ValueError: the action's shape or device is wrong, or a NumPy array or CPU tensor
                 contains NaN; nothing is stepped then. NaN elsewhere ends the episode.

@@ -48,6 +48,9 @@ class GymnasiumVectorEnv(StatefulAdapter, gymnasium.vector.VectorEnv):
 
     Observations are never overwritten, and in-place operations on them change no later result.
     ``call``, ``get_attr`` and ``set_attr`` address a ``SubEnv`` for each environment.
+
+    Methods raise ``ClosedEnvironmentError`` after ``close`` and ``RuntimeError`` in a fork that
+    cannot run JAX.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012  # as Gymnasium declares it
@@ -88,7 +91,6 @@ class GymnasiumVectorEnv(StatefulAdapter, gymnasium.vector.VectorEnv):
             TypeError: an option is unknown.
             ValueError: an option is out of range.
             ImportError: ``output`` is ``"torch"``, and torch is not installed.
-            RuntimeError: this process is a fork that cannot run JAX.
         """
         if render_mode == "human":
             raise ValueError(
@@ -144,8 +146,6 @@ class GymnasiumVectorEnv(StatefulAdapter, gymnasium.vector.VectorEnv):
             ValueError: the mask has another shape or no True, a seed is out of range or given with
                 a state, the state does not fit, or another option is given.
             ResetNeeded: the first reset has a mask with a False.
-            ClosedEnvironmentError: after ``close``.
-            RuntimeError: this process is a fork that cannot run JAX.
         """
         given = read_options(options, seed, self.num_envs)
         if "state" not in given:
@@ -168,8 +168,6 @@ class GymnasiumVectorEnv(StatefulAdapter, gymnasium.vector.VectorEnv):
         Raises:
             ResetNeeded: before the first reset; or autoreset is disabled and an ended episode
                 was not reset.
-            ClosedEnvironmentError: after ``close``.
-            RuntimeError: this process is a fork that cannot run JAX.
             TypeError: the actions are not floating point.
             ValueError: the actions' shape or device is wrong, or a NumPy array or CPU tensor
                 contains NaN; nothing is stepped then. NaN elsewhere ends that episode.
@@ -186,7 +184,6 @@ class GymnasiumVectorEnv(StatefulAdapter, gymnasium.vector.VectorEnv):
 
         Raises:
             ResetNeeded: before the first reset.
-            ClosedEnvironmentError: after ``close``.
         """
         if self.render_mode is None:
             return None

@@ -51,7 +51,8 @@ class SB3VecEnv(VecEnv):
 
     Observations share memory with JAX on a CPU and are copied from other devices. They may be
     written to. The same seed gives the same episodes as in a ``GymnasiumVectorEnv``. ``get_attr``,
-    ``set_attr`` and ``env_method`` address a ``SubEnv`` for each environment.
+    ``set_attr`` and ``env_method`` address a ``SubEnv`` for each environment. Methods raise
+    ``ClosedEnvironmentError`` after ``close`` and ``RuntimeError`` in a fork that cannot run JAX.
 
     Example:
         >>> env = VecMonitor(SB3VecEnv("inverted_pendulum", num_envs=64))
@@ -93,7 +94,6 @@ class SB3VecEnv(VecEnv):
             TypeError: an option is unknown.
             ValueError: an option is out of range, or Stable-Baselines3 would read rows or columns
                 as channels because there are at least as many channels.
-            RuntimeError: this process is a fork that cannot run JAX.
         """
         if render_mode is not None:
             check_choice("render_mode", render_mode, ("rgb_array",))
@@ -128,8 +128,6 @@ class SB3VecEnv(VecEnv):
 
         Raises:
             ValueError: ``set_options`` was called; no options exist. They are dropped.
-            ClosedEnvironmentError: after ``close``.
-            RuntimeError: this process is a fork that cannot run JAX.
         """
         given = self._options
         # The next reset must not fail again.
@@ -164,8 +162,6 @@ class SB3VecEnv(VecEnv):
 
         Raises:
             ResetNeeded: before the first reset.
-            ClosedEnvironmentError: after ``close``.
-            RuntimeError: this process is a fork that cannot run JAX.
             TypeError: the actions are not floating point.
             ValueError: the actions have another shape or contain a NaN; nothing was stepped.
         """

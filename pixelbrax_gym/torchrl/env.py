@@ -38,7 +38,8 @@ class TorchRLEnv(EnvBase):
     ``"_reset"`` mask, as TorchRL's collectors and rollouts request. Other rows keep their state.
 
     Tensors share memory with JAX arrays that are not read again, so in-place operations are safe.
-    The same seed gives the same episodes as in a ``GymnasiumVectorEnv``.
+    The same seed gives the same episodes as in a ``GymnasiumVectorEnv``. Methods raise
+    ``ClosedEnvironmentError`` after ``close`` and ``RuntimeError`` in a fork that cannot run JAX.
 
     Attributes:
         infos: tensors with leading axis N about the episodes of the last step:
@@ -75,7 +76,6 @@ class TorchRLEnv(EnvBase):
         Raises:
             TypeError: an option is unknown.
             ValueError: an option is out of range.
-            RuntimeError: this process is a fork that cannot run JAX.
         """
         check_not_forked()
         stateful = StatefulEnv(
@@ -209,7 +209,6 @@ class TorchRLEnv(EnvBase):
 
         Raises:
             ResetNeeded: before the first reset.
-            ClosedEnvironmentError: after ``close``.
         """
         return to_torch(self._stateful.render()).to(self.device)
 

@@ -21,11 +21,8 @@ from pixelbrax_jax.types import EnvParams
 class Algorithm(ABC):
     """An algorithm with its settings and environments, as pure functions.
 
-    Algorithms with equal settings and equal environments are equal, and share compiled programs.
-
-    Attributes:
-        config: the settings, of class ``config_class``.
-        acting: names of the networks that ``act`` needs.
+    Equal settings in equal environments share compiled programs. ``acting`` names the networks that
+    ``act`` needs.
 
     Raises:
         ValueError: the environments contradict the settings.

@@ -24,11 +24,7 @@ from pixelbrax_jax.validation import (
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Settings of every algorithm.
-
-    Raises:
-        ValueError: a setting is out of range.
-    """
+    """Settings of every algorithm; a setting out of range is a ValueError."""
 
     env: EnvConfig = EnvConfig()  # noqa: RUF009 (it is frozen)
     """Sets the environment's options; camera, look, clips and distractors are names."""
@@ -57,7 +53,7 @@ class TrainConfig:
     max_grad_norm: float = 0.5
     """Clips the gradient of each network to this global norm; 0 disables clipping."""
     memory_budget_gb: float | None = None
-    """Memory limit of the training state in GB (10^9 bytes); None uses the device's memory."""
+    """Memory limit of stored frames and state in GB (10^9 bytes); None uses the device's memory."""
 
     def __post_init__(self) -> None:
         """Check the settings."""
@@ -75,8 +71,8 @@ class TrainConfig:
         if min(self.env.height, self.env.width) < smallest:
             raise ValueError(
                 f"encoder {self.encoder!r} needs images of at least {smallest} x {smallest} "
-                f"pixels, got {self.env.height} x {self.env.width}; another encoder takes smaller "
-                "ones."
+                f"pixels, got {self.env.height} x {self.env.width}; raise height and width, or "
+                "choose another encoder."
             )
 
     @property
@@ -95,7 +91,7 @@ class TrainConfig:
         return 0
 
     def replace(self, **settings: Any) -> Self:
-        """Return a copy with changed settings; options of the environment, as ``height``, go to it.
+        """Return a copy with changed settings, also of the environment, such as ``height=64``.
 
         Raises:
             TypeError: a name is unknown.
@@ -110,7 +106,7 @@ class TrainConfig:
 
 
 def _check_env(env: EnvConfig) -> None:
-    """Reject an environment without pixels, or with options that JSON cannot store."""
+    """Reject options without pixels, and options that JSON cannot store."""
     if not isinstance(env, EnvConfig):
         raise TypeError(f"env must be an EnvConfig, got {env!r}.")
     for name, kind in (("camera", str), ("look", str), ("clips", (str, NoneType))):

@@ -32,10 +32,7 @@ class Optimizer:
     def step(
         self, networks: Networks, opt_state: Networks, gradients: Networks, iteration: jax.Array
     ) -> tuple[Networks, Networks, Metrics]:
-        """Update the networks that have gradients.
-
-        Returns parameters, optimiser state and the global norms of the unclipped gradients.
-        """
+        """Update the networks that have gradients; also return the norms of unclipped gradients."""
         networks, opt_state, norms = dict(networks), dict(opt_state), {}
         rate = self.learning_rate(iteration)
         for name, gradient in gradients.items():

@@ -21,12 +21,7 @@ ALGORITHMS: dict[str, type[Algorithm]] = {kind.name: kind for kind in (PPO, PPG,
 
 
 def make_algorithm(config: TrainConfig, envs: Environments) -> Algorithm:
-    """Make the algorithm that belongs to the class of ``config``.
-
-    Raises:
-        TypeError: no algorithm has settings of this class.
-        ValueError: the environments contradict the settings.
-    """
+    """Make the algorithm of these settings; settings of another class are a TypeError."""
     for kind in ALGORITHMS.values():
         if type(config) is kind.config_class:
             return kind(config, envs)

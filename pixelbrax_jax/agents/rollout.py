@@ -107,10 +107,7 @@ def collect(
     num_steps: int,
     random_shift: int = 0,
 ) -> tuple[EnvState, Rollout]:
-    """Collect ``num_steps`` steps; return the environments' state after them and the rollout.
-
-    ``random_shift`` is the largest shift of the observations in pixels.
-    """
+    """Collect ``num_steps`` steps, and shift observations by up to ``random_shift`` pixels."""
     num_envs = envs.num_envs
     shift_key = jax.random.fold_in(key, num_steps + 1)
     shift = jax.random.randint(shift_key, (num_envs, 2), -random_shift, random_shift + 1)
@@ -150,10 +147,7 @@ def collect(
 
 
 def observations(frames: Frames, times: jax.Array, random_shift: int = 0) -> jax.Array:
-    """Rebuild the observations at (B, N) int32 times.
-
-    The pixels are (N B, H, W, 3 K) uint8, ordered by environment, with the oldest frame first.
-    """
+    """Rebuild the (N B, H, W, 3 K) uint8 pixels at (B, N) int32 times, ordered by environment."""
     stack = frames.pixels.shape[0] - frames.age.shape[0] + 1
     age = jnp.take_along_axis(frames.age, times, axis=0)
     back = jnp.minimum(jnp.arange(stack - 1, -1, -1), age[..., None])
@@ -168,10 +162,7 @@ def observations(frames: Frames, times: jax.Array, random_shift: int = 0) -> jax
 
 
 def at_times(rows: jax.Array, times: jax.Array) -> jax.Array:
-    """Map (T, N, ...) rows and (B, N) int32 times to (N B, ...), ordered by environment.
-
-    The order keeps the samples of an environment on its device.
-    """
+    """Map (T, N, ...) rows and (B, N) int32 times to (N B, ...), ordered by environment."""
     picked = jax.vmap(lambda rows, index: rows[index], in_axes=1)(rows, times)
     return picked.reshape(-1, *rows.shape[2:])
 
@@ -184,9 +175,9 @@ def split_obs(obs: Any) -> tuple[Any, Any]:
 
 
 def shifted(pixels: jax.Array, shift: jax.Array, at_most: int) -> jax.Array:
-    """Shift (N, H, W, C) images by (N, 2) int32 pixels down and right, and repeat their edges.
+    """Shift (N, H, W, C) images by (N, 2) pixels down and right (Yarats et al., arXiv 2004.13649).
 
-    Follows Yarats et al., arXiv 2004.13649. ``at_most`` is a static bound of the shifts.
+    Edges repeat. ``at_most`` is a static bound of the shifts.
     """
     if not at_most:
         return pixels

@@ -22,7 +22,7 @@ _ENVS, _NETWORKS, _ACTIONS, _UPDATES, _AUXILIARY = range(5)
 
 
 def along_envs(axis: int, *, kept: bool = True) -> Any:
-    """Declare a field whose arrays have the environments along ``axis``; devices share that axis.
+    """Declare a field whose arrays have environments along ``axis``, which is split over devices.
 
     Checkpoints skip a field with ``kept=False``; a resumed run takes its value from ``init``.
     """
@@ -45,8 +45,7 @@ class TrainState(struct.PyTreeNode):
     A subclass declares each further field with ``along_envs``, ``without_envs`` or ``as_declared``.
 
     Attributes:
-        networks: parameters by network name.
-        opt_state: optimiser state by network name.
+        networks, opt_state: parameters and optimiser state by network name.
         key: typed PRNG key of the run; constant.
         iteration: () uint32, iterations so far, of ``config.steps_per_iteration`` control steps.
     """

@@ -101,9 +101,7 @@ def test_errors_name_the_setting_and_the_cure(capsys):
     assert main(["train", "ppo", "--task", "antt"]) == 1
     assert "Did you mean 'ant'?" in capsys.readouterr().err
     assert main(["record", "/nowhere"]) == 1
-    assert "no checkpoint in /nowhere/checkpoints, for there is no such folder" in (
-        capsys.readouterr().err
-    )
+    assert "no checkpoint in /nowhere/checkpoints, which does not exist" in capsys.readouterr().err
     assert main(["train", "--task", "ant"]) == 2
     assert "name an algorithm first, as in 'pixelbrax train ppo --task" in capsys.readouterr().err
 
@@ -188,7 +186,7 @@ def test_a_run_is_evaluated_and_recorded(tmp_path, capsys):
     assert again["standard_error"] == evaluation["eval/clean/standard_error"]
     assert (again["steps"], again["split"]) == (16, "clean")
     assert main(["evaluate", folder, "--split", "test"]) == 1
-    assert "there is only 'clean'" in capsys.readouterr().err
+    assert "the run has none; its splits: 'clean'." in capsys.readouterr().err
     video = str(tmp_path / "video.mp4")
     line = ["record", folder, "--output", video, "--grid", "3", "--size", "15", "--num-frames", "3"]
     assert main(line) == 0
@@ -199,7 +197,7 @@ def test_a_run_is_evaluated_and_recorded(tmp_path, capsys):
         ("--best --steps 16", "give best or steps, not both; got steps=16"),
         ("--run 1", "run must be from 0 to 0, got 1"),
         ("--split tset", "Did you mean 'test'?"),
-        ("--steps 3", "there are those of 16 steps"),
+        ("--steps 3", "existing checkpoints have 16 steps"),
         ("--output a.avi", "one of .gif, .mp4, got 'a.avi'"),
     ):
         assert main(["record", folder, *wrong.split()]) == 1

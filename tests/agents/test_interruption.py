@@ -164,7 +164,7 @@ def test_what_a_scheduler_sends_stops_a_run_once(whole, tmp_path, names):
     assert stopped_by in names[:2]
     assert told.count("stopping within two iterations") == 1
     assert f"stopped by {stopped_by} after" in told
-    assert "go on with --resume latest" in told
+    assert "continue with --resume latest" in told
     assert_goes_on(tmp_path, whole)
 
 
@@ -229,7 +229,7 @@ def test_the_disk_of_the_logs_is_full(whole, tmp_path, disk, in_time):
     # Without room for the policy that is an error, but the checkpoint is there.
     assert process.wait(60) == (128 + signal.SIGTERM if in_time else 1)
     told = log.read_text()
-    assert told.count("metrics.jsonl: No space left on device; training goes on") == 1
+    assert told.count("metrics.jsonl: No space left on device; training continues") == 1
     assert ("policy.jax: No space left on device" in told) == (not in_time)
     assert ("metrics.jsonl may lack records after" in told) == (not in_time)
     if in_time:
@@ -251,14 +251,14 @@ def test_the_disk_of_the_checkpoints_is_full(whole, tmp_path, disk, in_time):
         process = start(run, f"--checkpoint-every {2 * PER_ITERATION}", stderr=file)
     until(lambda: latest_steps(disk.folder))
     disk.fill()
-    until(lambda: "Training goes on, and a checkpoint is tried again" in log.read_text())
+    until(lambda: "Training continues and will retry the checkpoint" in log.read_text())
     if in_time:
         disk.make_room()
         until(lambda: "steps is written" in log.read_text())
     process.send_signal(signal.SIGTERM)
     assert process.wait(60) == (128 + signal.SIGTERM if in_time else 1)
     told = log.read_text()
-    assert ("the last one, is lost; that of" in told) == (not in_time)
+    assert ("steps, is lost; that of" in told) == (not in_time)
     if not in_time:
         disk.make_room()
     assert_goes_on(run, whole)

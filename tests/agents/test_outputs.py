@@ -1,4 +1,4 @@
-"""Lines, bars, records and checkpoints that cannot be written: training goes on, and says so."""
+"""Training continues and reports messages, bars, records and checkpoints that cannot be written."""
 
 from __future__ import annotations
 
@@ -76,9 +76,9 @@ def test_no_more_than_so_much_waits(tmp_path, monkeypatch):
                 file.append(block)
     # Records after a gap would tell a wrong story: the file ends before it.
     for _ in range(2):
-        with pytest.raises(OSError, match="more waited"):
+        with pytest.raises(OSError, match="64 MiB waited"):
             file.append(b"later")
-    with pytest.raises(OSError, match="more waited"):
+    with pytest.raises(OSError, match="64 MiB waited"):
         file.close()
     assert (tmp_path / "file").read_bytes() == b"1234567890"
 
@@ -90,11 +90,11 @@ def test_records_are_complete_when_there_is_room_again(tmp_path):
         for steps in (10, 20, 2**33):
             writer.write(steps, {"loss/value": 0.5, "learning_rate": 0.25})
         assert len(told) == 2, "once each"
-        assert all("training goes on, its records wait in memory" in line for line in told)
+        assert all("training continues, its records wait in memory" in line for line in told)
         assert len(writer.missing()) == 2
     writer.write(2**33 + 1, {"loss/value": 1.5})
     assert len(told) == 4
-    assert all("what it lacked is written" in line for line in told[2:])
+    assert all("missing records were added" in line for line in told[2:])
     writer.close()
     assert writer.missing() == []
     steps = [10, 20, 2**33, 2**33 + 1]
@@ -138,8 +138,8 @@ def test_weights_and_biases_may_fail(tmp_path, monkeypatch):
     writer.close()
     assert logged == [1, 2], "what has failed is left alone"
     assert told == [
-        "cannot write to Weights & Biases: the service has died; training goes on, all are in "
-        f"{tmp_path / 'metrics.jsonl'}"
+        "cannot write to Weights & Biases: the service has died; training continues, "
+        f"{tmp_path / 'metrics.jsonl'} has all records"
     ]
     (missing,) = writer.missing()
     assert "Weights & Biases may lack records after 1 steps" in missing
@@ -171,7 +171,7 @@ def test_a_bar_that_cannot_be_drawn_is_told_once(monkeypatch):
     for _ in range(3):
         bar.update(1, {"episode/return": 1.0})
     bar.close()
-    assert told == ["the progress bar cannot be drawn: Broken pipe; the run goes on without it"]
+    assert told == ["the progress bar cannot be drawn: Broken pipe; the run continues without it"]
 
 
 def test_a_run_without_a_reader_is_the_same(tmp_path, monkeypatch):
@@ -204,7 +204,7 @@ def test_a_policy_that_cannot_be_written_costs_no_checkpoint(tmp_path, monkeypat
 
     monkeypatch.setattr(train, "save_policy", full)
     algorithm = PPO(PPOConfig(**SMALL), ball_envs())
-    with pytest.raises(OSError, match=r"policy.jax: No space left on device.*160 steps is whole"):
+    with pytest.raises(OSError, match=r"policy.jax: No space left.*160 steps is complete"):
         run(algorithm, PARAMS, RunConfig(str(tmp_path), progress=False))
     assert latest_steps(tmp_path / "checkpoints") == 5 * PER_ITERATION
 
@@ -225,7 +225,7 @@ def test_a_checkpoint_is_tried_again(tmp_path, monkeypatch):
     for steps in (20, 30):
         checkpoints.save(state, steps, None)
     (line,) = told
-    assert "Training goes on" in line
+    assert "Training continues" in line
     now[0] = 661
     assert checkpoints.is_due_by_clock(), "sooner than usual"
     free[0] = 1 << 40
@@ -233,7 +233,7 @@ def test_a_checkpoint_is_tried_again(tmp_path, monkeypatch):
     checkpoints.look_after(wait=True)
     assert told[1:] == ["the checkpoint of 40 steps is written"]
     free[0] = 1
-    with pytest.raises(CheckpointError, match=r"of 50 steps.*is lost; that of 40 steps stays"):
+    with pytest.raises(CheckpointError, match="of 50 steps, is lost; that of 40 steps remains"):
         checkpoints.save(state, 50, None, last=True)
     assert checkpoints.steps() == [10, 40]
     checkpoints.close()

@@ -47,10 +47,10 @@ def test_a_pretrained_policy_earns_what_its_table_says(name, capsys):
     ("arguments", "message"),
     [
         (["--pretrained", "cheetah"], "unknown pretrained policy: 'cheetah'; allowed: "),
-        ([], "give the folder of a run, or --pretrained"),
-        (["runs/ppo", "--pretrained", "halfcheetah"], "one of the two"),
-        (["--pretrained", "halfcheetah", "--best"], "--steps, --best and --run choose"),
-        (["--pretrained", "halfcheetah", "--split", "test"], "there is only 'clean'"),
+        ([], "give either the folder of a run or --pretrained"),
+        (["runs/ppo", "--pretrained", "halfcheetah"], "give either the folder of a run or"),
+        (["--pretrained", "halfcheetah", "--best"], "--steps, --best and --run need the folder"),
+        (["--pretrained", "halfcheetah", "--split", "test"], "its splits: 'clean'."),
     ],
 )
 def test_a_wrong_choice_is_told(command, arguments, message, capsys):
@@ -77,5 +77,5 @@ def test_a_policy_of_another_jax_is_told(tmp_path, monkeypatch):
 
 def test_a_pretrained_policy_has_no_sampled_actions():
     agent = load_pretrained(list_pretrained()[0])
-    with pytest.raises(ValueError, match="mean actions alone"):
+    with pytest.raises(ValueError, match="only mean actions"):
         agent.algorithm.act({}, jnp.zeros((1, *agent.algorithm.policy.shape), jnp.uint8), 0)

@@ -1,4 +1,4 @@
-"""Runs of other releases: an earlier one's goes on, and a later one's is refused by name."""
+"""Runs of earlier releases continue, and those of later ones are refused by name."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_a_run_of_0_2_0_goes_on(folder):
     lines = []
     options = RunConfig(str(folder), resume="latest", progress=False)
     outcome = run(ppo(), PARAMS, options, report=lines.append)
-    assert "going on from the checkpoint of 32 steps" in lines
+    assert "continuing from the checkpoint of 32 steps" in lines
     assert int(outcome.state.iteration) == 5
     assert not same(outcome.state.networks, before.networks)
     assert load_config(read_about(folder / "checkpoints")) == ppo().config
@@ -126,11 +126,11 @@ def test_of_clips_the_content_decides_and_without_digests_the_folder(tmp_path, m
 
     assert other("a", "b", ["1", "2"], ["1", "2"]) == []
     assert other("a", "a", ["1", "2"], ["2", "1"]) == [
-        f"clips: those of '{tmp_path}/a' there, others in '{tmp_path}/a' here"
+        f"clips: those of '{tmp_path}/a' there, different ones in '{tmp_path}/a' here"
     ]
     assert other("a", str(tmp_path / "a"), None, ["1"]) == []
     assert other("a", "b", None, ["1"])[0].endswith(
-        f"'{tmp_path}/b' here (it has no digest of its clips: the folder decides)"
+        f"'{tmp_path}/b' here (the run has no digest of its clips, so the folder must be equal)"
     )
     assert other(None, "procedural") == []
     assert other("procedural", "a", None, ["1"]) == [

@@ -100,12 +100,12 @@ def test_a_resumed_run_is_the_same_to_the_bit(whole, tmp_path, monkeypatch, stop
             stopped = run(ppg(), PARAMS, resuming, report=lines.append)
         assert (stopped.interrupted, stopped.signal) == (True, stopped_by)
         assert int(stopped.state.iteration) == 6
-        for told in ("a new run begins", "stopping within two iterations"):
+        for told in ("starting a new run", "stopping within two iterations"):
             assert any(told in line for line in lines)
         assert any(f"stopped by {stopped_by.name} after" in line for line in lines)
     resumed = run(ppg(), PARAMS, resuming, report=lines.append)
     steps = PER_ITERATION * (5 if stopped_by is None else 6)
-    assert f"going on from the checkpoint of {steps} steps" in lines
+    assert f"continuing from the checkpoint of {steps} steps" in lines
     assert not resumed.interrupted
     assert same(resumed.state, outcome.state)
     ours, theirs = (read_metrics(path / "metrics.jsonl") for path in (tmp_path, folder))
@@ -149,7 +149,7 @@ def test_an_earlier_run_is_not_overwritten(whole):
     before = (whole[1] / "config.json").read_bytes()
     with pytest.raises(FileExistsError, match="--resume latest"):
         run(ppg(), PARAMS, options(whole[1]))
-    with pytest.raises(CheckpointError, match="total_steps=160 are fewer than the 256 that the"):
+    with pytest.raises(CheckpointError, match="total_steps=160 must be at least 256"):
         run(ppg(5), PARAMS, options(whole[1], resume="latest"))
     assert (whole[1] / "config.json").read_bytes() == before
 
@@ -166,7 +166,7 @@ def test_another_configuration_is_refused_by_name(whole):
         run(ppg(), PARAMS, options(whole[1], resume="latest"))
     # Of the format before, the networks can still be read.
     about.write_text(json.dumps(json.loads(text) | {"format": 2}))
-    with pytest.raises(CheckpointError, match="reads the networks alone: evaluate or record"):
+    with pytest.raises(CheckpointError, match="only its networks: you can evaluate or record"):
         run(ppg(), PARAMS, options(whole[1], resume="latest"))
     steps = int(about.parents[1].name)
     networks = read_networks(whole[1] / "checkpoints", whole[0].state.networks, steps)
@@ -207,7 +207,7 @@ def test_the_best_and_the_latest_are_kept(tmp_path):
     checkpoints.look_after(wait=True)
     assert checkpoints.steps() == [2, 2**33, 2**33 + 5]
     assert best_steps(tmp_path) == 2
-    with pytest.raises(CheckpointError, match="there are those of 2, 8589934592, 8589934597"):
+    with pytest.raises(CheckpointError, match="checkpoints have 2, 8589934592, 8589934597"):
         read_about(tmp_path, 3)
     assert same(checkpoints.restore(state), state)
     checkpoints.close()

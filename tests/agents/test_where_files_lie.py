@@ -115,9 +115,9 @@ def test_a_run_goes_on_wherever_its_clips_lie(home, train, monkeypatch, capsys):
     again = [*train, "--resume", "latest", "--clips"]
     assert main([*again, "others"]) == 1
     told = capsys.readouterr().err
-    assert f"clips: those of '{home}/clips' there, others in '{home}/others' here" in told
+    assert f"clips: those of '{home}/clips' there, different ones in '{home}/others' here" in told
     assert main([*again, "node/staged"]) == 0
-    assert "going on from the checkpoint of 8 steps" in capsys.readouterr().err
+    assert "continuing from the checkpoint of 8 steps" in capsys.readouterr().err
 
     # From another folder, where the path of the training would not be found.
     (home / "elsewhere").mkdir()
@@ -125,7 +125,7 @@ def test_a_run_goes_on_wherever_its_clips_lie(home, train, monkeypatch, capsys):
     of_run = [str(home / "run"), "--split", "train", "--clips", "../others"]
     for command in ("evaluate", "record"):
         assert main([command, *of_run]) == 1
-        assert "are not those of the training" in capsys.readouterr().err
+        assert "differ from those of the training" in capsys.readouterr().err
 
 
 @pytest.mark.slow
@@ -142,7 +142,7 @@ def test_a_run_is_played_wherever_its_clips_lie(home, train, monkeypatch, capsys
     told = capsys.readouterr()
     assert rows(told.out).keys() == {"clean"}
     assert f"there is no folder of clips at {home}/clips" in told.err
-    assert "name their folder with --clips" in told.err
+    assert "set their folder with --clips" in told.err
     assert main([*of_run, "--clips", "../node/staged"]) == 0
     told = capsys.readouterr()
     found = rows(told.out)
@@ -150,26 +150,26 @@ def test_a_run_is_played_wherever_its_clips_lie(home, train, monkeypatch, capsys
     assert found["train"]["clips"] == f"{home}/elsewhere/../node/staged"
     assert "clips" not in found["clean"]
     assert (found["train"]["steps"], found["train"]["seed"]) == (16, 0)
-    assert "no split 'test': of the 2 clips of split 'all'" in told.err
+    assert "no split 'test': training uses 2 of the 2 clips of split 'all'" in told.err
     assert main([*of_run, "--clips", "../others", "--split", "test"]) == 0
     assert rows(capsys.readouterr().out)["test"]["clips"] == f"{home}/elsewhere/../others"
     assert main([*of_run, "--clips", "../others", "--split", "train"]) == 1
-    assert "are not those of the training" in capsys.readouterr().err
+    assert "differ from those of the training" in capsys.readouterr().err
     # A run of a release that stored no digests.
     path = home / "run" / "checkpoints" / "16" / "about" / "metadata"
     about = json.loads(path.read_text())
     path.write_text(json.dumps({n: v for n, v in about.items() if n != "clips"}))
     assert main([*of_run, "--clips", "../others", "--split", "train"]) == 1
-    assert "are not those of the training" in capsys.readouterr().err
+    assert "differ from those of the training" in capsys.readouterr().err
     (home / "node" / "staged").rename(home / "node" / "gone")
     assert main([*of_run, "--clips", "../others", "--split", "train"]) == 0
     told = capsys.readouterr()
-    assert "has no digest of its clips; those of ../others are taken for them" in told.err
+    assert "has no digest of its clips; assuming that ../others has the same clips" in told.err
     assert rows(told.out)["train"]["clips"] == f"{home}/elsewhere/../others"
     path.write_text(json.dumps(about))
     video = ["--num-frames", "2", "--grid", "1", "--size", "18", "--output", "a.gif"]
     assert main(["record", str(home / "run"), "--clips", "../others", *video]) == 1
-    assert "are not those of the training" in capsys.readouterr().err
+    assert "differ from those of the training" in capsys.readouterr().err
     assert main(["record", str(home / "run"), "--clips", "../node/gone", *video]) == 0
     assert (home / "elsewhere" / "a.gif").stat().st_size > 0
 
@@ -177,4 +177,6 @@ def test_a_run_is_played_wherever_its_clips_lie(home, train, monkeypatch, capsys
 def test_clips_for_a_run_without_any_are_refused(capsys):
     line = ["evaluate", "--pretrained", "halfcheetah", "--clips", "procedural"]
     assert main(line) == 1
-    assert "no distractor of the run plays clips; it had none" in capsys.readouterr().err
+    assert (
+        "needs a run with a video distractor; its distractors are none" in capsys.readouterr().err
+    )

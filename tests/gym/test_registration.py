@@ -56,7 +56,7 @@ def test_lazy_names():
 def test_register_rejects_unknown_tasks_and_taken_ids():
     with pytest.raises(ValueError, match=r"unknown task: 'toy_bal'.*Did you mean 'toy_ball'"):
         pixelbrax_gym.register("toy_bal")
-    with pytest.raises(ValueError, match="'PixelBrax/Ant-v0' is registered already"):
+    with pytest.raises(ValueError, match="'PixelBrax/Ant-v0' is already registered"):
         pixelbrax_gym.register(TASK, "PixelBrax/Ant-v0")
     assert pixelbrax_gym.register(TASK) == ID, "once more"
     assert pixelbrax_gym.register(TASK, "Mine/Ball-v3") == "Mine/Ball-v3"

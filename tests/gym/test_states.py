@@ -89,7 +89,7 @@ def test_what_is_refused(make_single, make_vector):
         env.get_state()
     env.reset(seed=0)
     state = env.get_state()
-    with pytest.raises(TypeError, match="must be an EnvState, as get_state"):
+    with pytest.raises(TypeError, match="must be an EnvState from get_state"):
         env.set_state({"frames": state.frames})
     with pytest.raises(ValueError, match=r"takes a seed or options\['state'\], got both"):
         env.reset(seed=1, options={"state": state})
@@ -99,7 +99,7 @@ def test_what_is_refused(make_single, make_vector):
                 frames=np.zeros((3, 13, 12, 6), np.uint8)
             )
         )
-    with pytest.raises(ValueError, match="has other parts"):
+    with pytest.raises(ValueError, match="does not have the structure"):
         make_single(distractors="color").set_state(state)
     with pytest.raises(ValueError, match="allowed: reset_mask, state"):
         make_vector().reset(options={"mask": 1})

@@ -22,13 +22,7 @@ POLICIES = ("gaussian", "tanh_gaussian", "deacrep")
 
 
 class ActorOutput(struct.PyTreeNode):
-    """The output of an actor for B observations.
-
-    Attributes:
-        policy: distribution of the actions.
-        value: (B,) float32 from the actor's value head; None without a value head.
-        features: (B, F) float32 from the encoder.
-    """
+    """An actor's policy, (B,) value or None, and (B, F) features of the encoder."""
 
     policy: Normal
     value: Any
@@ -98,9 +92,7 @@ class Critic(nn.Module):
 class ActorCritic:
     """An actor and a separate critic, or an actor with a value head.
 
-    Attributes:
-        critic_module: the separate critic; None if the actor's value head is the critic.
-        detach_value: stops gradients of the actor's value head at the encoder.
+    ``detach_value`` stops gradients of the actor's value head at the encoder.
     """
 
     actor_module: Actor

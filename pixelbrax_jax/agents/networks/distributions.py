@@ -45,10 +45,7 @@ class Normal(struct.PyTreeNode):
         return log_prob.sum(-1)
 
     def entropy(self, key: jax.Array) -> jax.Array:
-        """Return the (...) differential entropy of the action in nats.
-
-        With ``squash``, one sample estimates the mean of ``log(1 - tanh^2 u)``.
-        """
+        """Return the (...) entropy of the action in nats, with ``squash`` from one sample."""
         entropy = (jnp.log(self.std) + 0.5 * (1.0 + _LOG_2PI)).sum(-1)
         if self.squash:
             entropy += _log_slope(self.sample(key)).sum(-1)

@@ -20,10 +20,7 @@ Pads = tuple[tuple[int, int], tuple[int, int]]
 
 
 def convolve(x: jax.Array, kernel: jax.Array, stride: int, pads: Pads) -> jax.Array:
-    """Cross-correlate (B, H, W, C) with (h, w, C, D), padded with zeros.
-
-    A CPU computes matrix products, which are faster there than XLA's convolution in ``lax.scan``.
-    """
+    """Cross-correlate (B, H, W, C) with (h, w, C, D); on a CPU matrix products are faster."""
 
     def products(x: jax.Array, kernel: jax.Array) -> jax.Array:
         return _as_products(x, kernel, stride, pads)
@@ -87,10 +84,7 @@ class Conv(nn.Module):
 
 
 def max_pool(x: jax.Array) -> jax.Array:
-    """Take the maximum over 3 x 3 windows with stride 2 and ``SAME`` padding.
-
-    The gradient of ``nn.max_pool`` is slow and not deterministic on a GPU.
-    """
+    """Take 3 x 3 maxima with stride 2; ``nn.max_pool`` is slow and not deterministic on a GPU."""
     height, width = x.shape[1:3]
     pads = jax.lax.padtype_to_pads((height, width), (3, 3), (2, 2), "SAME")
     x = jnp.pad(x, ((0, 0), *pads, (0, 0)), constant_values=-jnp.inf)

@@ -37,10 +37,7 @@ Loss = Callable[[Networks, Batch, jax.Array], tuple[jax.Array, Metrics]]
 class OnPolicyState(TrainState):
     """The state of an on-policy algorithm.
 
-    Attributes:
-        aux_opt_state: optimiser state of the auxiliary phase, or None.
-        scaler: statistics of rewards.
-        buffer: rollouts for the auxiliary phase, or None.
+    ``aux_opt_state`` and ``buffer`` belong to the auxiliary phase, and are None without one.
     """
 
     aux_opt_state: Networks | None = without_envs()
@@ -81,12 +78,9 @@ class OnPolicy(Algorithm):
         """Learn from a rollout; ``state`` is the state after it."""
 
     def make_agent(self, *, shared: bool, has_value: bool, detach: bool = False) -> ActorCritic:
-        """Make the networks of the settings.
+        """Make an actor, with or without a value head, and a critic, separate or ``shared``.
 
-        Args:
-            shared: whether the actor's value head is the critic.
-            has_value: whether the actor has a value head.
-            detach: whether gradients of a shared value stop at the encoder.
+        ``detach`` stops gradients of a shared value at the encoder.
         """
         config = self.config
         action_size = self.envs.env.action_size
@@ -190,17 +184,9 @@ class OnPolicy(Algorithm):
     ) -> tuple[OnPolicyState, Metrics]:
         """Take an optimiser step for each minibatch of a rollout, ``num_epochs`` times.
 
-        Args:
-            state: contains the parameters.
-            loss: function to minimise.
-            experience: the rollout.
-            num_epochs: number of passes.
-            key: for minibatches and loss.
-            learners: networks that learn; None means all that have an optimiser state.
-            target_kl: approximate KL divergence above which the update stops.
-
-        Returns:
-            The state, and the mean of each metric over the minibatches used.
+        Only ``learners`` learn; None means all networks with an optimiser state. The update stops
+        above the approximate KL divergence ``target_kl``. Metrics are means over the minibatches
+        used.
         """
         config, optimizer = self.config, Optimizer(self.config)
 

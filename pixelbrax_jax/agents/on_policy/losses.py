@@ -50,9 +50,7 @@ class RewardScaler(struct.PyTreeNode):
 
     Attributes:
         discounted: (N,) float32, G of each environment.
-        count: () float32, number of returns with 24 bits of precision.
-        mean: () float32.
-        square: () float32, variance.
+        count, mean, square: () float32, number, mean and variance of the returns.
     """
 
     discounted: jax.Array = along_envs(0)

@@ -74,14 +74,7 @@ class PhasicConfig(OnPolicyConfig):
 
 
 class Buffer(struct.PyTreeNode):
-    """P rollouts; every array has a leading axis P.
-
-    Attributes:
-        unclipped_action: (P, T, N, A) float32.
-        returns: (P, T, N) float32.
-        done: (P, T, N) bool, whether an episode ended.
-        valid: (P, T, N) bool, False at an episode reset.
-    """
+    """P rollouts: (P, T, N, ...) arrays with the meaning of ``Rollout``, and ``Frames`` with P."""
 
     frames: Frames = as_declared(leading_axes=1)
     unclipped_action: jax.Array = along_envs(2)
@@ -93,14 +86,8 @@ class Buffer(struct.PyTreeNode):
 class Chunk(NamedTuple):
     """B = N C samples: C consecutive steps of each of N environments, ordered by environment.
 
-    Attributes:
-        pixels: (B, H, W, 3 K) uint8.
-        state: (B, S) float32, or None.
-        unclipped_action: (B, A) float32.
-        returns: (B,) float32.
-        weight: (B,) float32, 0 at an episode reset, else 1.
-        policy: distribution of actions before the phase.
-        num_steps: C.
+    Shapes are those of ``Batch``. ``policy`` is the distribution of actions before the phase, and
+    ``num_steps`` is C.
     """
 
     pixels: jax.Array
@@ -203,10 +190,7 @@ class Phasic(OnPolicy):
     def loss_with_kept_policy(
         self, networks: Networks, chunk: Chunk, critic_coef: float
     ) -> tuple[ActorOutput, jax.Array, Metrics]:
-        """Return the actor's output, a loss that fits values and keeps the policy, and metrics.
-
-        ``critic_coef`` is the weight of a separate critic's loss.
-        """
+        """Return the actor's output, a loss that fits values and keeps the policy, and metrics."""
         output = self.agent.actor(networks["actor"], chunk.pixels)
         error = value_loss(output.value, chunk.returns, chunk.weight)
         kl = mean(chunk.policy.kl_to(output.policy), chunk.weight)

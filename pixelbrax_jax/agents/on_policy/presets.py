@@ -165,13 +165,10 @@ TASK_SETTINGS: dict[str, dict[str, dict[str, dict[str, Any]]]] = {
 def preset(
     algorithm: str, name: str = "default", task: str | None = None, **changes: Any
 ) -> TrainConfig:
-    """Return the settings of a preset.
+    """Return the settings of a preset, with ``changes`` as in ``TrainConfig.replace``.
 
-    Args:
-        algorithm: ``"ppo"``, ``"ppg"`` or ``"dcpg"``.
-        name: ``"default"``, ``"deacrep"``, ``"procgen"``, ``"ci"`` or ``"cpu"``.
-        task: name of the task; None uses the preset's task.
-        **changes: settings to change, passed to ``TrainConfig.replace``.
+    The algorithm is ``"ppo"``, ``"ppg"`` or ``"dcpg"``; the name is ``"default"``, ``"deacrep"``,
+    ``"procgen"``, ``"ci"`` or ``"cpu"``. ``task=None`` uses the preset's task.
 
     Raises:
         ValueError: a name is unknown, a setting is out of range, or the preset lacks the task.

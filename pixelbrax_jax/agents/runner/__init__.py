@@ -1,1 +1,1 @@
-"""What runs an algorithm: training, checkpoints, evaluation, videos, metrics."""
+"""Training runs: checkpoints, evaluation, videos and metrics."""

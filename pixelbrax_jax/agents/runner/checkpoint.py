@@ -1,4 +1,4 @@
-"""What a checkpoint is on disk, and how parts of it are read."""
+"""The format of a checkpoint, and reading parts of it."""
 
 from __future__ import annotations
 
@@ -15,53 +15,49 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 FORMAT = 4
-"""Number of the format; raised when what is stored changes its meaning."""
+"""Number of the format, increased when the meaning of stored data changes."""
 
 _NETWORKS_ALONE = (2, 3)
-"""Former formats whose networks can be read: their runs can be evaluated, and not gone on with."""
+"""Former formats with readable networks; such runs can be evaluated but not continued."""
 
 Tree = TypeVar("Tree")
 
 
 class CheckpointError(RuntimeError):
-    """A checkpoint cannot be written or read; the message says why and what to do."""
+    """A checkpoint cannot be written or read."""
 
 
 class DiskFullError(CheckpointError):
-    """There is no room for a checkpoint; raised in all processes alike, before any writes."""
+    """The disk is too full for a checkpoint; all processes raise it before writing."""
 
 
 def latest_steps(folder: str | Path) -> int | None:
-    """Return the control steps of the latest checkpoint in a folder; None if there is none."""
+    """Return the control steps of the latest checkpoint in a folder, or None."""
     return max(_all_steps(Path(folder)), default=None)
 
 
 def best_steps(folder: str | Path) -> int | None:
-    """Return the steps of the checkpoint with the highest score; None if none has a score."""
+    """Return the control steps of the checkpoint with the highest score, or None."""
     scores = {steps: read_about(folder, steps)["score"] for steps in _all_steps(Path(folder))}
     scores = {steps: score for steps, score in scores.items() if score is not None}
     return max(scores, key=lambda steps: (scores[steps], steps), default=None)
 
 
 def read_about(folder: str | Path, steps: int | None = None) -> dict[str, Any]:
-    """Return what is stored beside a checkpoint's arrays: algorithm, config, steps, score.
-
-    Args:
-        folder: of the checkpoints.
-        steps: of which one; None takes the latest.
+    """Read a checkpoint's algorithm, config, steps and score; ``steps=None`` means the latest.
 
     Raises:
-        CheckpointError: there is none, or it is of another format.
+        CheckpointError: there is no such checkpoint, or it has another format.
     """
     folder = Path(folder)
     known = _all_steps(folder)
     if not known:
-        why = "" if folder.exists() else ", for there is no such folder"
+        why = "" if folder.exists() else ", which does not exist"
         raise CheckpointError(f"there is no checkpoint in {folder}{why}.")
     path = folder / str(known[-1] if steps is None else steps) / "about" / "metadata"
     if not path.exists():
         raise CheckpointError(
-            f"there is no checkpoint in {path.parents[1]}; there are those of "
+            f"there is no checkpoint in {path.parents[1]}; existing checkpoints have "
             f"{', '.join(map(str, known))} steps."
         )
     about: dict[str, Any] = json.loads(path.read_text("utf-8"))
@@ -73,15 +69,10 @@ def read_about(folder: str | Path, steps: int | None = None) -> dict[str, Any]:
 
 
 def read_networks(folder: str | Path, template: Tree, steps: int | None = None) -> Tree:
-    """Return parameters alone, of a checkpoint of any settings with equal networks.
-
-    Args:
-        folder: of the checkpoints.
-        template: networks of the same shapes, or their ``jax.eval_shape``.
-        steps: as for `read_about`.
+    """Read only the parameters; ``template`` has the same shapes, or is their ``jax.eval_shape``.
 
     Raises:
-        CheckpointError: there is none, or its networks have other shapes.
+        CheckpointError: there is no such checkpoint, or its networks have other shapes.
     """
     about = read_about(folder, steps)
     path = Path(folder).absolute() / str(about["steps"]) / "state"
@@ -100,20 +91,20 @@ def read_networks(folder: str | Path, template: Tree, steps: int | None = None) 
 
 
 def shapes_of(path: Path) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of stored arrays, by their place."""
+    """Return the shapes of stored arrays by path."""
     with without_warnings():
         found = ocp.Checkpointer(ocp.PyTreeCheckpointHandler()).metadata(path)
     return {name: tuple(leaf.shape) for name, leaf in found.item_metadata.tree.items()}
 
 
 def _all_steps(folder: Path) -> list[int]:
-    # Without the file, a folder is one that is being deleted.
+    # A folder without the file is being deleted.
     found = (path for path in folder.glob("*") if path.name.isdigit())
     return sorted(int(path.name) for path in found if (path / "about" / "metadata").exists())
 
 
 def leaves_of(tree: Any) -> dict[str, Any]:
-    """Return leaves by their place, keys as numbers; without empty arrays, which tell nothing."""
+    """Return the leaves by path, without empty arrays, and with PRNG keys as numbers."""
     leaves = {}
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
         if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
@@ -128,11 +119,11 @@ def leaves_of(tree: Any) -> dict[str, Any]:
 
 
 def tree_of(template: Tree, leaves: dict[str, Any]) -> Tree:
-    """Return the tree that `leaves_of` took apart."""
+    """Rebuild a tree from the leaves of `leaves_of`."""
 
     def leaf(path: Any, like: Any) -> Any:
         if not like.size:
-            # Made by a program, as those of other processes' devices must be.
+            # A program makes the array, because its devices may belong to other processes.
             empty = jax.jit(
                 lambda: jnp.zeros(like.shape, like.dtype), out_shardings=sharding_of(like)
             )
@@ -150,7 +141,7 @@ def _place(path: Any) -> str:
 
 
 def sharding_of(leaf: Any) -> Any:
-    """Return where a leaf is, or shall be; the first device where it does not say."""
+    """Return the sharding of a leaf; the default is the first device."""
     if getattr(leaf, "sharding", None) is not None:
         return leaf.sharding
     return jax.sharding.SingleDeviceSharding(jax.devices()[0])

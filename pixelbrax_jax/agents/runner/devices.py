@@ -1,9 +1,4 @@
-"""Several devices and processes: how a state is spread, what all must agree on, what fits.
-
-What belongs to environments is spread along them; everything else is the same on every device. A
-minibatch has equally many steps of every environment, so that each device computes the gradient of
-its own, and XLA adds them up.
-"""
+"""Sharding over devices, agreement between processes, and the memory check."""
 
 from __future__ import annotations
 
@@ -24,16 +19,13 @@ from pixelbrax_jax.memory import device_memory
 
 
 def mesh_of(algorithm: Algorithm) -> Mesh | None:
-    """Return the devices over which an algorithm's environments are spread, if they are."""
+    """Return the device mesh of an algorithm's environments, or None."""
     mesh: Mesh | None = getattr(algorithm.envs, "mesh", None)
     return mesh
 
 
 def state_shardings(mesh: Mesh, template: Any, num_seeds: int = 1) -> Any:
-    """Return a sharding for each leaf of a ``TrainState``, or of its ``jax.eval_shape``.
-
-    The mesh has an axis ``"envs"``. Of several seeds the leaves have a leading axis.
-    """
+    """Return the shardings of a ``TrainState``: environments over the mesh, the rest replicated."""
 
     def sharding(axis: int) -> NamedSharding:
         if axis < 0:
@@ -44,23 +36,23 @@ def state_shardings(mesh: Mesh, template: Any, num_seeds: int = 1) -> Any:
 
 
 def replicated(mesh: Mesh) -> NamedSharding:
-    """Return the sharding of what is the same on all devices."""
+    """Return the sharding of values that are equal on all devices."""
     return NamedSharding(mesh, PartitionSpec())
 
 
 def replicate(mesh: Mesh, tree: Any) -> Any:
-    """Put the same values on all devices of all processes."""
+    """Copy values to all devices of all processes."""
     same = replicated(mesh)
     return jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf), same), tree)
 
 
 def any_process(here: bool) -> bool:
-    """Return whether something is so in any process, when all must go the same way."""
+    """Return whether the flag is set in any process."""
     return bool(highest(int(here))[0])
 
 
 def highest(*here: int) -> tuple[int, ...]:
-    """Return the highest of each number over all processes, when all must go the same way."""
+    """Return the maximum of each number over all processes."""
     if jax.process_count() == 1:
         return here
     everyone = multihost_utils.process_allgather(np.array(here, np.int32))
@@ -68,7 +60,7 @@ def highest(*here: int) -> tuple[int, ...]:
 
 
 def check_memory(algorithm: Algorithm, template: TrainState, report: Report) -> None:
-    """Report what a state like ``template`` takes, or raise a MemoryError if it would not fit."""
+    """Report the memory of a state like ``template``; raise a MemoryError if it does not fit."""
     config = algorithm.config
     frames = config.bytes_per_iteration * template.iteration.size
     memories, total = _memories(algorithm), _nbytes(template)
@@ -78,7 +70,7 @@ def check_memory(algorithm: Algorithm, template: TrainState, report: Report) -> 
         f"stored: frames of an iteration {frames / 1e9:.2f} GB, all state {total / 1e9:.2f} GB"
         + "".join(large)
     )
-    # What belongs to environments is spread over the devices; the rest is the same on all.
+    # Devices share the environments; every device holds the rest.
     leaves = zip(jax.tree.leaves(template), jax.tree.leaves(env_axes(template)), strict=True)
     alike = sum(_nbytes(leaf) for leaf, axis in leaves if axis < 0)
     needed = alike + (frames + total - alike) / memories
@@ -87,9 +79,9 @@ def check_memory(algorithm: Algorithm, template: TrainState, report: Report) -> 
     if any_process(needed > limit):
         where = f" in each of {memories} memories" if memories > 1 else ""
         raise MemoryError(
-            f"frames and state take {needed / 1e9:.2f} GB{where}, of {limit / 1e9:.2f} GB that "
-            f"may be used. Lower {', '.join(config.memory_settings)} or the size of the images, or "
-            "raise memory_budget_gb."
+            f"frames and state need {needed / 1e9:.2f} GB{where}, but only {limit / 1e9:.2f} GB "
+            f"may be used. Lower {', '.join(config.memory_settings)} or the image size, or raise "
+            "memory_budget_gb."
         )
 
 
@@ -98,7 +90,7 @@ def _nbytes(tree: Any) -> int:
 
 
 def _memories(algorithm: Algorithm) -> int:
-    """Return memories over which environments are spread; devices of a CPU share one."""
+    """Return the number of memories that hold environments; CPU devices share one."""
     mesh = mesh_of(algorithm)
     if mesh is None:
         return 1

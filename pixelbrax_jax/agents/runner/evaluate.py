@@ -1,4 +1,4 @@
-"""How good a policy is: whole episodes, the same ones every time."""
+"""Evaluate a policy on complete, reproducible episodes."""
 
 from __future__ import annotations
 
@@ -25,12 +25,7 @@ from pixelbrax_jax.validation import check_positive_int
 
 @dataclass(frozen=True)
 class Result:
-    """Episodes of one policy.
-
-    Attributes:
-        returns: (E,) float64, sums of rewards.
-        lengths: (E,) int, control steps.
-    """
+    """The (E,) float64 returns and (E,) int lengths, in control steps, of E episodes."""
 
     returns: np.ndarray
     lengths: np.ndarray
@@ -42,17 +37,17 @@ class Result:
 
     @property
     def standard_error(self) -> float:
-        """Standard error of the mean return; NaN of a single episode."""
+        """Standard error of the mean return; NaN for a single episode."""
         if len(self.returns) < 2:
             return float("nan")
         return float(self.returns.std(ddof=1) / np.sqrt(len(self.returns)))
 
 
 class Evaluator:
-    """Plays whole episodes, the same ones every time.
+    """Runs ``num_episodes`` complete episodes in parallel, the same ones every time.
 
-    Episode i of seed s begins from ``fold_in(key(s), i)``, whatever the training's seed was. All
-    episodes run at once, each in an environment of its own, until the last one has ended.
+    Episode i starts from ``fold_in(key(seed), i)``, whatever the seed of the training.
+    ``deterministic`` selects mean actions, otherwise actions are sampled.
     """
 
     def __init__(
@@ -65,16 +60,7 @@ class Evaluator:
         seed: int = 1_000_003,
         deterministic: bool = True,
     ) -> None:
-        """Compile nothing yet.
-
-        Args:
-            algorithm: whose ``act`` plays.
-            env: a ``PixelEnv`` that shows pixels.
-            env_params: of it.
-            num_episodes: E.
-            seed: of the episodes.
-            deterministic: whether the mean action is played, or a sampled one.
-        """
+        """Prepare the evaluation of ``algorithm.act`` in ``env``, a ``PixelEnv`` with pixels."""
         envs = VectorPixelEnv(env, num_episodes, "disabled")
         self._play = partial(_play, envs, algorithm, deterministic)
         self._acting = algorithm.acting
@@ -83,7 +69,7 @@ class Evaluator:
         self._params = env_params
 
     def __call__(self, networks: Networks) -> Result:
-        """Play the episodes of a policy."""
+        """Evaluate the policy of these networks."""
         acting = {name: networks[name] for name in self._acting}
         returns, lengths = jax.device_get(self._play(acting, self._key, self._params))
         return Result(returns=returns.astype(np.float64), lengths=lengths)
@@ -98,7 +84,7 @@ def _play(
     key: jax.Array,
     params: EnvParams,
 ) -> tuple[jax.Array, jax.Array]:
-    """Return returns and lengths of episodes, (E,) each."""
+    """Return the (E,) returns and lengths of the episodes."""
     num_steps = -(-params.episode_length // envs.env.action_repeat)
 
     def goes_on(carry: tuple[EnvState, jax.Array, Any]) -> jax.Array:
@@ -110,13 +96,13 @@ def _play(
         action_key = None if deterministic else jax.random.fold_in(action_keys, number)
         action = algorithm.act(networks, envs.obs(state), action_key)
         state, timestep = envs.step(state, action, params)
-        # Beyond its end an episode goes on without meaning.
+        # Results after the end of an episode are ignored.
         returns = jnp.where(over, returns, timestep.info["episode_return"])
         lengths = jnp.where(over, lengths, timestep.info["episode_length"])
         over |= timestep.terminated | timestep.truncated
         return state, number + 1, (over, returns, lengths)
 
-    # Episode i begins from fold_in(key, i).
+    # Reset i uses fold_in(key, i), so the actions use the next number.
     action_keys = jax.random.fold_in(key, envs.num_envs)
     state, _ = envs.reset(key, params)
     nothing = jnp.zeros(envs.num_envs)
@@ -133,23 +119,19 @@ def evaluate(
     clips: str | None = None,
     report: Report = silent,
 ) -> Iterator[dict[str, Any]]:
-    """Yield a row for each split, as soon as its episodes are played: what JSON has.
+    """Evaluate an agent with mean actions; yield a row of JSON values after each split.
 
-    Args:
-        agent: who plays, with mean actions.
-        episodes: of each split.
-        splits: names, all of which must be there; without any, those that are there.
-        clips: folder of the clips, in place of that of the training.
-        report: gets a line about what is left out or not known.
+    ``episodes`` is the number per split. Without ``splits`` it evaluates all available ones.
+    ``clips`` is a folder; None uses the training's.
 
     Raises:
-        ValueError: an option is out of range, or there is no such split.
+        ValueError: an option is out of range, or the run has no such split.
         FileNotFoundError: the folder of the clips is missing.
     """
     check_positive_int("episodes", episodes)
     config, shown = with_clips(agent, clips)
     if clips and not shown:
-        report(f"the run has no digest of its clips; those of {clips} are taken for them")
+        report(f"the run has no digest of its clips; assuming that {clips} has the same clips")
     for name, (env, params) in make_splits(config, splits, shown=shown, report=report):
         result = Evaluator(agent.algorithm, env, params, num_episodes=episodes)(agent.networks)
         row = {
@@ -168,7 +150,7 @@ def evaluate(
 
 
 def together(runs: Sequence[Result]) -> tuple[Result, dict[str, float]]:
-    """Return all episodes of several runs, and what is logged of them, by name."""
+    """Join the episodes of several runs, and return the scalars to log by name."""
     logged = {}
     if len(runs) > 1:
         middle = interquartile_mean(np.array([run.mean for run in runs]))
@@ -186,7 +168,7 @@ def together(runs: Sequence[Result]) -> tuple[Result, dict[str, float]]:
 
 @dataclass(frozen=True)
 class Interval:
-    """A statistic with its interval of confidence."""
+    """A statistic with its confidence interval."""
 
     value: float
     low: float
@@ -194,14 +176,9 @@ class Interval:
 
 
 def interquartile_mean(scores: np.ndarray, *, confidence: float = 0.95, seed: int = 0) -> Interval:
-    """Return the mean of the middle half of scores, with a bootstrap interval over runs.
+    """Compute the interquartile mean of (R,) scores with a bootstrap interval over runs.
 
-    Recommended for a handful of runs by Agarwal et al., arXiv 2108.13264.
-
-    Args:
-        scores: (R,) one score for each run, at least 2.
-        confidence: of the interval, in (0, 1).
-        seed: of the resampling.
+    Recommended for few runs by Agarwal et al., arXiv 2108.13264. ``confidence`` is in (0, 1).
 
     Raises:
         ValueError: there are fewer than 2 scores.

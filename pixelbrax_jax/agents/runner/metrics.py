@@ -1,4 +1,4 @@
-"""Numbers of a training run: put together over iterations, and written where people look."""
+"""Summarise the metrics of a run and write them to JSON, TensorBoard and Weights & Biases."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from pixelbrax_jax.agents.runner.progress import Report, reason
 _SUMS = ("episode/return_sum", "episode/length_sum", "episode/count")
 
 _MAX_WAITING = 64 * 2**20
-"""Bytes kept in memory for a file that cannot be written."""
+"""Maximum number of bytes in memory for a file that cannot be written."""
 
 
 def summarize(records: list[Mapping[str, Any]]) -> dict[str, float]:
-    """Return one record of several iterations, of which some may have more names than others.
+    """Combine the metrics of several iterations, whose names may differ, into one record.
 
-    Episodes count equally, whichever iteration they ended in; all else is the mean. Without a
-    finished episode there is no return and no length. Metrics of several runs have a leading axis,
-    over which the record is too, with each run's return.
+    All episodes have the same weight; other metrics are averaged over iterations. Return and length
+    are missing if no episode ended. Metrics of several runs have a leading axis; the record
+    averages over it and adds each run's return.
     """
     names = {name: None for record in records for name in record}
     values = {
@@ -49,34 +49,27 @@ def summarize(records: list[Mapping[str, Any]]) -> dict[str, float]:
 
 
 class AppendedFile:
-    """A file that bytes are appended to; those the disk does not take are kept for the next time.
-
-    Nothing is written twice or left out in between: the file is complete as soon as all could be
-    written, and lacks only its end until then.
-    """
+    """An append-only file without gaps, which keeps bytes in memory while the disk is full."""
 
     def __init__(self, path: Path) -> None:
-        """Open the file, which is made if need be."""
+        """Open or create the file."""
         self._file = path.open("ab", buffering=0)
         self._waiting = bytearray()
         self._ended = False
 
     def append(self, block: bytes = b"") -> None:
-        """Write what waits, then a block; an OSError if some of it waits still.
-
-        The file ends where more than 64 MiB would have to wait.
-        """
+        """Write the waiting bytes and a block; raise an OSError if some bytes still wait."""
         self._ended = self._ended or len(self._waiting) + len(block) > _MAX_WAITING
         if not self._ended:
             self._waiting += block
         while self._waiting:
-            # The disk may take a part of it.
+            # The disk may accept only a part.
             del self._waiting[: self._file.write(self._waiting)]
         if self._ended:
-            raise OSError("more waited for room on the disk than is kept in memory")
+            raise OSError("more than 64 MiB waited for free disk space")
 
     def close(self) -> None:
-        """Write what waits and close the file, or raise an OSError."""
+        """Write the waiting bytes and close the file, or raise an OSError."""
         try:
             self.append()
         finally:
@@ -85,22 +78,21 @@ class AppendedFile:
 
 @dataclass
 class _Output:
-    """A place that records are written to; both functions may raise."""
+    """A destination of records; both functions may raise."""
 
     name: str
     write: Callable[[int, float, Mapping[str, float]], None]
-    """Takes steps, seconds and the record."""
+    """Receives steps, seconds and the record."""
     close: Callable[[], None]
     retries: bool = True
-    """Whether ``write`` keeps what it could not write, and tries again the next time."""
+    """Whether ``write`` keeps failed records and retries them."""
     failure: str = ""
-    """Why records are missing; empty while none is."""
+    """Why records are missing, or empty."""
     last: int = 0
-    """Steps of the last record that is there for certain."""
+    """Steps of the last record that was written."""
 
 
 def _lines(path: Path) -> _Output:
-    """Open ``metrics.jsonl``."""
     file = AppendedFile(path)
 
     def write(steps: int, seconds: float, record: Mapping[str, float]) -> None:
@@ -111,17 +103,13 @@ def _lines(path: Path) -> _Output:
 
 
 def _tensorboard(folder: Path, first_step: int) -> _Output:
-    """Open an event file of TensorBoard.
-
-    It is written by the thread that trains. tensorboardX's own writer has a thread that ends at
-    the first error, behind which ``add_scalar`` blocks for ever.
-    """
+    """Open an event file of TensorBoard; tensorboardX's writer would block after an error."""
     folder.mkdir(parents=True, exist_ok=True)
     name = f"events.out.tfevents.{int(time.time())}.{socket.gethostname()}.{os.getpid()}"
     file = AppendedFile(folder / name)
 
     def add(event: Any) -> None:
-        """Append an event in the TFRecord format: length and bytes, each with its checksum."""
+        """Append an event in the TFRecord format: length and bytes, each with a checksum."""
         event.wall_time = time.time()
         data = event.SerializeToString()
         length = struct.pack("<Q", len(data))
@@ -133,7 +121,7 @@ def _tensorboard(folder: Path, first_step: int) -> _Output:
         values = [Summary.Value(tag=name, simple_value=value) for name, value in record.items()]
         add(Event(step=steps, summary=Summary(value=values)))
 
-    # TensorBoard forgets what an earlier attempt wrote beyond this step.
+    # A SessionLog tells TensorBoard to drop the records of an earlier attempt after this step.
     first_step = first_step + 1 if first_step else 0
     add(Event(step=first_step, file_version="brain.Event:2"))
     add(Event(step=first_step, session_log=SessionLog(status=SessionLog.START)))
@@ -141,12 +129,11 @@ def _tensorboard(folder: Path, first_step: int) -> _Output:
 
 
 def _wandb(project: str, config: dict[str, Any], folder: Path) -> _Output:
-    """Begin a run of Weights & Biases."""
     try:
         import wandb
     except ImportError as error:
         raise ImportError(
-            "wandb_project is given, but wandb is not installed: pip install wandb"
+            "wandb_project needs wandb, which is not installed: pip install wandb"
         ) from error
     run = wandb.init(project=project, config=config, dir=str(folder))
 
@@ -158,10 +145,7 @@ def _wandb(project: str, config: dict[str, Any], folder: Path) -> _Output:
 
 
 class MetricsWriter:
-    """Writes records to all outputs of `open_metrics`, or to none.
-
-    It never raises: what fails is reported, once, and the others go on.
-    """
+    """Writes records to all outputs; never raises, and reports the first error of each output."""
 
     def __init__(
         self,
@@ -175,7 +159,7 @@ class MetricsWriter:
         self._began = time.monotonic() - seconds
 
     def write(self, steps: int, record: Mapping[str, float]) -> None:
-        """Write one record, of so many control steps."""
+        """Write the record after ``steps`` control steps."""
         seconds = time.monotonic() - self._began
         for output in self._outputs:
             if output.failure and not output.retries:
@@ -188,7 +172,7 @@ class MetricsWriter:
             output.last = steps
             if output.failure:
                 output.failure = ""
-                self._report(f"{output.name} can be written again; what it lacked is written")
+                self._report(f"{output.name} can be written again; missing records were added")
 
     def close(self) -> None:
         """Close the files."""
@@ -202,7 +186,7 @@ class MetricsWriter:
                     output.failure = ""
 
     def missing(self) -> list[str]:
-        """Return one line for each place that lacks records."""
+        """Return a line for each output that lacks records."""
         return [
             f"{output.name} may lack records after {output.last} steps: {output.failure}"
             for output in self._outputs
@@ -212,9 +196,9 @@ class MetricsWriter:
     def _fail(self, output: _Output, error: Exception) -> None:
         if not output.failure:
             lines = self._outputs[0].name
-            then = "its records wait in memory" if output.retries else f"all are in {lines}"
+            then = "its records wait in memory" if output.retries else f"{lines} has all records"
             self._report(
-                f"cannot write to {output.name}: {reason(error)}; training goes on, {then}"
+                f"cannot write to {output.name}: {reason(error)}; training continues, {then}"
             )
         output.failure = reason(error)
 
@@ -227,10 +211,10 @@ def open_metrics(
     first_step: int = 0,
     wandb_project: str | None = None,
 ) -> MetricsWriter:
-    """Open ``metrics.jsonl``, TensorBoard's file and, if asked, Weights & Biases; or raise.
+    """Open ``metrics.jsonl``, TensorBoard's file and, with a project, Weights & Biases.
 
-    ``config`` is written to ``config.json`` for people and scripts; nothing reads it back. Records
-    of an earlier attempt beyond ``first_step`` are dropped, for they will be written again.
+    Writes ``config`` to ``config.json``, and drops records of an earlier attempt after
+    ``first_step``. Raises an OSError, or an ImportError if wandb is not installed.
     """
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "config.json").write_text(json.dumps(config, indent=2) + "\n", "utf-8")
@@ -245,7 +229,7 @@ def open_metrics(
 
 
 def read_metrics(path: str | Path) -> list[dict[str, float]]:
-    """Return all records of a ``metrics.jsonl``; a last line that was cut off is left out."""
+    """Read all records of a ``metrics.jsonl``, without an incomplete last line."""
     records = []
     for line in Path(path).read_text("utf-8").splitlines():
         try:
@@ -256,7 +240,7 @@ def read_metrics(path: str | Path) -> list[dict[str, float]]:
 
 
 def _keep_until(path: Path, first_step: int) -> float:
-    """Drop records beyond a step, and return the seconds that the kept ones took."""
+    """Drop the records after a step, and return the seconds of the last record before."""
     if not path.exists():
         return 0.0
     kept = [r for r in read_metrics(path) if first_step and r["steps"] <= first_step]

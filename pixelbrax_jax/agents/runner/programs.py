@@ -1,4 +1,4 @@
-"""One or several seeds of an algorithm, trained by one compiled program."""
+"""Train one or several seeds of an algorithm in one compiled program."""
 
 from __future__ import annotations
 
@@ -24,15 +24,10 @@ def _env(runs: Runs) -> Any:
 
 @dataclass(frozen=True)
 class Runs:
-    """Runs of an algorithm; equal ones share compiled programs.
+    """``num_seeds`` runs of an algorithm; equal objects share compiled programs.
 
-    With several, states and metrics have a leading axis S. On an accelerator the runs go side by
-    side. On a CPU they take turns within the program: convolutions with a kernel for each run are
-    slow there, and gain nothing.
-
-    Attributes:
-        algorithm: with its settings.
-        num_seeds: S.
+    Several runs add a leading axis to states and metrics. An accelerator computes them in parallel,
+    a CPU one after another, because convolutions with one kernel per run are slow there.
     """
 
     algorithm: Algorithm
@@ -40,7 +35,7 @@ class Runs:
 
     @jit(_env, static_argnums=0)
     def init(self, seed: jax.Array, env_params: EnvParams) -> TrainState:
-        """Return the state before the first iteration; each run has the seed after the last."""
+        """Return the initial state; the runs have consecutive seeds."""
         return self._spread(self._init(seed, env_params), {})[0]
 
     @under_default_flags
@@ -51,20 +46,20 @@ class Runs:
             keys = jnp.stack([jax.random.key(seed + i) for i in range(self.num_seeds)])
         return self._each(self.algorithm.init, keys, env_params)
 
-    # The state before an iteration is not needed after it: its memory is used again.
+    # An iteration reuses the memory of the previous state.
 
     @jit(_env, static_argnums=0, donate_argnums=1)
     def iterate(self, state: TrainState, env_params: EnvParams) -> tuple[TrainState, Metrics]:
-        """As ``Algorithm.iterate``."""
+        """See ``Algorithm.iterate``."""
         return self._spread(*self._each(self.algorithm.iterate, state, env_params))
 
     @jit(_env, static_argnums=0, donate_argnums=1)
     def auxiliary(self, state: TrainState) -> tuple[TrainState, Metrics]:
-        """As ``Algorithm.auxiliary``."""
+        """See ``Algorithm.auxiliary``."""
         return self._spread(*self._each(self.algorithm.auxiliary, state))
 
     def template(self, env_params: EnvParams) -> TrainState:
-        """Return shapes, dtypes and, of several devices, shardings of the state."""
+        """Return shapes, dtypes and, with several devices, shardings of the state."""
         template: TrainState = jax.eval_shape(self._init, jnp.uint32(0), env_params)
         mesh = mesh_of(self.algorithm)
         if mesh is None:
@@ -76,13 +71,12 @@ class Runs:
         )
 
     def split(self, tree: Any) -> list[Any]:
-        """Return each run's part of a tree."""
+        """Split a tree into the parts of each run."""
         if self.num_seeds == 1:
             return [tree]
         return [jax.tree.map(lambda x, i=i: x[i], tree) for i in range(self.num_seeds)]
 
     def _each(self, function: Callable[..., Any], first: Any, *others: Any) -> Any:
-        """Map ``function`` over the runs of its first argument."""
         if self.num_seeds == 1:
             return function(first, *others)
 
@@ -92,7 +86,7 @@ class Runs:
         return map_runs(one, first)
 
     def _spread(self, state: TrainState, metrics: Metrics) -> tuple[TrainState, Metrics]:
-        """Spread the state over the devices, and give all of them the metrics."""
+        """Shard the state over the devices and replicate the metrics."""
         mesh = mesh_of(self.algorithm)
         if mesh is None:
             return state, metrics

@@ -1,4 +1,4 @@
-"""A video of a trained agent."""
+"""Write a video of a trained agent."""
 
 from __future__ import annotations
 
@@ -30,24 +30,18 @@ def write_video(
     num_frames: int = 300,
     seed: int = 0,
 ) -> Path:
-    """Write an MP4, or an animated GIF, of ``grid`` x ``grid`` episodes, side by side.
+    """Write a video of ``grid`` x ``grid`` episodes with mean actions, and return its path.
 
-    Args:
-        agent: who plays, with mean actions.
-        path: of the video, which is returned; its suffix decides the format.
-        split: ``"clean"``, ``"train"`` or ``"test"``.
-        clips: folder of the clips, in place of that of the training.
-        grid: episodes a side.
-        size: pixels of one episode, square.
-        num_frames: at most.
-        seed: of the episodes.
+    The suffix of ``path`` selects MP4 or animated GIF. ``split`` is ``"clean"``, ``"train"`` or
+    ``"test"``. ``clips`` is a folder; None uses the training's. ``size`` is height and width of one
+    episode in pixels.
 
     Raises:
-        NoSplitError: the clips are not those of the split.
+        NoSplitError: the clips do not match the split.
         ValueError: an option is out of range, or the run has no such split.
         FileNotFoundError: the folder of the clips is missing.
-        ImportError: imageio-ffmpeg or Pillow is not installed, with the fix.
-        OSError: the file cannot be written, or is not what was drawn; with the reason.
+        ImportError: imageio-ffmpeg or Pillow is not installed.
+        OSError: the file cannot be written, or does not show the rendered frames.
     """
     check_positive_int("grid", grid)
     check_positive_int("size", size)

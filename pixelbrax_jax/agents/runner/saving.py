@@ -1,4 +1,4 @@
-"""Where training stands, on disk: written whole or not at all, and read back to the bit."""
+"""Write and restore checkpoints atomically and bit-exactly."""
 
 from __future__ import annotations
 
@@ -31,17 +31,16 @@ from pixelbrax_jax.agents.runner.progress import Report, silent
 from pixelbrax_jax.agents.runner.settings import differences, unknown_settings, versions
 
 _ROOM = 1.2
-"""Free bytes on the disk that are asked for, in sizes of a checkpoint."""
+"""Free space that a checkpoint requires, relative to its size."""
 
 _RETRY_MINUTES = 1.0
 
 
 class Checkpoints:
-    """The checkpoints of one run.
+    """The checkpoints of one run, in folders named by the number of control steps.
 
-    Each is a folder named by the number of control steps. It appears under that name only when
-    it is complete, so that a run that is killed while writing leaves the one before. One that
-    cannot be written is reported and tried again; but for the last one, which is an error.
+    A folder gets its name when it is complete, so a killed run leaves the previous checkpoint. A
+    checkpoint that cannot be written is reported and retried; for the last one it is an error.
     """
 
     def __init__(
@@ -55,16 +54,10 @@ class Checkpoints:
         minutes: float = 0.0,
         report: Report = silent,
     ) -> None:
-        """Open the folder, or raise a CheckpointError if it cannot be written to.
+        """Create the folder, or raise a CheckpointError if it cannot be written.
 
-        Args:
-            folder: of the checkpoints, which is made if need be.
-            about: of ``describe_run``, stored with every checkpoint.
-            keep: as ``RunConfig.keep_checkpoints``.
-            former: by name, what a stored run had that lacks a setting.
-            every: as ``RunConfig.checkpoint_every``.
-            minutes: as ``RunConfig.checkpoint_minutes``.
-            report: gets a line about checkpoints that cannot be written.
+        Every checkpoint stores ``about``, the result of ``describe_run``. ``former`` has values of
+        settings that a stored run may lack. ``RunConfig`` describes the other options.
         """
         self.folder = Path(folder).absolute()
         self._about = {"format": FORMAT, **about, "versions": versions()}
@@ -77,7 +70,7 @@ class Checkpoints:
         )
         options = ocp.CheckpointManagerOptions(
             preservation_policy=policy.AnyPreservationPolicy([policy.LatestN(keep), best]),
-            # Without it scores are not written, and a resumed run would drop the best.
+            # Stores the scores, without which a resumed run would delete the best checkpoint.
             best_fn=lambda metrics: metrics["score"],
             cleanup_tmp_directories=True,
         )
@@ -88,32 +81,28 @@ class Checkpoints:
         logging.getLogger("absl").addFilter(_not_a_traceback)
 
     def steps(self) -> list[int]:
-        """Return control steps of all checkpoints, ascending."""
+        """Return the control steps of all checkpoints, ascending."""
         return sorted(self._manager.all_steps())
 
     def latest(self) -> int | None:
-        """Return the steps of the latest checkpoint; None if there is none."""
+        """Return the steps of the latest checkpoint, or None."""
         return max(self._manager.all_steps(), default=None)
 
     def is_due_by_clock(self) -> bool:
-        """Return whether it is time for a checkpoint; processes have different clocks."""
+        """Return whether the clock of this process demands a checkpoint."""
         return time.monotonic() >= self._due
 
     def is_due_after(self, steps: int) -> bool:
-        """Return whether so many steps ask for a checkpoint."""
+        """Return whether this number of control steps demands a checkpoint."""
         return bool(self._every) and steps // self._every > self._last_steps // self._every
 
     def save(self, state: Any, steps: int, score: float | None, *, last: bool = False) -> None:
-        """Begin to write a checkpoint; training may go on meanwhile.
+        """Start to write a checkpoint of a pytree after ``steps`` control steps.
 
-        Args:
-            state: any pytree of arrays.
-            steps: control steps so far.
-            score: the higher, the better; None if it is not known.
-            last: whether the run stops behind it: it is waited for, and must be written.
+        A higher ``score`` is better. With ``last`` it waits for the checkpoint.
 
         Raises:
-            CheckpointError: it must be written and cannot be, or only some processes can.
+            CheckpointError: the last checkpoint cannot be written, or only some processes fail.
         """
         self.look_after(wait=True)
         self._last_steps, self._due = steps, self._in_minutes(self._minutes)
@@ -126,16 +115,16 @@ class Checkpoints:
                 self._fail(error)
                 return
             latest = self.latest()
-            kept = "there is no other" if latest is None else f"that of {latest} steps stays"
+            kept = "no other exists" if latest is None else f"that of {latest} steps remains"
             raise CheckpointError(
-                f"the checkpoint of {steps} steps, the last one, is lost; {kept}. {error} "
-                "Make room or mend the folder, and go on with --resume latest."
+                f"the last checkpoint, of {steps} steps, is lost; {kept}. {error} Free disk space "
+                "or make the folder writable, then continue with --resume latest."
             ) from error
 
     def look_after(self, *, wait: bool = False) -> None:
-        """Tell what has become of the checkpoint that is being written; raises as `save`."""
+        """Report the result of the current checkpoint; raises like `save`."""
         if not wait:
-            # Of several processes, all must look at the same time.
+            # Several processes must look at the same time, which only `wait` ensures.
             if jax.process_count() > 1 or not self._writing:
                 return
             if self._manager.is_saving_in_progress():
@@ -150,10 +139,10 @@ class Checkpoints:
             self._report(f"the checkpoint of {self._last_steps} steps is written")
 
     def restore(self, template: Tree) -> Tree:
-        """Return the state of the latest checkpoint, equal to the bit to what was saved.
+        """Restore the latest checkpoint; ``template`` is a state or its ``jax.eval_shape``.
 
-        ``template`` is a state of the same shapes, or its ``jax.eval_shape``. A checkpoint of other
-        settings or of another format is a CheckpointError.
+        Raises:
+            CheckpointError: the checkpoint has another format, other settings or other arrays.
         """
         about = read_about(self.folder)
         self._check(about)
@@ -169,7 +158,7 @@ class Checkpoints:
         return tree_of(template, restored["state"])
 
     def other_versions(self) -> list[str]:
-        """Return packages whose versions, and devices whose kind or number, were others then."""
+        """Describe packages and devices that differ from those of the checkpoint."""
         old, new = read_about(self.folder)["versions"], self._about["versions"]
         return [
             f"{name} {old.get(name)} there, {new.get(name)} here"
@@ -178,11 +167,11 @@ class Checkpoints:
         ]
 
     def close(self) -> None:
-        """Wait for what is being written, and let go of the folder."""
+        """Finish the current checkpoint and close the folder."""
         try:
             self._wait()
         finally:
-            # `_wait` has raised what it may raise of a full disk.
+            # `_wait` has already raised the errors of a full disk.
             with suppress(OSError, ValueError):
                 self._manager.close()
             logging.getLogger("absl").removeFilter(_not_a_traceback)
@@ -196,7 +185,7 @@ class Checkpoints:
             raise self._failed(error) from error
         if any_process(free < _ROOM * size):
             raise DiskFullError(
-                f"a checkpoint takes {_bytes(size)}, but {self.folder} has only {_bytes(free)} "
+                f"a checkpoint needs {_bytes(size)}, but {self.folder} has only {_bytes(free)} "
                 "free."
             )
         about = self._about | {"steps": steps, "score": score}
@@ -205,25 +194,24 @@ class Checkpoints:
         )
         metrics = None if score is None else {"score": score}
         try:
-            with without_warnings():  # That there is no score is no mistake.
+            with without_warnings():  # A checkpoint may have no score.
                 self._manager.save(steps, args=arguments, metrics=metrics, force=True)
         except (OSError, ValueError) as error:
             raise self._failed(error) from error
         self._writing = True
 
     def _wait(self) -> None:
-        """Return when everything is written, or raise a CheckpointError."""
         self._writing = False
         try:
             self._manager.wait_until_finished()
-        except (OSError, ValueError) as error:  # TensorStore has a ValueError for a full disk.
+        except (OSError, ValueError) as error:  # TensorStore raises ValueError for a full disk.
             raise self._failed(error) from error
 
     def _fail(self, error: CheckpointError) -> None:
         if jax.process_count() > 1 and not isinstance(error, DiskFullError):
             raise error
         if not self._failing:
-            self._report(f"{error} Training goes on, and a checkpoint is tried again.")
+            self._report(f"{error} Training continues and will retry the checkpoint.")
         self._failing = True
         self._due = self._in_minutes(min(self._minutes, _RETRY_MINUTES))
 
@@ -231,30 +219,29 @@ class Checkpoints:
         return time.monotonic() + 60 * minutes if self._minutes else math.inf
 
     def _failed(self, error: Exception) -> CheckpointError:
-        """Return what to raise for a checkpoint that cannot be written; removes what there is."""
+        """Remove the incomplete checkpoint and return the error to raise."""
         if jax.process_index() == 0:
             for path in self.folder.glob("*.orbax-checkpoint-tmp*"):
                 shutil.rmtree(path, ignore_errors=True)
-        # The manager has left out those that the new one would have replaced.
+        # The manager has already forgotten the checkpoints that the new one would have replaced.
         with suppress(OSError):
             self._manager.reload()
-        # TensorStore's messages end with the system's own words.
+        # TensorStore's messages end with the message of the operating system.
         reason = str(error).partition("\n")[0].rsplit(": ", 1)[-1]
         reason = getattr(error, "strerror", None) or reason or type(error).__name__
         return CheckpointError(f"cannot write a checkpoint to {self.folder}: {reason}.")
 
     def _check(self, about: dict[str, Any]) -> None:
-        """Reject a checkpoint of another format, algorithm or settings."""
         own = self._about
         if about["format"] != FORMAT:
             raise CheckpointError(
-                f"{self.folder} has format {about['format']!r}, of which this version reads the "
-                "networks alone: evaluate or record the run, and train anew in another "
+                f"{self.folder} has format {about['format']!r}, and this version reads only its "
+                "networks: you can evaluate or record the run, but training needs another "
                 "--output-dir."
             )
         if about["algorithm"] != own["algorithm"]:
             raise CheckpointError(
-                f"{self.folder} is a run of {about['algorithm']}, not of {own['algorithm']}; give "
+                f"{self.folder} is a run of {about['algorithm']}, not of {own['algorithm']}; use "
                 "another --output-dir."
             )
         about = about | {"config": self._former | about["config"]}
@@ -262,14 +249,15 @@ class Checkpoints:
         if other := differences(about, own):
             why = unknown_settings(about, new)
             if old.get("total_steps") != new.get("total_steps") and new.get("anneal"):
-                why += "A step size that falls over all of total_steps leaves them fixed. "
+                why += (
+                    "With anneal, total_steps cannot change, because the step size depends on it. "
+                )
             raise CheckpointError(
                 f"the checkpoint in {self.folder} has other settings: {'; '.join(other)}. "
-                f"{why}Use the same ones, or another --output-dir."
+                f"{why}Use the same settings, or another --output-dir."
             )
 
     def _check_arrays(self, about: dict[str, Any], wanted: dict[str, Any]) -> None:
-        """Reject a checkpoint whose arrays are others."""
         stored = shapes_of(self.folder / str(about["steps"]) / "state")
         shapes = {name: tuple(leaf.shape) for name, leaf in wanted.items()}
         other = [
@@ -279,31 +267,30 @@ class Checkpoints:
         ]
         if other:
             more = f" and {len(other) - 3} more" if len(other) > 3 else ""
-            others = "; ".join(self.other_versions()) or "the versions are the same"
+            others = "; ".join(self.other_versions()) or "the versions are equal"
             raise CheckpointError(
                 f"the checkpoint in {self.folder} has other arrays: {'; '.join(other[:3])}{more} "
-                f"({others}). Go on with what wrote it, or train anew in another --output-dir."
+                f"({others}). Continue with the versions that wrote it, or use another "
+                "--output-dir."
             )
 
 
 def _check_writable(folder: Path) -> None:
-    """Reject a folder that cannot be made or written to."""
     probe = folder / ".writable"
     try:
         folder.mkdir(parents=True, exist_ok=True)
         probe.write_bytes(b"")
-        probe.unlink(missing_ok=True)  # Other processes try the same.
+        probe.unlink(missing_ok=True)  # Other processes write the same file.
     except OSError as error:
         raise CheckpointError(
-            f"cannot write to {folder}: {error.strerror or error}. Give another --output-dir."
+            f"cannot write to {folder}: {error.strerror or error}. Use another --output-dir."
         ) from error
 
 
 def _bytes(number: float) -> str:
-    """Return a number of bytes with a unit in which it shows."""
     return f"{number / 1e9:.2f} GB" if number >= 1e8 else f"{number / 1e6:.2f} MB"
 
 
 def _not_a_traceback(record: logging.LogRecord) -> bool:
-    """Return whether a record is no traceback of Orbax, whose errors `Checkpoints` raises."""
+    """Reject tracebacks of Orbax, because `Checkpoints` raises its errors."""
     return not (record.exc_info and "orbax" in record.pathname)

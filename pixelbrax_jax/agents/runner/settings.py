@@ -1,4 +1,4 @@
-"""Settings of a run, how they are stored, and with which of them a stored run may go on."""
+"""Settings of a run, their stored form, and the settings with which a run may continue."""
 
 from __future__ import annotations
 
@@ -23,20 +23,19 @@ from pixelbrax_jax.validation import check_choice, check_positive_int
 RESUME = ("never", "latest")
 
 FORMER_DEFAULTS: dict[str, Any] = {}
-"""Values, by name, of settings in runs that do not store them, where those are not the defaults. A
-default that changes is added here with its former value."""
+"""Former defaults, by name of the setting, for stored runs that lack it."""
 
 OF_RUNS = ("seed", "seeds")
-"""Settings of ``RunConfig`` that decide the result of a run."""
+"""Settings of ``RunConfig`` that affect the result of a run."""
 
 _PACKAGES = ("pixelbrax", "jax", "jaxlib", "brax", "mujoco", "flax", "optax")
-"""Packages whose versions a run's last bits depend on."""
+"""Packages whose versions affect the bits of a run."""
 
 _GONE = {"physics_batching"}
-"""Settings of former releases that changed no result."""
+"""Settings of former releases that did not affect results."""
 
 _FREE = ("total_steps", "memory_budget_gb")
-"""Settings that a run may go on with although they differ."""
+"""Settings that may change when a run continues."""
 
 
 def _on_terminal() -> bool:
@@ -45,39 +44,35 @@ def _on_terminal() -> bool:
 
 @dataclass(frozen=True)
 class RunConfig:
-    """What is done around the training; nothing but the seeds changes a bit of it.
-
-    Raises:
-        ValueError: a setting is out of range; the message says what is allowed.
-    """
+    """Seeds, and settings of logs, checkpoints and evaluation, which do not affect the training."""
 
     output_dir: str = "runs/train"
-    """Folder of logs, checkpoints and the policy."""
+    """Folder for logs, checkpoints and the policy."""
     seed: int = 0
     """Seed of the run."""
     seeds: int = 1
-    """Runs in one program, of the seeds ``seed``, ``seed`` + 1, ..."""
+    """Number of runs in one program, with the seeds ``seed``, ``seed`` + 1, ..."""
     resume: str = "never"
-    """``latest`` goes on from the latest checkpoint in the folder, if there is one."""
+    """``latest`` continues from the latest checkpoint in the folder, if it has one."""
     log_training_metrics: bool = True
-    """Whether metrics of the training itself are logged."""
+    """Logs the metrics of the training."""
     log_every: int = 1
-    """Iterations that one record sums up."""
+    """Number of iterations that one record summarises."""
     num_evals: int = 0
-    """Evaluations, evenly over the run, the last at its end; 0 never makes such environments."""
+    """Number of evaluations, evenly over the run, the last one at its end; 0 disables them."""
     eval_episodes: int = 32
-    """Episodes of an evaluation, for each split."""
+    """Number of episodes per evaluation and split."""
     checkpoint_every: int = 0
-    """Control steps between checkpoints, besides those by the clock, at evaluations and at the end;
-    0 writes no more than those."""
+    """Writes a checkpoint every so many control steps, besides those by the clock, at evaluations
+    and at the end; 0 disables it."""
     checkpoint_minutes: float = 10.0
-    """Minutes without a checkpoint after which one is written; 0 goes by no clock."""
+    """Writes a checkpoint after this many minutes without one; 0 ignores the clock."""
     keep_checkpoints: int = 3
-    """Latest checkpoints that are kept, besides the best."""
+    """Number of latest checkpoints to keep, in addition to the best one."""
     wandb_project: str | None = None
-    """Project of Weights & Biases; none writes nothing there."""
+    """Logs to this project of Weights & Biases; None disables it."""
     progress: bool = field(default_factory=_on_terminal)
-    """Whether a progress bar is shown; by default where stderr is a terminal."""
+    """Shows a progress bar; default: only if stderr is a terminal."""
 
     def __post_init__(self) -> None:
         """Check the settings."""
@@ -96,10 +91,10 @@ class RunConfig:
 def describe_run(
     algorithm: Algorithm, options: RunConfig, clips: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """Return what decides the result of a run, as JSON has it: algorithm, settings, clips.
+    """Return all that affects the result of a run as JSON values: algorithm, settings, clips.
 
-    ``clips`` are digests of what is played. Those of made clips are not stored: their name tells
-    them, and they may differ in a pixel from one processor to the next.
+    ``clips`` are digests. Those of procedural clips are not stored, because processors may render
+    single pixels differently.
     """
     settings = describe(algorithm.config) | {name: getattr(options, name) for name in OF_RUNS}
     settings["clips"] = place_of(settings["clips"])
@@ -112,7 +107,7 @@ def describe_run(
 
 
 def former_settings(kind: type[TrainConfig]) -> dict[str, Any]:
-    """Return by name what a stored run had for settings that it lacks; ``kind`` is their class."""
+    """Return the values, by name, that settings of class ``kind`` have if a run lacks them."""
     defaults = {field.name: field.default for field in (*fields(kind), *fields(RunConfig))}
     names = {*ENV_OPTIONS, *(field.name for field in fields(kind)), *OF_RUNS} - {"env"}
     known = vars(defaults["env"]) | defaults | FORMER_DEFAULTS
@@ -121,7 +116,7 @@ def former_settings(kind: type[TrainConfig]) -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Return versions of packages, and number and kind of devices."""
+    """Return the versions of packages, and number and kind of devices."""
     found = {"devices": f"{jax.device_count()} x {jax.devices()[0].device_kind}"}
     for name in _PACKAGES:
         with suppress(metadata.PackageNotFoundError):
@@ -130,23 +125,20 @@ def versions() -> dict[str, str]:
 
 
 def unknown_settings(about: Mapping[str, Any], known: Mapping[str, Any]) -> str:
-    """Return a sentence on what is stored in ``about`` and not ``known`` here; empty if nothing."""
+    """Return a sentence about stored settings that are not ``known`` here, or an empty string."""
     names = [name for name in about["config"] if name not in known and name not in _GONE]
     if not names:
         return ""
     written = about.get("versions", {}).get("pixelbrax", "another release")
     those = ", ".join(f"{name}={about['config'][name]!r}" for name in names)
     return (
-        f"This release does not know {those}: the run was written by pixelbrax {written}; take "
+        f"This release does not know {those}: the run was written by pixelbrax {written}; use "
         "that release or a later one. "
     )
 
 
 def differences(about: Mapping[str, Any], own: Mapping[str, Any]) -> list[str]:
-    """Return the settings with which a stored run may not go on, one line each.
-
-    Both are of ``describe_run``: ``about`` as stored, ``own`` of the run that shall go on.
-    """
+    """List what prevents a run ``own`` from continuing ``about``, both from ``describe_run``."""
     old, new = about["config"], own["config"]
     free = {name for name in _FREE if name != "total_steps" or not new.get("anneal")}
     found = []
@@ -158,16 +150,16 @@ def differences(about: Mapping[str, Any], own: Mapping[str, Any]) -> list[str]:
     there, here = (place_of(settings.get("clips")) or "procedural" for settings in (old, new))
     if about.get("clips") and own.get("clips"):
         if about["clips"] != own["clips"]:
-            found.append(f"clips: those of {there!r} there, others in {here!r} here")
+            found.append(f"clips: those of {there!r} there, different ones in {here!r} here")
     elif there != here:
         named = there == "procedural" or about.get("clips")
-        why = "" if named else " (it has no digest of its clips: the folder decides)"
+        why = "" if named else " (the run has no digest of its clips, so the folder must be equal)"
         found.append(f"clips: {there!r} there, {here!r} here{why}")
     return found
 
 
 def clip_digests(clips: Clips | None) -> list[str]:
-    """Return a hash of the content of each clip, at its size, wherever it comes from."""
+    """Return a hash of the size and content of each clip."""
     if clips is None:
         return []
     pixels, *parts = jax.device_get((clips.packed, clips.first, clips.length))
@@ -181,7 +173,7 @@ def clip_digests(clips: Clips | None) -> list[str]:
 
 
 def place_of(clips: str | None) -> str | None:
-    """Return where clips are, whatever the current folder will be."""
+    """Return the absolute path of a clips folder; other values stay."""
     if clips is None or clips == "procedural":
         return clips
     return str(whole_path(clips))

@@ -1,4 +1,4 @@
-"""Environments to evaluate in: without distractors, with those of the training, with new clips."""
+"""Evaluation environments: without distractors, with those of the training, with new clips."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from pixelbrax_jax.validation import check_choice
 SPLITS = ("clean", "train", "test")
 
 HELD_OUT = {"train": "test", "paper-train": "paper-test"}
-"""Split of the clips that training plays -> the one kept for tests. Of another split the test
-plays the same one, of another folder."""
+"""Test split of each training split. Other splits serve for both, with test clips from another
+folder."""
 
 WITHOUT_DISTRACTORS: dict[str, Any] = {"distractors": (), "clips": None, "split": "train"}
-"""Options of an environment that shows none, whatever its other options are."""
+"""Options that remove all distractors from an environment."""
 
 
 class NoSplitError(ValueError):
-    """A split is not there, or would not be what its name says."""
+    """A split is missing, or its clips do not fit its name."""
 
 
 def splits_of(config: TrainConfig) -> tuple[str, ...]:
-    """Return names of the splits that there may be."""
+    """Return the names of the splits that fit the settings."""
     env = config.env
     if not env.distractors:
         return SPLITS[:1]
@@ -46,21 +46,15 @@ def make_splits(
     shown: Sequence[str] | None = None,
     report: Report = silent,
 ) -> Iterator[tuple[str, tuple[PixelEnv, EnvParams]]]:
-    """Yield environments to evaluate in: the name of the split, the environment, its parameters.
+    """Yield name, environment and parameters of each split.
 
-    ``clean`` has no distractors, ``train`` those of the training, and ``test`` the same with clips
-    that training never shows: those of the split ``test``, or ``paper-test`` where training plays
-    ``paper-train``. Without distractors there is only ``clean``, and without a video no ``test``.
+    ``clean`` has no distractors. ``train`` has those of the training. ``test`` has the same
+    distractors with other clips: split ``test``, or ``paper-test`` if training uses
+    ``paper-train``. ``train`` needs distractors, and ``test`` needs video distractors.
 
-    Args:
-        config: of the training, or with other clips.
-        names: of the splits, all of which must be there; without any, those that are there.
-        shown: digests of the clips that training plays, as of ``clip_digests``; None takes those
-            that ``config`` names.
-        report: gets a line about a split that is left out.
-
-    Raises:
-        ValueError, FileNotFoundError: as `make_split`.
+    Without ``names`` it yields all available splits and reports the missing ones. ``shown`` are
+    ``clip_digests`` of the training's clips; None uses the clips of ``config``. Errors are those of
+    `make_split`.
     """
     for name in names or splits_of(config):
         try:
@@ -76,21 +70,22 @@ def make_splits(
 def make_split(
     config: TrainConfig, name: str, shown: Sequence[str] | None = None
 ) -> tuple[PixelEnv, EnvParams]:
-    """Return one of the environments of `make_splits`.
+    """Make one of the environments of `make_splits`.
 
     Raises:
-        NoSplitError: ``train`` would not show the clips of the training, or ``test`` would show
-            some of them, or there are no clips for it.
-        ValueError: there is no such split.
+        NoSplitError: ``train`` has other clips than the training, or ``test`` shares some or has
+            none.
+        ValueError: the run has no such split.
         FileNotFoundError: the folder of the clips is missing.
     """
     check_choice("split", name, SPLITS)
     names = splits_of(config)
     if name not in names:
         has_any = bool(config.env.distractors)
-        lacks = "clips, and the run played" if has_any else "distractors, and the run had"
+        lacks = "clips" if has_any else "distractors"
         raise ValueError(
-            f"split {name!r} is for {lacks} none; there is only {' and '.join(map(repr, names))}."
+            f"split {name!r} needs {lacks}, but the run has none; its splits: "
+            f"{', '.join(map(repr, names))}."
         )
     if name == "clean":
         return _make(config, **WITHOUT_DISTRACTORS)
@@ -98,8 +93,8 @@ def make_split(
         env, params = _make(config)
         if shown and clip_digests(params.clips) != list(shown):
             raise NoSplitError(
-                f"the clips of split {config.env.split!r} of {_source(config)} are not those of "
-                "the training."
+                f"the clips of split {config.env.split!r} of {_source(config)} differ from those "
+                "of the training."
             )
         return env, params
     split = HELD_OUT.get(config.env.split, config.env.split)
@@ -109,27 +104,26 @@ def make_split(
     played = clip_digests(params.clips)
     if shared := sum(digest in shown for digest in played):
         raise NoSplitError(
-            f"of the {len(played)} clips of split {split!r} of {_source(config)}, training plays "
-            f"{shared}; --clips takes others."
+            f"training uses {shared} of the {len(played)} clips of split {split!r} of "
+            f"{_source(config)}; choose other clips with --clips."
         )
     return env, params
 
 
 def _make(config: TrainConfig, **changes: Any) -> tuple[PixelEnv, EnvParams]:
     try:
-        # What training sees of the state, evaluation need not.
+        # Evaluation does not need the simulator's state.
         return make_env(config, obs_mode="pixels", **changes)
     except FileNotFoundError as error:
         if _source(config) == "procedural":
             raise
         raise FileNotFoundError(
-            "the clips of the run are not there; if they are elsewhere, name their folder with "
-            f"--clips: {error}"
+            f"the clips of the run are missing; set their folder with --clips: {error}"
         ) from error
 
 
 def _check_there(config: TrainConfig, split: str) -> None:
-    """Raise a NoSplitError that lists the splits of the clips, if this one is not among them."""
+    """Raise a NoSplitError that lists the splits of the clips unless this one exists."""
     try:
         if _source(config) == "procedural":
             check_choice("split of procedural clips", split, procedural.SPLITS)

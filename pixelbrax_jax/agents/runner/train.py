@@ -1,4 +1,4 @@
-"""A training run: iterations, and between them logs, evaluations and checkpoints."""
+"""Train an algorithm with logs, evaluations and checkpoints."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ from pixelbrax_jax.types import EnvParams
 __all__ = ["Outcome", "RunConfig", "TrainingDivergedError", "run", "train"]
 
 Splits = dict[str, tuple[PixelEnv, EnvParams]]
-"""Environments to evaluate in, and their parameters, by name."""
+"""Evaluation environments and their parameters, by name."""
 
 
 class TrainingDivergedError(RuntimeError):
@@ -55,15 +55,13 @@ class TrainingDivergedError(RuntimeError):
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a run leaves.
+    """The result of a run.
 
     Attributes:
-        state: where training stands.
-        metrics: the last record of the training; empty if none was logged.
-        evaluations: the last results, by split.
-        interrupted: whether it was stopped before its end.
-        signal: number of the signal that stopped it; 0 if none did.
-        incomplete: what of the messages and records could not be written, and why, in lines.
+        metrics: the last record of the training, or empty.
+        evaluations: the last results by split.
+        interrupted, signal: whether a signal stopped the run, and its number or 0.
+        incomplete: lines about messages and records that could not be written.
     """
 
     state: TrainState
@@ -75,7 +73,7 @@ class Outcome:
 
 
 def train(config: TrainConfig, options: RunConfig, report: Report = silent) -> Outcome:
-    """Make the environments that settings name, on all devices, and `run` their algorithm."""
+    """Make the environments of the settings on all devices, and `run` the algorithm."""
     env, env_params = make_env(config)
     devices = jax.device_count()
     envs: Any = VectorPixelEnv(env, config.num_envs)
@@ -100,27 +98,18 @@ def run(
     report: Report = silent,
     splits: Splits | None = None,
 ) -> Outcome:
-    """Train to the end, or until it is interrupted.
+    """Train to the end or until an interruption.
 
-    Ctrl-C, or a signal of ``stop_signals``, lets the iteration finish, and one that waits behind
-    it, writes a checkpoint and returns. What reports, draws or logs may fail without an effect on
-    the training.
-
-    Args:
-        algorithm: with its settings.
-        env_params: of its environments.
-        options: what is done around it.
-        report: gets lines about what is going on; it may raise.
-        splits: environments to evaluate in, with their parameters, by name; one is ``"clean"``,
-            which chooses the best checkpoint. None makes those that the settings name, which
-            environments of your own are not.
+    After Ctrl-C or another signal of ``stop_signals``, the run finishes the current iterations,
+    writes a checkpoint and returns. Errors of messages and logs do not affect the training.
+    ``splits`` are evaluation environments with their parameters, by name: ``"clean"`` is required
+    and selects the best checkpoint. None makes the environments of the settings.
 
     Raises:
-        CheckpointError: the folder cannot be written to, or holds another run or a longer one, or
-            the last checkpoint cannot be written.
-        OSError: files of records cannot be opened, or the policy cannot be written.
-        MemoryError: what must be stored would not fit.
-        TrainingDivergedError: a loss is not finite; the last good checkpoint stays.
+        CheckpointError: checkpoints cannot be written, or the folder has another or a longer run.
+        OSError: a log or the policy cannot be written.
+        MemoryError: state and frames do not fit into memory.
+        TrainingDivergedError: a metric is not finite.
     """
     messages = Messages(report)
     with stop_requests(report) as stop:
@@ -162,7 +151,7 @@ def run(
 
 
 def _goes_on(checkpoints: Checkpoints, options: RunConfig, report: Report) -> bool:
-    """Return whether the run goes on from a checkpoint, or raise if it may not."""
+    """Return whether the run continues from a checkpoint, or raise if it may not."""
     found = bool(checkpoints.steps())
     if any_process(found) and any_process(not found):
         raise CheckpointError(
@@ -171,34 +160,34 @@ def _goes_on(checkpoints: Checkpoints, options: RunConfig, report: Report) -> bo
         )
     if found and options.resume != "latest":
         raise FileExistsError(
-            f"{checkpoints.folder} has checkpoints of an earlier run: go on with "
-            "--resume latest, or give another --output-dir."
+            f"{checkpoints.folder} has checkpoints of an earlier run: continue it with "
+            "--resume latest, or use another --output-dir."
         )
     if not found and options.resume == "latest":
-        report(f"no checkpoint in {checkpoints.folder}: a new run begins")
+        report(f"no checkpoint in {checkpoints.folder}: starting a new run")
     return found
 
 
 def _restored(
     checkpoints: Checkpoints, template: TrainState, algorithm: Algorithm, report: Report
 ) -> TrainState:
-    """Return the state of the latest checkpoint, or raise if it is not of this run."""
+    """Restore the latest checkpoint, or raise if it is from another run."""
     state = checkpoints.restore(kept(template))
     steps, config = _steps(algorithm, state), algorithm.config
     if steps > config.num_iterations * config.steps_per_iteration:
         raise CheckpointError(
-            f"total_steps={config.total_steps} are fewer than the {steps} that the run in "
-            f"{checkpoints.folder} has had; give at least as many, or another --output-dir."
+            f"total_steps={config.total_steps} must be at least {steps}, the steps already "
+            f"trained in {checkpoints.folder}; raise total_steps, or use another --output-dir."
         )
     if others := checkpoints.other_versions():
-        report(f"going on under other versions, so not to the bit: {', '.join(others)}")
-    report(f"going on from the checkpoint of {steps} steps")
+        report(f"continuing with other versions, so not bit-exactly: {', '.join(others)}")
+    report(f"continuing from the checkpoint of {steps} steps")
     return state
 
 
 @dataclass
 class _Run:
-    """One call of `run`: the loop over iterations, and what follows each."""
+    """The state of one call of `run`."""
 
     runs: Runs
     env_params: EnvParams
@@ -208,7 +197,7 @@ class _Run:
     stop: StopRequest
     evaluators: dict[str, Evaluator]
     pending: list[dict[str, Any]] = field(default_factory=list)
-    """Metrics of iterations that no record sums up yet."""
+    """Metrics of iterations since the last record."""
     record: dict[str, float] = field(default_factory=dict)
     results: dict[str, Result] = field(default_factory=dict)
     evaluated_steps: int = -1
@@ -222,7 +211,6 @@ class _Run:
         self.is_first = jax.process_index() == 0
 
     def train(self, state: TrainState) -> Outcome:
-        """Train from ``state`` to the end, or until a signal."""
         began = steps = _steps(self.algorithm, state)
         self.writer = self.open_writer(steps)
         try:
@@ -245,7 +233,7 @@ class _Run:
         return Outcome(state, self.record, self.results, interrupted, stopped_by, incomplete)
 
     def open_writer(self, steps: int) -> MetricsWriter:
-        """Open the files of records in the first process, or raise in all of them."""
+        """Open the logs in the first process; an error raises in all processes."""
         writer, failure = MetricsWriter(self.report), None
         if self.is_first:
             settings = describe_run(self.algorithm, self.options)["config"]
@@ -260,19 +248,21 @@ class _Run:
             except (ImportError, OSError) as error:
                 failure = error
         if any_process(failure is not None):
-            raise failure or RuntimeError("process 0 cannot write metrics; it says why.")
+            raise failure or RuntimeError("process 0 cannot write metrics; see its message.")
         return writer
 
     def iterations(self, state: TrainState, steps: int) -> tuple[TrainState, int, int]:
-        """Return the state at the end or behind a signal, its steps, the signal's number or 0."""
+        """Train to the end or to a signal; return state, steps and the signal's number or 0."""
         per_iteration, total = self.config.steps_per_iteration, self.config.num_iterations
         done = steps // per_iteration
         self.bar.update(done)
         if done >= total:
-            self.report(f"the run has had its {steps} steps")
+            self.report(f"the run is already complete with {steps} steps")
             return state, steps, 0
         if stopped_by := highest(self.stop.signal)[0]:
-            left = f"go on from {steps} steps with --resume latest" if steps else "nothing is lost"
+            left = (
+                f"continue from {steps} steps with --resume latest" if steps else "nothing is lost"
+            )
             self.report(f"stopped by {signal_name(stopped_by)} before the first iteration; {left}")
             return state, steps, stopped_by
         self.report("compiling")
@@ -280,7 +270,7 @@ class _Run:
         for number in range(done + 1, total + 1):
             state, steps = self.iterate(state, number), number * per_iteration
             self.bar.update(1)
-            # The clock is that of the first process.
+            # The clock of the first process decides.
             by_clock = self.is_first and self.checkpoints.is_due_by_clock()
             stopped_by, due = highest(self.stop.signal, int(by_clock))
             stopped_by = 0 if number == total else stopped_by
@@ -298,10 +288,10 @@ class _Run:
                 self.checkpoints.look_after()
             if stopped_by:
                 self.report(
-                    f"stopped by {signal_name(stopped_by)} after {steps} steps; go on with "
+                    f"stopped by {signal_name(stopped_by)} after {steps} steps; continue with "
                     "--resume latest"
                 )
-                # Behind the checkpoint: whoever is asked to stop may soon be killed.
+                # Comes after the checkpoint, because the process may soon be killed.
                 if evaluates:
                     self.evaluate(state, steps)
                 break
@@ -310,15 +300,14 @@ class _Run:
         return state, steps, stopped_by
 
     def iterate(self, state: TrainState, number: int) -> TrainState:
-        """Run iteration ``number``, and the auxiliary phase if it is due."""
         state, metrics = self.runs.iterate(state, self.env_params)
         phases = self.algorithm.auxiliary_every
         if phases and number % phases == 0:
             state, aux_metrics = self.runs.auxiliary(state)
             metrics |= aux_metrics
         self.pending.append(metrics)
-        # One iteration is under way and the next one waits; were there more, the bar would run
-        # ahead and Ctrl-C would wait for all of them.
+        # At most one iteration waits behind the running one. With more, the bar would run ahead
+        # and Ctrl-C would wait for all of them.
         jax.block_until_ready(self.pending[-2:-1])
         return state
 
@@ -326,7 +315,7 @@ class _Run:
         self.timed_since, self.timed_steps = time.perf_counter(), steps
 
     def log(self, steps: int) -> None:
-        """Write the metrics of the latest iterations, or raise a TrainingDivergedError."""
+        """Write the metrics since the last record, or raise a TrainingDivergedError."""
         if self.pending:
             records = jax.device_get(self.pending)
             self.pending = []
@@ -350,15 +339,18 @@ class _Run:
             seeds = f" of seed {', '.join(str(self.options.seed + int(i)) for i in those)}"
         self.checkpoints.look_after(wait=True)
         latest = self.checkpoints.latest()
-        good = "there is none" if latest is None else f"that of {latest} steps is good"
+        good = (
+            "No checkpoint exists"
+            if latest is None
+            else f"The checkpoint of {latest} steps is good"
+        )
         raise TrainingDivergedError(
-            f"not finite within the iterations before step {steps}{seeds}: {', '.join(wrong)}. Of "
-            f"the checkpoints {good}. Begin anew in another --output-dir; a lower learning_rate or "
+            f"not finite in the iterations before step {steps}{seeds}: {', '.join(wrong)}. "
+            f"{good}. Train again in another --output-dir; a lower learning_rate or "
             "max_grad_norm may help."
         )
 
     def evaluate(self, state: TrainState, steps: int) -> None:
-        """Evaluate each run in each split, and log it."""
         record: dict[str, float] = {}
         policies = self.runs.split(jax.device_get(state.networks))
         for split, evaluator in self.evaluators.items():
@@ -373,13 +365,12 @@ class _Run:
         self.writer.write(steps, record)
 
     def score(self, steps: int) -> float | None:
-        """Return by what the best checkpoint is chosen: one measure for all those of a run."""
+        """Return the score of a checkpoint: the evaluated return, or the training return."""
         if self.options.num_evals:
             return self.results["clean"].mean if self.evaluated_steps == steps else None
         return self.record.get("episode/return")
 
     def export(self, state: TrainState, steps: int) -> None:
-        """Write the policies, or raise an OSError."""
         for i, networks in enumerate(self.runs.split(jax.device_get(state.networks))):
             several = self.runs.num_seeds > 1
             name = f"policy_seed{self.options.seed + i}.jax" if several else "policy.jax"
@@ -388,16 +379,16 @@ class _Run:
             except OSError as error:
                 raise OSError(
                     f"cannot write {self.folder / name}: {reason(error)}. The checkpoint of "
-                    f"{steps} steps is whole: make room, and the same command with --resume latest "
-                    "writes the policy at its end."
+                    f"{steps} steps is complete: free disk space and repeat the command with "
+                    "--resume latest to write the policy."
                 ) from error
 
 
 def is_due(number: int, times: int, total: int) -> bool:
-    """Return whether one of ``times``, spread evenly over ``total``, follows the ``number``-th."""
+    """Return whether one of ``times`` events, evenly over ``total``, is due after ``number``."""
     return number * times // total > (number - 1) * times // total
 
 
 def _steps(algorithm: Algorithm, state: TrainState) -> int:
-    """Return the control steps so far; all seeds are equally far."""
+    """Return the control steps so far, which are equal for all seeds."""
     return int(np.ravel(state.iteration)[0]) * algorithm.config.steps_per_iteration

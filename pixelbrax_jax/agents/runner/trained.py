@@ -1,4 +1,4 @@
-"""A trained agent: read from the folder of its run, or from the package; its policy in a file."""
+"""Load a trained agent from its run's folder or the package, and export its policy."""
 
 from __future__ import annotations
 
@@ -35,27 +35,27 @@ from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.policy import Policy, load_policy, read_pretrained
 
 PLATFORMS = ("cpu", "cuda", "tpu")
-"""Devices that an exported policy runs on."""
+"""Platforms of an exported policy."""
 
 
 class Player(Protocol):
-    """What chooses actions; hashable. Every ``Algorithm`` does."""
+    """The hashable part of an ``Algorithm`` that chooses actions."""
 
     @property
     def acting(self) -> tuple[str, ...]:
-        """As ``Algorithm.acting``."""
+        """See ``Algorithm.acting``."""
 
     @property
     def config(self) -> TrainConfig:
-        """Settings of its training."""
+        """Settings of the training."""
 
     def act(self, networks: Networks, pixels: jax.Array, key: jax.Array | None = None) -> jax.Array:
-        """As ``Algorithm.act``."""
+        """See ``Algorithm.act``."""
 
 
 @dataclass(frozen=True, eq=False)
 class Pretrained:
-    """A policy with its parameters within."""
+    """A policy of the package, which contains its parameters."""
 
     config: TrainConfig
     policy: Policy
@@ -63,24 +63,19 @@ class Pretrained:
 
     @under_default_flags
     def act(self, networks: Networks, pixels: jax.Array, key: jax.Array | None = None) -> jax.Array:
-        """Return mean actions; there are no others, so that a key is a ValueError."""
+        """Return mean actions; a key is a ValueError, because the policy cannot sample."""
         del networks
         if key is not None:
-            raise ValueError("a pretrained policy has mean actions alone, got a key.")
+            raise ValueError("a pretrained policy has only mean actions: key must be None.")
         return self.policy(pixels)
 
 
 @dataclass(frozen=True)
 class Trained:
-    """One run's networks at one checkpoint, or a policy that comes with the package.
+    """The networks of a run at one checkpoint, or a policy of the package.
 
-    Attributes:
-        algorithm: with the run's settings; its ``act`` plays.
-        networks: for ``act``, for an ``Evaluator`` and for ``save_policy``.
-        steps: control steps of the checkpoint.
-        seed: of the run.
-        clips: digests of the clips that it was trained on, for ``make_split``; None where they are
-            not stored, and the settings' own are taken.
+    ``steps`` are the control steps of the checkpoint. ``clips`` are digests of the training's
+    clips, or None if the run did not store them.
     """
 
     algorithm: Player
@@ -91,7 +86,7 @@ class Trained:
 
 
 def load_pretrained(name: str) -> Trained:
-    """Return a policy that comes with the package, one of ``pixelbrax_jax.list_pretrained()``."""
+    """Load a policy of the package by a name of ``pixelbrax_jax.list_pretrained()``."""
     about = read_pretrained(name)
     player = Pretrained(load_config(about), load_policy(name))
     return Trained(player, {}, about["steps"], about["config"].get("seed", 0))
@@ -105,29 +100,26 @@ def load_agent(
     best: bool = False,
     run: int = 0,
 ) -> Trained:
-    """Return an agent from a folder, as `load_trained`, or of a name, as `load_pretrained`."""
+    """Load an agent from a folder (`load_trained`) or by name (`load_pretrained`)."""
     if folder is not None and pretrained is None:
         return load_trained(folder, steps=steps, best=best, run=run)
     if folder is not None or pretrained is None:
-        raise ValueError("give the folder of a run, or --pretrained and a name: one of the two.")
+        raise ValueError("give either the folder of a run or --pretrained with a name.")
     if steps is not None or best or run:
-        raise ValueError("--steps, --best and --run choose of a run's folder, not of --pretrained.")
+        raise ValueError("--steps, --best and --run need the folder of a run, not --pretrained.")
     return load_pretrained(pretrained)
 
 
 def load_trained(
     folder: str | Path, *, steps: int | None = None, best: bool = False, run: int = 0
 ) -> Trained:
-    """Read the networks of a checkpoint.
+    """Load a checkpoint from the output folder of a training run.
 
-    Args:
-        folder: output folder of a training run.
-        steps: of which checkpoint; None takes the latest.
-        best: whether instead the best checkpoint is taken.
-        run: which of several runs that were trained together, from 0.
+    ``steps`` are the control steps of the checkpoint, None for the latest. ``run`` is the index of
+    the run, from 0, if several were trained together.
 
     Raises:
-        CheckpointError: there is no such checkpoint, or its algorithm is unknown here.
+        CheckpointError: there is no such checkpoint, or its algorithm is unknown.
         ValueError: an option is out of range.
     """
     checkpoints = Path(folder) / "checkpoints"
@@ -137,15 +129,14 @@ def load_trained(
         steps = best_steps(checkpoints)
         if steps is None:
             raise CheckpointError(
-                f"no checkpoint in {checkpoints} has a score yet; without --best the latest is "
-                "taken."
+                f"no checkpoint in {checkpoints} has a score yet; omit --best to load the latest."
             )
     about = read_about(checkpoints, steps)
     config = load_config(about)
     num_seeds = about["config"].get("seeds", 1)
     if not 0 <= run < num_seeds:
         raise ValueError(f"run must be from 0 to {num_seeds - 1}, got {run}.")
-    # The networks are those of training, whose environments may show more than pixels.
+    # The networks depend on the observations of training, which may include the state.
     env, params = make_env(config, **WITHOUT_DISTRACTORS)
     algorithm = ALGORITHMS[about["algorithm"]](config, VectorPixelEnv(env, config.num_envs))
     runs = Runs(algorithm, num_seeds)
@@ -162,23 +153,20 @@ def load_trained(
 
 
 def with_clips(agent: Trained, clips: str | None) -> tuple[TrainConfig, tuple[str, ...] | None]:
-    """Return the settings of an agent, and digests of the clips that its training played.
+    """Return an agent's settings with other ``clips``, and digests of its training's clips.
 
-    Those are None where none are stored and the clips are no longer where they were.
-
-    Args:
-        agent: who plays.
-        clips: a folder or ``"procedural"`` for the settings; None keeps that of the training.
+    ``clips`` is a folder or ``"procedural"``; None keeps the training's. The digests are None if
+    they are neither stored nor computable, because the folder is missing.
 
     Raises:
-        ValueError: clips are given, but no distractor of the run plays any.
+        ValueError: clips are given, but the run has no video distractor.
     """
     config, shown = agent.algorithm.config, agent.clips
     if clips is None:
         return config, shown
     if "test" not in splits_of(config):
         raise ValueError(
-            f"--clips {clips} is given, but no distractor of the run plays clips; it had "
+            f"--clips {clips} needs a run with a video distractor; its distractors are "
             f"{', '.join(map(str, as_tuple(config.env.distractors))) or 'none'}."
         )
     if shown is None:
@@ -188,11 +176,11 @@ def with_clips(agent: Trained, clips: str | None) -> tuple[TrainConfig, tuple[st
 
 
 def load_config(about: Mapping[str, Any]) -> TrainConfig:
-    """Return the settings that are stored with a checkpoint, or raise if they are unknown here."""
+    """Read the settings in a checkpoint's data; raise a CheckpointError if some are unknown."""
     if about["algorithm"] not in ALGORITHMS:
         raise CheckpointError(
-            f"the checkpoint is of {about['algorithm']!r}, which is none of "
-            f"{', '.join(ALGORITHMS)}; read one of your own with "
+            f"the checkpoint's algorithm must be one of {', '.join(ALGORITHMS)}, got "
+            f"{about['algorithm']!r}; read your own algorithm's with "
             "pixelbrax_jax.agents.runner.checkpoint.read_networks."
         )
     kind = ALGORITHMS[about["algorithm"]].config_class
@@ -204,15 +192,10 @@ def load_config(about: Mapping[str, Any]) -> TrainConfig:
 
 
 def save_policy(algorithm: Algorithm, networks: Networks, path: str | Path) -> Path:
-    """Write a policy's mean action as a compiled function of JAX's export format.
+    """Export the mean actions of a policy to a file, and return its path.
 
-    The file holds program and parameters, runs on CPU, CUDA and TPU for any number of
-    observations, and needs nothing but JAX: ``jax.export.deserialize(bytes).call(pixels)``.
-
-    Args:
-        algorithm: whose ``act`` is stored.
-        networks: its parameters.
-        path: of the file, which is returned.
+    The file contains program and parameters, and needs only JAX on CPU, CUDA or TPU:
+    ``jax.export.deserialize(bytes).call(pixels)`` for any number of observations.
     """
     spec = algorithm.envs.env.obs_spec
     spec = spec["pixels"] if isinstance(spec, dict) else spec
@@ -223,7 +206,7 @@ def save_policy(algorithm: Algorithm, networks: Networks, path: str | Path) -> P
     )(jax.ShapeDtypeStruct((batch, *spec.shape), jnp.uint8))
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    # Written aside and renamed: a file of this name is always whole.
+    # A temporary file is renamed, so a file of this name is always complete.
     part = path.with_name(path.name + ".part")
     try:
         part.write_bytes(exported.serialize())
