@@ -59,7 +59,7 @@ def test_a_wrong_choice_is_told(command, arguments, message, capsys):
 
 
 def test_an_unknown_name_tells_which_there_are(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"the names are: .*halfcheetah"):
+    with pytest.raises(FileNotFoundError, match=r"pretrained policies: .*halfcheetah"):
         load_policy("cheetah")
     # A file is taken before a name.
     with pytest.raises(FileNotFoundError):

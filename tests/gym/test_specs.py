@@ -137,7 +137,11 @@ def test_what_json_has_nothing_for_is_named():
         ({"look": {"type": "Lok"}}, ValueError, "unknown entry 'type': 'Lok'.*'Look'"),
         ({"distractors": {"type": "color", "scal": 1}}, TypeError, "'scal'.*'scale'"),
         ({"distractors": [{"type": "no_such:Path"}]}, ValueError, "no_such:Path.*No module named"),
-        ({"distractors": [{"type": "pathlib:Path"}]}, ValueError, "'pathlib:Path' is no distract"),
+        (
+            {"distractors": [{"type": "pathlib:Path"}]},
+            ValueError,
+            "'pathlib:Path' must be a subclass",
+        ),
         ({"distractors": {"type": "color", "scale": -1.0}}, ValueError, "scale"),
         ({"camera": {"type": "color"}}, TypeError, "camera must be"),
     ],
