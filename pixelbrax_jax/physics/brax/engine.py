@@ -177,8 +177,6 @@ class BraxPhysics(GuardedPhysics):
 
     def _step(self, state: PhysicsState, action: jax.Array) -> PhysicsState:
         action = jnp.asarray(action, jnp.float32)
-        if action.shape != (self.action_size,):
-            raise ValueError(f"action must have shape ({self.action_size},), got {action.shape}")
         carry = state.engine
         # Brax updates these dicts in place.
         metrics, info = jax.tree.map(lambda leaf: leaf, (carry.metrics, carry.info))

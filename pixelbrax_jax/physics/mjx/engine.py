@@ -118,8 +118,6 @@ class MjxPhysics(GuardedPhysics):
     def move(self, state: MjxState, action: jax.Array) -> tuple[MjxState, jax.Array]:
         """Advance by one control step; return the state and the sensors for ``observe``."""
         action = jnp.asarray(action, jnp.float32)
-        if action.shape != (self.action_size,):
-            raise ValueError(f"action must have shape ({self.action_size},), got {action.shape}")
         return self.dynamics.step(state.replace(ctrl=self.control(action)), self._formulas.substeps)
 
     def _reset(self, key: jax.Array) -> PhysicsState:
