@@ -76,12 +76,13 @@ def test_scenes_of_many_geoms_have_the_older_emitters(monkeypatch):
     monkeypatch.setattr(compilation, "_is_known", lambda option, value: True)
     for geoms, lamps, expected in ((50, 0, None), (51, 0, False), (25, 1, None), (26, 1, False)):
         physics = SimpleNamespace(
+            compiler_options={},
             geoms=SimpleNamespace(kind=(GeomKind.SPHERE,) * geoms),
             look=SimpleNamespace(lamps=(None,) * lamps),
         )
         options = compilation._options(physics)
         assert options.get("xla_cpu_use_fusion_emitters") is expected
-    del physics.look  # only some physics has one
+    physics.look = None  # only some physics has one
     assert compilation._options(physics).get("xla_cpu_use_fusion_emitters") is None
 
 

@@ -82,10 +82,10 @@ def test_batches_are_equal_by_value():
 
 
 def test_physics_that_are_loaded_again_are_equal():
-    from pixelbrax_jax.physics.brax import tasks
+    from pixelbrax_jax.physics.brax import loading
 
     first = pb.make(TASK, **SIZE)[0]
-    tasks._load.cache_clear()
+    loading._load.cache_clear()
     second = pb.make(TASK, **SIZE)[0]
     assert first.physics is not second.physics
     assert first == second
