@@ -28,7 +28,7 @@ demo: $(VENV)/.installed-demo ## train a PyTorch agent from pixels; results in r
 
 # Tests of what needs no torch.
 TORCHLESS := tests/renderer tests/distractors tests/envs tests/physics tests/scene tests/agents \
-	tests/test_validation.py tests/test_compilation.py tests/test_architecture.py
+	tests/platform tests/golden tests/test_video.py tests/test_validation.py tests/test_compilation.py tests/test_architecture.py
 # The first that runs; pyenv may have one that is not chosen.
 find_python = $(firstword $(shell for python in python$(1) $(HOME)/.pyenv/versions/$(1).*/bin/python; \
 	do $$python -c "" 2>/dev/null && echo $$python; done) python$(1))

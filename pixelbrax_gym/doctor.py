@@ -251,13 +251,17 @@ def inspect() -> Machine:
             raise RuntimeError(broken["XLA_FLAGS"])
         import jax
 
-        from pixelbrax_jax.renderer.choice import auto_renderer
-
         first = jax.devices()[0]
         device, jax_platform = str(first), first.platform
-        renderer = auto_renderer()
     except Exception as error:  # Any error is reported, not raised.
         jax_error = f"{type(error).__name__}: {error}"
+    if jax_error is None:
+        try:
+            from pixelbrax_jax.renderer.choice import auto_renderer
+
+            renderer = auto_renderer()
+        except Exception as error:
+            renderer = "unknown", f"its check fails with {type(error).__name__}: {error}"
     torch_cuda: bool | str | None = None
     to_torch: bool | str | None = None
     to_jax: bool | str | None = None

@@ -102,7 +102,9 @@ def _type_of(name: Any) -> Any:
     for part in path.split("."):
         cls = getattr(cls, part, None)
     if not (isinstance(cls, type) and issubclass(cls, Distractor)):
-        raise ValueError(f"{TYPE}={name!r} must be a subclass of pixelbrax_jax.Distractor.")
+        raise ValueError(
+            f"{TYPE}={name!r} must be a subclass of pixelbrax_jax.distractors.Distractor."
+        )
     return cls
 
 

@@ -17,7 +17,7 @@ def renderer(
     size: int = 84,
     look: str = "default",
     shadows: bool = False,
-    renderer: str = "fused",
+    renderer: str = "auto",
 ) -> dict[str, Any]:
     """Measure rendering from link poses to packed pixels, without physics."""
     env, params = pb.make(

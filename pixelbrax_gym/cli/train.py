@@ -71,7 +71,7 @@ def _first(arguments: Sequence[str]) -> _First:
 def run(arguments: Sequence[str]) -> int:
     """Run the command."""
     with needs_extra("train"):
-        from pixelbrax_jax.agents.on_policy.presets import PRESETS
+        from pixelbrax_jax.agents.presets import PRESETS
         from pixelbrax_jax.agents.registry import ALGORITHMS
         from pixelbrax_jax.agents.runner.checkpoint import CheckpointError, latest_steps
         from pixelbrax_jax.agents.runner.train import TrainingDivergedError, train
@@ -121,7 +121,7 @@ def _report(line: str) -> None:
 
 def parse(algorithm: str, arguments: Sequence[str]) -> tuple[Launch, TrainConfig, RunConfig]:
     """Parse the options of an algorithm; raise a ValueError if a setting is out of range."""
-    from pixelbrax_jax.agents.on_policy.presets import PRESETS, preset
+    from pixelbrax_jax.agents.presets import PRESETS, preset
     from pixelbrax_jax.agents.runner.settings import RunConfig
 
     # Defaults are those of a preset, which may be those of a task.

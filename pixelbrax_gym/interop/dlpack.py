@@ -38,7 +38,10 @@ def actions_to_jax(tensor: torch.Tensor, device: jax.Device) -> np.ndarray | jax
     if tensor.layout != torch.strided:
         raise TypeError(f"action must be a dense tensor, got {tensor.layout}; try .to_dense().")
     if not tensor.is_floating_point():
-        raise TypeError(f"action must be floating point in [-1, 1], got {tensor.dtype}.")
+        raise TypeError(
+            f"action must be floating point in [-1, 1], got {tensor.dtype}; convert it to float32, "
+            "e.g. with .float()."
+        )
     expected = torch_device(device)
     if tensor.device.type != expected.type or (
         expected.index is not None and tensor.device.index != expected.index

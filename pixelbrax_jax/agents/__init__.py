@@ -4,7 +4,7 @@ from pixelbrax_jax.agents.algorithm import Algorithm
 from pixelbrax_jax.agents.on_policy.dcpg import DCPG, DCPGConfig
 from pixelbrax_jax.agents.on_policy.ppg import PPG, PPGConfig
 from pixelbrax_jax.agents.on_policy.ppo import PPO, PPOConfig
-from pixelbrax_jax.agents.on_policy.presets import preset
+from pixelbrax_jax.agents.presets import preset
 from pixelbrax_jax.agents.registry import ALGORITHMS, make_algorithm, make_train
 
 __all__ = [

@@ -33,8 +33,10 @@ class Color(Distractor):
     uniform one on [-scale, scale], and is limited so that materials stay in [0, 1]. ``dynamics``
     decides when:
 
-    * ``"static"``: once per episode, * ``"iid"``: for each frame, * ``"walk"``: once per episode,
-    and then ``x += N(0, (0.03 scale)^2)`` for each frame,   clipped to [-scale, scale].
+    * ``"static"``: once per episode,
+    * ``"iid"``: for each frame,
+    * ``"walk"``: once per episode, and then ``x += N(0, (0.03 scale)^2)`` for each frame, clipped
+      to [-scale, scale].
 
     Sources: one normal offset per frame with standard deviation 0.3 is from the paper, arXiv
     2502.00021 (preset ``"paper-color"``). Materials on a walk are from the Distracting Control

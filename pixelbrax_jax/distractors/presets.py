@@ -53,12 +53,13 @@ PRESETS = (
 def preset(name: str, task: str) -> tuple[Distractor, ...]:
     """Return the distractors of a benchmark, one of ``PRESETS``; others raise ValueError.
 
-    * ``"color"``, ``"video"``, ``"camera"``: each with its defaults. * ``"paper-color"``,
-    ``"paper-video"``: those of the paper, arXiv 2502.00021. * ``"dcs-easy"``, ``"dcs-medium"``,
-    ``"dcs-hard"``, and each with ``"-static"``: color, video   and camera of the Distracting
-    Control Suite, arXiv 2101.02722. The task decides how much of   the ground the video covers. *
-    ``"color-easy"``, ``"color-hard"``, ``"video-easy"``, ``"video-hard"``: of the DMControl
-    Generalization Benchmark, arXiv 2011.13389; colors are sampled, see ``Color``.
+    * ``"color"``, ``"video"``, ``"camera"``: each with its defaults.
+    * ``"paper-color"``, ``"paper-video"``: those of the paper, arXiv 2502.00021.
+    * ``"dcs-easy"``, ``"dcs-medium"``, ``"dcs-hard"``, and each with ``"-static"``: color, video
+      and camera of the Distracting Control Suite, arXiv 2101.02722. The task decides how much of
+      the ground the video covers.
+    * ``"color-easy"``, ``"color-hard"``, ``"video-easy"``, ``"video-hard"``: of the DMControl
+      Generalization Benchmark, arXiv 2011.13389; colors are sampled, see ``Color``.
     """
     check_choice("distractor", name, PRESETS)
     if name in _FIXED:

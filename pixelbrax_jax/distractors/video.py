@@ -40,15 +40,16 @@ class Video(Distractor):
 
     With v the video's pixel and a = ``alpha``:
 
-    * ``mode="overlay"``: every pixel p becomes ``(1 - a) p + a v``. * ``mode="background"``: the
-    sky s becomes ``(1 - a) s + a v``, the ground g becomes   ``g ground_alpha + (1 - ground_alpha)
-    v``; all other pixels keep their bits.
+    * ``mode="overlay"``: every pixel p becomes ``(1 - a) p + a v``.
+    * ``mode="background"``: the sky s becomes ``(1 - a) s + a v``, the ground g becomes
+      ``g ground_alpha + (1 - ground_alpha) v``; all other pixels keep their bits.
 
     Clip, first frame and direction are sampled at an episode reset. At frame t of the episode a
     clip of L frames that started at s in direction d shows
 
-    * ``"loop"``: frame ``(s + d t) mod L``, * ``"pingpong"``: with ``P = 2 (L - 1)`` and ``q = (s +
-    d t) mod P``, frame ``min(q, P - q)``, * ``"static"``: frame s.
+    * ``"loop"``: frame ``(s + d t) mod L``,
+    * ``"pingpong"``: with ``P = 2 (L - 1)`` and ``q = (s + d t) mod P``, frame ``min(q, P - q)``,
+    * ``"static"``: frame s.
 
     Sources: an overlay with a = 0.5 is from the paper, arXiv 2502.00021; pingpong backgrounds are
     from the Distracting Control Suite, arXiv 2101.02722; loops in the sky, or in sky and ground,

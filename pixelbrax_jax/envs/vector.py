@@ -36,12 +36,14 @@ class VectorPixelEnv:
 
     ``autoreset_mode`` has Gymnasium's meanings:
 
-    * ``"next_step"``: the step that ends an episode returns its last observation. The next   step
-    ignores that environment's action and returns the first observation of the next   episode, with
-    reward 0. * ``"same_step"``: the step that ends an episode returns the first observation of the
-    next one. ``info["final_obs"]`` and ``info["final_info"]`` have the last observation and   info;
-    they are meaningful only where an episode ended. * ``"disabled"``: nothing resets by itself;
-    call ``reset_where``. Until then the   environment continues with finite but meaningless values.
+    * ``"next_step"``: the step that ends an episode returns its last observation. The next step
+      ignores that environment's action and returns the first observation of the next episode, with
+      reward 0.
+    * ``"same_step"``: the step that ends an episode returns the first observation of the next one.
+      ``info["final_obs"]`` and ``info["final_info"]`` have the last observation and info; they are
+      meaningful only where an episode ended.
+    * ``"disabled"``: nothing resets by itself; call ``reset_where``. Until then the environment
+      continues with finite but meaningless values.
 
     Attributes:
         env: the environment.

@@ -123,10 +123,14 @@ class Physics(abc.ABC):
 
 
 def check_physics(physics: object) -> Physics:
-    """Return ``physics``; raise TypeError if it is not a ``Physics``."""
-    if isinstance(physics, Physics):
-        return physics
-    raise TypeError(
-        f"physics must be a pixelbrax_jax.Physics, got a {type(physics).__name__}: make its class "
-        "a subclass, class MyPhysics(pixelbrax_jax.Physics)."
-    )
+    """Return ``physics``; raise TypeError if it is not a ``Physics`` with all its attributes."""
+    kind = type(physics).__name__
+    if not isinstance(physics, Physics):
+        raise TypeError(
+            f"physics must be a pixelbrax_jax.Physics, got a {kind}: make its class a subclass, "
+            "class MyPhysics(pixelbrax_jax.Physics)."
+        )
+    missing = [name for name in Physics.__annotations__ if not hasattr(physics, name)]
+    if missing:
+        raise TypeError(f"{kind} lacks what a Physics has to declare: {', '.join(missing)}.")
+    return physics

@@ -77,6 +77,10 @@ class GuardedPhysics(Physics):
     @under_default_flags
     def step(self, state: PhysicsState, action: jax.Array) -> PhysicsState:
         """See ``Physics.step``."""
+        if jnp.shape(action) != (self.action_size,):
+            raise ValueError(
+                f"action must have shape ({self.action_size},), got {jnp.shape(action)}."
+            )
         after = self._step(state, action)
         finite = self._is_finite(after)
 

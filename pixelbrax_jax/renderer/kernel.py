@@ -97,7 +97,7 @@ def _near(view: View, band: _Band, start: jax.Array, last: jax.Array) -> Near:
     seen = may_see(view, window_of(view, (top, bottom), columns, band.height, band.width))
 
     def near(rank: int, update: Callable[[Any], Any], value: Any) -> Any:
-        if view.kind[rank] == GeomKind.PLANE:
+        if GeomKind(view.kind[rank]).reach == "all":
             return update(value)
         return jax.lax.cond(seen(rank), update, lambda value: value, value)
 

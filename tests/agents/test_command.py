@@ -12,7 +12,7 @@ import pytest
 from pixelbrax_gym.cli import main
 from pixelbrax_gym.cli.train import parse
 from pixelbrax_jax.agents.config import describe
-from pixelbrax_jax.agents.on_policy.presets import PRESETS, TASK_SETTINGS, preset
+from pixelbrax_jax.agents.presets import PRESETS, TASK_SETTINGS, preset
 from pixelbrax_jax.agents.registry import ALGORITHMS
 from pixelbrax_jax.agents.runner import train
 from pixelbrax_jax.agents.runner.trained import load_config

@@ -14,7 +14,7 @@ from pixelbrax_jax.agents.on_policy.dcpg import DCPGConfig
 from pixelbrax_jax.agents.on_policy.ppg import PPGConfig
 from pixelbrax_jax.agents.on_policy.ppo import PPO, PPOConfig
 from pixelbrax_jax.agents.registry import ALGORITHMS, make_train
-from pixelbrax_jax.agents.runner.train import RunConfig
+from pixelbrax_jax.agents.runner.settings import RunConfig
 from pixelbrax_jax.config import EnvConfig
 from pixelbrax_jax.distractors.video import Video
 from pixelbrax_jax.envs.vector import VectorPixelEnv

@@ -23,7 +23,8 @@ from pixelbrax_jax.agents.runner.checkpoint import CheckpointError, latest_steps
 from pixelbrax_jax.agents.runner.metrics import AppendedFile, open_metrics, read_metrics
 from pixelbrax_jax.agents.runner.progress import Bar, Messages
 from pixelbrax_jax.agents.runner.saving import Checkpoints
-from pixelbrax_jax.agents.runner.train import RunConfig, run
+from pixelbrax_jax.agents.runner.settings import RunConfig
+from pixelbrax_jax.agents.runner.train import run
 from tests.agents.small import ABOUT, PARAMS, SMALL, ball_envs, same
 
 PER_ITERATION = SMALL["num_envs"] * SMALL["num_steps"]

@@ -14,7 +14,8 @@ from pixelbrax_jax.agents.algorithm import Algorithm
 from pixelbrax_jax.agents.config import TrainConfig
 from pixelbrax_jax.agents.optimizer import Optimizer
 from pixelbrax_jax.agents.rollout import collect
-from pixelbrax_jax.agents.runner.train import RunConfig, run
+from pixelbrax_jax.agents.runner.settings import RunConfig
+from pixelbrax_jax.agents.runner.train import run
 from pixelbrax_jax.agents.train_state import (
     TrainState,
     action_key,

@@ -14,7 +14,8 @@ from pixelbrax_jax.agents.runner import settings
 from pixelbrax_jax.agents.runner.checkpoint import CheckpointError, read_about
 from pixelbrax_jax.agents.runner.programs import Runs
 from pixelbrax_jax.agents.runner.saving import Checkpoints
-from pixelbrax_jax.agents.runner.train import RunConfig, run
+from pixelbrax_jax.agents.runner.settings import RunConfig
+from pixelbrax_jax.agents.runner.train import run
 from pixelbrax_jax.agents.runner.trained import load_config
 from tests.agents.small import OPTIONS, PARAMS, SMALL, ball_envs, same
 

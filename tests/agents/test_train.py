@@ -28,7 +28,8 @@ from pixelbrax_jax.agents.runner.checkpoint import (
 )
 from pixelbrax_jax.agents.runner.metrics import read_metrics, summarize
 from pixelbrax_jax.agents.runner.saving import Checkpoints
-from pixelbrax_jax.agents.runner.train import RunConfig, TrainingDivergedError, run
+from pixelbrax_jax.agents.runner.settings import RunConfig
+from pixelbrax_jax.agents.runner.train import TrainingDivergedError, run
 from pixelbrax_jax.policy import load_policy
 from tests.agents.small import (
     ABOUT,

@@ -30,7 +30,7 @@ import pixelbrax_jax
 from pixelbrax_gym.bench.machine import describe_cpu
 from pixelbrax_gym.cli.train import parse
 from pixelbrax_jax.agents.config import TrainConfig
-from pixelbrax_jax.agents.on_policy.presets import TASK_SETTINGS, preset
+from pixelbrax_jax.agents.presets import TASK_SETTINGS, preset
 from pixelbrax_jax.agents.registry import ALGORITHMS
 from pixelbrax_jax.agents.runner.checkpoint import read_about
 from pixelbrax_jax.agents.runner.metrics import read_metrics

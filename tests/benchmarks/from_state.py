@@ -17,7 +17,7 @@ from brax.training.agents.ppo import train as ppo
 
 from pixelbrax_jax import BraxEnv, make, wrap_fresh_episodes
 from pixelbrax_jax.agents.config import TrainConfig, describe
-from pixelbrax_jax.agents.on_policy.presets import preset
+from pixelbrax_jax.agents.presets import preset
 from pixelbrax_jax.physics.brax.tasks import REWARD_PRESETS
 from tests.benchmarks.experiments import TASKS
 from tests.benchmarks.results import FOLDER, task_key

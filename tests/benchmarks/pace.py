@@ -16,7 +16,7 @@ from operator import itemgetter
 from pathlib import Path
 
 from pixelbrax_gym.bench.machine import describe_cpu
-from pixelbrax_jax.agents.on_policy.presets import preset
+from pixelbrax_jax.agents.presets import preset
 from pixelbrax_jax.agents.registry import ALGORITHMS
 from pixelbrax_jax.agents.runner.metrics import read_metrics
 from tests.benchmarks.experiments import TASKS

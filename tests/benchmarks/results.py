@@ -11,7 +11,7 @@ import numpy as np
 
 from pixelbrax_gym.bench.tables import table as markdown_table
 from pixelbrax_jax import list_pretrained
-from pixelbrax_jax.agents.on_policy.presets import preset
+from pixelbrax_jax.agents.presets import preset
 from pixelbrax_jax.policy import read_pretrained
 from tests.benchmarks.experiments import DOCS, TASKS
 from tests.benchmarks.pages import Figures

@@ -12,7 +12,7 @@ from pixelbrax_gym.bench.case import ABSENT
 from pixelbrax_gym.bench.timing import compiled, rate
 from pixelbrax_jax.agents.config import make_env
 from pixelbrax_jax.agents.on_policy.ppo import PPO
-from pixelbrax_jax.agents.on_policy.presets import preset
+from pixelbrax_jax.agents.presets import preset
 from pixelbrax_jax.agents.runner.devices import replicate, state_shardings
 from pixelbrax_jax.envs.sharded import ShardedVectorEnv, make_env_mesh
 

@@ -142,7 +142,7 @@ def test_autoreset_mode(mode):
 
 
 def test_human_rendering_of_many():
-    with pytest.raises(ValueError, match=r"gymnasium\.make takes it; here there is 'rgb_array'"):
+    with pytest.raises(ValueError, match=r"use gymnasium\.make for it, or "):
         GymnasiumVectorEnv(TASK, 2, render_mode="human")
 
 

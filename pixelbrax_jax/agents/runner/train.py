@@ -43,7 +43,7 @@ from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.stop_signals import StopRequest, signal_name, stop_requests
 from pixelbrax_jax.types import EnvParams
 
-__all__ = ["Outcome", "RunConfig", "TrainingDivergedError", "run", "train"]
+__all__ = ["Outcome", "TrainingDivergedError", "run", "train"]
 
 Splits = dict[str, tuple[PixelEnv, EnvParams]]
 """Evaluation environments and their parameters, by name."""
@@ -107,6 +107,7 @@ def run(
 
     Raises:
         CheckpointError: checkpoints cannot be written, or the folder has another or a longer run.
+        FileExistsError: the folder has a run, and ``options.resume`` is not ``"latest"``.
         OSError: a log or the policy cannot be written.
         MemoryError: state and frames do not fit into memory.
         TrainingDivergedError: a metric is not finite.
