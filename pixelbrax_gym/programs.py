@@ -128,18 +128,18 @@ class Programs:
         return jax.tree.map(lambda x: x[0], state) if self.single else state
 
     @compilation.jit(_env, static_argnums=0)
-    def start(self, state: EnvState) -> Stepped:
+    def start(self, state: EnvState, params: EnvParams) -> Stepped:
         """Continue from states, without the leading axis for a single environment."""
         if self.single:
             state = jax.tree.map(lambda x: x[None], state)
-        return self._started(state)
+        return self._started(state, params)
 
     @compilation.jit(_env, static_argnums=0)
     def start_where(
         self, packed: Packed, mask: Array, state: EnvState, params: EnvParams
     ) -> Stepped:
         """Continue from states where ``mask``, (N,) bool; the others stay."""
-        return self._started(_where(mask, state, self._state(packed, params)))
+        return self._started(_where(mask, state, self._state(packed, params)), params)
 
     @compilation.jit(_env, static_argnums=(0, 3, 4))
     def images(self, packed: Packed, params: EnvParams, height: int, width: int) -> jax.Array:
@@ -187,9 +187,10 @@ class Programs:
     def _step(self, state: EnvState, action: Array, params: EnvParams) -> tuple[EnvState, Timestep]:
         return self.vector.step(state, action[None] if self.single else action, params)
 
-    def _started(self, state: EnvState) -> Stepped:
-        timestep = jax.vmap(self.vector.env.timestep)(state, jnp.zeros(self.vector.num_envs))
-        return self._stepped(state, timestep)
+    def _started(self, state: EnvState, params: EnvParams) -> Stepped:
+        rewards = jnp.zeros(self.vector.num_envs)
+        see = jax.vmap(self.vector.env.timestep, in_axes=(0, 0, None))
+        return self._stepped(state, see(state, rewards, params))
 
     def _stepped(
         self, state: EnvState, timestep: Timestep, reported: Array | None = None

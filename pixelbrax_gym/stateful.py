@@ -200,7 +200,7 @@ class StatefulEnv:
         self._check_usable()
         self._programs.check_state(state, self.params)
         if mask is None:
-            return self._replace(self._programs.start(state))
+            return self._replace(self._programs.start(state, self.params))
         if self._snapshot is None:
             raise error.ResetNeeded("the first reset must be of all environments.")
         packed = self._snapshot.packed

@@ -87,7 +87,7 @@ class VectorPixelEnv:
         frames = jnp.broadcast_to(blank, (self.num_envs, *blank.shape))
         frames = self._push_frames(frames, sim, rows, jnp.ones(self.num_envs, bool))
         state = EnvState(sim=sim, frames=frames, key=keys)
-        return state, self._timestep(state, jnp.zeros(self.num_envs))
+        return state, self._timestep(state, jnp.zeros(self.num_envs), rows)
 
     @partial(jax.jit, static_argnums=0)
     @under_default_flags
@@ -121,7 +121,7 @@ class VectorPixelEnv:
             state = state.replace(key=jnp.where(mask, keys, state.key))
             episode = jnp.zeros_like(episode)
         state = self._reset_and_draw(state, mask, episode, rows)
-        return state, self._timestep(state, jnp.zeros(self.num_envs))
+        return state, self._timestep(state, jnp.zeros(self.num_envs), rows)
 
     @partial(jax.jit, static_argnums=0)
     @under_default_flags
@@ -146,14 +146,14 @@ class VectorPixelEnv:
             state = state.replace(sim=self._reset_rows(state, ended, sim.episode + 1, rows))
             frames = self._push_frames(state.frames, state.sim, rows, ended)
             state = state.replace(frames=frames)
-            return state, self._timestep(state, jnp.where(ended, 0.0, reward))
+            return state, self._timestep(state, jnp.where(ended, 0.0, reward), rows)
         frames = self._push_frames(state.frames, sim, rows, jnp.zeros(self.num_envs, bool))
         state = state.replace(frames=frames)
-        timestep = self._timestep(state, reward)
+        timestep = self._timestep(state, reward, rows)
         if self.autoreset_mode == "disabled":
             return state, timestep
         state = self._reset_and_draw(state, state.done, state.sim.episode + 1, rows)
-        first = self._timestep(state, reward)
+        first = self._timestep(state, reward, rows)
         info = {**first.info, "final_obs": timestep.obs, "final_info": timestep.info}
         return state, timestep.replace(obs=first.obs, info=info)
 
@@ -188,8 +188,11 @@ class VectorPixelEnv:
         check_key(key, (self.num_envs,))
         return key
 
-    def _timestep(self, state: EnvState, reward: jax.Array) -> Timestep:
-        return jax.vmap(self.env.timestep)(state, reward)
+    def _timestep(self, state: EnvState, reward: jax.Array, params: ParamRows) -> Timestep:
+        def see(state: EnvState, reward: jax.Array, own: Any) -> Timestep:
+            return self.env.timestep(state, reward, params.join(own))
+
+        return jax.vmap(see)(state, reward, params.own)
 
     def _push_frames(
         self, frames: jax.Array, sim: SimState, params: ParamRows, is_first: jax.Array
