@@ -113,12 +113,17 @@ def _make(options: Options) -> tuple[GymnasiumEnv, Act]:
     import jax
 
     from pixelbrax_gym.gymnasium.env import GymnasiumEnv
-    from pixelbrax_jax.policy import load_policy
+    from pixelbrax_jax.policy import list_pretrained, load_policy
 
     given = {name: getattr(options, name) for name in ENV_OPTIONS}
     given = {name: value for name, value in given.items() if value not in (None, False, ())}
     policy = None
     if options.policy == "pretrained":
+        if options.task not in (names := list_pretrained()):
+            raise ValueError(
+                f"task {options.task!r} has no pretrained policy; these tasks have one: "
+                f"{', '.join(names)}."
+            )
         policy = load_policy(options.task)
         given = (policy.env_options or {}) | given
     task: Any = given.pop("task", options.task)

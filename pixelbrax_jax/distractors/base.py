@@ -27,7 +27,9 @@ class Distractor:
 
     def reset(self, key: jax.Array, params: EnvParams) -> Any:
         """Sample the state at the first frame of an episode."""
-        raise NotImplementedError
+        raise NotImplementedError(
+            f"{type(self).__name__} needs a method reset(key, params) that returns its state."
+        )
 
     def advance(self, state: Any, key: jax.Array, frame: jax.Array, params: EnvParams) -> Any:
         """Return the state at the next frame, () int32 ``frame`` of its episode, from 0.
@@ -116,6 +118,11 @@ class Chain:
         for link, state in zip(self.links, states, strict=True):
             backdrop = link.backdrop(state, params, rows, height, width)
             frame = link.change_frame(state, frame, backdrop)
+            if not isinstance(frame, Frame):
+                raise TypeError(
+                    f"change_frame of distractor {link.kind!r} must return a Frame, got a "
+                    f"{type(frame).__name__}."
+                )
         return frame
 
     def info(self, states: tuple[Any, ...]) -> dict[str, jax.Array]:

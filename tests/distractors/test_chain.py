@@ -177,6 +177,21 @@ def test_a_distractor_of_your_own():
     )
 
 
+def test_a_change_that_returns_nothing_is_told():
+    class Forgetful(distractors.Distractor):
+        kind, stream = "forgetful", 9
+
+        def reset(self, key, params):
+            return ()
+
+        def change_frame(self, state, frame, backdrop):
+            frame.replace(r=frame.g)
+
+    env = PixelEnv(Ball(), **SIZE, distractors=(Forgetful(),))
+    with pytest.raises(TypeError, match="'forgetful' must return a Frame, got a NoneType"):
+        env.reset(jax.random.key(0), PARAMS)
+
+
 def test_presets():
     assert distractors.preset("paper-video", "ant") == (
         Video(mode="overlay", alpha=0.5, dynamics="loop"),

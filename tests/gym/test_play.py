@@ -115,7 +115,7 @@ def test_ctrl_c_leaves_a_whole_file(tmp_path, monkeypatch):
     [
         (["antt"], "Did you mean 'ant'?"),
         (["ant", "--look", "origin"], "'original'"),
-        (["reacher", "--policy", "pretrained"], "policy in the package"),
+        (["reacher", "--policy", "pretrained"], "has no pretrained policy"),
         (["ant", "--size", "0"], "size must be a positive integer"),
         (["ant", "--num-frames", "0"], "num_frames must be a positive integer"),
     ],
