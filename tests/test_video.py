@@ -220,7 +220,7 @@ def test_what_was_written_is_compared_with_what_was_given(tmp_path, monkeypatch)
                 super().append(frame)
 
     monkeypatch.setattr(video, "Encoder", Lossy)
-    with pytest.raises(OSError, match=r"4 frames of \(32, 48, 3\), and 2 of \(32, 48, 3\) come"):
+    with pytest.raises(OSError, match=r"4 frames of \(32, 48, 3\), but it has 2 of \(32, 48, 3\)"):
         write_frames(tmp_path / "a.mp4", flashes(4), 20)
     append = video._Gif.append
     monkeypatch.setattr(video._Gif, "append", lambda self, frame: append(self, frame[:8]))
