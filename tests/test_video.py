@@ -224,5 +224,7 @@ def test_what_was_written_is_compared_with_what_was_given(tmp_path, monkeypatch)
         write_frames(tmp_path / "a.mp4", flashes(4), 20)
     append = video._Gif.append
     monkeypatch.setattr(video._Gif, "append", lambda self, frame: append(self, frame[:8]))
-    with pytest.raises(OSError, match=r"200 ms of \(32, 48, 3\), but it has 200 ms of \(8, 48, 3\)"):
+    with pytest.raises(
+        OSError, match=r"200 ms of \(32, 48, 3\), but it has 200 ms of \(8, 48, 3\)"
+    ):
         write_frames(tmp_path / "a.gif", flashes(4), 20)
