@@ -9,7 +9,7 @@ import torch
 
 from tests.compilations import counted
 from tests.gym.adapters import ADAPTERS, as_bytes
-from tests.gym.test_same_everywhere import DOORS
+from tests.gym.test_same_everywhere import ADAPTERS_AND_JAX
 
 
 def spoil(returned):
@@ -23,9 +23,9 @@ def spoil(returned):
             leaf[...] = 1
 
 
-@pytest.mark.parametrize("name", sorted(set(DOORS) - {"jax"}))
+@pytest.mark.parametrize("name", sorted(set(ADAPTERS_AND_JAX) - {"jax"}))
 def test_writing_to_results_changes_nothing_later(name):
-    clean, dirty = DOORS[name](), DOORS[name]()
+    clean, dirty = ADAPTERS_AND_JAX[name](), ADAPTERS_AND_JAX[name]()
     returned = dirty.reset()
     assert as_bytes(returned) == as_bytes(clean.reset())
     for _ in range(30):
@@ -56,9 +56,9 @@ def test_one_end_leaves_the_others_alone(name):
             assert as_bytes(one) == as_bytes(other)
 
 
-@pytest.mark.parametrize("name", DOORS)
+@pytest.mark.parametrize("name", ADAPTERS_AND_JAX)
 def test_nothing_is_compiled_twice(name):
-    adapter = DOORS[name]()
+    adapter = ADAPTERS_AND_JAX[name]()
     adapter.reset()
     for _ in range(30):
         adapter.call()

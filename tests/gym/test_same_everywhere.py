@@ -12,7 +12,7 @@ from tests.gym.adapters import ACTIONS, ADAPTERS, OPTIONS, Event, Vector, row_of
 from tests.gym.conftest import TASK
 
 CALLS = 100
-DOORS = ADAPTERS | {
+ADAPTERS_AND_JAX = ADAPTERS | {
     f"{output}-{mode}": lambda mode=mode, output=output: Vector(mode, output=output)
     for output in ("numpy", "torch")
     for mode in ("next_step", "same_step", "disabled")
@@ -82,9 +82,9 @@ def test_jax_same_step(expected):
     check(through_jax("same_step"), expected)
 
 
-@pytest.mark.parametrize("name", DOORS)
+@pytest.mark.parametrize("name", ADAPTERS_AND_JAX)
 def test_every_adapter(name, expected):
-    adapter = DOORS[name]()
+    adapter = ADAPTERS_AND_JAX[name]()
     events = adapter.first(adapter.reset(seed=0))
     for _ in range(CALLS):
         events += adapter.call()[0]
