@@ -9,7 +9,7 @@ import shutil
 import signal
 import subprocess
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, Any
 
@@ -55,114 +55,89 @@ def check_ffmpeg() -> None:
         raise OSError(f"{command[0]} does not start: {reason(result.stderr) or result.returncode}.")
 
 
-class Encoder:
-    """Writes frames to an MP4 file in H.264, 4:2:0, which every player supports."""
+@contextlib.contextmanager
+def encoder(path: Path, fps: float) -> Iterator[Callable[[np.ndarray], None]]:
+    """Return a function that writes a frame to an MP4 file in H.264, 4:2:0, as all players support.
 
-    def __init__(self, path: Path, fps: float) -> None:
-        self._program, self._path, self._fps = find_ffmpeg(), path, fps
-        self._process: subprocess.Popen[bytes] | None = None
-        self._log: IO[bytes] | None = None
-
-    def append(self, frame: np.ndarray) -> None:
-        """Write a frame; an odd side gets its last row or column twice. Raises as ``close``."""
-        height, width = (side % 2 for side in frame.shape[:2])
-        if height or width:
-            frame = np.pad(frame, ((0, height), (0, width), (0, 0)), mode="edge")
-        frame = np.ascontiguousarray(frame)
-        if self._process is None:
-            self._start(*frame.shape[:2])
-        assert self._process is not None
-        assert self._process.stdin is not None
-        try:
-            self._process.stdin.write(frame.data)
-        except OSError as error:
-            self.close()  # it says why
-            raise OSError(f"{self._path} was not written: {error}.") from error
-
-    def _start(self, height: int, width: int) -> None:
-        taken = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"]
-        # Named explicitly: an FFmpeg without it would choose a codec that few players support.
-        h264 = ["-c:v", "libx264", "-pix_fmt", "yuv420p"]
-        given = ["-f", "mp4", *h264, str(self._path.absolute())]
-        # A file, because FFmpeg stops once a pipe that nobody reads is full.
-        self._log = tempfile.TemporaryFile()  # noqa: SIM115
-        self._process = _start(
-            [self._program, "-y", "-v", "error", *taken, "-r", str(self._fps), "-i", "-", *given],
-            stdin=subprocess.PIPE,
-            stderr=self._log,
-        )
-
-    def close(self) -> None:
-        """Finish the file; raise OSError with the reason if FFmpeg could not write it."""
-        process, log = self._process, self._log
-        if process is None or log is None:
-            return
-        self._process = self._log = None
+    An odd side gets its last row or column twice. Raises OSError with the reason if FFmpeg could
+    not write the file, and the errors of ``find_ffmpeg``.
+    """
+    # Each PPM has its own size. The codec is explicit: an FFmpeg without it would choose one that
+    # few players support.
+    frames = ["-f", "image2pipe", "-c:v", "ppm", "-framerate", str(fps), "-i", "-"]
+    h264 = ["-f", "mp4", "-c:v", "libx264", "-pix_fmt", "yuv420p", str(path.absolute())]
+    command = [find_ffmpeg(), "-y", "-v", "error", *frames, *h264]
+    # The log is a file, because FFmpeg stops once a pipe that nobody reads is full.
+    with tempfile.TemporaryFile() as log:
+        process = _start(command, stdin=subprocess.PIPE, stderr=log)
         assert process.stdin is not None
-        with log:
+        pipe = process.stdin
+
+        def append(frame: np.ndarray) -> None:
+            odd = [(0, side % 2) for side in frame.shape[:2]]
+            frame = np.pad(frame, (*odd, (0, 0)), mode="edge")
+            pipe.write(b"P6\n%d %d\n255\n" % (frame.shape[1], frame.shape[0]))
+            pipe.write(frame.tobytes())
+
+        try:
+            yield append
+        finally:
             with contextlib.suppress(OSError):
-                process.stdin.close()
+                pipe.close()
             status = process.wait()
             if status:
-                log.seek(0)
-                why = reason(_text(log)) or f"FFmpeg's exit status is {status}"
+                why = reason(_read(log)) or f"FFmpeg's exit status is {status}"
                 if status < 0:
                     why = f"FFmpeg was ended by {signal.Signals(-status).name}"
-                self._path.unlink(missing_ok=True)  # a part of a file that no player plays
-                raise OSError(f"{self._path} was not written: {why}.")
+                path.unlink(missing_ok=True)  # a part of a file that no player plays
+                raise OSError(f"{path} was not written: {why}.")
 
 
-class Decoder:
-    """Reads the frames of a video file at a constant rate, rotated as a player rotates them.
+def decode(path: Path, keep: Callable[[np.ndarray], None]) -> tuple[int, str]:
+    """Call ``keep`` with each frame of a video, at a constant rate, rotated as a player does.
 
-    Attributes:
-        declared: after all frames, the approximate number of frames the file declares; None if it
-            declares none.
-        of_file: whether that number comes from the length of the whole file, whose sound may be
-            longer than its video.
-        complaint: FFmpeg's error in one line; empty if none.
+    Frames are (H, W, 3) uint8. Returns their number, and FFmpeg's log.
     """
+    found = 0
+    # Each PPM has its own size; a video may change its size.
+    images = ["-f", "image2pipe", "-c:v", "ppm", "-pix_fmt", "rgb24", "-"]
+    # An absolute path, because FFmpeg takes a name with a colon for a protocol.
+    file = ["-nostdin", "-nostats", "-loglevel", "level+info", "-i", str(path.absolute())]
+    with (
+        tempfile.TemporaryFile() as log,
+        # At an error the pipe is closed, which ends FFmpeg.
+        _start([find_ffmpeg(), *file, *images], stdout=subprocess.PIPE, stderr=log) as process,
+    ):
+        assert process.stdout is not None
+        while (image := _read_ppm(process.stdout)) is not None:
+            keep(image)
+            found += 1
+        process.wait()
+        return found, _read(log)
 
-    def __init__(self, path: Path) -> None:
-        self._program, self._path = find_ffmpeg(), path
-        self.declared: int | None = None
-        self.of_file = False
-        self.complaint = ""
 
-    def __iter__(self) -> Iterator[np.ndarray]:
-        """Yield (H, W, 3) uint8 frames."""
-        # Each PPM has its own size; a video may change its size.
-        images = ["-f", "image2pipe", "-c:v", "ppm", "-pix_fmt", "rgb24", "-"]
-        # An absolute path, because FFmpeg takes a name with a colon for a protocol.
-        file = ["-nostdin", "-nostats", "-loglevel", "level+info", "-i", str(self._path.absolute())]
-        with tempfile.TemporaryFile() as log:
-            process = _start([self._program, *file, *images], stdout=subprocess.PIPE, stderr=log)
-            assert process.stdout is not None
-            try:
-                with process.stdout as pipe:
-                    while (image := _read_ppm(pipe)) is not None:
-                        yield image
-                    process.wait()
-            finally:
-                process.kill()  # of whoever stops early
-                process.wait()
-            log.seek(0)
-            self._interpret(_text(log))
+def complaint(log: str) -> str:
+    """Return the first error of the log of ``decode`` in one line; empty if none."""
+    if "Stream #0:" in _source(log) and "Video: " not in _source(log):
+        return "it has only sound"
+    return reason(log) if "[error]" in log or "[fatal]" in log else ""
 
-    def _interpret(self, log: str) -> None:
-        source = log.partition("Output #0")[0]
-        self.complaint = reason(log) if "[error]" in log or "[fatal]" in log else ""
-        if "Stream #0:" in source and "Video: " not in source:
-            self.complaint = "it has only sound"
-        duration = re.search(r"Duration: (\d+):(\d+):([\d.]+)", source)
-        rate = re.search(r"Video: .* ([\d.]+) fps", source)
-        count = _frames_of_avi(self._path)
-        alone = source.count("Stream #0:") <= 1
-        if duration and rate and (alone or not count):
-            hours, minutes, seconds = map(float, duration.groups())
-            length = 3600 * hours + 60 * minutes + seconds
-            count, self.of_file = max(count, round(length * float(rate[1]))), not alone
-        self.declared = count or None
+
+def declared_frames(path: Path, log: str) -> tuple[int, bool]:
+    """Return about how many frames a video file declares, 0 if none, given the log of ``decode``.
+
+    The second result is whether the number comes from the length of the whole file, whose sound may
+    be longer than its video.
+    """
+    source, count = _source(log), _frames_of_avi(path)
+    duration = re.search(r"Duration: (\d+):(\d+):([\d.]+)", source)
+    rate = re.search(r"Video: .* ([\d.]+) fps", source)
+    has_sound = source.count("Stream #0:") > 1
+    if not duration or not rate or (has_sound and count):
+        return count, False
+    hours, minutes, seconds = map(float, duration.groups())
+    length = 3600 * hours + 60 * minutes + seconds
+    return max(count, round(length * float(rate[1]))), has_sound
 
 
 def reason(log: str) -> str:
@@ -172,6 +147,10 @@ def reason(log: str) -> str:
     # "[mov,mp4 @ 0x55] [error] moov atom not found"
     said = [re.sub(r"^(\[[^]]*\]\s*)+", "", line).strip().rstrip(".") for line in wrong]
     return said[0] if said else ""
+
+
+def _source(log: str) -> str:
+    return log.partition("Output #0")[0]
 
 
 def _start(command: list[str], **pipes: Any) -> subprocess.Popen[bytes]:
@@ -199,5 +178,6 @@ def _frames_of_avi(path: Path) -> int:
     return int.from_bytes(head[48:52], "little")
 
 
-def _text(log: IO[bytes]) -> str:
+def _read(log: IO[bytes]) -> str:
+    log.seek(0)
     return log.read().decode("utf-8", "replace")

@@ -9,7 +9,6 @@ from typing import Any, ParamSpec, TypeVar
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
@@ -32,16 +31,6 @@ _FLAGS = (
 checks must be off: jaxopt, used by Brax, leaks tracers, joint limits are infinite, and models
 contain Python numbers. Inputs and outputs of a compiled program are checked as the process has set
 it."""
-
-_SHORT = {
-    np.dtype(long): np.dtype(short)
-    for long, short in (
-        ("float64", "float32"),
-        ("int64", "int32"),
-        ("uint64", "uint32"),
-        ("complex128", "complex64"),
-    )
-}
 
 
 @contextmanager
@@ -90,4 +79,6 @@ def as_by_default(leaf: Any) -> Any:
             return leaf
         # JAX's other implementations hold a threefry key twice.
         return jax.random.wrap_key_data(jax.random.key_data(leaf)[..., :2], impl=PRNG)
-    return leaf.astype(_SHORT[dtype]) if dtype in _SHORT else leaf
+    if dtype.str[1:] in ("f8", "i8", "u8", "c16"):
+        return leaf.astype(f"{dtype.kind}{dtype.itemsize // 2}")
+    return leaf

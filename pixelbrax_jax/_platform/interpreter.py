@@ -140,7 +140,10 @@ _CALLS = {"jit": "jaxpr", "closed_call": "call_jaxpr"}
 
 
 def _program(eqn: core.JaxprEqn) -> core.ClosedJaxpr | None:
-    """Return the program in an equation, to be inlined; of ``by_platform`` the CPU's form."""
+    """Return the program in an equation, to be inlined; of ``by_platform`` the CPU's form.
+
+    Only CPUs use this module.
+    """
     if eqn.primitive.name in _CALLS:
         return eqn.params[_CALLS[eqn.primitive.name]]
     for platforms, branch in zip(
@@ -163,14 +166,6 @@ def _cond(eqn: core.JaxprEqn, inputs: Sequence[Operand], size: int) -> list[Any]
 
     branches = [partial(branch, closed) for closed in eqn.params["branches"]]
     values = [x.value for x in operands]
-    platforms = eqn.params.get("branches_platforms")
-    if platforms is not None:
-        # The CPU's form of `by_platform`, because only CPUs use this module.
-        return next(
-            take(*values)
-            for take, names in zip(branches, platforms, strict=True)
-            if names is None or "cpu" in names
-        )
     if not index.batched:
         return list(lax.switch(index.value, branches, *values))
     # Rows take different branches: all branches are computed, as under `jax.vmap`.

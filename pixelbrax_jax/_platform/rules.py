@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -225,9 +226,7 @@ def _dot(eqn: core.JaxprEqn, inputs: Sequence[Operand], size: int) -> list[Any] 
 
 def _is_short(eqn: core.JaxprEqn) -> bool:
     (contracted, _), _ = eqn.params["dimension_numbers"]
-    terms = 1
-    for axis in contracted:
-        terms *= row_aval(eqn.invars[0]).shape[axis]
+    terms = math.prod(row_aval(eqn.invars[0]).shape[axis] for axis in contracted)
     # Libraries accumulate products of short floats in longer ones.
     dtype = row_aval(eqn.outvars[0]).dtype
     is_short_float = jnp.issubdtype(dtype, jnp.floating) and dtype.itemsize < 4

@@ -10,7 +10,6 @@ import sys
 import tempfile
 import warnings
 import zipfile
-from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -39,7 +38,6 @@ _NOT_THE_USER = {
     "contextlib",
 }
 """Packages between a user's code and ``load_clips``."""
-
 
 _Decoded = tuple[np.ndarray, np.ndarray, list[str]]
 """Frames, lengths of the clips, and defects of their files."""
@@ -99,7 +97,7 @@ class ClipBank:
     @property
     def device_bytes(self) -> int:
         """Bytes that ``to_device`` takes: four per pixel."""
-        return int(self.frames.shape[0] * self.frames.shape[1] * self.frames.shape[2] * 4)
+        return self.frames.size // 3 * 4
 
     def to_device(self) -> Clips:
         """Return ``EnvParams.clips``, on JAX's default device."""
@@ -161,12 +159,11 @@ def load_clips(
     folder = whole_path(source)
     sources, present = folders.find(folder, split)
     if present != split:
-        warnings.warn(
+        _warn(
             f"split={split!r} selects {present!r}, the only split of {folder}, which has no clips "
             f"to test on. Pass split={present!r} if that is what you want, or put the clips "
             "into subfolders train and test.",
             OnlySplitWarning,
-            stacklevel=_stacklevel_of_the_user(),
         )
     sources = sources[:num_clips]
     images = sum(len(s.files) for s in sources if not s.is_video)
@@ -179,7 +176,7 @@ def load_clips(
     _write_cache(cache_dir, cached, frames, length, lacks)
     for clip, lack in zip(sources, lacks, strict=True):
         if lack:
-            warnings.warn(f"{clip.files[0]} {lack}; {AGAIN}.", stacklevel=_stacklevel_of_the_user())
+            _warn(f"{clip.files[0]} {lack}; {AGAIN}.")
     return ClipBank(frames, length, tuple(s.name for s in sources), str(folder), present)
 
 
@@ -193,23 +190,20 @@ def _procedural(names: tuple[str, ...], split: str, height: int, width: int) -> 
 
 def warn_procedural() -> None:
     """Warn, once per place in the user's code, that clips are not DAVIS."""
-    warnings.warn(
+    _warn(
         "the background plays procedural clips, because clips= is not given; results are not "
         "comparable with DAVIS. Pass clips='procedural' if that is what you want, or "
         "clips='<folder of DAVIS-2017>'.",
         ProceduralClipsWarning,
-        stacklevel=_stacklevel_of_the_user(),
     )
 
 
-def _stacklevel_of_the_user() -> int:
-    """Return the ``stacklevel`` with which the caller's warning points to the user's line."""
-    level, frame = 1, sys._getframe(1)
-    while frame.f_globals.get("__name__", "").partition(".")[0] in _NOT_THE_USER:
-        if frame.f_back is None:
-            return 1
+def _warn(message: str, category: type[Warning] = UserWarning) -> None:
+    """Warn of the line in the user's code."""
+    level, frame = 1, sys._getframe()
+    while frame.f_back and frame.f_globals["__name__"].partition(".")[0] in _NOT_THE_USER:
         level, frame = level + 1, frame.f_back
-    return level
+    warnings.warn(message, category, stacklevel=level)
 
 
 def _check_size(frames: int, height: int, width: int, max_bytes: int) -> None:
@@ -227,28 +221,21 @@ def _decode(
 ) -> _Decoded:
     clips: list[np.ndarray] = []
     lacks: list[str] = []
-    total = 0
 
     def check_count(count: int) -> None:
-        _check_size(total + count, height, width, max_bytes)
+        _check_size(sum(map(len, clips)) + count, height, width, max_bytes)
 
-    for source in _with_progress(sources, progress):
+    with contextlib.suppress(ImportError):
+        from tqdm import tqdm
+
+        # None hides the bar if standard error is not a terminal.
+        hidden = None if progress else True
+        sources = tqdm(sources, "reading clips", unit="clip", leave=False, disable=hidden)
+    for source in sources:
         frames, lack = read_clip(source, height, width, check_count)
         clips.append(np.stack(frames))
         lacks.append(lack)
-        total += len(frames)
     return np.concatenate(clips), np.array([len(clip) for clip in clips], np.int32), lacks
-
-
-def _with_progress(sources: list[folders.Source], progress: bool) -> Iterable[folders.Source]:
-    if not progress:
-        return sources
-    try:
-        from tqdm import tqdm
-    except ImportError:
-        return sources
-    # None hides the bar if standard error is not a terminal.
-    return tqdm(sources, desc="reading clips", unit="clip", leave=False, disable=None)
 
 
 def _digest(sources: list[folders.Source], height: int, width: int) -> str:
@@ -301,8 +288,7 @@ def _write_cache(
         if half is not None:
             with contextlib.suppress(OSError):
                 half.unlink(missing_ok=True)
-        warnings.warn(
+        _warn(
             f"clips could not be cached ({error}) and are decoded again each time; set the "
-            "environment variable PIXELBRAX_CACHE to a folder.",
-            stacklevel=_stacklevel_of_the_user(),
+            "environment variable PIXELBRAX_CACHE to a folder."
         )

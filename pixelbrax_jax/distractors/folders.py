@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -63,13 +62,12 @@ def find(folder: Path, split: str) -> tuple[list[Source], str]:
     (DAVIS's validation set), ``"paper-train"`` and ``"paper-test"``. Any other folder has video
     files, or folders of images, in subfolders named like the splits; without subfolders all are in
     split ``"all"``. If there is only one split and its name is not that of a test, ``"train"`` also
-    selects it. Unreadable subfolders are skipped with a warning. Clips are in the order of the
-    split file, else by name.
+    selects it. Clips are in the order of the split file, else by name.
 
     Raises:
         FileNotFoundError: the folder, a split file or a listed clip is missing; the message has the
             expected layout.
-        PermissionError: the folder cannot be read.
+        PermissionError: the folder or a subfolder cannot be read.
         ValueError: the split is unknown or has no clips.
     """
     if folder.is_file():
@@ -131,23 +129,8 @@ def _davis(images: Path, split: str) -> list[Source]:
 
 def _plain(folder: Path, split: str) -> tuple[list[Source], str]:
     # A folder of images is a clip; a folder of clips is a split; other folders are ignored.
-    closed: dict[Path, None] = {}
-
-    def clips_in(part: Path) -> list[Path]:
-        return _clips(part, closed)
-
-    parts = {
-        p.name: found
-        for p in _entries(folder)
-        if p.is_dir() and (found := _if_open(clips_in, p, closed))
-    }
-    clips = clips_in(folder)
-    if closed:
-        warnings.warn(
-            f"folders that cannot be read are skipped: {', '.join(map(str, closed))}; if they have "
-            "clips that you want, change their permissions.",
-            stacklevel=4,  # the caller of load_clips
-        )
+    parts = {p.name: found for p in _entries(folder) if p.is_dir() and (found := _clips(p))}
+    clips = _clips(folder)
     if parts and clips:
         raise ValueError(
             f"{folder} has clips next to the folders {', '.join(parts)}, which also have clips; "
@@ -173,25 +156,12 @@ def _present(folder: Path, split: str, splits: list[str]) -> str:
     return check_choice(f"split of {folder}", split, splits)
 
 
-def _clips(folder: Path, closed: dict[Path, None]) -> list[Path]:
+def _clips(folder: Path) -> list[Path]:
     return [
         entry
         for entry in _entries(folder)
-        if (
-            _if_open(_pictures, entry, closed) if entry.is_dir() else entry.suffix.lower() in VIDEOS
-        )
+        if (_pictures(entry) if entry.is_dir() else entry.suffix.lower() in VIDEOS)
     ]
-
-
-def _if_open(
-    look: Callable[[Path], list[Path]], folder: Path, closed: dict[Path, None]
-) -> list[Path]:
-    """Return a folder's content; if it cannot be read, nothing, and add it to ``closed``."""
-    try:
-        return look(folder)
-    except PermissionError:
-        closed[folder] = None
-        return []
 
 
 def _source(clip: Path) -> Source:

@@ -11,7 +11,7 @@ import numpy as np
 
 from pixelbrax_jax.distractors.folders import Source
 from pixelbrax_jax.extras import install_extra
-from pixelbrax_jax.ffmpeg import Decoder
+from pixelbrax_jax.ffmpeg import complaint, declared_frames, decode
 
 AGAIN = "get it again, or remove it"
 """Fix for a file that cannot be read or is incomplete."""
@@ -59,25 +59,21 @@ def read_clip(
 
 
 def _read_video(file: Path, keep: Callable[[Any], None]) -> str:
-    image_module = pillow()
+    from_array = pillow().fromarray
     try:
-        decoder = Decoder(file)
+        found, log = decode(file, lambda frame: keep(from_array(frame)))
     except ImportError as error:
         raise ImportError(
             f"reading videos needs imageio-ffmpeg; try: {install_extra('clips')}"
         ) from error
-    found = 0
-    for frame in decoder:
-        keep(image_module.fromarray(frame))
-        found += 1
+    why = complaint(log)
     if not found:
-        return decoder.complaint or "it has no frames"
-    declared = decoder.declared or found
+        return why or "it has no frames"
+    declared, of_file = declared_frames(file, log)
     # Rounded rates add up: 23.98 for 24000 / 1001.
     short = declared - found > _TOLERANCE + declared / 500
-    if short and (decoder.complaint or not decoder.of_file):
-        why = f" ({decoder.complaint})" if decoder.complaint else ""
-        return f"declares {declared} frames but has {found}{why}"
+    if short and (why or not of_file):
+        return f"declares {declared} frames but has {found}" + (f" ({why})" if why else "")
     return ""
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import os
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 from weakref import WeakValueDictionary
@@ -75,20 +75,10 @@ def make(task: str | EnvConfig, **options: Any) -> tuple[PixelEnv, EnvParams]:
 
 
 # For help() and editors.
+_options = dict(inspect.signature(EnvConfig).parameters)
+_task = _options.pop("task").replace(default=inspect.Parameter.empty)
 make.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
-    [
-        inspect.Parameter("task", inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation="str"),
-        *(
-            inspect.Parameter(
-                field.name,
-                inspect.Parameter.KEYWORD_ONLY,
-                default=field.default,
-                annotation=field.type,
-            )
-            for field in fields(EnvConfig)
-            if field.name != "task"
-        ),
-    ]
+    [_task, *(o.replace(kind=inspect.Parameter.KEYWORD_ONLY) for o in _options.values())]
 )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,38 +13,24 @@ from pixelbrax_jax.types import EnvParams
 
 _TWO_OR_THREE = "2 or 3"
 
-_SHAPES: dict[str, tuple[int | str, ...]] = {
-    "geoms.size": ("G", 3),
-    "geoms.pos": ("G", 3),
-    "geoms.quat": ("G", 4),
-    "geoms.rgb": ("M", 3),
-    "geoms.strings.ends": (2, 3),
-    "geoms.strings.length": (),
-    "rig.track": (3,),
-    "rig.eye": (3,),
-    "rig.target": (3,),
-    "rig.up": (3,),
-    "rig.fovy": (),
-    "look.light": (3,),
-    "look.ambient": (),
-    "look.diffuse": (),
-    "look.specular": (),
-    "look.highlight": (),
-    "look.sky": (_TWO_OR_THREE, 3),
-    "look.ground_rgb": (2, 3),
-    "look.ground_pitch": (),
-    "look.headlight": (),
-    "look.lamps.pos": (3,),
-    "look.lamps.axis": (3,),
-    "look.lamps.cos_cutoff": (),
-    "look.lamps.diffuse": (),
-    "look.lamps.highlight": (),
-    "clips.packed": ("T", "H", "W"),
-    "clips.first": ("C",),
-    "clips.length": ("C",),
-    "episode_length": (),
+_NAMES: dict[tuple[int | str, ...], str] = {
+    (): """
+        episode_length rig.fovy geoms.strings.length look.ambient look.diffuse look.specular
+        look.highlight look.ground_pitch look.headlight look.lamps.cos_cutoff look.lamps.diffuse
+        look.lamps.highlight
+    """,
+    (3,): "rig.track rig.eye rig.target rig.up look.light look.lamps.pos look.lamps.axis",
+    (2, 3): "look.ground_rgb geoms.strings.ends",
+    (_TWO_OR_THREE, 3): "look.sky",
+    ("G", 3): "geoms.size geoms.pos",
+    ("G", 4): "geoms.quat",
+    ("M", 3): "geoms.rgb",
+    ("C",): "clips.first clips.length",
+    ("T", "H", "W"): "clips.packed",
 }
 """Shapes of the parameters of one environment, as in ``types``."""
+
+_SHAPES = {name: shape for shape, names in _NAMES.items() for name in names.split()}
 
 
 @dataclass(frozen=True)
@@ -63,6 +49,15 @@ class ParamRows:
         leaves = [next(rows) if is_own else next(rest) for is_own in self.is_own]
         params: EnvParams = jax.tree.unflatten(self.tree, leaves)
         return params
+
+    def of_row(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        """Return ``function`` with an environment's rows as last argument, its parameters."""
+
+        def of_row(*args: Any) -> Any:
+            *others, own = args
+            return function(*others, self.join(own))
+
+        return of_row
 
     def mark(self, own: Any, shared: Any) -> Any:
         """Return a tree like the parameters, with one value for rows, another for shared arrays."""

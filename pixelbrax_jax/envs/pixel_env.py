@@ -12,7 +12,6 @@ import jax.numpy as jnp
 from pixelbrax_jax._platform.frame_stack import push, unpack
 from pixelbrax_jax.config import ProgramConfig
 from pixelbrax_jax.distractors.base import Chain
-from pixelbrax_jax.distractors.presets import as_tuple
 from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.memory import check_fits
 from pixelbrax_jax.physics.base import Physics, check_physics
@@ -64,7 +63,7 @@ class PixelEnv(ProgramConfig):
                 f"physics must be hashable, got a {type(self.physics).__name__}: make it a frozen "
                 "dataclass, or do not override its __eq__."
             ) from error
-        chain = Chain(as_tuple(self.distractors) if self.obs_mode != "state" else ())
+        chain = Chain(self.distractors if self.obs_mode != "state" else ())
         self._store("distractors", chain.links)
         self.check_memory(1)
         if self.renderer == "auto" and self.obs_mode != "state":
@@ -73,7 +72,7 @@ class PixelEnv(ProgramConfig):
     @cached_property
     def chain(self) -> Chain:
         """The chain of all distractors."""
-        return Chain(as_tuple(self.distractors))
+        return Chain(self.distractors)
 
     @property
     def action_size(self) -> int:
@@ -145,7 +144,7 @@ class PixelEnv(ProgramConfig):
         """
         action = check_action(action, (self.action_size,))
         sim, reward = self.advance(state.sim, state.key, action, params)
-        frames = self.push_frame(state.frames, sim, params, jnp.bool_(False))
+        frames = self.push_frame(state.frames, sim, jnp.bool_(False), params)
         state = state.replace(sim=sim, frames=frames)
         return state, self.timestep(state, reward, params)
 
@@ -182,7 +181,7 @@ class PixelEnv(ProgramConfig):
         self, key: jax.Array, episode: jax.Array, params: EnvParams, pose: Any = None
     ) -> tuple[EnvState, Timestep]:
         sim = self.reset_sim(key, episode, params, pose)
-        frames = self.push_frame(self.blank_frames(), sim, params, jnp.bool_(True))
+        frames = self.push_frame(self.blank_frames(), sim, jnp.bool_(True), params)
         state = EnvState(sim=sim, frames=frames, key=key)
         return state, self.timestep(state, jnp.float32(0.0), params)
 
@@ -289,7 +288,7 @@ class PixelEnv(ProgramConfig):
         return jnp.zeros((0, 0, 0) if self.obs_mode == "state" else shape, jnp.uint8)
 
     def push_frame(
-        self, frames: jax.Array, sim: SimState, params: EnvParams, is_first: jax.Array
+        self, frames: jax.Array, sim: SimState, is_first: jax.Array, params: EnvParams
     ) -> jax.Array:
         """Return the frame stack with the image of a state, or K copies of it in a first state."""
         if self.obs_mode == "state":

@@ -78,7 +78,7 @@ class ShardedVectorEnv:
     @partial(jax.jit, static_argnums=0)
     @under_default_flags
     def reset(self, key: jax.Array, params: EnvParams) -> tuple[EnvState, Timestep]:
-        """See ``VectorPixelEnv.reset``; takes a single key."""
+        """See ``VectorPixelEnv.reset``."""
         keys = self._local.env_keys(key, self.num_envs)
         result: tuple[EnvState, Timestep] = self._shard(self._local.reset, 1, params)(keys, params)
         return result

@@ -77,12 +77,9 @@ class VectorPixelEnv:
             TypeError: ``key`` is neither.
             ValueError: an array of ``params`` has another shape; the message has its name.
         """
-        keys, rows = self._env_keys(key), self._rows(params)
-
-        def reset(key: jax.Array, episode: jax.Array, own: Any) -> SimState:
-            return self.env.reset_sim(key, episode, rows.join(own))
-
-        sim = jax.vmap(reset)(keys, jnp.zeros(self.num_envs, jnp.uint32), rows.own)
+        keys, rows = self.env_keys(key, self.num_envs), self._rows(params)
+        reset = jax.vmap(rows.of_row(self.env.reset_sim))
+        sim = reset(keys, jnp.zeros(self.num_envs, jnp.uint32), rows.own)
         blank = self.env.blank_frames()
         frames = jnp.broadcast_to(blank, (self.num_envs, *blank.shape))
         frames = self._push_frames(frames, sim, rows, jnp.ones(self.num_envs, bool))
@@ -117,7 +114,7 @@ class VectorPixelEnv:
             )
         episode, rows = state.sim.episode + 1, self._rows(params)
         if key is not None:
-            keys = self._env_keys(key)
+            keys = self.env_keys(key, self.num_envs)
             state = state.replace(key=jnp.where(mask, keys, state.key))
             episode = jnp.zeros_like(episode)
         state = self._reset_and_draw(state, mask, episode, rows)
@@ -163,7 +160,10 @@ class VectorPixelEnv:
 
     @staticmethod
     def env_keys(key: jax.Array, num_envs: int) -> jax.Array:
-        """Return the keys of environments 0, 1, ...: (num_envs,) ``fold_in(key, i)``."""
+        """Return (num_envs,) keys as they are, or ``fold_in(key, i)`` of a single key."""
+        if getattr(key, "shape", ()) != ():
+            check_key(key, (num_envs,))
+            return key
         check_key(key)
         return jax.vmap(partial(jax.random.fold_in, key))(jnp.arange(num_envs))
 
@@ -182,35 +182,24 @@ class VectorPixelEnv:
         last = self.env.physics.batch_last
         return step_rows(step, sim, (keys, action, params.own), params.shared, last=last)
 
-    def _env_keys(self, key: jax.Array) -> jax.Array:
-        if getattr(key, "shape", ()) == ():
-            return self.env_keys(key, self.num_envs)
-        check_key(key, (self.num_envs,))
-        return key
-
     def _timestep(self, state: EnvState, reward: jax.Array, params: ParamRows) -> Timestep:
-        def see(state: EnvState, reward: jax.Array, own: Any) -> Timestep:
-            return self.env.timestep(state, reward, params.join(own))
-
-        return jax.vmap(see)(state, reward, params.own)
+        see = jax.vmap(params.of_row(self.env.timestep))
+        timestep: Timestep = see(state, reward, params.own)
+        return timestep
 
     def _push_frames(
         self, frames: jax.Array, sim: SimState, params: ParamRows, is_first: jax.Array
     ) -> jax.Array:
-        def push(frames: jax.Array, sim: SimState, own: Any, is_first: jax.Array) -> jax.Array:
-            return self.env.push_frame(frames, sim, params.join(own), is_first)
-
-        return jax.vmap(push)(frames, sim, params.own, is_first)
+        push = jax.vmap(params.of_row(self.env.push_frame))
+        pushed: jax.Array = push(frames, sim, is_first, params.own)
+        return pushed
 
     def _reset_rows(
         self, state: EnvState, mask: jax.Array, episode: jax.Array, params: ParamRows
     ) -> SimState:
         """Return the simulation states, reset where ``mask`` is set."""
-
-        def reset(key: jax.Array, episode: jax.Array, own: Any) -> SimState:
-            return self.env.reset_sim(key, episode, params.join(own))
-
-        sim: SimState = reset_rows(reset, (state.key, episode, params.own), mask, state.sim)
+        reset, rows = params.of_row(self.env.reset_sim), (state.key, episode, params.own)
+        sim: SimState = reset_rows(reset, rows, mask, state.sim)
         return sim
 
     def _reset_and_draw(
@@ -222,11 +211,7 @@ class VectorPixelEnv:
         if self.env.obs_mode == "state":
             return state
         blank = jnp.zeros((self.num_envs, self.env.height, self.env.width), jnp.uint32)
-
-        def draw(sim: SimState, own: Any) -> jax.Array:
-            return self.env.draw(sim, params.join(own))
-
-        newest = replace_rows(draw, (sim, params.own), mask, blank)
+        newest = replace_rows(params.of_row(self.env.draw), (sim, params.own), mask, blank)
         first = jax.vmap(push)(state.frames, newest, jnp.ones_like(mask))
         # Other environments keep their stack, because nothing was rendered for them.
         return state.replace(frames=jnp.where(mask[:, None, None, None], first, state.frames))

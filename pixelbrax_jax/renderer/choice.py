@@ -5,9 +5,9 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import cache
 from importlib.util import find_spec
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -36,13 +36,10 @@ _DEPTH = 1e-4
 """Largest relative difference of depths from rounding."""
 
 
-@dataclass(frozen=True)
-class KernelCheck:
+class KernelCheck(NamedTuple):
     """Result of comparing the kernel with the fused renderer.
 
-    Attributes:
-        passed: whether the images agree.
-        text: what was compared, or what differs, as a sentence without its period.
+    ``text`` is what was compared, or what differs, as a sentence without its period.
     """
 
     passed: bool
@@ -83,27 +80,29 @@ def why_unsupported() -> str | None:
     # Without a plugin nothing for GPUs is imported or traced.
     if platform != "gpu" and not _has_plugin():
         return f"JAX computes on a {platform}; the kernel is for NVIDIA GPUs"
-    if platform == "gpu" and "rocm" in _driver(jax.devices()[0]).lower():
+    device = jax.devices()[0]
+    if platform == "gpu" and "rocm" in _driver(device).lower():
         return "JAX computes on ROCm; the kernel is for NVIDIA GPUs"
+    card, capability = device.device_kind, getattr(device, "compute_capability", "")
     try:
         from jax.experimental.pallas import triton
 
         # In jax 0.12.0.1 this describes an abstract or a real GPU; 0.10.2 has no such function.
-        info = triton.get_gpu_info() if hasattr(triton, "get_gpu_info") else None
+        if hasattr(triton, "get_gpu_info"):
+            card, capability = "the card", triton.get_gpu_info().compute_capability / 10
+        elif platform != "gpu":
+            return None
     except ImportError:
         return f"jax {jax.__version__} has no Pallas for Triton"
     except ValueError as error:
         return f"Pallas does not know the card: {error}"
-    if info is not None:
-        return _why_too_old("the card", info.compute_capability / 10)
-    if platform != "gpu":
-        return None
-    card = jax.devices()[0]
-    capability = str(getattr(card, "compute_capability", ""))
     try:
-        return _why_too_old(card.device_kind, float(capability))
+        too_old = float(capability) < _CAPABILITY
     except ValueError:
-        return f"the compute capability of {card.device_kind} is unknown: {capability!r}"
+        return f"the compute capability of {card} is unknown: {capability!r}"
+    if too_old:
+        return f"{card} has compute capability {capability}, and the kernel needs {_CAPABILITY}"
+    return None
 
 
 def why_not_here() -> str | None:
@@ -219,12 +218,6 @@ def _scene(eye: jax.Array) -> Scene:
         camera=Camera(pos=eye, xmat=spatial.look_at(eye, target, up), fovy=jnp.float32(45.0)),
         look=look,
     )
-
-
-def _why_too_old(card: str, capability: float) -> str | None:
-    if capability >= _CAPABILITY:
-        return None
-    return f"{card} has compute capability {capability}, and the kernel needs {_CAPABILITY}"
 
 
 def _driver(device: jax.Device) -> str:

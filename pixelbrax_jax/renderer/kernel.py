@@ -11,7 +11,7 @@ import numpy as np
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton
 
-from pixelbrax_jax.renderer.fused import Near, Seen, View, rays, see, view_of
+from pixelbrax_jax.renderer.fused import Near, View, rays, see, view_of
 from pixelbrax_jax.renderer.intersect import at_least, at_most
 from pixelbrax_jax.renderer.per_pixel import per_pixel
 from pixelbrax_jax.types import Frame, GeomKind, Scene
@@ -43,8 +43,8 @@ def draw(scene: Scene, height: int, width: int, change: Callable[[Frame], jax.Ar
     if by_pixel is None:
         return change(render(scene, height, width))
 
-    def changed(view: View, numbers: Any, images: Any, seen: Seen) -> list[jax.Array]:
-        return [by_pixel.apply(seen.frame(_geom(view, seen)), numbers, images)]
+    def changed(numbers: Any, images: Any, frame: Frame) -> list[jax.Array]:
+        return [by_pixel.apply(frame, numbers, images)]
 
     band, inputs = _Band(height, width, 0, height), (by_pixel.numbers, by_pixel.images)
     (image,) = _call(changed, view_of(scene, height, _einsum), *inputs, band, [jnp.uint32])
@@ -60,18 +60,17 @@ def render(
 ) -> Frame:
     """Render a band of rows, without a derivative; see ``fused.render``."""
 
-    def planes(view: View, numbers: Any, images: Any, seen: Seen) -> list[jax.Array]:
+    def planes(numbers: Any, images: Any, frame: Frame) -> list[jax.Array]:
         del numbers, images
-        return [seen.r, seen.g, seen.b, seen.depth, _geom(view, seen)]
+        return [frame.r, frame.g, frame.b, frame.depth, frame.seg]
 
     band = _Band(height, width, first_row, height if num_rows is None else num_rows)
     view = view_of(scene, height, _einsum)
     dtypes = [*[jnp.float32] * 4, jnp.int32]
     r, g, b, depth, seg = _call(planes, view, (), (), band, dtypes)
     ground = jnp.zeros(seg.shape, bool)
-    for geom, is_ground in zip(view.geom, view.ground, strict=True):
-        if is_ground:
-            ground |= seg == geom
+    for g in filter(view.geoms.is_ground, view.order):
+        ground |= seg == g
     return Frame(r=r, g=g, b=b, depth=depth, seg=seg, ground=ground)
 
 
@@ -96,10 +95,10 @@ def _near(view: View, band: _Band, start: jax.Array, last: jax.Array) -> Near:
         columns = (jnp.where(one_row, first, 0), jnp.where(one_row, end, width - 1))
     seen = may_see(view, window_of(view, (top, bottom), columns, band.height, band.width))
 
-    def near(rank: int, update: Callable[[Any], Any], value: Any) -> Any:
-        if GeomKind(view.kind[rank]).reach == "all":
+    def near(g: int, update: Callable[[Any], Any], value: Any) -> Any:
+        if GeomKind(view.geoms.kind[g]).reach == "all":
             return update(value)
-        return jax.lax.cond(seen(rank), update, lambda value: value, value)
+        return jax.lax.cond(seen(g), update, lambda value: value, value)
 
     return near
 
@@ -118,11 +117,11 @@ def _einsum(subscripts: str, a: Any, b: Any) -> jax.Array:
     return jnp.sum(terms[0] * terms[1], axis=-1)
 
 
-def _geom(view: View, seen: Seen) -> jax.Array:
+def _geom(view: View, ranks: jax.Array) -> jax.Array:
     """Return the geom of each pixel without a lookup table, which a kernel cannot have."""
-    geom = jnp.full(seen.rank.shape, -1, jnp.int32)
-    for rank, of_rank in enumerate(view.geom):
-        geom = jnp.where(seen.rank == rank, of_rank, geom)
+    geom = jnp.full(ranks.shape, -1, jnp.int32)
+    for rank, g in enumerate(view.order):
+        geom = jnp.where(ranks == rank, g, geom)
     return geom
 
 
@@ -134,7 +133,7 @@ def _call(
     band: _Band,
     dtypes: Sequence[Any],
 ) -> list[jax.Array]:
-    """Return bands of images, (num_rows, width), from ``compute(view, numbers, images, seen)``."""
+    """Return bands of images, (num_rows, width), from ``compute(numbers, images, frame)``."""
     height, width, first_row, num_rows = band
     inputs, inputs_tree = jax.tree.flatten((view, list(numbers), first_row))
     inputs = [jax.lax.stop_gradient(jnp.asarray(x)) for x in inputs]
@@ -160,8 +159,8 @@ def _call(
         column = jax.lax.rem(index, np.int32(width))
         last = jnp.minimum(start + BLOCK, num_pixels) - 1
         near = _near(view, band._replace(first_row=first_row), start, last)
-        seen = see(view, rays(view, height, width, row, column), near)
-        results = compute(view, numbers, images, seen)
+        frame = see(view, rays(view, height, width, row, column), near)
+        results = compute(numbers, images, frame.replace(seg=_geom(view, frame.seg)))
         for ref, result in zip(refs[-len(dtypes) :], results, strict=True):
             triton.store(ref.at[:], result, mask=inside)
 
@@ -212,25 +211,23 @@ def window_of(
 
 
 def may_see(view: View, window: Window) -> Callable[[int], jax.Array]:
-    """Return a function of a geom's rank: whether rays of a window may hit its bounding sphere.
+    """Return a function of a geom: whether rays of a window may hit its bounding sphere.
 
     Along one axis of the image, a sphere at (c, d), d in front of the camera, covers the slopes s
     between its two tangents, ``|c - s d| = r sqrt(1 + s^2)``. A vector holds 32 geoms.
     """
-    count = len(view.geom)
-    kinds = [view.kind[view.geom.index(g)] for g in range(count)]
-    words = [_word(view, window, kinds, first) for first in range(0, count, _GEOMS)]
+    words = [_word(view, window, first) for first in range(0, len(view.order), _GEOMS)]
 
-    def seen(rank: int) -> jax.Array:
-        word, bit = divmod(view.geom[rank], _GEOMS)
+    def seen(g: int) -> jax.Array:
+        word, bit = divmod(g, _GEOMS)
         return ((words[word] >> bit) & 1) != 0
 
     return seen
 
 
-def _word(view: View, window: Window, kinds: Sequence[int], first: int) -> jax.Array:
+def _word(view: View, window: Window, first: int) -> jax.Array:
     """Return one bit for each of the geoms from ``first`` on."""
-    kinds = kinds[first : first + _GEOMS]
+    kinds = view.geoms.kind[first : first + _GEOMS]
     lane = jnp.arange(_GEOMS, dtype=jnp.int32)
     g = first + jnp.minimum(lane, len(kinds) - 1)
 
@@ -238,7 +235,7 @@ def _word(view: View, window: Window, kinds: Sequence[int], first: int) -> jax.A
         mask = sum([1 << bit for bit, kind in enumerate(kinds) if condition(GeomKind(kind))])
         return ((np.int32(np.uint32(mask).view(np.int32)) >> lane) & 1) != 0
 
-    size = [view.size[g, k] for k in range(3)]
+    size = [view.geoms.size[g, k] for k in range(3)]
     long = where(lambda kind: kind.is_long)
     half = jnp.where(long, size[1], 0.0)
     square = size[0] * size[0] + size[1] * size[1] + size[2] * size[2]

@@ -20,11 +20,8 @@ def render(
     """Render a band of rows of an image; see ``base.render``."""
     geoms, look, camera = scene.geoms, scene.look, scene.camera
     rays = pixel_rays(camera, height, width, first_row + jnp.arange(num_rows))
-    distances, normals = [], []
-    for g in range(len(geoms.kind)):
-        t, normal = _cast_geom(scene, g, camera.pos, rays)
-        distances.append(t)
-        normals.append(normal)
+    count = range(len(geoms.kind))
+    distances, normals = zip(*(_cast(scene, g, camera.pos, rays) for g in count), strict=True)
     t = jnp.stack(distances)
     nearest = jnp.argmin(t, axis=0)
     t = jnp.min(t, axis=0)
@@ -34,12 +31,10 @@ def render(
     points = camera.pos + t[..., None] * rays
 
     color = jnp.asarray(geoms.rgb)[jnp.array(geoms.material)[nearest]]
-    is_ground = [geoms.is_ground(g) for g in range(len(geoms.kind))]
-    on_ground = hit & jnp.array(is_ground)[nearest]
-    for g in range(len(geoms.kind)):
-        if is_ground[g]:
-            tiles = _ground_color(scene, g, rays, height)
-            color = jnp.where((nearest == g)[..., None], tiles, color)
+    on_ground = hit & jnp.array([geoms.is_ground(g) for g in count])[nearest]
+    for g in filter(geoms.is_ground, count):
+        tiles = _ground_color(scene, g, rays, height)
+        color = jnp.where((nearest == g)[..., None], tiles, color)
 
     back = camera.xmat[:, 2]
     n_z = normal @ back
@@ -93,17 +88,17 @@ def pixel_rays(camera: Camera, height: int, width: int, rows: jax.Array) -> jax.
     return spatial.unit(jnp.stack([x, y, -jnp.ones_like(x)], axis=-1)) @ camera.xmat.T
 
 
-def _cast_geom(
-    scene: Scene, g: int, origin: jax.Array, rays: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    geoms = scene.geoms
-    t, normal = _cast(geoms.kind[g], origin, rays, scene.pos[g], scene.xmat[g], geoms.size[g])
+def _cast(scene: Scene, g: int, origin: jax.Array, rays: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return distances at which rays enter a geom (``inf`` if never), and normals, world frame."""
+    geoms, xmat, size = scene.geoms, scene.xmat[g], scene.geoms.size[g]
+    d = rays @ xmat
+    o = jnp.broadcast_to((origin - scene.pos[g]) @ xmat, d.shape)
+    t, normal = _LOCAL[GeomKind(geoms.kind[g])](o, d, size)
     if geoms.is_bounded(g):
-        at = _at((origin - scene.pos[g]) @ scene.xmat[g], rays @ scene.xmat[g], t)[..., :2]
-        half = geoms.size[g, :2]
-        inside = jnp.all((jnp.abs(at) <= half) | (half <= 0.0), axis=-1)
+        half = size[:2]
+        inside = jnp.all((jnp.abs(_at(o, d, t)[..., :2]) <= half) | (half <= 0.0), axis=-1)
         t = jnp.where(inside, t, jnp.inf)
-    return t, normal
+    return t, normal @ xmat.T
 
 
 def _shaded(
@@ -113,7 +108,7 @@ def _shaded(
     shaded = jnp.zeros(nearest.shape, bool)
     for g, kind in enumerate(scene.geoms.kind):
         if kind != GeomKind.PLANE:
-            way, _ = _cast_geom(scene, g, origin, rays)
+            way, _ = _cast(scene, g, origin, rays)
             blocked = jnp.isfinite(way) & (way > shading.SHADOW_BIAS) & (way < until)
             shaded |= blocked & (nearest != g)
     return shaded
@@ -137,22 +132,6 @@ def _lamplight(
     return strength * lamp.diffuse * n_l, strength * lamp.highlight * shine
 
 
-def _cast(
-    kind: int,
-    origin: jax.Array,
-    rays: jax.Array,
-    pos: jax.Array,
-    xmat: jax.Array,
-    size: jax.Array,
-) -> tuple[jax.Array, jax.Array]:
-    """Return distances at which rays enter a geom (``inf`` if never), and normals, world frame."""
-    o = (origin - pos) @ xmat
-    d = rays @ xmat
-    o = jnp.broadcast_to(o, d.shape)
-    t, normal = _LOCAL[GeomKind(kind)](o, d, size)
-    return t, normal @ xmat.T
-
-
 def _entry(a: jax.Array, b: jax.Array, c: jax.Array) -> jax.Array:
     """Return the smaller root of ``a t^2 + 2 b t + c`` if it is real and positive, else ``inf``."""
     discriminant = b * b - a * c
@@ -168,7 +147,7 @@ def _at(o: jax.Array, d: jax.Array, t: jax.Array) -> jax.Array:
 
 
 def _plane(o: jax.Array, d: jax.Array, size: jax.Array) -> tuple[jax.Array, jax.Array]:
-    del size  # see _cast_geom
+    del size  # see _cast
     descends = d[..., 2] < -1e-7
     t = -o[..., 2] / jnp.where(descends, d[..., 2], -1.0)
     normal = jnp.broadcast_to(jnp.array([0.0, 0.0, 1.0]), d.shape)
@@ -180,15 +159,20 @@ def _sphere(o: jax.Array, d: jax.Array, size: jax.Array) -> tuple[jax.Array, jax
     return t, spatial.unit(_at(o, d, t))
 
 
-def _capsule(o: jax.Array, d: jax.Array, size: jax.Array) -> tuple[jax.Array, jax.Array]:
-    radius, half = size[0], size[1]
+def _side(o: jax.Array, d: jax.Array, size: jax.Array) -> jax.Array:
+    """Return distances at which rays enter a cylinder through its side."""
     flat_o, flat_d = o[..., :2], d[..., :2]
     t = _entry(
         jnp.sum(flat_d * flat_d, -1),
         jnp.sum(flat_o * flat_d, -1),
-        jnp.sum(flat_o * flat_o, -1) - radius**2,
+        jnp.sum(flat_o * flat_o, -1) - size[0] ** 2,
     )
-    t = jnp.where(jnp.abs(_at(o, d, t)[..., 2]) <= half, t, jnp.inf)
+    return jnp.where(jnp.abs(_at(o, d, t)[..., 2]) <= size[1], t, jnp.inf)
+
+
+def _capsule(o: jax.Array, d: jax.Array, size: jax.Array) -> tuple[jax.Array, jax.Array]:
+    half = size[1]
+    t = _side(o, d, size)
     for end in (-half, half):
         cap, _ = _sphere(o - jnp.array([0.0, 0.0, 1.0]) * end, d, size)
         t = jnp.minimum(t, cap)
@@ -205,13 +189,7 @@ def _ellipsoid(o: jax.Array, d: jax.Array, size: jax.Array) -> tuple[jax.Array, 
 
 def _cylinder(o: jax.Array, d: jax.Array, size: jax.Array) -> tuple[jax.Array, jax.Array]:
     radius, half = size[0], size[1]
-    flat_o, flat_d = o[..., :2], d[..., :2]
-    side = _entry(
-        jnp.sum(flat_d * flat_d, -1),
-        jnp.sum(flat_o * flat_d, -1),
-        jnp.sum(flat_o * flat_o, -1) - radius**2,
-    )
-    side = jnp.where(jnp.abs(_at(o, d, side)[..., 2]) <= half, side, jnp.inf)
+    side = _side(o, d, size)
     outward = jnp.where(d[..., 2] > 0, -1.0, 1.0)
     slanted = jnp.abs(d[..., 2]) > 1e-7
     cap = (outward * half - o[..., 2]) / jnp.where(slanted, d[..., 2], 1.0)

@@ -64,7 +64,7 @@ def images(envs):
     def image(place):
         state = envs.env.reset_sim(jax.random.key(0), jnp.uint32(0), PARAMS)
         state = state.replace(physics=Probes.at(place))
-        return envs.env.push_frame(envs.env.blank_frames(), state, PARAMS, jnp.bool_(True))
+        return envs.env.push_frame(envs.env.blank_frames(), state, jnp.bool_(True), PARAMS)
 
     return image(jnp.arange(len(NAMES)))
 

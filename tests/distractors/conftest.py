@@ -7,7 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from pixelbrax_jax.distractors import ClipBank
+from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.types import Clips
+from tests.envs.toy import PARAMS, Ball
 
 SIZE = {"height": 24, "width": 20, "frame_stack": 2}
 
@@ -21,6 +23,17 @@ def make_bank(lengths=(5, 1, 8), height=24, width=20):
 
 def make_clips(**options) -> Clips:
     return jax.tree.map(np.asarray, make_bank(**options).to_device())
+
+
+def episode(distractor, num_frames, key=0, clips=None):
+    """Timestep, clean or changed image, and state of each frame of an episode of the toy."""
+    env = PixelEnv(Ball(), **SIZE, distractors=(distractor,) if distractor else ())
+    params = PARAMS.replace(clips=make_clips() if clips is None else clips)
+    state, timestep = env.reset(jax.random.key(key), params)
+    yield timestep, env.render(state, params), state
+    for _ in range(num_frames - 1):
+        state, timestep = env.step(state, jnp.array([0.3]), params)
+        yield timestep, env.render(state, params), state
 
 
 def walk(distractor, params, steps, num):

@@ -9,7 +9,7 @@ import pytest
 
 from pixelbrax_jax import VectorPixelEnv, distractors
 from pixelbrax_jax.envs.pixel_env import PixelEnv
-from tests.distractors.conftest import SIZE, walk
+from tests.distractors.conftest import SIZE, episode, walk
 from tests.envs.toy import PARAMS, Ball
 
 KEYS = jax.vmap(jax.random.key)(jnp.arange(20_000))
@@ -59,20 +59,12 @@ def test_a_walk_takes_small_steps_and_stays_in_its_box():
     assert (shifts.max(0) - shifts.min(0)).mean() > 0.2
 
 
-def frames_of(color, steps=4):
-    env = PixelEnv(Ball(), **SIZE, distractors=(color,) if color else ())
-    state, timestep = env.reset(jax.random.key(0), PARAMS)
-    seen = [(timestep, env.render(state, PARAMS))]
-    for _ in range(steps - 1):
-        state, timestep = env.step(state, jnp.array([0.2]), PARAMS)
-        seen.append((timestep, env.render(state, PARAMS)))
-    return seen
-
-
 def test_paper_color_is_one_offset_for_each_frame():
     (color,) = distractors.preset("paper-color", "ant")
     offsets = []
-    for (timestep, frame), (_, clean) in zip(frames_of(color), frames_of(None), strict=True):
+    for (timestep, frame, _), (_, clean, _) in zip(
+        episode(color, 4), episode(None, 4), strict=True
+    ):
         offset = np.asarray(timestep.info["color"])
         offsets.append(offset)
         for c, (plane, bare) in enumerate(
@@ -101,7 +93,7 @@ def test_materials_keep_colors_in_range(dynamics, distribution):
 
 def test_geom_colors_change_things_and_not_the_sky():
     color = distractors.Color("geom", "static", 0.3, "uniform")
-    for (_, frame), (_, clean) in zip(frames_of(color), frames_of(None), strict=True):
+    for (_, frame, _), (_, clean, _) in zip(episode(color, 4), episode(None, 4), strict=True):
         sky, ball = clean.seg == -1, clean.seg == 1
         np.testing.assert_array_equal(frame.r[sky], clean.r[sky])
         assert (np.asarray(frame.g)[ball] != np.asarray(clean.g)[ball]).all()

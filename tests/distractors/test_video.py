@@ -11,7 +11,7 @@ from pixelbrax_jax import VectorPixelEnv, distractors
 from pixelbrax_jax.distractors.video import frame_index
 from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.types import GeomKind
-from tests.distractors.conftest import SIZE, make_clips
+from tests.distractors.conftest import SIZE, episode, make_clips
 from tests.envs.toy import PARAMS, Ball
 
 
@@ -39,21 +39,9 @@ def test_closed_form_is_the_counter(dynamics, length, direction):
         assert closed == counted(dynamics, length, start, direction, frames)
 
 
-def run(distractor, frames=5, key=0, clips=None):
-    """Words, clean words and states of an episode of the toy."""
-    env = PixelEnv(Ball(), **SIZE, distractors=(distractor,) if distractor else ())
-    params = PARAMS.replace(clips=make_clips() if clips is None else clips)
-    state, timestep = env.reset(jax.random.key(key), params)
-    seen = [(timestep, env.render(state, params), state)]
-    for _ in range(frames - 1):
-        state, timestep = env.step(state, jnp.array([0.3]), params)
-        seen.append((timestep, env.render(state, params), state))
-    return seen
-
-
 def test_an_overlay_covers_everything():
-    video = run(distractors.Video(mode="overlay", alpha=0.25, dynamics="loop"))
-    clean = run(None)
+    video = episode(distractors.Video(mode="overlay", alpha=0.25, dynamics="loop"), 5)
+    clean = episode(None, 5)
     clips = make_clips()
     for (timestep, frame, _), (_, plain, _) in zip(video, clean, strict=True):
         info = timestep.info
@@ -65,8 +53,8 @@ def test_an_overlay_covers_everything():
 
 @pytest.mark.parametrize(("ground_alpha", "alpha"), [(1.0, 1.0), (0.3, 0.4), (0.0, 0.0)])
 def test_a_background_leaves_the_agent_alone(ground_alpha, alpha):
-    video = run(distractors.Video(ground_alpha=ground_alpha, alpha=alpha))
-    clean = run(None)
+    video = episode(distractors.Video(ground_alpha=ground_alpha, alpha=alpha), 5)
+    clean = episode(None, 5)
     clips = make_clips()
     ground = Ball.geoms.kind.index(GeomKind.PLANE)
     for (timestep, frame, _), (bare, plain, _) in zip(video, clean, strict=True):
@@ -93,7 +81,7 @@ def test_every_frame_shows_the_clip_in_order():
     clips = make_clips()
     for dynamics in ("loop", "pingpong", "static"):
         for key in range(4):
-            steps = run(distractors.Video(dynamics=dynamics), frames=12, key=key, clips=clips)
+            steps = list(episode(distractors.Video(dynamics=dynamics), 12, key, clips))
             state = steps[0][2].sim.distractor_state[0]
             expected = counted(
                 dynamics,
@@ -125,7 +113,7 @@ def test_an_episode_draws_a_clip_a_start_and_a_direction():
 def test_few_clips_and_no_random_start():
     video = distractors.Video(num_clips=1, random_start=False)
     for key in range(5):
-        (timestep, *_), *_ = run(video, frames=1, key=key)
+        ((timestep, *_),) = episode(video, 1, key)
         assert (int(timestep.info["video_clip"]), int(timestep.info["video_frame"])) == (0, 0)
 
 

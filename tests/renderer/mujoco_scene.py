@@ -5,6 +5,8 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
+from tests.renderer.mujoco_rays import cast_rays
+
 
 def shown_geoms(
     model: mujoco.MjModel, data: mujoco.MjData, camera: int
@@ -53,20 +55,8 @@ def cast(
     mujoco.mj_kinematics(targets, posed)
 
     eye, axes = data.cam_xpos[camera], data.cam_xmat[camera].reshape(3, 3)
-    half = np.tan(np.deg2rad(model.cam_fovy[camera]) / 2)
-    seen = np.full((size, size), "", dtype=object)
-    depth = np.full((size, size), np.inf)
-    hit = np.zeros(1, np.int32)
-    for row in range(size):
-        for column in range(size):
-            x, y = (2 * column + 1 - size) / size * half, (size - 1 - 2 * row) / size * half
-            ray = axes @ np.array([x, y, -1.0])
-            length = np.linalg.norm(ray)
-            t = mujoco.mj_ray(targets, posed, eye, ray / length, None, 1, -1, hit)
-            if t >= 0:
-                seen[row, column] = shown[int(hit[0])][0]
-                depth[row, column] = t / length
-    return seen, depth
+    seg, depth = cast_rays(targets, posed, eye, axes, model.cam_fovy[camera], size, size)
+    return np.array([*(name for name, _ in shown), ""], dtype=object)[seg], depth
 
 
 ROUND = ("capsule", "cylinder")

@@ -8,7 +8,7 @@ import numpy as np
 
 from pixelbrax_jax import Camera, Geoms, Look, make_look
 from pixelbrax_jax.spatial import look_at
-from pixelbrax_jax.types import Scene
+from pixelbrax_jax.types import FAR, Scene
 
 PRIMITIVES_MJCF = """
 <mujoco>
@@ -29,19 +29,38 @@ def primitives() -> mujoco.MjModel:
     return mujoco.MjModel.from_xml_string(PRIMITIVES_MJCF)
 
 
-def geoms_of(model: mujoco.MjModel) -> Geoms:
-    """All geoms of a model, on no link, each with a color of its own."""
-    count = model.ngeom
+def geoms_of(kinds, sizes, names=None, **static) -> Geoms:
+    """Geoms on no link, each with a color of its own."""
+    count = len(kinds)
     return Geoms(
-        kind=tuple(int(kind) for kind in model.geom_type),
+        kind=tuple(int(kind) for kind in kinds),
         link=(-1,) * count,
         material=tuple(range(count)),
-        name=tuple(model.geom(g).name for g in range(count)),
-        size=jnp.asarray(model.geom_size, jnp.float32),
+        name=tuple(names or (f"geom/{g}" for g in range(count))),
+        size=jnp.asarray(sizes, jnp.float32),
         pos=jnp.zeros((count, 3)),
         quat=jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0]), (count, 1)),
         rgb=jnp.linspace(0.2, 0.9, 3 * count).reshape(count, 3),
+        **static,
     )
+
+
+def scene_of(*solids, look=None, camera=None, **static) -> Scene:
+    """A scene of (kind, size, position), axes along the world's, seen from above."""
+    kinds, sizes, positions = zip(*solids, strict=True)
+    return Scene(
+        geoms=geoms_of(kinds, sizes, **static),
+        pos=jnp.array(positions, jnp.float32),
+        xmat=jnp.tile(jnp.eye(3), (len(kinds), 1, 1)),
+        camera=camera or from_above(2.0),
+        look=look or make_look("default"),
+    )
+
+
+def from_above(height, fovy=60.0) -> Camera:
+    """A camera that looks straight down, x right and y up in its image."""
+    pos = jnp.array([0.0, 0.0, height], jnp.float32)
+    return Camera(pos=pos, xmat=jnp.eye(3), fovy=jnp.float32(fovy))
 
 
 def camera(eye, target=(0.0, 0.0, 0.5), fovy=50.0) -> Camera:
@@ -54,8 +73,10 @@ def camera(eye, target=(0.0, 0.0, 0.5), fovy=50.0) -> Camera:
 def random_scene(seed: int, look: Look | None = None) -> Scene:
     """All primitives at random poses above the ground, seen from a random side."""
     rng = np.random.default_rng(seed)
-    geoms = geoms_of(primitives())
-    count = len(geoms.kind)
+    model = primitives()
+    count = model.ngeom
+    names = [model.geom(g).name for g in range(count)]
+    geoms = geoms_of(model.geom_type, model.geom_size, names)
     pos = rng.uniform([-0.8, -0.8, 0.1], [0.8, 0.8, 1.1], (count, 3))
     quat = rng.normal(size=(count, 4))
     pos[0], quat[0] = 0.0, (1.0, 0.0, 0.0, 0.0)
@@ -75,20 +96,15 @@ def random_scene(seed: int, look: Look | None = None) -> Scene:
 
 def one_geom(kind: int, size, eye, *, pos=(0.0, 0.0, 0.0), target=(0.0, 0.0, 0.0), fovy=40.0):
     """A scene with a single geom, axes along the world's."""
-    geoms = Geoms(
-        kind=(int(kind),),
-        link=(-1,),
-        material=(0,),
-        name=("it",),
-        size=jnp.array([size], jnp.float32),
-        pos=jnp.zeros((1, 3)),
-        quat=jnp.array([[1.0, 0.0, 0.0, 0.0]]),
-        rgb=jnp.array([[0.5, 0.4, 0.3]]),
-    )
-    return Scene(
-        geoms=geoms,
-        pos=jnp.array([pos], jnp.float32),
-        xmat=jnp.eye(3)[None],
-        camera=camera(eye, target, fovy),
-        look=make_look("default"),
-    )
+    return scene_of((kind, size, pos), camera=camera(eye, target, fovy))
+
+
+def assert_alike(one, other, colors: float) -> None:
+    """Two images are the same, but for single pixels at silhouettes and edges of shadows."""
+    same = np.asarray(one.seg == other.seg)
+    assert same.mean() > 0.998
+    np.testing.assert_array_equal(one.ground[same], other.ground[same])
+    difference = np.max([np.abs(getattr(one, c) - getattr(other, c)) for c in "rgb"], axis=0)
+    assert np.mean(difference > 2 / 255) < colors
+    both = same & (other.depth < FAR)
+    np.testing.assert_allclose(one.depth[both], other.depth[both], rtol=1e-3)

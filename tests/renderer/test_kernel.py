@@ -162,8 +162,7 @@ def test_no_geom_is_left_out_that_is_seen():
             )
             one = scene.replace(geoms=geoms, pos=scene.pos[g : g + 1], xmat=scene.xmat[g : g + 1])
             alone.append(render(one, height, width, "fused").seg == 0)
-            rank = view.geom.index(g)
-            flags.append(jnp.stack([seen(rank), by_rows(rank)]))
+            flags.append(jnp.stack([seen(g), by_rows(g)]))
         return jnp.stack(alone), jnp.stack(flags)
 
     alone, flags = map(np.asarray, look(batch, rows, columns))

@@ -10,7 +10,8 @@ import pytest
 from pixelbrax_jax import GeomKind, make_look
 from pixelbrax_jax.renderer.base import render
 from pixelbrax_jax.types import Lamp
-from tests.renderer.test_planes import RENDERERS, SIZE, from_above, ground_points, scene_of
+from tests.renderer.scenes import from_above, scene_of
+from tests.renderer.test_planes import RENDERERS, SIZE, ground_points
 
 LAMP = Lamp(
     link=-1,

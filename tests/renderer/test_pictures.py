@@ -94,14 +94,8 @@ def test_fused_draws_what_the_reference_draws(draw, look, shadows):
     look = make_look(look, shadows=shadows)
     for seed in range(6):
         scene = scenes.random_scene(seed, look)
-        fast, plain = (draw(scene, SIZE, SIZE, name) for name in ("fused", "reference"))
-        same = np.asarray(fast.seg == plain.seg)
-        assert same.mean() > 0.998
-        difference = np.abs(rgb(fast) - rgb(plain)).max(axis=-1)
-        # Single pixels may fall on the other side of a silhouette or a shadow's edge.
-        assert np.mean(difference > 2 / 255) < 0.004
-        both = same & (plain.depth < FAR)
-        np.testing.assert_allclose(fast.depth[both], plain.depth[both], rtol=1e-3)
+        pair = (draw(scene, SIZE, SIZE, name) for name in ("fused", "reference"))
+        scenes.assert_alike(*pair, colors=0.004)
 
 
 def test_bands_of_rows_make_up_the_picture(draw):

@@ -7,45 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pixelbrax_jax import GeomKind, Geoms, make_look
+from pixelbrax_jax import GeomKind, make_look
 from pixelbrax_jax.renderer.base import render
-from pixelbrax_jax.types import FAR, Scene
+from pixelbrax_jax.types import FAR
 from tests.renderer import scenes
+from tests.renderer.scenes import scene_of
 
 SIZE = 40
 RENDERERS = ("fused", "reference")
 HALF = (0.5, 0.25)
-
-
-def scene_of(*solids, look=None, camera=None, bounded=(), patterned=()) -> Scene:
-    """A scene of (kind, size, position), axes along the world's, a color each."""
-    count = len(solids)
-    geoms = Geoms(
-        kind=tuple(int(kind) for kind, _, _ in solids),
-        link=(-1,) * count,
-        material=tuple(range(count)),
-        name=tuple(f"geom/{g}" for g in range(count)),
-        size=jnp.array([size for _, size, _ in solids], jnp.float32),
-        pos=jnp.zeros((count, 3)),
-        quat=jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0]), (count, 1)),
-        rgb=jnp.linspace(0.2, 0.9, 3 * count).reshape(count, 3),
-        bounded=bounded,
-        patterned=patterned,
-    )
-    return Scene(
-        geoms=geoms,
-        pos=jnp.array([pos for _, _, pos in solids], jnp.float32),
-        xmat=jnp.tile(jnp.eye(3), (count, 1, 1)),
-        camera=camera or from_above(2.0),
-        look=look or make_look("default"),
-    )
-
-
-def from_above(height, fovy=60.0):
-    """A camera that looks straight down, x right and y up in its image."""
-    return scenes.camera((0.0, -1.0, 1.0), fovy=fovy).replace(
-        pos=jnp.array([0.0, 0.0, height]), xmat=jnp.eye(3)
-    )
 
 
 def ground_points(height, fovy, size=SIZE):
@@ -175,11 +145,4 @@ def test_fused_draws_what_the_reference_draws():
     draw = jax.jit(render, static_argnums=(1, 2, 3))
     for seed in range(4):
         scene = random_strip(seed)
-        fast, plain = (draw(scene, SIZE, SIZE, name) for name in RENDERERS)
-        same = np.asarray(fast.seg == plain.seg)
-        assert same.mean() > 0.998
-        np.testing.assert_array_equal(fast.ground[same], plain.ground[same])
-        for a, b in ((fast.r, plain.r), (fast.g, plain.g), (fast.b, plain.b)):
-            assert np.mean(np.abs(a - b) > 2 / 255) < 0.005
-        both = same & (plain.depth < FAR)
-        np.testing.assert_allclose(fast.depth[both], plain.depth[both], rtol=1e-3)
+        scenes.assert_alike(*(draw(scene, SIZE, SIZE, name) for name in RENDERERS), colors=0.005)
