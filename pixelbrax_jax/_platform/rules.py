@@ -49,8 +49,7 @@ def _rule_of_first(name: str) -> Callable[..., Callable[..., jax.Array]]:
     """Register a rule for a batched first operand and shared others."""
 
     def register(function: Callable[..., jax.Array]) -> Callable[..., jax.Array]:
-        def apply(eqn: core.JaxprEqn, inputs: Sequence[Operand], size: int) -> list[Any] | None:
-            del size
+        def apply(eqn: core.JaxprEqn, inputs: Sequence[Operand], _size: int) -> list[Any] | None:
             first, *others = inputs
             if not first.batched or any(x.batched for x in others):
                 return None
@@ -106,9 +105,8 @@ reduce_prod reduce_sum rev split squeeze
 
 
 @rule(*_NAMED_AXES_NAMES.split())
-def _named_axes(eqn: core.JaxprEqn, inputs: Sequence[Operand], size: int) -> list[Any]:
+def _named_axes(eqn: core.JaxprEqn, inputs: Sequence[Operand], _size: int) -> list[Any]:
     """Bind unchanged: parameters name the axes, and one more at the end does not matter."""
-    del size
     return bind(eqn, *(x.value for x in inputs))
 
 

@@ -36,12 +36,10 @@ class Distractor:
 
         The key is unique for this frame and distractor.
         """
-        del key, frame, params
         return state
 
     def change_params(self, state: Any, params: EnvParams) -> EnvParams:
         """Return the parameters for the frame, such as other colors or another camera."""
-        del state
         return params
 
     def backdrop(
@@ -51,7 +49,6 @@ class Distractor:
 
         ``rows``, (R,) int32, are row indices in [0, height).
         """
-        del state, params, rows, height, width
         return None
 
     def change_frame(self, state: Any, frame: Frame, backdrop: jax.Array | None) -> Frame:
@@ -60,12 +57,10 @@ class Distractor:
         ``backdrop`` has the same rows of the backdrop, if there is one; noise per pixel belongs
         there.
         """
-        del state, backdrop
         return frame
 
     def info(self, state: Any) -> dict[str, jax.Array]:
         """Return the entries that the state adds to ``Timestep.info``."""
-        del state
         return {}
 
 

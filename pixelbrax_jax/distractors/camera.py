@@ -101,7 +101,6 @@ class MovingCamera(Distractor):
         self, state: CameraState, key: jax.Array, frame: jax.Array, params: EnvParams
     ) -> CameraState:
         """Take one step of the random walk."""
-        del frame
         if not self.dynamic:
             return state
         low, high = self._box(params.rig)

@@ -91,7 +91,6 @@ class Color(Distractor):
         self, state: jax.Array, key: jax.Array, frame: jax.Array, params: EnvParams
     ) -> jax.Array:
         """Return the next shift."""
-        del frame
         if self.dynamics == "static":
             return state
         if self.dynamics == "iid":
@@ -118,7 +117,6 @@ class Color(Distractor):
 
     def change_frame(self, state: jax.Array, frame: Frame, backdrop: jax.Array | None) -> Frame:
         """Return the frame plus the offset."""
-        del backdrop
         if self.mode == "geom":
             return frame
         return frame.replace(

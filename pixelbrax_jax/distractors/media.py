@@ -79,23 +79,23 @@ def _read_video(file: Path, keep: Callable[[Any], None]) -> str:
 
 def _read_gif(file: Path, keep: Callable[[Any], None]) -> str:
     image_module = pillow()
+    from PIL import ImageSequence
+
     found = 0
     try:
         with image_module.open(file) as image:
-            while True:
-                keep(image)
+            for frame in ImageSequence.Iterator(image):
+                keep(frame)
                 found += 1
-                image.seek(found)
-    except EOFError:
         # A GIF declares no number of frames, but marks its end.
         ended = file.read_bytes().rstrip(b"\0").endswith(b";")
-        return "" if ended else f"is cut short after {found} frames"
     except MemoryError:
         raise
     except Exception as error:  # Pillow's of damaged files are of every kind
         if not found:
             raise ValueError(f"{file} cannot be read as a video: {_say(file, error)}.") from error
-        return f"is cut short after {found} frames"
+        ended = False
+    return "" if ended else f"is cut short after {found} frames"
 
 
 def _picture(file: Path, height: int, width: int) -> np.ndarray:

@@ -114,7 +114,6 @@ class Video(Distractor):
         self, state: VideoState, key: jax.Array, frame: jax.Array, params: EnvParams
     ) -> VideoState:
         """Return the state with the clip's next frame."""
-        del key
         length = jnp.asarray(_clips(params).length)[state.clip]
         return state.replace(
             frame=frame_index(self.dynamics, length, state.start, state.direction, frame)
@@ -137,7 +136,6 @@ class Video(Distractor):
 
     def change_frame(self, state: VideoState, frame: Frame, backdrop: jax.Array | None) -> Frame:
         """Return the frame blended with the video."""
-        del state
         assert backdrop is not None
         kept: float | jax.Array = 1.0 - self.fraction
         if self.mode == "background":

@@ -60,8 +60,7 @@ def render(
 ) -> Frame:
     """Render a band of rows, without a derivative; see ``fused.render``."""
 
-    def planes(numbers: Any, images: Any, frame: Frame) -> list[jax.Array]:
-        del numbers, images
+    def planes(_numbers: Any, _images: Any, frame: Frame) -> list[jax.Array]:
         return [frame.r, frame.g, frame.b, frame.depth, frame.seg]
 
     band = _Band(height, width, first_row, height if num_rows is None else num_rows)
