@@ -23,8 +23,8 @@ def find_ffmpeg() -> str:
 
     Raises:
         ImportError: imageio-ffmpeg, which includes it, is not installed.
-        OSError: no FFmpeg exists for this machine, it cannot be started, or ``IMAGEIO_FFMPEG_EXE``
-            is not a program; the message has the fix.
+        OSError: no FFmpeg runs on this machine, or ``IMAGEIO_FFMPEG_EXE`` is not a program; the
+            message has the fix.
     """
     import imageio_ffmpeg
 
@@ -34,12 +34,8 @@ def find_ffmpeg() -> str:
         raise FileNotFoundError(
             f"imageio-ffmpeg has no FFmpeg for this machine; install one and set {_VARIABLE} to it."
         ) from error
+    # imageio-ffmpeg tries all programs but that of the variable.
     if shutil.which(program) is None:
-        if not os.environ.get(_VARIABLE):
-            raise FileNotFoundError(
-                f"the FFmpeg of imageio-ffmpeg, {program}, cannot be started; install "
-                "imageio-ffmpeg again."
-            )
         raise FileNotFoundError(
             f"the environment variable {_VARIABLE} is {program!r}, which is not a program; unset "
             "it to use the FFmpeg of imageio-ffmpeg."

@@ -201,10 +201,3 @@ def test_an_encoder_without_h264(tmp_path, monkeypatch):
     with pytest.raises(OSError, match=r"a\.mp4 was not written: Unknown encoder 'libx264'\.$"):
         write_frames(tmp_path / "a.mp4", flashes(1), 20)
     assert not (tmp_path / "a.mp4").exists()
-
-
-def test_an_ffmpeg_of_imageios_that_cannot_be_started(monkeypatch):
-    monkeypatch.delenv("IMAGEIO_FFMPEG_EXE", raising=False)
-    monkeypatch.setattr("imageio_ffmpeg.get_ffmpeg_exe", lambda: "/nowhere/ffmpeg")
-    with pytest.raises(OSError, match=r"/nowhere/ffmpeg, cannot be .*install imageio-ffmpeg again"):
-        find_ffmpeg()

@@ -169,11 +169,12 @@ def load_clips(
     images = sum(len(s.files) for s in sources if not s.is_video)
     _check_size(images, height, width, max_bytes)
     cached = Path("clips", f"{_digest(sources, height, width)}.npz")
-    frames, length, lacks = _read_cache(cache_dir, cached) or _decode(
-        sources, height, width, max_bytes, progress
-    )
+    clips = _read_cache(cache_dir, cached)
+    if clips is None:
+        clips = _decode(sources, height, width, max_bytes, progress)
+        _write_cache(cache_dir, cached, clips)
+    frames, length, lacks = clips
     _check_size(len(frames), height, width, max_bytes)
-    _write_cache(cache_dir, cached, frames, length, lacks)
     for clip, lack in zip(sources, lacks, strict=True):
         if lack:
             _warn(f"{clip.files[0]} {lack}; {AGAIN}.")
@@ -251,43 +252,24 @@ def _digest(sources: list[folders.Source], height: int, width: int) -> str:
 
 
 def _read_cache(cache_dir: str | Path | None, name: Path) -> _Decoded | None:
-    try:
-        file = cache_folder(cache_dir) / name
-        if not file.is_file():
-            return None
-        with file.open("rb") as opened, np.load(opened) as cached:
+    # A file that is damaged, or cannot be read now, is the same as none.
+    with contextlib.suppress(OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile):
+        with np.load(cache_folder(cache_dir) / name) as cached:
             return cached["frames"], cached["length"], cached["lacks"].tolist()
-    except (EOFError, ValueError, KeyError, zipfile.BadZipFile):
-        with contextlib.suppress(OSError):
-            file.unlink(missing_ok=True)  # damaged: it is made again
-        return None
-    except OSError:  # cannot be read now; the clips themselves can
-        return None
+    return None
 
 
-def _write_cache(
-    cache_dir: str | Path | None,
-    name: Path,
-    frames: np.ndarray,
-    length: np.ndarray,
-    lacks: list[str],
-) -> None:
-    """Write to a temporary file and rename it, so that the cache is never incomplete."""
-    half: Path | None = None
+def _write_cache(cache_dir: str | Path | None, name: Path, clips: _Decoded) -> None:
+    """Write to a temporary folder and rename the file, so that the cache is never incomplete."""
+    frames, length, lacks = clips
     try:
         file = cache_folder(cache_dir) / name
-        if file.is_file():
-            return
         file.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=file.parent, suffix=".tmp", delete=False) as opened:
-            half = Path(opened.name)
-            np.savez(opened, frames=frames, length=length, lacks=np.array(lacks, str))
-        half.chmod(0o644)  # others may share the cache
-        half.replace(file)
+        with tempfile.TemporaryDirectory(dir=file.parent) as part:
+            half = Path(part, file.name)
+            np.savez(half, frames=frames, length=length, lacks=np.array(lacks, str))
+            half.replace(file)
     except OSError as error:
-        if half is not None:
-            with contextlib.suppress(OSError):
-                half.unlink(missing_ok=True)
         _warn(
             f"clips could not be cached ({error}) and are decoded again each time; set the "
             "environment variable PIXELBRAX_CACHE to a folder."

@@ -83,24 +83,21 @@ def why_unsupported() -> str | None:
     device = jax.devices()[0]
     if platform == "gpu" and "rocm" in _driver(device).lower():
         return "JAX computes on ROCm; the kernel is for NVIDIA GPUs"
-    card, capability = device.device_kind, getattr(device, "compute_capability", "")
     try:
         from jax.experimental.pallas import triton
 
         # In jax 0.12.0.1 this describes an abstract or a real GPU; 0.10.2 has no such function.
         if hasattr(triton, "get_gpu_info"):
             card, capability = "the card", triton.get_gpu_info().compute_capability / 10
-        elif platform != "gpu":
+        elif platform == "gpu":
+            card, capability = device.device_kind, float(device.compute_capability)
+        else:
             return None
     except ImportError:
         return f"jax {jax.__version__} has no Pallas for Triton"
-    except ValueError as error:
+    except (AttributeError, ValueError) as error:
         return f"Pallas does not know the card: {error}"
-    try:
-        too_old = float(capability) < _CAPABILITY
-    except ValueError:
-        return f"the compute capability of {card} is unknown: {capability!r}"
-    if too_old:
+    if capability < _CAPABILITY:
         return f"{card} has compute capability {capability}, and the kernel needs {_CAPABILITY}"
     return None
 

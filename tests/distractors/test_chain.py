@@ -120,11 +120,6 @@ def test_order_of_giving_does_not_matter(runs):
     np.testing.assert_array_equal(reordered.obs["pixels"], runs[0].obs["pixels"])
 
 
-def test_two_of_a_kind():
-    with pytest.raises(ValueError, match="two distractors of kind 'color'"):
-        Chain((Color(), Color(scale=0.1)))
-
-
 def test_what_cannot_work_together_is_refused():
     class Nameless(distractors.Distractor):
         pass
@@ -140,6 +135,7 @@ def test_what_cannot_work_together_is_refused():
         __hash__ = None
 
     for given, error, message in (
+        ((Color(), Color(scale=0.1)), ValueError, "two distractors of kind 'color'"),
         (("color",), TypeError, "expected a Distractor, got str; only pixelbrax_jax.make"),
         ((Nameless(),), TypeError, "Nameless needs a kind"),
         ((Reset(),), ValueError, "Reset needs a stream, a positive integer, got 0"),

@@ -173,25 +173,6 @@ def test_fresh_episodes_are_those_of_same_step_autoreset(limit):
     np.testing.assert_array_equal(sums["sum_reward"][ended], final["episode_return"][ended])
 
 
-def test_brax_itself_repeats_the_first_episode(limit):
-    first, states = brax_rollout(
-        training.wrap(make_brax(obs_mode="both"), episode_length=limit), 2 * limit
-    )
-    expected = pixel_rollout(make(obs_mode="both"), limit, limited(limit))
-    ended = np.asarray(states.done, bool)
-    for i in range(NUM_ENVS):
-        length = int(np.argmax(ended[:, i])) + 1
-        once, again = slice(0, length), slice(length, 2 * length)
-        np.testing.assert_array_equal(states.done[once, i], ends(expected)[once, i])
-        np.testing.assert_array_equal(
-            states.info["truncation"][once, i], expected.truncated[once, i]
-        )
-        np.testing.assert_array_equal(states.reward[once, i], expected.reward[once, i])
-        for name in (PIXELS, "state"):
-            np.testing.assert_array_equal(states.obs[name][length - 1, i], first.obs[name][i])
-            np.testing.assert_array_equal(states.obs[name][again, i], states.obs[name][once, i])
-
-
 def test_the_time_limit_is_braxs_alone():
     env = BraxEnv(make(obs_mode="state", action_repeat=2), limited(5))
     assert env.episode_length == 3  # calls, of which the last would have been cut short

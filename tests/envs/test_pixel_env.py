@@ -58,15 +58,6 @@ def env_frame(env, state):
     return np.floor(255 * rgb + np.float32(0.5)).astype(np.uint8)
 
 
-@pytest.mark.parametrize("frame_stack", [1, 2, 5])
-def test_frame_stack_sizes(frame_stack):
-    env = make(frame_stack=frame_stack)
-    state, timestep = env.reset(jax.random.key(0), PARAMS)
-    assert timestep.obs.shape == (16, 16, 3 * frame_stack)
-    _, timestep = env.step(state, RIGHT, PARAMS)
-    assert timestep.obs.shape == (16, 16, 3 * frame_stack)
-
-
 def test_obs_modes_show_the_same_episode():
     steps = {}
     for mode in ("pixels", "state", "both"):

@@ -144,13 +144,6 @@ def test_one_end_leaves_the_others_untouched(mode):
         np.testing.assert_array_equal(busy.reward[others], calm.reward[others])
 
 
-def test_successive_episodes_begin_differently():
-    venv = make("next_step", obs_mode="state")
-    _, steps = run(venv, 60, jnp.ones((N, 1)))
-    starts = {float(step.obs[1, 0]) for step in steps if int(step.info["episode_length"][1]) == 0}
-    assert len(starts) >= 4
-
-
 @pytest.mark.parametrize("num_envs", [1, 33, 70])
 def test_more_ends_than_one_block_and_ragged_batches(num_envs):
     venv, params = make("next_step", num_envs, obs_mode="state"), toy.limited(3)
