@@ -253,10 +253,11 @@ def _digest(sources: list[folders.Source], height: int, width: int) -> str:
 
 def _read_cache(cache_dir: str | Path | None, name: Path) -> _Decoded | None:
     # A file that is damaged, or cannot be read now, is the same as none.
-    with contextlib.suppress(OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile):
+    try:
         with np.load(cache_folder(cache_dir) / name) as cached:
             return cached["frames"], cached["length"], cached["lacks"].tolist()
-    return None
+    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile):
+        return None
 
 
 def _write_cache(cache_dir: str | Path | None, name: Path, clips: _Decoded) -> None:

@@ -8,7 +8,6 @@ from functools import cached_property, partial
 from typing import Any
 
 import jax
-import numpy as np
 from jax.sharding import AxisType, Mesh, PartitionSpec
 
 from pixelbrax_jax.envs.param_rows import split_params
@@ -56,24 +55,6 @@ class ShardedVectorEnv:
             raise ValueError(f"num_envs={num_envs} must be a multiple of the {size} devices.")
         object.__setattr__(self, "num_envs", num_envs)
         _ = self._local  # It checks the other fields.
-
-    def __getstate__(self) -> dict[str, Any]:
-        ids = [device.id for device in self.mesh.devices.flat]
-        fields = ("env", "num_envs", "autoreset_mode")
-        return {name: getattr(self, name) for name in fields} | {"mesh": ids}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        devices = {device.id: device for device in jax.devices()}
-        missing = [i for i in state["mesh"] if i not in devices]
-        if missing:
-            raise ValueError(
-                f"environments on devices {state['mesh']} need devices {missing}, but this process "
-                f"has only {sorted(devices)}."
-            )
-        # In their original order, which `jax.make_mesh` might change.
-        own = np.array([devices[i] for i in state["mesh"]])
-        mesh = Mesh(own, (AXIS,), axis_types=(AxisType.Auto,))
-        self.__dict__.update(state | {"mesh": mesh})
 
     @partial(jax.jit, static_argnums=0)
     @under_default_flags

@@ -16,7 +16,6 @@ import pytest
 import torch
 
 import pixelbrax_jax
-from pixelbrax_jax.envs.sharded import make_env_mesh
 from tests.gym.adapters import ADAPTERS, Single, Vector, as_bytes
 
 COPIES = {
@@ -113,15 +112,6 @@ def test_equal_environments_after_a_pickle(task):
         assert copy.deepcopy(one) == one
     restored = pickle.loads(pickle.dumps(params))
     jax.tree.map(np.testing.assert_array_equal, restored, params)
-
-
-def test_environments_spread_over_devices():
-    env, _ = pixelbrax_jax.make("inverted_pendulum", height=12, width=12)
-    sharded = pixelbrax_jax.ShardedVectorEnv(env, 4, make_env_mesh(1))
-    assert pickle.loads(pickle.dumps(sharded)) == sharded
-    assert copy.deepcopy(sharded) == sharded
-    with pytest.raises(ValueError, match=r"need devices \[7\], but this process has only"):
-        sharded.__setstate__(sharded.__getstate__() | {"mesh": [0, 7]})
 
 
 def test_another_process_goes_on(tmp_path):
