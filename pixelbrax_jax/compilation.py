@@ -10,7 +10,6 @@ from typing import Any, ParamSpec, TypeVar
 import jax
 import numpy as np
 
-from pixelbrax_jax._platform.lowering import default_platform
 from pixelbrax_jax.flags import is_guarded, under_default_flags
 from pixelbrax_jax.validation import check_choice
 
@@ -102,7 +101,7 @@ def _physics(env: Any) -> Any:
 
 def _options(physics: Any, platform: str | None = None) -> dict[str, Any]:
     if platform is None:
-        platform = default_platform()
+        platform = jax.default_backend()
     else:
         platform = _PLATFORMS[check_choice("platform", platform, _PLATFORMS)]
     flags = os.environ.get("XLA_FLAGS", "")

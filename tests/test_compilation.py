@@ -103,7 +103,7 @@ def test_on_a_gpu_loops_are_captured_unless_the_user_says_otherwise(monkeypatch)
     assert "WHILE" in ours[commands].split(",")
     assert compiler_options(platform="cuda") == ours
     with monkeypatch.context() as patch:
-        patch.setattr("pixelbrax_jax.compilation.default_platform", lambda: "gpu")
+        patch.setattr("jax.default_backend", lambda: "gpu")
         assert compiler_options() == ours
     monkeypatch.setenv("XLA_FLAGS", f"--{commands}=-WHILE")
     assert compiler_options(platform="gpu") == {}

@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax._platform.interpreter import batch_last
-from pixelbrax_jax._platform.lowering import by_platform, trace_once
 
 _CHUNK = 128
 """Largest number of rows that a CPU computes together, to keep intermediate results in its
@@ -28,19 +27,23 @@ def step_rows(
     ``step`` returns a row's next state, with the same tree, and a () float32. With ``last`` the
     batch is the last axis of intermediate results on a CPU, see ``batch_last``.
     """
-    step = trace_once(step)
+    step = jax.jit(step, inline=True)  # traced once for all forms
     together = jax.vmap(step, in_axes=(0, 0, None))
     if len(jax.tree.leaves(state)[0]) == 1:
         return together(state, rows, shared)
     in_chunks = partial(_step_chunks, step, last)
-    moved: tuple[Any, jax.Array] = by_platform(state, rows, shared, cpu=in_chunks, default=together)
+    moved: tuple[Any, jax.Array] = jax.lax.platform_dependent(
+        state, rows, shared, cpu=in_chunks, default=together
+    )
     return moved
 
 
 def map_runs(function: Callable[[Any], Any], runs: Any) -> Any:
     """Return ``jax.vmap(function)(runs)``; on a CPU one run after the other."""
-    function = trace_once(function)
-    return by_platform(runs, cpu=partial(jax.lax.map, function), default=jax.vmap(function))
+    function = jax.jit(function, inline=True)
+    return jax.lax.platform_dependent(
+        runs, cpu=partial(jax.lax.map, function), default=jax.vmap(function)
+    )
 
 
 def _step_chunks(

@@ -6,8 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pixelbrax_jax._platform.lowering import by_platform
-
 
 def unpack(packed: jax.Array) -> jax.Array:
     """Unpack pixels, channels last: (..., H, W) uint32 -> (..., H, W, 3) uint8."""
@@ -19,7 +17,9 @@ def push(frames: jax.Array, newest: jax.Array, is_first: jax.Array) -> jax.Array
 
     With ``is_first``, () bool, it becomes K copies of the frame.
     """
-    pushed: jax.Array = by_platform(frames, newest, is_first, cpu=_concatenate, default=_shift)
+    pushed: jax.Array = jax.lax.platform_dependent(
+        frames, newest, is_first, cpu=_concatenate, default=_shift
+    )
     return pushed
 
 

@@ -28,7 +28,7 @@ def batch_last(fn: Callable[..., Any], in_axes: Sequence[int | None]) -> Callabl
     effects.
 
     The rules read private parameters of JAX's primitives. If a release changes them, ``jax.vmap``
-    computes all of ``fn``, with one RuntimeWarning per process and side effects possibly twice.
+    computes all of ``fn``, with a RuntimeWarning and side effects possibly twice.
 
     Raises ValueError if arguments have different numbers of rows. An argument's axis is 0 or None.
     """
@@ -55,28 +55,20 @@ def batch_last(fn: Callable[..., Any], in_axes: Sequence[int | None]) -> Callabl
         # Whatever this meets in an unknown release must not stop a user: `fn` itself, and so the
         # user's mistakes, went through `make_jaxpr` above.
         except Exception as error:
-            _warn_once(error)
+            warnings.warn(
+                f"jax {jax.__version__} has programs that PixelBrax cannot compute with the "
+                f"environments as last axis ({type(error).__name__}: {error}). They are computed "
+                "by jax.vmap: the results are as good, and on a CPU physics take up to three times "
+                "as long.",
+                RuntimeWarning,
+                stacklevel=1,  # one line, which Python warns of once
+            )
             return jax.vmap(fn, in_axes=tuple(in_axes))(*args)
         outputs, tree = jax.tree.flatten(shapes)
         rows = [spread(x, out.shape, padded) for x, out in zip(results, outputs, strict=True)]
         return jax.tree.unflatten(tree, [jnp.moveaxis(x, -1, 0)[:size] for x in rows])
 
     return rows_of
-
-
-_warned: list[str] = []
-"""Content of the only warning given in this process."""
-
-
-def _warn_once(error: Exception) -> None:
-    if _warned:
-        return
-    _warned.append(
-        f"jax {jax.__version__} has programs that PixelBrax cannot compute with the environments "
-        f"as last axis ({type(error).__name__}: {error}). They are computed by jax.vmap: the "
-        "results are as good, and on a CPU physics take up to three times as long."
-    )
-    warnings.warn(_warned[0], RuntimeWarning, stacklevel=3)
 
 
 def _varies(x: jax.Array) -> bool:
@@ -140,7 +132,7 @@ _CALLS = {"jit": "jaxpr", "closed_call": "call_jaxpr"}
 
 
 def _program(eqn: core.JaxprEqn) -> core.ClosedJaxpr | None:
-    """Return the program in an equation, to be inlined; of ``by_platform`` the CPU's form.
+    """Return the program in an equation, to be inlined; of ``platform_dependent`` the CPU's form.
 
     Only CPUs use this module.
     """

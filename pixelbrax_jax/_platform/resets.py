@@ -9,8 +9,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from pixelbrax_jax._platform.lowering import by_platform, trace_once
-
 _BLOCK = 32
 """Environments that are reset together; their number is rounded up to a multiple."""
 
@@ -24,12 +22,14 @@ def reset_rows(
     would wait for the host in every iteration, so it resets all rows and selects, unless the reset
     contains a loop that waits in any case.
     """
-    fn = trace_once(fn)
+    fn = jax.jit(fn, inline=True)
     row = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), arguments)
     replace = partial(replace_rows, fn)
     if _has_open_loop(jax.make_jaxpr(fn)(*row).jaxpr):
         return replace(arguments, mask, rows)
-    return by_platform(arguments, mask, rows, cpu=replace, default=partial(_select_rows, fn))
+    return jax.lax.platform_dependent(
+        arguments, mask, rows, cpu=replace, default=partial(_select_rows, fn)
+    )
 
 
 def replace_rows(

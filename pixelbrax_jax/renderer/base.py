@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pixelbrax_jax._platform.lowering import by_platform
 from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.renderer import choice, fused, reference
 from pixelbrax_jax.types import Frame, Scene
@@ -129,7 +128,7 @@ def draw(
     forms = {"cpu": in_a_conditional, "tpu": behind_a_barrier}
     if renderer == "auto" and choice.why_no_kernel() is None:
         forms["cuda"] = by_kernel
-    image: jax.Array = by_platform(default=in_bands, **forms)
+    image: jax.Array = jax.lax.platform_dependent(default=in_bands, **forms)
     return image
 
 
@@ -161,7 +160,7 @@ def _fast(
         return by_kernel()
     if renderer == "fused" or choice.why_no_kernel() is not None:
         return plain()
-    frame: Frame = by_platform(cuda=by_kernel, default=plain)
+    frame: Frame = jax.lax.platform_dependent(cuda=by_kernel, default=plain)
     return frame
 
 

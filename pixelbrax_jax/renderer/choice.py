@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from pixelbrax_jax import spatial
-from pixelbrax_jax._platform.lowering import default_platform
 from pixelbrax_jax.flags import default_flags
 from pixelbrax_jax.renderer import fused
 from pixelbrax_jax.types import Camera, Frame, GeomKind, Geoms, Lamp, Look, Scene
@@ -48,8 +47,8 @@ class KernelCheck(NamedTuple):
 
 def auto_renderer() -> tuple[str, str]:
     """Return the renderer that ``"auto"`` means on JAX's default device, and the reason."""
-    if default_platform() != "gpu":
-        return "fused", f"JAX computes on a {default_platform()}; the kernel is for NVIDIA GPUs"
+    if jax.default_backend() != "gpu":
+        return "fused", f"JAX computes on a {jax.default_backend()}; the kernel is for NVIDIA GPUs"
     why = why_no_kernel()
     if why is not None:
         return "fused", f"not by one kernel: {why}"
@@ -64,7 +63,7 @@ def why_no_kernel() -> str | None:
     unchecked.
     """
     why = why_unsupported()
-    if why is None and default_platform() == "gpu":
+    if why is None and jax.default_backend() == "gpu":
         check = kernel_check()
         return None if check.passed else check.text
     return why
@@ -76,7 +75,7 @@ def why_unsupported() -> str | None:
     With JAX's CUDA plugin, programs can be compiled for a GPU on a machine without one. jax
     0.12.0.1 must be told the GPU, jax 0.10.2 need not; see `docs/renderer.md`.
     """
-    platform = default_platform()
+    platform = jax.default_backend()
     # Without a plugin nothing for GPUs is imported or traced.
     if platform != "gpu" and not _has_plugin():
         return f"JAX computes on a {platform}; the kernel is for NVIDIA GPUs"
@@ -105,8 +104,8 @@ def why_unsupported() -> str | None:
 def why_not_here() -> str | None:
     """Return why JAX's default device cannot run the kernel, checked or not; None if it can."""
     why = why_unsupported()
-    if why is None and default_platform() != "gpu":
-        return f"JAX computes on a {default_platform()}"
+    if why is None and jax.default_backend() != "gpu":
+        return f"JAX computes on a {jax.default_backend()}"
     return why
 
 

@@ -88,7 +88,7 @@ def card(monkeypatch):
 
     client = SimpleNamespace(platform_version="cuda 12.9")
     card = SimpleNamespace(device_kind="NVIDIA H100", compute_capability="9.0", client=client)
-    monkeypatch.setattr(choice, "default_platform", lambda: "gpu")
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(jax, "devices", lambda: [card])
     monkeypatch.delattr(triton, "get_gpu_info", raising=False)
     check = choice.kernel_check

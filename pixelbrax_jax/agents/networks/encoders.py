@@ -10,8 +10,6 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
-from pixelbrax_jax._platform.lowering import by_platform
-
 _GREY = 0.5
 """Centre of the pixels in [0, 1], which ``Small`` and ``Patch`` subtract. Positive inputs give all
 weights of a filter gradients of the same sign, and large steps then turn most filters off."""
@@ -30,7 +28,7 @@ def convolve(x: jax.Array, kernel: jax.Array, stride: int, pads: Pads) -> jax.Ar
             x, kernel, (stride, stride), pads, dimension_numbers=("NHWC", "HWIO", "NHWC")
         )
 
-    result: jax.Array = by_platform(x, kernel, cpu=products, default=native)
+    result: jax.Array = jax.lax.platform_dependent(x, kernel, cpu=products, default=native)
     return result
 
 

@@ -10,7 +10,6 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from pixelbrax_jax._platform.lowering import default_platform
 from pixelbrax_jax.agents.algorithm import Algorithm
 from pixelbrax_jax.agents.runner.progress import Report
 from pixelbrax_jax.agents.train_state import TrainState, env_axes
@@ -94,4 +93,4 @@ def _memories(algorithm: Algorithm) -> int:
     mesh = mesh_of(algorithm)
     if mesh is None:
         return 1
-    return jax.process_count() if default_platform() == "cpu" else int(mesh.size)
+    return jax.process_count() if jax.default_backend() == "cpu" else int(mesh.size)

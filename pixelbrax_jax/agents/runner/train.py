@@ -11,7 +11,6 @@ from typing import Any
 import jax
 import numpy as np
 
-from pixelbrax_jax._platform.lowering import default_platform
 from pixelbrax_jax.agents.algorithm import Algorithm
 from pixelbrax_jax.agents.config import TrainConfig, make_env
 from pixelbrax_jax.agents.registry import make_algorithm
@@ -83,7 +82,7 @@ def train(config: TrainConfig, options: RunConfig, report: Report = silent) -> O
     with suppress(Exception):  # as in `run`
         report(
             f"{algorithm.name} on {config.env.task}, {config.num_envs} environments, {devices} "
-            f"{default_platform()} device{'s' * (devices > 1)}, {config.num_iterations} "
+            f"{jax.default_backend()} device{'s' * (devices > 1)}, {config.num_iterations} "
             f"iterations of {config.steps_per_iteration} control steps; "
             f"into {Path(options.output_dir).resolve()}"
         )

@@ -5,8 +5,6 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from pixelbrax_jax._platform.lowering import by_platform
-
 LARGEST = 17
 """Largest number of unknowns for which elimination is faster on a CPU than LAPACK per matrix."""
 
@@ -19,7 +17,7 @@ def solve(matrix: jax.Array, right: jax.Array) -> jax.Array:
     """
     if len(matrix) > LARGEST:
         return _by_factors(matrix, right)
-    return by_platform(matrix, right, cpu=eliminate, default=_by_factors)
+    return jax.lax.platform_dependent(matrix, right, cpu=eliminate, default=_by_factors)
 
 
 def _by_factors(matrix: jax.Array, right: jax.Array) -> jax.Array:

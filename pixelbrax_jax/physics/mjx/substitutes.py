@@ -10,7 +10,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from pixelbrax_jax._platform.lowering import by_platform
 from pixelbrax_jax.physics.mjx import elimination
 from pixelbrax_jax.physics.mjx.contact_frames import PAIR, aligned_with_capsules
 from pixelbrax_jax.physics.mjx.solver import is_supported, solve
@@ -65,7 +64,9 @@ def body_tree(model: Any, of_body: Any, *args: Any, **options: Any) -> Any:
 
     def level(*values: Any) -> Any:
         barrier = jax.lax.optimization_barrier
-        return by_platform(of_body(*values), cpu=barrier, default=lambda found: found)
+        return jax.lax.platform_dependent(
+            of_body(*values), cpu=barrier, default=lambda found: found
+        )
 
     return _body_tree(model, level, *args, **options)
 
@@ -96,7 +97,7 @@ def factor_m(model: Any, data: Any) -> Any:
         return jnp.full_like(inertia, jnp.nan)
 
     if _is_small(model):
-        found = by_platform(inertia, data.qacc, cpu=no_factors, default=factors)
+        found = jax.lax.platform_dependent(inertia, data.qacc, cpu=no_factors, default=factors)
         return data.tree_replace({"_impl.qLD": found})
     nothing = (0 * data.qacc).sum()
     return _factor_m(model, data.tree_replace({"_impl.M": inertia + nothing}))
@@ -116,7 +117,7 @@ def solve_m(model: Any, data: Any, right: Any) -> Any:
         return elimination.eliminate(inertia, right)
 
     arguments = data._impl.M, data._impl.qLD, right
-    return by_platform(*arguments, cpu=by_elimination, default=by_factors)
+    return jax.lax.platform_dependent(*arguments, cpu=by_elimination, default=by_factors)
 
 
 def _is_small(model: Any) -> bool:
