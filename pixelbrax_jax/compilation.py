@@ -108,18 +108,17 @@ def _options(physics: Any, platform: str | None = None) -> dict[str, Any]:
     if platform == "gpu" and _COMMANDS not in flags:
         chosen: dict[str, Any] = {_COMMANDS: _CAPTURED}
     elif platform == "cpu" and _WIDTH not in flags:
-        chosen = {_WIDTH: 512, **(physics.compiler_options if physics else {})}
-        if physics is not None and _intersections(physics) > _MOST_INTERSECTIONS:
-            # The newer ones split long loops and compute shared values again in each part:
-            # rendering DM Control's swimmer15 takes 250 times as long.
-            chosen.setdefault(_EMITTERS, False)
+        chosen = {_WIDTH: 512}
+        if physics is not None:
+            chosen |= physics.compiler_options
+            rays = 1 + len(physics.look.lamps if physics.look else ())
+            if len(physics.geoms.kind) * rays > _MOST_INTERSECTIONS:
+                # The newer ones split long loops and compute shared values again in each part:
+                # rendering DM Control's swimmer15 takes 250 times as long.
+                chosen.setdefault(_EMITTERS, False)
     else:
         return {}
     return {name: value for name, value in chosen.items() if _is_known(name, value)}
-
-
-def _intersections(physics: Any) -> int:
-    return len(physics.geoms.kind) * (1 + len(physics.look.lamps if physics.look else ()))
 
 
 @cache

@@ -137,7 +137,13 @@ class VectorPixelEnv:
         """
         action = check_action(action, (self.num_envs, self.env.action_size))
         ended, rows = state.done, self._rows(params)
-        sim, reward = self._advance(state.sim, state.key, action, rows)
+
+        def advance(sim: SimState, own: Any, shared: Any) -> tuple[SimState, jax.Array]:
+            key, action, own_params = own
+            return self.env.advance(sim, key, action, rows.join(own_params, shared))
+
+        own, last = (state.key, action, rows.own), self.env.physics.batch_last
+        sim, reward = step_rows(advance, state.sim, own, rows.shared, last=last)
         state = state.replace(sim=sim)
         if self.autoreset_mode == "next_step":
             state = state.replace(sim=self._reset_rows(state, ended, sim.episode + 1, rows))
@@ -169,18 +175,6 @@ class VectorPixelEnv:
 
     def _rows(self, params: EnvParams) -> ParamRows:
         return split_params(params, self.num_envs)
-
-    def _advance(
-        self, sim: SimState, keys: jax.Array, action: jax.Array, params: ParamRows
-    ) -> tuple[SimState, jax.Array]:
-        """Return the states after their actions, without resets, and the rewards."""
-
-        def step(sim: SimState, rows: tuple[Any, Any, Any], shared: Any) -> Any:
-            key, action, own = rows
-            return self.env.advance(sim, key, action, params.join(own, shared))
-
-        last = self.env.physics.batch_last
-        return step_rows(step, sim, (keys, action, params.own), params.shared, last=last)
 
     def _timestep(self, state: EnvState, reward: jax.Array, params: ParamRows) -> Timestep:
         see = jax.vmap(params.of_row(self.env.timestep))

@@ -110,19 +110,27 @@ def see(view: View, ray: Vector, near: Near | None = None) -> Frame:
 
     to_light = None if look.light is None else _vector(look.light)
     along = _directions(ray, to_light, bool(look.lamps))
-    key, products = _no_hit(count, shape), [jnp.zeros(shape)] * len(along)
+    # A key is a distance with the rank in its last bits; the smallest one wins.
+    bits = np.uint32((1 << count.bit_length()) - 1)
+    key = jnp.full(shape, (_INF_BITS & ~bits) | np.uint32(count), jnp.uint32)
+    products = [jnp.zeros(shape)] * len(along)
+
+    def nearer(key: jax.Array, rank: int, entry: Hit) -> jax.Array:
+        distance = jax.lax.bitcast_convert_type(entry.t, jnp.uint32)
+        return jnp.minimum(key, (distance & ~bits) | np.uint32(rank))
 
     def update(rank: int, best: tuple[Any, list[Any]]) -> tuple[Any, list[Any]]:
         entry = hit(view.order[rank])
-        key = _nearer(best[0], entry, rank, count)
+        key = nearer(best[0], rank, entry)
         return key, _normal_products(entry, along, key != best[0], best[1])
 
     for rank, g in enumerate(view.order):
         if near is None:
-            key = _nearer(key, hit(g), rank, count)
+            key = nearer(key, rank, hit(g))
         else:
             key, products = near(g, partial(update, rank), (key, products))
-    t, winner = _distance(key, count), _rank(key, count)
+    t = jax.lax.bitcast_convert_type(key & ~bits, jnp.float32)
+    winner = (key & bits).astype(jnp.int32)
     seen = {g: winner == rank for rank, g in enumerate(view.order)}
     if near is None:
         # Only for the nearest geom: XLA on a CPU is faster without dependent selects.
@@ -242,28 +250,6 @@ def _normal_products(
         jnp.where(here, hit.normal_dot(v, ray_v), product)
         for (v, ray_v), product in zip(along, products, strict=True)
     ]
-
-
-def _rank_bits(count: int) -> np.uint32:
-    """Return the bits of a key that hold a rank; that of the sky is ``count``."""
-    return np.uint32((1 << count.bit_length()) - 1)
-
-
-def _no_hit(count: int, shape: tuple[int, ...]) -> jax.Array:
-    return jnp.full(shape, (_INF_BITS & ~_rank_bits(count)) | np.uint32(count), jnp.uint32)
-
-
-def _nearer(key: jax.Array, hit: Hit, rank: int, count: int) -> jax.Array:
-    bits = jax.lax.bitcast_convert_type(hit.t, jnp.uint32)
-    return jnp.minimum(key, (bits & ~_rank_bits(count)) | np.uint32(rank))
-
-
-def _distance(key: jax.Array, count: int) -> jax.Array:
-    return jax.lax.bitcast_convert_type(key & ~_rank_bits(count), jnp.float32)
-
-
-def _rank(key: jax.Array, count: int) -> jax.Array:
-    return (key & _rank_bits(count)).astype(jnp.int32)
 
 
 def _surface_colors(view: View, winner: jax.Array) -> list[jax.Array]:
