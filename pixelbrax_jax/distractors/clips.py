@@ -254,7 +254,8 @@ def _digest(sources: list[folders.Source], height: int, width: int) -> str:
 def _read_cache(cache_dir: str | Path | None, name: Path) -> _Decoded | None:
     # A file that is damaged, or cannot be read now, is the same as none.
     try:
-        with np.load(cache_folder(cache_dir) / name) as cached:
+        file = cache_folder(cache_dir) / name
+        with file.open("rb") as opened, np.load(opened) as cached:
             return cached["frames"], cached["length"], cached["lacks"].tolist()
     except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile):
         return None
