@@ -68,8 +68,8 @@ def render(
     dtypes = [*[jnp.float32] * 4, jnp.int32]
     r, g, b, depth, seg = _call(planes, view, (), (), band, dtypes)
     ground = jnp.zeros(seg.shape, bool)
-    for g in filter(view.geoms.is_ground, view.order):
-        ground |= seg == g
+    for geom in filter(view.geoms.is_ground, view.order):
+        ground |= seg == geom
     return Frame(r=r, g=g, b=b, depth=depth, seg=seg, ground=ground)
 
 
