@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from pixelbrax_jax._platform.frame_stack import push, unpack
 from pixelbrax_jax.config import ProgramConfig
 from pixelbrax_jax.distractors.base import Chain
+from pixelbrax_jax.distractors.presets import as_tuple
 from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.memory import check_fits
 from pixelbrax_jax.physics.base import Physics, check_physics
@@ -63,7 +64,7 @@ class PixelEnv(ProgramConfig):
                 f"physics must be hashable, got a {type(self.physics).__name__}: make it a frozen "
                 "dataclass, or do not override its __eq__."
             ) from error
-        chain = Chain(self.distractors if self.obs_mode != "state" else ())
+        chain = Chain(as_tuple(self.distractors) if self.obs_mode != "state" else ())
         self._store("distractors", chain.links)
         self.check_memory(1)
         if self.renderer == "auto" and self.obs_mode != "state":
@@ -72,7 +73,7 @@ class PixelEnv(ProgramConfig):
     @cached_property
     def chain(self) -> Chain:
         """The chain of all distractors."""
-        return Chain(self.distractors)
+        return Chain(as_tuple(self.distractors))
 
     @property
     def action_size(self) -> int:

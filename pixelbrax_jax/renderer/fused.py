@@ -188,12 +188,12 @@ def see(view: View, ray: Vector, near: Near | None = None) -> Frame:
         highlight = jnp.where(on_ground, 0.0, highlight)
 
     rise = dot(ray, _vector(view.up))
-    r, g, b = (
+    red, green, blue = (
         jnp.where(sky, shading.sky(look, rise, c), between(0.0, color[c] * shade + highlight, 1.0))
         for c in range(3)
     )
     depth = jnp.where(sky, FAR, -t * ray[2])
-    return Frame(r=r, g=g, b=b, depth=depth, seg=winner, ground=on_ground)
+    return Frame(r=red, g=green, b=blue, depth=depth, seg=winner, ground=on_ground)
 
 
 def render(
@@ -223,8 +223,14 @@ def _solid(view: View, g: int) -> _Solid:
     geoms = view.geoms
     x, y, z = (tuple(view.xmat[g, k, axis] for k in range(3)) for axis in range(3))
     size = tuple(geoms.size[g, k] for k in range(3))
-    form = {"bounded": geoms.is_bounded(g), "distant": geoms.distant}
-    hit = partial(intersect, geoms.kind[g], axes=(x, y, z), size=size, **form)
+    hit = partial(
+        intersect,
+        geoms.kind[g],
+        axes=(x, y, z),
+        size=size,
+        bounded=geoms.is_bounded(g),
+        distant=geoms.distant,
+    )
     return _Solid(tuple(view.pos[g, k] for k in range(3)), (x, y, z), size, hit)
 
 
