@@ -72,14 +72,15 @@ def load(options: AgentOptions) -> Trained:
     """Load the agent that the options select; raise a CommandError if its checkpoint is missing."""
     with needs_extra("train"):
         from pixelbrax_jax.agents.runner.checkpoint import CheckpointError
-        from pixelbrax_jax.agents.runner.trained import load_agent
-    try:
-        return load_agent(
-            options.folder,
-            options.pretrained,
-            steps=options.steps,
-            best=options.best,
-            run=options.run_index,
-        )
-    except CheckpointError as error:
-        raise CommandError(str(error)) from error
+        from pixelbrax_jax.agents.runner.trained import load_pretrained, load_trained
+    steps, best, run = options.steps, options.best, options.run_index
+    if options.folder is not None and options.pretrained is None:
+        try:
+            return load_trained(options.folder, steps=steps, best=best, run=run)
+        except CheckpointError as error:
+            raise CommandError(str(error)) from error
+    if options.folder is not None or options.pretrained is None:
+        raise ValueError("give either the folder of a run or --pretrained with a name.")
+    if steps is not None or best or run:
+        raise ValueError("--steps, --best and --run need the folder of a run, not --pretrained.")
+    return load_pretrained(options.pretrained)

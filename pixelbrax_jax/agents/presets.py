@@ -174,7 +174,7 @@ def preset(
         ValueError: a name is unknown, a setting is out of range, or the preset lacks the task.
     """
     check_choice("algorithm", algorithm, ALGORITHMS)
-    check_choice("preset", name, [n for n in PRESETS if n == "default" or algorithm in PRESETS[n]])
+    check_choice("preset", name, PRESETS)
     kind, settings = ALGORITHMS[algorithm].config_class, PRESETS[name].get(algorithm, {})
     if task is not None:
         settings = settings | {"task": task}

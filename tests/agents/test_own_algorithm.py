@@ -17,10 +17,11 @@ from pixelbrax_jax.agents.rollout import collect
 from pixelbrax_jax.agents.runner.settings import RunConfig
 from pixelbrax_jax.agents.runner.train import run
 from pixelbrax_jax.agents.train_state import (
+    ACTIONS,
+    ENVS,
     TrainState,
-    action_key,
     along_envs,
-    env_key,
+    stream_key,
     without_envs,
 )
 from tests.agents.small import PARAMS, SMALL, ball_envs, same
@@ -51,7 +52,7 @@ class Own(Algorithm):
         return OwnState(
             networks=networks,
             opt_state=Optimizer(self.config).init(networks),
-            env_state=self.envs.reset(env_key(key), env_params)[0],
+            env_state=self.envs.reset(jax.random.fold_in(key, ENVS), env_params)[0],
             key=key,
             iteration=jnp.uint32(0),
             target=networks,
@@ -68,7 +69,7 @@ class Own(Algorithm):
             return action, action
 
         env_state, rollout = collect(
-            self.envs, state.env_state, env_params, choose, action_key(state), STEPS
+            self.envs, state.env_state, env_params, choose, stream_key(state, ACTIONS), STEPS
         )
         new = jnp.concatenate([rollout.choice, rollout.reward[..., None]], -1)
         replay = jnp.roll(state.replay, STEPS, 0).at[:STEPS].set(new)

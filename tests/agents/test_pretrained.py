@@ -73,9 +73,3 @@ def test_a_policy_of_another_jax_is_told(tmp_path, monkeypatch):
     monkeypatch.setattr(policy, "FOLDER", tmp_path)
     with pytest.raises(ValueError, match=r"It was made with jax 9\.9\.9"):
         load_policy("ant")
-
-
-def test_a_pretrained_policy_has_no_sampled_actions():
-    agent = load_pretrained(list_pretrained()[0])
-    with pytest.raises(ValueError, match="only mean actions"):
-        agent.algorithm.act({}, jnp.zeros((1, *agent.algorithm.policy.shape), jnp.uint8), 0)

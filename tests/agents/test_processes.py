@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pixelbrax_jax.agents.runner.saving import Checkpoints
+from pixelbrax_jax.agents.runner.checkpoint import Checkpoints, all_steps
 from tests.agents.small import ABOUT
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
@@ -184,6 +184,6 @@ def test_all_checkpoints_of_a_killed_run_are_whole(tmp_path):
     process.wait()
     checkpoints = Checkpoints(tmp_path / "checkpoints", ABOUT)
     checkpoints.close()
-    assert checkpoints.steps()
-    for steps in checkpoints.steps():
+    assert all_steps(checkpoints.folder)
+    for steps in all_steps(checkpoints.folder):
         assert "networks.actor.params.mean.kernel" in leaves(tmp_path, steps)

@@ -18,13 +18,14 @@ from pixelbrax_jax.agents.on_policy.losses import Batch, RewardScaler, gae, mean
 from pixelbrax_jax.agents.optimizer import Optimizer
 from pixelbrax_jax.agents.rollout import Rollout, at_times, collect, observations, split_obs
 from pixelbrax_jax.agents.train_state import (
+    ACTIONS,
+    ENVS,
+    NETWORKS,
     Metrics,
     Networks,
     TrainState,
-    action_key,
     as_declared,
-    env_key,
-    network_key,
+    stream_key,
     without_envs,
 )
 from pixelbrax_jax.flags import under_default_flags
@@ -95,8 +96,8 @@ class OnPolicy(Algorithm):
     @under_default_flags
     def init(self, key: jax.Array, env_params: EnvParams) -> OnPolicyState:
         """See ``Algorithm.init``."""
-        networks = self.init_networks(network_key(key))
-        env_state, _ = self.envs.reset(env_key(key), env_params)
+        networks = self.init_networks(jax.random.fold_in(key, NETWORKS))
+        env_state, _ = self.envs.reset(jax.random.fold_in(key, ENVS), env_params)
         return OnPolicyState(
             networks=networks,
             opt_state=Optimizer(self.config).init(networks),
@@ -120,7 +121,8 @@ class OnPolicy(Algorithm):
     @under_default_flags
     def act(self, networks: Networks, pixels: jax.Array, key: jax.Array | None = None) -> jax.Array:
         """See ``Algorithm.act``; without a key the actions are the mean actions."""
-        return self.agent.act(networks, pixels, key)
+        policy = self.agent.actor(networks["actor"], pixels).policy
+        return policy.action(policy.mean if key is None else policy.sample(key))
 
     def gather(
         self, state: OnPolicyState, env_params: EnvParams
@@ -139,7 +141,7 @@ class OnPolicy(Algorithm):
             state.env_state,
             env_params,
             choose,
-            action_key(state),
+            stream_key(state, ACTIONS),
             config.num_steps,
             config.random_shift,
         )

@@ -66,10 +66,9 @@ class Bar:
         try:
             yield
         except Exception as error:
-            bar, self._bar = self._bar, tqdm(disable=True)
             # An open bar would be redrawn after every message.
             with suppress(Exception):
-                bar.close()
+                self._bar.close()
             self.failure = reason(error)
             self._report(
                 f"the progress bar cannot be drawn: {self.failure}; the run continues without it"

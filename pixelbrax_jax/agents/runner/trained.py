@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -38,21 +38,6 @@ PLATFORMS = ("cpu", "cuda", "tpu")
 """Platforms of an exported policy."""
 
 
-class Player(Protocol):
-    """The hashable part of an ``Algorithm`` that chooses actions."""
-
-    @property
-    def acting(self) -> tuple[str, ...]:
-        """See ``Algorithm.acting``."""
-
-    @property
-    def config(self) -> TrainConfig:
-        """Settings of the training."""
-
-    def act(self, networks: Networks, pixels: jax.Array, key: jax.Array | None = None) -> jax.Array:
-        """See ``Algorithm.act``."""
-
-
 @dataclass(frozen=True, eq=False)
 class Pretrained:
     """A policy of the package, which contains its parameters."""
@@ -62,12 +47,14 @@ class Pretrained:
     acting: ClassVar[tuple[str, ...]] = ()
 
     @under_default_flags
-    def act(self, networks: Networks, pixels: jax.Array, key: jax.Array | None = None) -> jax.Array:
-        """Return mean actions; a key is a ValueError, because the policy cannot sample."""
+    def act(self, networks: Networks, pixels: jax.Array) -> jax.Array:
+        """Return mean actions; without networks, because the policy contains them."""
         del networks
-        if key is not None:
-            raise ValueError("a pretrained policy has only mean actions: key must be None.")
         return self.policy(pixels)
+
+
+Player = Algorithm | Pretrained
+"""What chooses actions: an ``Algorithm`` with its networks, or a policy."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +69,7 @@ class Trained:
     networks: Networks
     steps: int
     seed: int = 0
-    clips: tuple[str, ...] | None = None
+    clips: Sequence[str] | None = None
 
 
 def load_pretrained(name: str) -> Trained:
@@ -90,24 +77,6 @@ def load_pretrained(name: str) -> Trained:
     about = read_pretrained(name)
     player = Pretrained(load_config(about), load_policy(name))
     return Trained(player, {}, about["steps"], about["config"].get("seed", 0))
-
-
-def load_agent(
-    folder: str | Path | None,
-    pretrained: str | None,
-    *,
-    steps: int | None = None,
-    best: bool = False,
-    run: int = 0,
-) -> Trained:
-    """Load an agent from a folder (`load_trained`) or by name (`load_pretrained`)."""
-    if folder is not None and pretrained is None:
-        return load_trained(folder, steps=steps, best=best, run=run)
-    if folder is not None or pretrained is None:
-        raise ValueError("give either the folder of a run or --pretrained with a name.")
-    if steps is not None or best or run:
-        raise ValueError("--steps, --best and --run need the folder of a run, not --pretrained.")
-    return load_pretrained(pretrained)
 
 
 def load_trained(
@@ -142,17 +111,11 @@ def load_trained(
     runs = Runs(algorithm, num_seeds)
     template = runs.template(params).networks
     networks = runs.split(read_networks(checkpoints, template, about["steps"]))[run]
-    clips = about.get("clips")
-    return Trained(
-        algorithm,
-        networks,
-        about["steps"],
-        about["config"].get("seed", 0) + run,
-        None if clips is None else tuple(clips),
-    )
+    seed = about["config"].get("seed", 0) + run
+    return Trained(algorithm, networks, about["steps"], seed, about.get("clips"))
 
 
-def with_clips(agent: Trained, clips: str | None) -> tuple[TrainConfig, tuple[str, ...] | None]:
+def with_clips(agent: Trained, clips: str | None) -> tuple[TrainConfig, Sequence[str] | None]:
     """Return an agent's settings with other ``clips``, and digests of its training's clips.
 
     ``clips`` is a folder or ``"procedural"``; None keeps the training's. The digests are None if
@@ -171,7 +134,7 @@ def with_clips(agent: Trained, clips: str | None) -> tuple[TrainConfig, tuple[st
         )
     if shown is None:
         with suppress(FileNotFoundError):
-            shown = tuple(clip_digests(make_env(config)[1].clips))
+            shown = clip_digests(make_env(config)[1].clips)
     return config.replace(clips=clips), shown
 
 
