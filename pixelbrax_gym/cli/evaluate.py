@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 from pixelbrax_gym.cli import CommandError, needs_extra, parse, say
+from pixelbrax_jax.validation import check_positive_int
 
 if TYPE_CHECKING:
     from pixelbrax_jax.agents.runner.trained import Trained
@@ -54,16 +55,23 @@ def run(arguments: Sequence[str]) -> int:
     """Run the command."""
     options = parse("evaluate", Options, arguments)
     agent = load(options)
-    from pixelbrax_jax.agents.runner.evaluate import evaluate
+    from pixelbrax_jax.agents.runner.evaluate import Evaluator
+    from pixelbrax_jax.agents.runner.settings import place_of
+    from pixelbrax_jax.agents.runner.splits import make_splits
+    from pixelbrax_jax.agents.runner.trained import with_clips
 
-    for row in evaluate(
-        agent,
-        episodes=options.episodes,
-        splits=options.split,
-        clips=options.clips,
-        report=partial(say, "evaluate"),
-    ):
-        sys.stdout.write(json.dumps(row) + "\n")
+    report, episodes = partial(say, "evaluate"), options.episodes
+    check_positive_int("episodes", episodes)
+    config, shown = with_clips(agent, options.clips)
+    if options.clips and not shown:
+        clips = options.clips
+        report(f"the run has no digest of its clips; assuming that {clips} has the same clips")
+    for name, (env, params) in make_splits(config, options.split, shown=shown, report=report):
+        result = Evaluator(agent.algorithm, env, params, num_episodes=episodes)(agent.networks)
+        row = {"steps": agent.steps, "seed": agent.seed, "split": name, "episodes": episodes}
+        if params.clips is not None:
+            row["clips"] = place_of(str(config.env.clips or "procedural"))
+        sys.stdout.write(json.dumps(row | result.scalars) + "\n")
         sys.stdout.flush()
     return 0
 

@@ -174,7 +174,8 @@ def test_a_bar_that_cannot_be_drawn_is_told_once(monkeypatch):
     told = []
     bar = Bar(True, 10, told.append)
     for _ in range(3):
-        bar.update(1, {"episode/return": 1.0})
+        bar.update(1)
+        bar.set_postfix(episode_return="1.0")
     bar.close()
     assert told == ["the progress bar cannot be drawn: Broken pipe; the run continues without it"]
 

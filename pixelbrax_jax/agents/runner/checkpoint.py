@@ -25,9 +25,6 @@ from pixelbrax_jax.agents.runner.settings import differences, unknown_settings, 
 FORMAT = 4
 """Number of the format, increased when the meaning of stored data changes."""
 
-_NETWORKS_ALONE = (2, 3)
-"""Former formats with readable networks; such runs can be evaluated but not continued."""
-
 _ROOM = 1.2
 """Free space that a checkpoint requires, relative to its size."""
 
@@ -81,7 +78,7 @@ def read_about(folder: str | Path, steps: int | None = None) -> dict[str, Any]:
             f"{', '.join(map(str, known))} steps."
         )
     about: dict[str, Any] = json.loads((path / "about" / "metadata").read_text("utf-8"))
-    if about.get("format") not in (*_NETWORKS_ALONE, FORMAT):
+    if about.get("format") != FORMAT:
         raise CheckpointError(
             f"{path} has format {about.get('format')!r}, this version reads {FORMAT}."
         )
@@ -284,12 +281,6 @@ class Checkpoints:
 
     def _check(self, about: dict[str, Any]) -> None:
         own = self._about
-        if about["format"] != FORMAT:
-            raise CheckpointError(
-                f"{self.folder} has format {about['format']!r}, and this version reads only its "
-                "networks: you can evaluate or record the run, but training needs another "
-                "--output-dir."
-            )
         if about["algorithm"] != own["algorithm"]:
             raise CheckpointError(
                 f"{self.folder} is a run of {about['algorithm']}, not of {own['algorithm']}; use "

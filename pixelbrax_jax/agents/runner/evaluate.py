@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,16 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pixelbrax_jax.agents.runner.progress import Report, silent
-from pixelbrax_jax.agents.runner.settings import place_of
-from pixelbrax_jax.agents.runner.splits import make_splits
-from pixelbrax_jax.agents.runner.trained import Player, Trained, with_clips
+from pixelbrax_jax.agents.runner.trained import Player
 from pixelbrax_jax.agents.train_state import Networks
 from pixelbrax_jax.compilation import jit
 from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.types import EnvParams, EnvState
-from pixelbrax_jax.validation import check_positive_int
 
 
 @dataclass(frozen=True)
@@ -93,35 +89,6 @@ def _play(
     results = (nothing.astype(bool), nothing, nothing.astype(jnp.int32))
     carry = jax.lax.while_loop(goes_on, step, (state, jnp.int32(0), results))
     return carry[2][1], carry[2][2]
-
-
-def evaluate(
-    agent: Trained,
-    *,
-    episodes: int = 32,
-    splits: Sequence[str] = (),
-    clips: str | None = None,
-    report: Report = silent,
-) -> Iterator[dict[str, Any]]:
-    """Evaluate an agent with mean actions; yield a row of JSON values after each split.
-
-    ``episodes`` is the number per split. Without ``splits`` it evaluates all available ones.
-    ``clips`` is a folder; None uses the training's.
-
-    Raises:
-        ValueError: an option is out of range, or the run has no such split.
-        FileNotFoundError: the folder of the clips is missing.
-    """
-    check_positive_int("episodes", episodes)
-    config, shown = with_clips(agent, clips)
-    if clips and not shown:
-        report(f"the run has no digest of its clips; assuming that {clips} has the same clips")
-    for name, (env, params) in make_splits(config, splits, shown=shown, report=report):
-        result = Evaluator(agent.algorithm, env, params, num_episodes=episodes)(agent.networks)
-        row = {"steps": agent.steps, "seed": agent.seed, "split": name, "episodes": episodes}
-        if params.clips is not None:
-            row["clips"] = place_of(str(config.env.clips or "procedural"))
-        yield row | result.scalars
 
 
 def together(runs: Sequence[Result]) -> tuple[Result, dict[str, float]]:

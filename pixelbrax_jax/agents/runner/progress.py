@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
 
 from tqdm import tqdm
 
@@ -37,39 +38,26 @@ class Messages:
             self.failure = self.failure or reason(error)
 
 
-class Bar:
-    """An optional tqdm progress bar; ``failure`` is its error, or empty."""
+class Bar(tqdm):  # type: ignore[misc]
+    """An optional progress bar, gone after an error; ``failure`` is the error, or empty."""
 
     def __init__(self, shown: bool, total: int, report: Report) -> None:
         """Show a bar of ``total`` iterations."""
-        self._report = report
-        self.failure = ""
-        self._bar = tqdm(disable=True)
-        with self._watched():
-            self._bar = tqdm(total=total, unit="iteration", disable=not shown)
+        self.failure, self._report = "", report
+        super().__init__(total=total, unit="iteration", disable=not shown)
 
-    def update(self, number: int, record: dict[str, float] | None = None) -> None:
-        """Add iterations, and show the return in a record."""
-        with self._watched():
-            self._bar.update(number)
-            if record and "episode/return" in record:
-                self._bar.set_postfix(episode_return=f"{record['episode/return']:.1f}")
-
-    def close(self) -> None:
-        """Draw the bar for the last time."""
-        with self._watched():
-            self._bar.close()
-
-    @contextmanager
-    def _watched(self) -> Iterator[None]:
-        """Remove the bar after an error."""
+    def display(self, *arguments: Any, **options: Any) -> Any:
+        """Draw the bar."""
         try:
-            yield
+            return super().display(*arguments, **options)
         except Exception as error:
-            # An open bar would be redrawn after every message.
-            with suppress(Exception):
-                self._bar.close()
+            self.disable = True
             self.failure = reason(error)
             self._report(
                 f"the progress bar cannot be drawn: {self.failure}; the run continues without it"
             )
+
+    def close(self) -> None:
+        """Draw the bar for the last time."""
+        with suppress(Exception):
+            super().close()

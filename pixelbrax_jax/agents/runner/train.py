@@ -321,7 +321,8 @@ class _Run:
             speed = (steps - steps_then) / (time.perf_counter() - then)
             self.record["speed/steps_per_second"] = speed
             self.writer.write(steps, self.record)
-        self.bar.update(0, self.record)
+        if "episode/return" in self.record:
+            self.bar.set_postfix(episode_return=f"{self.record['episode/return']:.1f}")
 
     def check_finite(self, record: dict[str, Any], steps: int) -> None:
         wrong = {name: ~np.isfinite(value) for name, value in record.items()}
