@@ -84,8 +84,8 @@ class OnPolicy(Algorithm):
         ``detach`` stops gradients of a shared value at the encoder.
         """
         config = self.config
-        action_size = self.envs.env.action_size
-        actor = Actor(config.encoder, action_size, config.policy, config.initial_std, has_value)
+        size = self.envs.env.action_size
+        actor = Actor(config.encoder, size, config.policy, config.initial_std, has_value)
         critic = None if shared else Critic(config.encoder, sees_state=config.state_critic)
         return ActorCritic(actor, critic, detach)
 
@@ -136,27 +136,14 @@ class OnPolicy(Algorithm):
             decision = Decision(unclipped, policy.log_prob(unclipped), value)
             return policy.action(unclipped), decision
 
-        env_state, rollout = collect(
-            self.envs,
-            state.env_state,
-            env_params,
-            choose,
-            stream_key(state, ACTIONS),
-            config.num_steps,
-            config.random_shift,
-        )
+        key, sizes = stream_key(state, ACTIONS), (config.num_steps, config.random_shift)
+        env_state, rollout = collect(self.envs, state.env_state, env_params, choose, key, *sizes)
         scaler, reward = state.scaler, rollout.reward
         if config.normalize_reward:
             scaler, reward = scaler(reward, rollout.done, rollout.valid, config.gamma)
-        advantage, returns = gae(
-            reward,
-            rollout.choice.value,
-            rollout.last_choice.value,
-            rollout.terminated,
-            rollout.truncated,
-            config.gamma,
-            config.gae_lambda,
-        )
+        values = rollout.choice.value, rollout.last_choice.value
+        ends = rollout.terminated, rollout.truncated
+        advantage, returns = gae(reward, *values, *ends, config.gamma, config.gae_lambda)
         weight = rollout.valid.astype(jnp.float32)
         metrics = rollout.episode_metrics() | _metrics(rollout.choice, advantage, returns, weight)
         metrics["reward/scale"] = scaler.scale if config.normalize_reward else jnp.float32(1.0)
@@ -201,19 +188,14 @@ class OnPolicy(Algorithm):
             gradients, metrics = jax.grad(loss, has_aux=True)(networks, batch, key)
             # Adam's momentum moves parameters even at a gradient of 0, so the others get none.
             gradients = {name: gradients[name] for name in opt_state}
-            new, new_opt_state, norms = optimizer.step(
-                networks, opt_state, gradients, state.iteration
-            )
+            old = networks, opt_state
+            *new, norms = optimizer.step(networks, opt_state, gradients, state.iteration)
             metrics |= {f"grad_norm/{name}": norm for name, norm in norms.items()}
             if target_kl is None:
-                return (new, new_opt_state, stopped), (metrics, jnp.float32(1.0))
+                return (*new, stopped), (metrics, jnp.float32(1.0))
             # This minibatch still counts, because its divergence is known only after the step.
             used = jnp.where(stopped, 0.0, 1.0)
-            keep = jax.tree.map(
-                lambda old, new: jnp.where(stopped, old, new),
-                (networks, opt_state),
-                (new, new_opt_state),
-            )
+            keep = jax.tree.map(lambda old, new: jnp.where(stopped, old, new), old, tuple(new))
             return (*keep, stopped | (metrics["policy/approx_kl"] > target_kl)), (metrics, used)
 
         networks = {name: state.networks[name] for name in state.opt_state}
@@ -223,10 +205,8 @@ class OnPolicy(Algorithm):
             step, carry, key, num_epochs, config.num_steps, config.num_envs, config.num_minibatches
         )
         metrics = {name: jnp.sum(x * used) / jnp.sum(used) for name, x in metrics.items()}
-        state = state.replace(
-            networks=state.networks | networks, opt_state=state.opt_state | opt_state
-        )
-        return state, metrics
+        opt_state = state.opt_state | opt_state
+        return state.replace(networks=state.networks | networks, opt_state=opt_state), metrics
 
 
 def passes(
