@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import partial
+from functools import partial, reduce
 from typing import Any
 
 import jax
@@ -19,14 +19,12 @@ Pads = tuple[tuple[int, int], tuple[int, int]]
 def convolve(x: jax.Array, kernel: jax.Array, stride: int, pads: Pads) -> jax.Array:
     """Cross-correlate (B, H, W, C) with (h, w, C, D); on a CPU matrix products are faster."""
 
-    def products(x: jax.Array, kernel: jax.Array) -> jax.Array:
-        return _as_products(x, kernel, stride, pads)
-
     def native(x: jax.Array, kernel: jax.Array) -> jax.Array:
         return jax.lax.conv_general_dilated(
             x, kernel, (stride, stride), pads, dimension_numbers=("NHWC", "HWIO", "NHWC")
         )
 
+    products = partial(_as_products, stride=stride, pads=pads)
     result: jax.Array = by_platform(x, kernel, cpu=products, default=native)
     return result
 
@@ -91,10 +89,7 @@ def max_pool(x: jax.Array) -> jax.Array:
         for i in range(3)
         for j in range(3)
     ]
-    pooled = windows[0]
-    for window in windows[1:]:
-        pooled = jnp.maximum(pooled, window)
-    return pooled
+    return reduce(jnp.maximum, windows)
 
 
 def dense(size: int, gain: float = math.sqrt(2.0), name: str | None = None) -> nn.Dense:

@@ -6,7 +6,7 @@ import hashlib
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import dataclass, field
 from importlib import metadata
 from typing import Any
 
@@ -22,7 +22,6 @@ from pixelbrax_jax.agents.config import (
     describe,
 )
 from pixelbrax_jax.cache import whole_path
-from pixelbrax_jax.config import ENV_OPTIONS
 from pixelbrax_jax.types import Clips
 from pixelbrax_jax.validation import check_choice
 
@@ -106,11 +105,8 @@ def describe_run(
 
 def former_settings(kind: type[TrainConfig]) -> dict[str, Any]:
     """Return the values, by name, that settings of class ``kind`` have if a run lacks them."""
-    defaults = {field.name: field.default for field in (*fields(kind), *fields(RunConfig))}
-    names = {*ENV_OPTIONS, *(field.name for field in fields(kind)), *OF_RUNS} - {"env"}
-    known = vars(defaults["env"]) | defaults | FORMER_DEFAULTS
-    plain = {n: list(v) if isinstance(v, tuple) else v for n, v in known.items() if n in names}
-    return {name: value for name, value in plain.items() if value is not MISSING}
+    known = describe(kind()) | {name: getattr(RunConfig(), name) for name in OF_RUNS}
+    return {name: FORMER_DEFAULTS.get(name, value) for name, value in known.items()}
 
 
 def versions() -> dict[str, str]:

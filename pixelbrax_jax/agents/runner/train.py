@@ -43,11 +43,6 @@ from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.stop_signals import StopRequest, stop_requests
 from pixelbrax_jax.types import EnvParams
 
-__all__ = ["Outcome", "TrainingDivergedError", "run", "train"]
-
-Splits = dict[str, tuple[PixelEnv, EnvParams]]
-"""Evaluation environments and their parameters, by name."""
-
 
 class TrainingDivergedError(RuntimeError):
     """A loss or a gradient is not finite."""
@@ -94,7 +89,7 @@ def run(
     options: RunConfig,
     *,
     report: Report = silent,
-    splits: Splits | None = None,
+    splits: dict[str, tuple[PixelEnv, EnvParams]] | None = None,
 ) -> Outcome:
     """Train to the end or until an interruption.
 
