@@ -26,7 +26,7 @@ from pixelbrax_jax.agents.runner.checkpoint import (
     latest_steps,
 )
 from pixelbrax_jax.agents.runner.metrics import AppendedFile, open_metrics, read_metrics
-from pixelbrax_jax.agents.runner.progress import Bar, Messages
+from pixelbrax_jax.agents.runner.progress import Bar
 from pixelbrax_jax.agents.runner.settings import RunConfig
 from pixelbrax_jax.agents.runner.train import run
 from tests.agents.small import ABOUT, PARAMS, SMALL, ball_envs, same
@@ -313,18 +313,3 @@ def test_what_schedulers_send_is_a_request_to_stop_unless_the_program_uses_it(nu
                 assert (request.signal, got) == (0, [number])
     finally:
         signal.signal(number, before)
-
-
-def test_messages_go_to_who_can_read_them():
-    told = []
-
-    def report(line):
-        if line == "bad":
-            raise OSError(5, "Input/output error")
-        told.append(line)
-
-    messages = Messages(report)
-    for line in ("one", "bad", "two"):
-        messages(line)
-    assert told == ["one", "two"]
-    assert messages.failure == "Input/output error"

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pixelbrax_jax import VectorPixelEnv
 from pixelbrax_jax.agents.algorithm import Algorithm
 from pixelbrax_jax.agents.config import TrainConfig
 from pixelbrax_jax.agents.optimizer import Optimizer
@@ -115,8 +114,3 @@ def test_settings_say_how_many_steps_an_iteration_has():
         _ = TrainConfig().num_iterations
     with pytest.raises(NotImplementedError, match="own has no auxiliary phase"):
         Own(OwnConfig(env=SMALL["env"], encoder="small", num_envs=4), ball_envs()).auxiliary(None)
-
-
-def test_its_environments_are_checked(own):
-    with pytest.raises(ValueError, match="num_envs is 4 in the settings, but 3 in the env"):
-        Own(own.config, VectorPixelEnv(own.envs.env, 3))

@@ -310,16 +310,6 @@ def test_a_folder_that_cannot_be_written_to_is_told_early(tmp_path):
         run(ppg(), PARAMS, options(tmp_path / "file" / "run"))
 
 
-def test_a_full_disk_is_told_before_anything_is_written(whole, tmp_path, monkeypatch):
-    usage = type("Usage", (), {"free": 10})()
-    monkeypatch.setattr("shutil.disk_usage", lambda path: usage)
-    checkpoints = Checkpoints(tmp_path, ABOUT)
-    with pytest.raises(CheckpointError, match="free"):
-        checkpoints.save(whole[0].state, 1, None, last=True)
-    checkpoints.close()
-    assert all_steps(tmp_path) == []
-
-
 def test_a_buffer_that_would_not_fit_is_told_with_figures(tmp_path):
     lines = []
     with pytest.raises(MemoryError, match=r"Lower num_envs, num_steps, num_policy_phases"):
@@ -362,14 +352,6 @@ def test_a_policy_in_a_file_acts_as_in_training(whole):
         policy(torch.from_numpy(pixels).float())
     with pytest.raises(ValueError, match=r"takes \(B, 18, 18, 6\) uint8 pixels, got \(5, 18, 18\)"):
         policy(torch.from_numpy(pixels[..., 0]))
-
-
-def test_no_policy_is_told(tmp_path):
-    with pytest.raises(FileNotFoundError, match="nor the name of a policy"):
-        load_policy(tmp_path / "policy.jax")
-    (tmp_path / "policy.jax").write_bytes(b"nonsense")
-    with pytest.raises(ValueError, match="as an exported policy"):
-        load_policy(tmp_path / "policy.jax")
 
 
 def test_episodes_count_equally_whichever_iteration_they_ended_in():
