@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import enum
 import os
 from collections.abc import Mapping
 from contextlib import suppress
@@ -38,8 +37,6 @@ def to_plain(value: Any) -> Any:
     Raises:
         ValueError: JSON cannot represent the value, such as a bank of clips or a local class.
     """
-    if isinstance(value, enum.Enum):
-        return to_plain(value.value)
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
     if isinstance(value, os.PathLike):

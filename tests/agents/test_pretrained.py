@@ -71,7 +71,5 @@ def test_a_policy_of_another_jax_is_told(tmp_path, monkeypatch):
     about = {"versions": {"jax": "9.9.9"}, "env_options": {}}
     (tmp_path / "ant.json").write_text(json.dumps(about))
     monkeypatch.setattr(policy, "FOLDER", tmp_path)
-    with pytest.raises(
-        ValueError, match=r"(?s)exported policy.*was made with jax 9\.9\.9"
-    ):
+    with pytest.raises(ValueError, match=r"(?s)exported policy.*was made with jax 9\.9\.9"):
         load_policy("ant")

@@ -235,7 +235,7 @@ class Checkpoints:
             state=ocp.args.StandardSave(leaves), about=ocp.args.JsonSave(about)
         )
         metrics = None if score is None else {"score": score}
-        try:
+        with self._cleaned():
             free = shutil.disk_usage(self.folder).free
             if any_process(free < _ROOM * size):
                 raise DiskFullError(
@@ -244,16 +244,12 @@ class Checkpoints:
                 )
             with _without_warnings():  # A checkpoint may have no score.
                 self._manager.save(steps, args=arguments, metrics=metrics, force=True)
-        except (OSError, ValueError) as error:
-            raise self._failed(error) from error
         self._writing = True
 
     def _wait(self) -> None:
         self._writing = False
-        try:
+        with self._cleaned():
             self._manager.wait_until_finished()
-        except (OSError, ValueError) as error:  # TensorStore raises ValueError for a full disk.
-            raise self._failed(error) from error
 
     def _fail(self, error: CheckpointError) -> None:
         if jax.process_count() > 1 and not isinstance(error, DiskFullError):
@@ -266,18 +262,24 @@ class Checkpoints:
     def _in_minutes(self, minutes: float) -> float:
         return time.monotonic() + 60 * minutes if self._minutes else math.inf
 
-    def _failed(self, error: Exception) -> CheckpointError:
-        """Remove the incomplete checkpoint and return the error to raise."""
-        if jax.process_index() == 0:
-            for path in self.folder.glob("*.orbax-checkpoint-tmp*"):
-                shutil.rmtree(path, ignore_errors=True)
-        # The manager has already forgotten the checkpoints that the new one would have replaced.
-        with suppress(OSError):
-            self._manager.reload()
-        # TensorStore's messages end with the message of the operating system.
-        reason = str(error).partition("\n")[0].rsplit(": ", 1)[-1]
-        reason = getattr(error, "strerror", None) or reason or type(error).__name__
-        return CheckpointError(f"cannot write a checkpoint to {self.folder}: {reason}.")
+    @contextmanager
+    def _cleaned(self) -> Iterator[None]:
+        """Remove the incomplete checkpoint after an error."""
+        try:
+            yield
+        except (OSError, ValueError) as error:  # TensorStore raises ValueError for a full disk.
+            if jax.process_index() == 0:
+                for path in self.folder.glob("*.orbax-checkpoint-tmp*"):
+                    shutil.rmtree(path, ignore_errors=True)
+            # The manager has already forgotten the checkpoints that the new one would replace.
+            with suppress(OSError):
+                self._manager.reload()
+            # TensorStore's messages end with the message of the operating system.
+            reason = str(error).partition("\n")[0].rsplit(": ", 1)[-1]
+            reason = getattr(error, "strerror", None) or reason or type(error).__name__
+            raise CheckpointError(
+                f"cannot write a checkpoint to {self.folder}: {reason}."
+            ) from error
 
     def _check(self, about: dict[str, Any]) -> None:
         own = self._about

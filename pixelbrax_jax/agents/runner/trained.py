@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from pixelbrax_jax.agents.algorithm import Algorithm
 from pixelbrax_jax.agents.config import TrainConfig, make_env
 from pixelbrax_jax.agents.registry import ALGORITHMS
+from pixelbrax_jax.agents.rollout import split_obs
 from pixelbrax_jax.agents.runner.checkpoint import (
     CheckpointError,
     best_steps,
@@ -33,9 +34,6 @@ from pixelbrax_jax.distractors.presets import as_tuple
 from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.policy import Policy, load_policy, read_pretrained
-
-PLATFORMS = ("cpu", "cuda", "tpu")
-"""Platforms of an exported policy."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,12 +92,10 @@ def load_trained(
     checkpoints = Path(folder) / "checkpoints"
     if best and steps is not None:
         raise ValueError(f"give best or steps, not both; got steps={steps}.")
-    if best:
-        steps = best_steps(checkpoints)
-        if steps is None:
-            raise CheckpointError(
-                f"no checkpoint in {checkpoints} has a score yet; omit --best to load the latest."
-            )
+    if best and (steps := best_steps(checkpoints)) is None:
+        raise CheckpointError(
+            f"no checkpoint in {checkpoints} has a score yet; omit --best to load the latest."
+        )
     about = read_about(checkpoints, steps)
     config = load_config(about)
     num_seeds = about["config"].get("seeds", 1)
@@ -160,12 +156,11 @@ def save_policy(algorithm: Algorithm, networks: Networks, path: str | Path) -> P
     The file contains program and parameters, and needs only JAX on CPU, CUDA or TPU:
     ``jax.export.deserialize(bytes).call(pixels)`` for any number of observations.
     """
-    spec = algorithm.envs.env.obs_spec
-    spec = spec["pixels"] if isinstance(spec, dict) else spec
+    spec, _ = split_obs(algorithm.envs.env.obs_spec)
     acting = {name: networks[name] for name in algorithm.acting}
     (batch,) = jax.export.symbolic_shape("batch")
     exported = jax.export.export(
-        jax.jit(lambda pixels: algorithm.act(acting, pixels)), platforms=PLATFORMS
+        jax.jit(lambda pixels: algorithm.act(acting, pixels)), platforms=("cpu", "cuda", "tpu")
     )(jax.ShapeDtypeStruct((batch, *spec.shape), jnp.uint8))
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
