@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from tqdm import tqdm
@@ -44,20 +44,27 @@ class Bar(tqdm):  # type: ignore[misc]
     def __init__(self, shown: bool, total: int, report: Report) -> None:
         """Show a bar of ``total`` iterations."""
         self.failure, self._report = "", report
-        super().__init__(total=total, unit="iteration", disable=not shown)
+        with self._watched():
+            super().__init__(total=total, unit="iteration", disable=not shown)
 
-    def display(self, *arguments: Any, **options: Any) -> Any:
+    def display(self, *arguments: Any, **options: Any) -> None:
         """Draw the bar."""
-        try:
-            return super().display(*arguments, **options)
-        except Exception as error:
-            self.disable = True
-            self.failure = reason(error)
-            self._report(
-                f"the progress bar cannot be drawn: {self.failure}; the run continues without it"
-            )
+        with self._watched():
+            super().display(*arguments, **options)
 
     def close(self) -> None:
         """Draw the bar for the last time."""
-        with suppress(Exception):
+        with self._watched():
             super().close()
+
+    @contextmanager
+    def _watched(self) -> Iterator[None]:
+        try:
+            yield
+        except Exception as error:
+            self.disable = True
+            if not self.failure:
+                self.failure = why = reason(error)
+                self._report(
+                    f"the progress bar cannot be drawn: {why}; the run continues without it"
+                )
