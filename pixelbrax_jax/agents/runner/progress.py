@@ -38,7 +38,7 @@ class Messages:
             self.failure = self.failure or reason(error)
 
 
-class Bar(tqdm):  # type: ignore[misc]
+class Bar(tqdm):
     """An optional progress bar, gone after an error; ``failure`` is the error, or empty."""
 
     def __init__(self, shown: bool, total: int, report: Report) -> None:
