@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import enum
 import os
 from collections.abc import Mapping
-from importlib import import_module
+from contextlib import suppress
+from pkgutil import resolve_name
 from typing import Any
 
 import jax
@@ -37,8 +37,6 @@ def to_plain(value: Any) -> Any:
     Raises:
         ValueError: JSON cannot represent the value, such as a bank of clips or a local class.
     """
-    if isinstance(value, enum.Enum):
-        return to_plain(value.value)
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
     if isinstance(value, os.PathLike):
@@ -94,13 +92,12 @@ def _name_in_module(cls: type) -> str:
 def _type_of(name: Any) -> Any:
     if not isinstance(name, str) or ":" not in name:
         return _TYPES[check_choice(f"entry {TYPE!r}", name, _TYPES)]
-    module, _, path = name.partition(":")
+    cls = None
     try:
-        cls: Any = import_module(module)
+        with suppress(AttributeError):
+            cls = resolve_name(name)
     except ModuleNotFoundError as error:
         raise ValueError(f"{TYPE}={name!r}: {error}.") from error
-    for part in path.split("."):
-        cls = getattr(cls, part, None)
     if not (isinstance(cls, type) and issubclass(cls, Distractor)):
         raise ValueError(
             f"{TYPE}={name!r} must be a subclass of pixelbrax_jax.distractors.Distractor."

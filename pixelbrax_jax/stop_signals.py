@@ -21,26 +21,6 @@ _APART = 1.0
 """Seconds between two intended SIGINTs; a wrapper may pass one key press on twice."""
 
 
-def stop_signals() -> list[signal.Signals]:
-    """Return the signals that a long command handles as a request to stop.
-
-    Signals other than SIGINT and SIGTERM are left out if they are ignored (``nohup``) or if the
-    program has its own handler (launchers that requeue a job).
-    """
-    # Windows has not all of them.
-    numbers = {name: getattr(signal, name, None) for name in (*_ALWAYS, *_UNLESS_IN_USE)}
-    return [
-        number
-        for name, number in numbers.items()
-        if number is not None and (name in _ALWAYS or signal.getsignal(number) == signal.SIG_DFL)
-    ]
-
-
-def signal_name(number: int) -> str:
-    """Return the name of a signal, such as SIGTERM."""
-    return signal.Signals(number).name
-
-
 class StopRequest:
     """Records the signal that asks the process to stop.
 
@@ -70,27 +50,38 @@ class StopRequest:
         self.signal = number
         # The terminal may be gone, and another line may be half written.
         with suppress(Exception):
+            name = signal.Signals(number).name
             self._report(
-                f"{signal_name(number)}: stopping within two iterations, with a checkpoint; a "
-                "second Ctrl-C stops at once, without one"
+                f"{name}: stopping within two iterations, with a checkpoint; a second Ctrl-C stops "
+                "at once, without one"
             )
 
 
 @contextmanager
 def stop_requests(report: Callable[[str], object]) -> Iterator[StopRequest]:
-    """Handle the signals that ask a process to stop, until the end of the block.
-
-    ``report`` gets one line at the first signal. Outside the main thread, where Python allows no
-    handlers, no request is recorded.
-    """
+    """Record requests to stop until the end of the block; ``report`` gets a line at the first."""
     request = StopRequest(report)
-    before = {}
-    for number in stop_signals():
-        with suppress(ValueError):
-            before[number] = signal.signal(number, request.ask)
-    try:
+    with handling(request.ask):
         yield request
+
+
+@contextmanager
+def handling(handler: Callable[[int, Any], object]) -> Iterator[None]:
+    """Handle the signals that ask a long command to stop, until the end of the block.
+
+    Signals other than SIGINT and SIGTERM are left out if they are ignored (``nohup``) or if the
+    program has its own handler (launchers that requeue a job). Outside the main thread, where
+    Python allows no handlers, nothing is handled.
+    """
+    before = {}
+    for name in (*_ALWAYS, *_UNLESS_IN_USE):
+        number = getattr(signal, name, None)  # Windows has not all of them.
+        if number and (name in _ALWAYS or signal.getsignal(number) == signal.SIG_DFL):
+            with suppress(ValueError):
+                before[number] = signal.signal(number, handler)
+    try:
+        yield
     finally:
-        for number, handler in before.items():
+        for number, old in before.items():
             # None means that the handler was not installed from Python.
-            signal.signal(number, signal.SIG_DFL if handler is None else handler)
+            signal.signal(number, signal.SIG_DFL if old is None else old)

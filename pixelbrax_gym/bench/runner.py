@@ -18,7 +18,7 @@ from pixelbrax_gym.bench.case import ABSENT, AbsentError, Case, Group
 from pixelbrax_gym.bench.machine import file_stem
 from pixelbrax_gym.bench.results import Results
 from pixelbrax_gym.bench.tables import number
-from pixelbrax_jax.stop_signals import stop_signals
+from pixelbrax_jax.stop_signals import handling
 
 OUT_OF_MEMORY = (
     "resource_exhausted",
@@ -46,8 +46,7 @@ def measure_all(
         KeyboardInterrupt: a signal to stop arrived, with its number; the results are written.
     """
     # A process that outlives this one would disturb later measurements.
-    before = {number: signal.signal(number, _interrupt) for number in stop_signals()}
-    try:
+    with handling(_interrupt):
         machine = measure(Case("machine", "machine.describe"), 300.0)
         if machine["status"] != "ok":
             raise RuntimeError(machine["why"])
@@ -68,9 +67,6 @@ def measure_all(
         finally:
             if file.exists():
                 report.write(file, groups)
-    finally:
-        for signal_number, handler in before.items():
-            signal.signal(signal_number, handler)
     return file, failed
 
 

@@ -15,7 +15,6 @@ from pixelbrax_gym.bench.case import Case, Group
 from pixelbrax_gym.bench.cases import FULL, QUICK
 from pixelbrax_gym.cli import CommandError, parse
 from pixelbrax_jax.extras import install_extra
-from pixelbrax_jax.stop_signals import signal_name
 
 
 @dataclass(frozen=True)
@@ -73,9 +72,8 @@ def measure_groups(options: Options, groups: Mapping[str, Group], chosen: Sequen
         )
     except KeyboardInterrupt as stopped:
         number = stopped.args[0] if stopped.args else signal.SIGINT
-        sys.stderr.write(
-            f"\nstopped by {signal_name(number)}; run the same command again to continue\n"
-        )
+        name = signal.Signals(number).name
+        sys.stderr.write(f"\nstopped by {name}; run the same command again to continue\n")
         return int(128 + number)
     except (RuntimeError, SubprocessError) as error:
         raise CommandError(str(error)) from error

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 from pixelbrax_gym.cli import CommandError, needs_extra, parse, say
+from pixelbrax_jax.validation import check_positive_int
 
 if TYPE_CHECKING:
     from pixelbrax_jax.agents.runner.trained import Trained
@@ -54,16 +55,23 @@ def run(arguments: Sequence[str]) -> int:
     """Run the command."""
     options = parse("evaluate", Options, arguments)
     agent = load(options)
-    from pixelbrax_jax.agents.runner.evaluate import evaluate
+    from pixelbrax_jax.agents.runner.evaluate import Evaluator
+    from pixelbrax_jax.agents.runner.settings import place_of
+    from pixelbrax_jax.agents.runner.splits import make_splits
+    from pixelbrax_jax.agents.runner.trained import with_clips
 
-    for row in evaluate(
-        agent,
-        episodes=options.episodes,
-        splits=options.split,
-        clips=options.clips,
-        report=partial(say, "evaluate"),
-    ):
-        sys.stdout.write(json.dumps(row) + "\n")
+    report, episodes = partial(say, "evaluate"), options.episodes
+    check_positive_int("episodes", episodes)
+    config, shown = with_clips(agent, options.clips)
+    if options.clips and not shown:
+        clips = options.clips
+        report(f"the run has no digest of its clips; assuming that {clips} has the same clips")
+    for name, (env, params) in make_splits(config, options.split, shown=shown, report=report):
+        result = Evaluator(agent.algorithm, env, params, num_episodes=episodes)(agent.networks)
+        row = {"steps": agent.steps, "seed": agent.seed, "split": name, "episodes": episodes}
+        if params.clips is not None:
+            row["clips"] = place_of(str(config.env.clips or "procedural"))
+        sys.stdout.write(json.dumps(row | result.scalars) + "\n")
         sys.stdout.flush()
     return 0
 
@@ -72,14 +80,15 @@ def load(options: AgentOptions) -> Trained:
     """Load the agent that the options select; raise a CommandError if its checkpoint is missing."""
     with needs_extra("train"):
         from pixelbrax_jax.agents.runner.checkpoint import CheckpointError
-        from pixelbrax_jax.agents.runner.trained import load_agent
-    try:
-        return load_agent(
-            options.folder,
-            options.pretrained,
-            steps=options.steps,
-            best=options.best,
-            run=options.run_index,
-        )
-    except CheckpointError as error:
-        raise CommandError(str(error)) from error
+        from pixelbrax_jax.agents.runner.trained import load_pretrained, load_trained
+    steps, best, run = options.steps, options.best, options.run_index
+    if options.folder is not None and options.pretrained is None:
+        try:
+            return load_trained(options.folder, steps=steps, best=best, run=run)
+        except CheckpointError as error:
+            raise CommandError(str(error)) from error
+    if options.folder is not None or options.pretrained is None:
+        raise ValueError("give either the folder of a run or --pretrained with a name.")
+    if steps is not None or best or run:
+        raise ValueError("--steps, --best and --run need the folder of a run, not --pretrained.")
+    return load_pretrained(options.pretrained)

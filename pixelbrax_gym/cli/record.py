@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from pixelbrax_gym.cli import parse
 from pixelbrax_gym.cli.evaluate import AgentOptions, load
+from pixelbrax_jax.validation import check_choice, check_positive_int
+from pixelbrax_jax.video import write_frames
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from pixelbrax_jax.agents.runner.trained import Trained
 
 
 @dataclass(frozen=True)
@@ -33,20 +42,45 @@ def run(arguments: Sequence[str]) -> int:
     """Run the command."""
     options = parse("record", Options, arguments)
     agent = load(options)
-    from pixelbrax_jax.agents.runner.record import write_video
+    from pixelbrax_jax.agents.runner.splits import SPLITS, make_split
+    from pixelbrax_jax.agents.runner.trained import with_clips
 
+    for name in ("grid", "size", "num_frames"):
+        check_positive_int(name, getattr(options, name))
     split = options.split or ("train" if agent.algorithm.config.env.distractors else "clean")
+    check_choice("split", split, SPLITS)
+    config, shown = with_clips(agent, options.clips)
+    env, params = make_split(config, split, shown)
     run = [f"run{options.run_index}"] if options.run_index else []
     name = "_".join([options.pretrained or str(agent.steps), split, *run])
-    path = write_video(
-        agent,
-        options.output or Path(options.folder or "") / "videos" / f"{name}.mp4",
-        split=split,
-        clips=options.clips,
-        grid=options.grid,
-        size=options.size,
-        num_frames=options.num_frames,
-        seed=options.seed,
-    )
-    sys.stdout.write(f"{path}\n")
+    path = options.output or Path(options.folder or "") / "videos" / f"{name}.mp4"
+    fps = min(max(1, round(1.0 / env.dt)), 60)
+    sys.stdout.write(f"{write_frames(path, _frames(agent, env, params, options), fps)}\n")
     return 0
+
+
+def _frames(agent: Trained, env: Any, params: Any, options: Options) -> Iterator[np.ndarray]:
+    """Play episodes with mean actions; yield frames with all of them, in rows and columns."""
+    import jax
+    import numpy as np
+
+    from pixelbrax_jax import VectorPixelEnv, compiler_options
+    from pixelbrax_jax.flags import default_flags
+
+    grid, size = options.grid, options.size
+    envs = VectorPixelEnv(env, grid * grid)
+
+    @partial(jax.jit, compiler_options=compiler_options(env))
+    def step(state: Any, params: Any) -> tuple[Any, jax.Array]:
+        action = agent.algorithm.act(agent.networks, envs.obs(state))
+        state, _ = envs.step(state, action, params)
+        draw = jax.vmap(lambda state: env.image(state, params, size, size))
+        return state, draw(state)
+
+    with default_flags():
+        key = jax.random.key(options.seed)
+    state, _ = envs.reset(key, params)
+    for _ in range(options.num_frames):
+        state, images = step(state, params)
+        tiles = jax.device_get(images).reshape(grid, grid, size, size, 3)
+        yield np.concatenate(np.concatenate(tiles, axis=1), axis=1)

@@ -107,7 +107,7 @@ def run(arguments: Sequence[str]) -> int:
             kept = f"continue from the checkpoint of {latest} steps with --resume latest"
         say("train", f"stopped at once; {kept}")
         raise
-    return 128 + outcome.signal if outcome.interrupted else 0
+    return 128 + outcome.signal if outcome.signal else 0
 
 
 def _report(line: str) -> None:

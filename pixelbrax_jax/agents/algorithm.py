@@ -37,7 +37,37 @@ class Algorithm(ABC):
 
     def __post_init__(self) -> None:
         """Check the environments."""
-        check_environments(self.config, self.envs)
+        config, envs = self.config, self.envs
+        try:
+            hash(envs)
+        except TypeError as error:
+            raise TypeError(
+                f"environments must be hashable, got a {type(envs).__name__}: make it a frozen "
+                "dataclass, or define __hash__ along with __eq__."
+            ) from error
+        if (mode := envs.autoreset_mode) != "next_step":
+            raise ValueError(
+                f"autoreset_mode of the environments must be 'next_step', got {mode!r}."
+            )
+        pixels, state = split_obs(envs.env.obs_spec)
+        if pixels is None or len(pixels.shape) != 3 or (config.state_critic and state is None):
+            wanted = "both" if config.state_critic else "pixels"
+            raise ValueError(
+                f"obs_mode of the environments must be {wanted!r} with "
+                f"state_critic={config.state_critic}, but their obs_spec is {envs.env.obs_spec}."
+            )
+        found = {
+            "num_envs": (config.num_envs, envs.num_envs),
+            "action_repeat": (config.env.action_repeat, envs.env.action_repeat),
+            "frame_stack": (config.env.frame_stack, pixels.shape[-1] // 3),
+            "height": (config.env.height, pixels.shape[0]),
+            "width": (config.env.width, pixels.shape[1]),
+        }
+        for name, (expected, given) in found.items():
+            if expected != given:
+                raise ValueError(
+                    f"{name} is {expected} in the settings, but {given} in the environments."
+                )
 
     @abstractmethod
     def init(self, key: jax.Array, env_params: EnvParams) -> TrainState:
@@ -66,40 +96,6 @@ class Algorithm(ABC):
     def auxiliary(self, state: Any) -> tuple[TrainState, Metrics]:
         """Learn from the data stored since the last auxiliary phase."""
         raise NotImplementedError(f"{self.name} has no auxiliary phase.")
-
-
-def check_environments(config: TrainConfig, envs: Environments) -> None:
-    """Reject environments that contradict the settings or cannot be hashed."""
-    try:
-        hash(envs)
-    except TypeError as error:
-        raise TypeError(
-            f"environments must be hashable, got a {type(envs).__name__}: make it a frozen "
-            "dataclass, or define __hash__ along with __eq__."
-        ) from error
-    if envs.autoreset_mode != "next_step":
-        raise ValueError(
-            f"autoreset_mode of the environments must be 'next_step', got {envs.autoreset_mode!r}."
-        )
-    pixels, state = split_obs(envs.env.obs_spec)
-    if pixels is None or len(pixels.shape) != 3 or (config.state_critic and state is None):
-        wanted = "both" if config.state_critic else "pixels"
-        raise ValueError(
-            f"obs_mode of the environments must be {wanted!r} with "
-            f"state_critic={config.state_critic}, but their obs_spec is {envs.env.obs_spec}."
-        )
-    found = {
-        "num_envs": (config.num_envs, envs.num_envs),
-        "action_repeat": (config.env.action_repeat, envs.env.action_repeat),
-        "frame_stack": (config.env.frame_stack, pixels.shape[-1] // 3),
-        "height": (config.env.height, pixels.shape[0]),
-        "width": (config.env.width, pixels.shape[1]),
-    }
-    for name, (expected, given) in found.items():
-        if expected != given:
-            raise ValueError(
-                f"{name} is {expected} in the settings, but {given} in the environments."
-            )
 
 
 def train_function(

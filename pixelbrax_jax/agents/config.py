@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from numbers import Integral, Real
 from types import NoneType
-from typing import Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self, get_type_hints
 
 from pixelbrax_jax.agents.networks.encoders import ENCODERS, SMALLEST
 from pixelbrax_jax.config import ENV_OPTIONS, EnvConfig
@@ -22,6 +23,34 @@ from pixelbrax_jax.validation import (
 )
 
 
+def check_positive(name: str, value: object, or_zero: bool = False) -> None:
+    """Raise a ValueError unless the setting is positive (or zero) and finite."""
+    known = isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
+    if not (known and (value > 0 or (or_zero and value == 0))):  # type: ignore[operator]
+        wanted = "a number of at least 0" if or_zero else "a positive number"
+        raise ValueError(f"{name} must be {wanted}, got {value!r}.")
+
+
+def check_count(name: str, value: object) -> None:
+    """Raise a ValueError unless the setting is an integer of at least 0."""
+    if not isinstance(value, Integral) or isinstance(value, bool) or value < 0:
+        raise ValueError(f"{name} must be a whole number of at least 0, got {value!r}.")
+
+
+PositiveInt = Annotated[int, check_positive_int]
+Count = Annotated[int, check_count]
+Fraction = Annotated[float, check_fraction]
+Positive = Annotated[float, check_positive]
+NotNegative = Annotated[float, partial(check_positive, or_zero=True)]
+
+
+def check_annotated(settings: Any) -> None:
+    """Check the fields whose types carry a check, such as ``PositiveInt``."""
+    for name, kind in get_type_hints(type(settings), include_extras=True).items():
+        for check in getattr(kind, "__metadata__", ()):
+            check(name, getattr(settings, name))
+
+
 @dataclass(frozen=True)
 class TrainConfig:
     """Settings of every algorithm; a setting out of range is a ValueError."""
@@ -32,9 +61,9 @@ class TrainConfig:
     memory_settings: ClassVar[tuple[str, ...]] = ("num_envs",)
     """Settings that reduce memory when they are lowered."""
 
-    total_steps: int = 25_000_000
+    total_steps: PositiveInt = 25_000_000
     """Control steps of the run over all environments, rounded up to whole iterations."""
-    num_envs: int = 256
+    num_envs: PositiveInt = 256
     """Number of environments N that run in parallel."""
 
     encoder: str = "impala"
@@ -42,15 +71,15 @@ class TrainConfig:
     state_critic: bool = False
     """Trains a separate critic on the simulator's state instead of pixels."""
 
-    gamma: float = 0.99
+    gamma: Fraction = 0.99
     """Discount of rewards per action."""
-    learning_rate: float = 3e-4
+    learning_rate: Positive = 3e-4
     """Adam's step size."""
     anneal: bool = False
     """Decreases the step size linearly to 0."""
-    adam_eps: float = 1e-5
+    adam_eps: Positive = 1e-5
     """Adam's epsilon."""
-    max_grad_norm: float = 0.5
+    max_grad_norm: NotNegative = 0.5
     """Clips the gradient of each network to this global norm; 0 disables clipping."""
     memory_budget_gb: float | None = None
     """Memory limit of stored frames and state in GB (10^9 bytes); None uses the device's memory."""
@@ -58,13 +87,8 @@ class TrainConfig:
     def __post_init__(self) -> None:
         """Check the settings."""
         _check_env(self.env)
-        for name in ("total_steps", "num_envs"):
-            check_positive_int(name, getattr(self, name))
+        check_annotated(self)
         check_choice("encoder", self.encoder, ENCODERS)
-        check_fraction("gamma", self.gamma)
-        for name in ("learning_rate", "adam_eps"):
-            check_positive(name, getattr(self, name))
-        check_positive("max_grad_norm", self.max_grad_norm, or_zero=True)
         if self.memory_budget_gb is not None:
             check_positive("memory_budget_gb", self.memory_budget_gb)
         smallest = SMALLEST[self.encoder]
@@ -133,20 +157,6 @@ def describe(config: TrainConfig) -> dict[str, Any]:
     values = {name: getattr(config.env, name) for name in ENV_OPTIONS}
     values |= {name: getattr(config, name) for name in names}
     return {name: list(v) if isinstance(v, tuple) else v for name, v in values.items()}
-
-
-def check_positive(name: str, value: object, or_zero: bool = False) -> None:
-    """Raise a ValueError unless the setting is positive (or zero) and finite."""
-    known = isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
-    if not (known and (value > 0 or (or_zero and value == 0))):  # type: ignore[operator]
-        wanted = "a number of at least 0" if or_zero else "a positive number"
-        raise ValueError(f"{name} must be {wanted}, got {value!r}.")
-
-
-def check_count(name: str, value: object) -> None:
-    """Raise a ValueError unless the setting is an integer of at least 0."""
-    if not isinstance(value, Integral) or isinstance(value, bool) or value < 0:
-        raise ValueError(f"{name} must be a whole number of at least 0, got {value!r}.")
 
 
 def check_divides(whole: str, size: int, part: str, count: int) -> None:

@@ -31,34 +31,33 @@ _PROCGEN = {
     "learning_rate": 5e-4,
     "ent_coef": 0.01,
 }
-_CI = {
+_PAPER = {"num_policy_phases": 32, "aux_minibatches": 32, "aux_epochs": 6}
+_FAST = {
+    "frame_stack": 2,
+    "num_steps": 32,
+    "learning_rate": 1e-3,
+    "anneal": True,
+    "ent_coef": 0.0,
+}
+_CI = _FAST | {
     "task": "inverted_pendulum",
     "height": 32,
     "width": 32,
-    "frame_stack": 2,
     "num_envs": 128,
-    "num_steps": 32,
     "total_steps": 1_400_000,
     "encoder": "small",
     "initial_std": 0.37,
-    "learning_rate": 1e-3,
-    "anneal": True,
-    "ent_coef": 0.0,
 }
-
-_CPU = {
+_CPU = _FAST | {
     "height": 48,
     "width": 48,
-    "frame_stack": 2,
     "encoder": "patch",
     "num_envs": 64,
-    "num_steps": 32,
     "num_minibatches": 16,
     "initial_std": 0.5,
-    "learning_rate": 1e-3,
-    "anneal": True,
-    "ent_coef": 0.0,
 }
+_PPG = {"layout": "detach", "aux_epochs": 1}
+_DCPG = {"num_policy_phases": 2, "aux_epochs": 2, "update_epochs": 2}
 
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     # The defaults of each class.
@@ -72,45 +71,22 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     # Moon et al. for Procgen (arXiv 2210.09960), and Cobbe et al. for PPG (arXiv 2009.04416).
     "procgen": {
         "ppo": _PROCGEN | {"clip_value": True},
-        "ppg": _PROCGEN
-        | {
-            "num_policy_phases": 32,
-            "aux_minibatches": 32,
-            "aux_epochs": 6,
-            "adam_eps": 1e-8,
-            "max_grad_norm": 0.0,
-        },
-        "dcpg": _PROCGEN | {"num_policy_phases": 32, "aux_minibatches": 32, "aux_epochs": 6},
+        "ppg": _PROCGEN | _PAPER | {"adam_eps": 1e-8, "max_grad_norm": 0.0},
+        "dcpg": _PROCGEN | _PAPER,
     },
     # Takes minutes on two CPU cores.
     "ci": {
         "ppo": _CI | {"layout": "shared", "update_epochs": 3},
         "ppg": _CI
-        | {
-            "layout": "detach",
-            "policy_epochs": 3,
-            "value_epochs": 3,
-            "num_policy_phases": 8,
-            "aux_minibatches": 8,
-            "aux_epochs": 1,
-        },
-        "dcpg": _CI
-        | {"num_policy_phases": 2, "aux_minibatches": 8, "aux_epochs": 2, "update_epochs": 2},
+        | _PPG
+        | {"policy_epochs": 3, "value_epochs": 3, "num_policy_phases": 8, "aux_minibatches": 8},
+        "dcpg": _CI | _DCPG | {"aux_minibatches": 8},
     },
     # Takes 6 to 9 minutes on two CPU cores; see docs/results.md.
     "cpu": {
         "ppo": _CPU | {"layout": "shared", "update_epochs": 2},
-        "ppg": _CPU
-        | {
-            "layout": "detach",
-            "policy_epochs": 2,
-            "value_epochs": 2,
-            "num_policy_phases": 2,
-            "aux_minibatches": 16,
-            "aux_epochs": 1,
-        },
-        "dcpg": _CPU
-        | {"num_policy_phases": 2, "aux_minibatches": 16, "aux_epochs": 2, "update_epochs": 2},
+        "ppg": _CPU | _PPG | {"policy_epochs": 2, "value_epochs": 2, "num_policy_phases": 2},
+        "dcpg": _CPU | _DCPG,
     },
 }
 """Changes to the defaults, by preset and algorithm."""
@@ -118,12 +94,7 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
 _CPU_TASKS: dict[str, dict[str, Any]] = {
     "halfcheetah": {"action_repeat": 2, "gamma": 0.97, "total_steps": 3_100_000},
     # With Brax's reward the walker stands and hardly walks; see docs/results.md.
-    "walker2d": {
-        "reward_preset": "paper",
-        "action_repeat": 4,
-        "gamma": 0.99,
-        "total_steps": 6_800_000,
-    },
+    "walker2d": {"reward_preset": "paper", "action_repeat": 4, "total_steps": 6_800_000},
     # Brax's reward subtracts half of each squared action, so noise of 0.5 costs Ant its reward for
     # staying up.
     "ant": {"initial_std": 0.25, "action_repeat": 2, "gamma": 0.97, "total_steps": 3_400_000},
@@ -174,7 +145,7 @@ def preset(
         ValueError: a name is unknown, a setting is out of range, or the preset lacks the task.
     """
     check_choice("algorithm", algorithm, ALGORITHMS)
-    check_choice("preset", name, [n for n in PRESETS if n == "default" or algorithm in PRESETS[n]])
+    check_choice("preset", name, PRESETS)
     kind, settings = ALGORITHMS[algorithm].config_class, PRESETS[name].get(algorithm, {})
     if task is not None:
         settings = settings | {"task": task}

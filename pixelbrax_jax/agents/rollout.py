@@ -3,45 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
 from pixelbrax_jax.agents.train_state import Metrics, along_envs
-from pixelbrax_jax.types import EnvParams, EnvState, Timestep
+from pixelbrax_jax.envs.sharded import ShardedVectorEnv
+from pixelbrax_jax.envs.vector import VectorPixelEnv
+from pixelbrax_jax.types import EnvParams, EnvState
 
 Choose = Callable[[jax.Array, jax.Array | None, jax.Array], tuple[jax.Array, Any]]
 """``choose(pixels, state, key) -> (action, choice)``: actions for N observations, and a tree of
 (N, ...) arrays that learning needs."""
 
 
-class Environments(Protocol):
-    """N hashable environments that reset in mode ``"next_step"``; equal ones behave the same."""
-
-    @property
-    def env(self) -> Any:
-        """The ``PixelEnv``."""
-
-    @property
-    def num_envs(self) -> int:
-        """N."""
-
-    @property
-    def autoreset_mode(self) -> str:
-        """Must be ``"next_step"``."""
-
-    def reset(self, key: jax.Array, params: EnvParams) -> tuple[EnvState, Timestep]:
-        """See ``VectorPixelEnv.reset``."""
-
-    def step(
-        self, state: EnvState, action: jax.Array, params: EnvParams
-    ) -> tuple[EnvState, Timestep]:
-        """See ``VectorPixelEnv.step``."""
-
-    def obs(self, state: EnvState) -> Any:
-        """See ``VectorPixelEnv.obs``."""
+Environments = VectorPixelEnv | ShardedVectorEnv
+"""N environments that reset in mode ``"next_step"``; others need the same methods and a hash."""
 
 
 class Frames(struct.PyTreeNode):

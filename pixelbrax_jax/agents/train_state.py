@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, is_dataclass
+from collections.abc import Callable
+from dataclasses import fields
 from typing import Any, TypeVar
 
 import jax
@@ -16,9 +17,10 @@ Networks = dict[str, Any]
 Metrics = dict[str, jax.Array]
 """Scalars by name."""
 
-_ENV_AXIS, _KEPT, _NONE = "env_axis", "kept", "none"
-_ENVS, _NETWORKS, _ACTIONS, _UPDATES, _AUXILIARY = range(5)
+ENVS, NETWORKS, ACTIONS, UPDATES, AUXILIARY = range(5)
 """Random streams, folded into the key of a run."""
+
+_AXES, _KEPT = "axes", "kept"
 
 
 def along_envs(axis: int, *, kept: bool = True) -> Any:
@@ -26,17 +28,26 @@ def along_envs(axis: int, *, kept: bool = True) -> Any:
 
     Checkpoints skip a field with ``kept=False``; a resumed run takes its value from ``init``.
     """
-    return struct.field(metadata={_ENV_AXIS: axis, _KEPT: kept})
+    return _field(lambda value: jax.tree.map(lambda _: axis, value), kept)
 
 
 def without_envs(*, kept: bool = True) -> Any:
     """Declare a field without an environment axis, which is the same on every device."""
-    return struct.field(metadata={_ENV_AXIS: _NONE, _KEPT: kept})
+    return along_envs(-1, kept=kept)
 
 
 def as_declared(leading_axes: int = 0, *, kept: bool = True) -> Any:
     """Declare a field whose class declares its fields; its arrays have more ``leading_axes``."""
-    return struct.field(metadata={_ENV_AXIS: ("class", leading_axes), _KEPT: kept})
+
+    def axes(value: Any) -> Any:
+        own = None if value is None else env_axes(value)
+        return jax.tree.map(lambda axis: axis + leading_axes if axis >= 0 else axis, own)
+
+    return _field(axes, kept)
+
+
+def _field(axes: Callable[[Any], Any], kept: bool) -> Any:
+    return struct.field(metadata={_AXES: axes, _KEPT: kept})
 
 
 class TrainState(struct.PyTreeNode):
@@ -64,29 +75,16 @@ def env_axes(tree: Any) -> Any:
     """Replace each leaf of a dataclass by its environment axis, or -1 if it has none.
 
     Raises:
-        TypeError: a field is not declared, or its class declares no fields.
+        TypeError: a field is not declared.
     """
     found = {}
     for field in fields(tree):
-        value, declared = getattr(tree, field.name), field.metadata.get(_ENV_AXIS)
-        if declared is None:
+        if _AXES not in field.metadata:
             raise TypeError(
                 f"{type(tree).__name__}.{field.name} does not declare its environment axis: "
                 "declare it with along_envs, without_envs or as_declared."
             )
-        if isinstance(declared, tuple) and value is not None:
-            if not is_dataclass(value):
-                raise TypeError(
-                    f"{type(tree).__name__}.{field.name} must be a dataclass that declares its "
-                    f"fields, got a {type(value).__name__}."
-                )
-            more = declared[1]
-            found[field.name] = jax.tree.map(
-                lambda axis, more=more: axis + more if axis >= 0 else axis, env_axes(value)
-            )
-        else:
-            axis = declared if isinstance(declared, int) else -1
-            found[field.name] = jax.tree.map(lambda _, axis=axis: axis, value)
+        found[field.name] = field.metadata[_AXES](getattr(tree, field.name))
     return tree.replace(**found)
 
 
@@ -101,26 +99,6 @@ def kept(state: State) -> State:
     return without
 
 
-def env_key(key: jax.Array) -> jax.Array:
-    """Return the key of a run's environments."""
-    return jax.random.fold_in(key, _ENVS)
-
-
-def network_key(key: jax.Array) -> jax.Array:
-    """Return the key of a run's initial parameters."""
-    return jax.random.fold_in(key, _NETWORKS)
-
-
-def action_key(state: TrainState) -> jax.Array:
-    """Return the key of this iteration's actions."""
-    return jax.random.fold_in(jax.random.fold_in(state.key, _ACTIONS), state.iteration)
-
-
-def update_key(state: TrainState) -> jax.Array:
-    """Return the key of this iteration's update."""
-    return jax.random.fold_in(jax.random.fold_in(state.key, _UPDATES), state.iteration)
-
-
-def auxiliary_key(state: TrainState) -> jax.Array:
-    """Return the key of the auxiliary phase that follows this iteration."""
-    return jax.random.fold_in(jax.random.fold_in(state.key, _AUXILIARY), state.iteration)
+def stream_key(state: TrainState, stream: int) -> jax.Array:
+    """Return the key of a random stream, such as ``ACTIONS``, in this iteration."""
+    return jax.random.fold_in(jax.random.fold_in(state.key, stream), state.iteration)

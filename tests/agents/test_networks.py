@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from functools import partial
 
 import jax
@@ -226,18 +225,8 @@ def test_the_squashed_density_stays_finite_far_out():
     assert np.isfinite(gradient).all()
 
 
-def test_the_policy_s_action_is_raw_or_squashed():
-    raw = jnp.array([[2.0, -0.5, 0.0]])
-    np.testing.assert_array_equal(normal().action(raw), raw)
-    np.testing.assert_allclose(normal(squash=True).action(raw), np.tanh(raw), rtol=1e-6)
-
-
 def test_samples_have_the_distribution_that_log_prob_tells():
     keys = jax.random.split(jax.random.key(4), 4000)
     drawn = np.asarray(jax.vmap(normal().sample)(keys))
     for i in range(3):
         assert stats.kstest(drawn[:, i], stats.norm(MEAN[i], STD[i]).cdf).pvalue > 1e-3
-
-
-def test_every_policy_s_name_is_told_in_its_docstring():
-    assert all(f'"{name}"' in inspect.getdoc(Actor) for name in POLICIES)

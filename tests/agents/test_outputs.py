@@ -18,11 +18,15 @@ from tensorboardX.record_writer import masked_crc32c
 
 from pixelbrax_jax import stop_signals
 from pixelbrax_jax.agents.on_policy.ppo import PPO, PPOConfig
-from pixelbrax_jax.agents.runner import metrics, saving, train
-from pixelbrax_jax.agents.runner.checkpoint import CheckpointError, latest_steps
+from pixelbrax_jax.agents.runner import checkpoint, metrics, train
+from pixelbrax_jax.agents.runner.checkpoint import (
+    CheckpointError,
+    Checkpoints,
+    all_steps,
+    latest_steps,
+)
 from pixelbrax_jax.agents.runner.metrics import AppendedFile, open_metrics, read_metrics
-from pixelbrax_jax.agents.runner.progress import Bar, Messages
-from pixelbrax_jax.agents.runner.saving import Checkpoints
+from pixelbrax_jax.agents.runner.progress import Bar
 from pixelbrax_jax.agents.runner.settings import RunConfig
 from pixelbrax_jax.agents.runner.train import run
 from tests.agents.small import ABOUT, PARAMS, SMALL, ball_envs, same
@@ -170,7 +174,8 @@ def test_a_bar_that_cannot_be_drawn_is_told_once(monkeypatch):
     told = []
     bar = Bar(True, 10, told.append)
     for _ in range(3):
-        bar.update(1, {"episode/return": 1.0})
+        bar.update(1)
+        bar.set_postfix(episode_return="1.0")
     bar.close()
     assert told == ["the progress bar cannot be drawn: Broken pipe; the run continues without it"]
 
@@ -213,7 +218,7 @@ def test_a_policy_that_cannot_be_written_costs_no_checkpoint(tmp_path, monkeypat
 def test_a_checkpoint_is_tried_again(tmp_path, monkeypatch):
     free, now, told = [1 << 40], [0.0], []
     monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=free[0]))
-    monkeypatch.setattr(saving, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr(checkpoint, "time", SimpleNamespace(monotonic=lambda: now[0]))
     checkpoints = Checkpoints(tmp_path, ABOUT, minutes=10, report=told.append)
     state = {"x": jnp.arange(3)}
     assert not checkpoints.is_due_by_clock()
@@ -236,7 +241,7 @@ def test_a_checkpoint_is_tried_again(tmp_path, monkeypatch):
     free[0] = 1
     with pytest.raises(CheckpointError, match="of 50 steps, is lost; that of 40 steps remains"):
         checkpoints.save(state, 50, None, last=True)
-    assert checkpoints.steps() == [10, 40]
+    assert all_steps(tmp_path) == [10, 40]
     checkpoints.close()
 
 
@@ -253,11 +258,11 @@ def test_a_checkpoint_that_fails_while_it_is_written_leaves_the_others(tmp_path,
             time.sleep(0.01)
     assert "File too large" in told[0]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["10"], "and nothing half written"
-    assert checkpoints.latest() == 10
+    assert latest_steps(tmp_path) == 10
     assert not [record for record in caplog.records if record.exc_info], "no traceback"
     assert not checkpoints.is_due_after(29)
     checkpoints.save(state, 30, None, last=True)
-    assert checkpoints.steps() == [30]
+    assert all_steps(tmp_path) == [30]
     checkpoints.close()
 
 
@@ -308,18 +313,3 @@ def test_what_schedulers_send_is_a_request_to_stop_unless_the_program_uses_it(nu
                 assert (request.signal, got) == (0, [number])
     finally:
         signal.signal(number, before)
-
-
-def test_messages_go_to_who_can_read_them():
-    told = []
-
-    def report(line):
-        if line == "bad":
-            raise OSError(5, "Input/output error")
-        told.append(line)
-
-    messages = Messages(report)
-    for line in ("one", "bad", "two"):
-        messages(line)
-    assert told == ["one", "two"]
-    assert messages.failure == "Input/output error"

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pixelbrax_jax import VectorPixelEnv
 from pixelbrax_jax.agents.algorithm import Algorithm
 from pixelbrax_jax.agents.config import TrainConfig
 from pixelbrax_jax.agents.optimizer import Optimizer
@@ -17,10 +16,11 @@ from pixelbrax_jax.agents.rollout import collect
 from pixelbrax_jax.agents.runner.settings import RunConfig
 from pixelbrax_jax.agents.runner.train import run
 from pixelbrax_jax.agents.train_state import (
+    ACTIONS,
+    ENVS,
     TrainState,
-    action_key,
     along_envs,
-    env_key,
+    stream_key,
     without_envs,
 )
 from tests.agents.small import PARAMS, SMALL, ball_envs, same
@@ -51,7 +51,7 @@ class Own(Algorithm):
         return OwnState(
             networks=networks,
             opt_state=Optimizer(self.config).init(networks),
-            env_state=self.envs.reset(env_key(key), env_params)[0],
+            env_state=self.envs.reset(jax.random.fold_in(key, ENVS), env_params)[0],
             key=key,
             iteration=jnp.uint32(0),
             target=networks,
@@ -68,7 +68,7 @@ class Own(Algorithm):
             return action, action
 
         env_state, rollout = collect(
-            self.envs, state.env_state, env_params, choose, action_key(state), STEPS
+            self.envs, state.env_state, env_params, choose, stream_key(state, ACTIONS), STEPS
         )
         new = jnp.concatenate([rollout.choice, rollout.reward[..., None]], -1)
         replay = jnp.roll(state.replay, STEPS, 0).at[:STEPS].set(new)
@@ -114,8 +114,3 @@ def test_settings_say_how_many_steps_an_iteration_has():
         _ = TrainConfig().num_iterations
     with pytest.raises(NotImplementedError, match="own has no auxiliary phase"):
         Own(OwnConfig(env=SMALL["env"], encoder="small", num_envs=4), ball_envs()).auxiliary(None)
-
-
-def test_its_environments_are_checked(own):
-    with pytest.raises(ValueError, match="num_envs is 4 in the settings, but 3 in the env"):
-        Own(own.config, VectorPixelEnv(own.envs.env, 3))

@@ -13,9 +13,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pixelbrax_jax.agents.runner.saving import Checkpoints
-from tests.agents.small import ABOUT
-
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
 ROOT = Path(__file__).parents[2]
@@ -170,20 +167,3 @@ def test_two_processes_learn_what_one_learns(tmp_path):
     ]
     assert [process.wait(300) for process in processes] == [0, 0]
     assert_networks_are_close(tmp_path / "two", tmp_path / "one", 3 * PER_ITERATION)
-
-
-def test_all_checkpoints_of_a_killed_run_are_whole(tmp_path):
-    options = f"--total-steps {400 * PER_ITERATION} --checkpoint-every {PER_ITERATION}"
-    process = subprocess.Popen(command("ppo", tmp_path, options), cwd=ROOT)
-    end = time.monotonic() + 200
-    while not list((tmp_path / "checkpoints").glob("[0-9]*0")):
-        assert process.poll() is None
-        assert time.monotonic() < end, "no checkpoint came"
-        time.sleep(0.05)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    checkpoints = Checkpoints(tmp_path / "checkpoints", ABOUT)
-    checkpoints.close()
-    assert checkpoints.steps()
-    for steps in checkpoints.steps():
-        assert "networks.actor.params.mean.kernel" in leaves(tmp_path, steps)

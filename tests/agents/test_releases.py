@@ -11,9 +11,8 @@ import pytest
 from pixelbrax_jax.agents.on_policy.ppg import PPGConfig
 from pixelbrax_jax.agents.on_policy.ppo import PPO, PPOConfig
 from pixelbrax_jax.agents.runner import settings
-from pixelbrax_jax.agents.runner.checkpoint import CheckpointError, read_about
+from pixelbrax_jax.agents.runner.checkpoint import CheckpointError, Checkpoints, read_about
 from pixelbrax_jax.agents.runner.programs import Runs
-from pixelbrax_jax.agents.runner.saving import Checkpoints
 from pixelbrax_jax.agents.runner.settings import RunConfig
 from pixelbrax_jax.agents.runner.train import run
 from pixelbrax_jax.agents.runner.trained import load_config

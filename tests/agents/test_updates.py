@@ -11,7 +11,7 @@ from pixelbrax_jax.agents.algorithm import train_function
 from pixelbrax_jax.agents.on_policy.losses import value_loss
 from pixelbrax_jax.agents.on_policy.ppg import PPG
 from pixelbrax_jax.agents.on_policy.ppo import PPO
-from tests.agents.small import AGENTS, PARAMS, PHASIC, SMALL, assert_close, same, small_agent
+from tests.agents.small import AGENTS, PARAMS, PHASIC, assert_close, same, small_agent
 
 ITERATIONS = 3
 """Of a run: an auxiliary phase comes after the second one."""
@@ -55,15 +55,6 @@ def test_minibatches_find_the_policy_and_value_that_played(agent):
     assert abs(float(facts["policy/approx_kl"])) < 1e-6
     if "loss/value_distill" in facts and "target" not in state.networks:
         assert float(facts["loss/value_distill"]) < 1e-10
-
-
-def test_the_step_size_of_a_run_falls_along_a_line():
-    state, rates = PPO_AGENT.init(), []
-    for _ in range(PPO_AGENT.config.num_iterations):
-        state, facts = PPO_AGENT.iterate(state)
-        rates.append(float(facts["learning_rate"]))
-    expected = SMALL["learning_rate"] * np.array([1.0, 0.8, 0.6, 0.4, 0.2])
-    np.testing.assert_allclose(rates, expected, rtol=1e-5)
 
 
 def test_ppg_without_auxiliary_phases_is_ppo():

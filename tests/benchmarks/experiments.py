@@ -35,7 +35,7 @@ from pixelbrax_jax.agents.registry import ALGORITHMS
 from pixelbrax_jax.agents.runner.checkpoint import read_about
 from pixelbrax_jax.agents.runner.metrics import read_metrics
 from pixelbrax_jax.agents.runner.trained import load_config
-from pixelbrax_jax.stop_signals import stop_signals
+from pixelbrax_jax.stop_signals import handling
 from pixelbrax_jax.tasks import DMC_TASKS
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -184,18 +184,14 @@ def run(arguments: list[str], folder: Path, until: float) -> int:
     """Make a run, or go on with it; its exit status, above 128 if it was stopped."""
     command = [sys.executable, "-m", "pixelbrax_gym.cli", *arguments]
     command += ["--resume", "latest", "--output-dir", str(folder)]
-    with subprocess.Popen(["nice", "-n", "19", *command], start_new_session=True) as process:
-        stop = lambda *_: process.terminate()  # noqa: E731
-        previous = {number: signal.signal(number, stop) for number in stop_signals()}
+    nice = subprocess.Popen(["nice", "-n", "19", *command], start_new_session=True)
+    with nice as process, handling(lambda *_: process.terminate()):
         try:
             # None would be no limit, and infinity is an error.
             return process.wait(min(1e6, max(0.0, until - time.monotonic())))
         except subprocess.TimeoutExpired:
             process.terminate()
             return process.wait() or 128 + signal.SIGTERM
-        finally:
-            for number, handler in previous.items():
-                signal.signal(number, handler)
 
 
 def config_of(arguments: list[str]) -> TrainConfig:

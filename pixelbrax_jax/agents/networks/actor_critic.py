@@ -127,8 +127,3 @@ class ActorCritic:
         if self.critic_module is None:
             return output.policy, output.value
         return output.policy, self.critic(networks["critic"], pixels, state)
-
-    def act(self, networks: Networks, pixels: jax.Array, key: jax.Array | None = None) -> jax.Array:
-        """Return (B, A) actions: samples with a key, else the mean actions."""
-        policy = self.actor(networks["actor"], pixels).policy
-        return policy.action(policy.mean if key is None else policy.sample(key))

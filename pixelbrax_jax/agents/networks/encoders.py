@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial, reduce
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
-
-_GREY = 0.5
-"""Centre of the pixels in [0, 1], which ``Small`` and ``Patch`` subtract. Positive inputs give all
-weights of a filter gradients of the same sign, and large steps then turn most filters off."""
 
 Pads = tuple[tuple[int, int], tuple[int, int]]
 
@@ -20,14 +17,12 @@ Pads = tuple[tuple[int, int], tuple[int, int]]
 def convolve(x: jax.Array, kernel: jax.Array, stride: int, pads: Pads) -> jax.Array:
     """Cross-correlate (B, H, W, C) with (h, w, C, D); on a CPU matrix products are faster."""
 
-    def products(x: jax.Array, kernel: jax.Array) -> jax.Array:
-        return _as_products(x, kernel, stride, pads)
-
     def native(x: jax.Array, kernel: jax.Array) -> jax.Array:
         return jax.lax.conv_general_dilated(
             x, kernel, (stride, stride), pads, dimension_numbers=("NHWC", "HWIO", "NHWC")
         )
 
+    products = partial(_as_products, stride=stride, pads=pads)
     result: jax.Array = jax.lax.platform_dependent(x, kernel, cpu=products, default=native)
     return result
 
@@ -92,10 +87,7 @@ def max_pool(x: jax.Array) -> jax.Array:
         for i in range(3)
         for j in range(3)
     ]
-    pooled = windows[0]
-    for window in windows[1:]:
-        pooled = jnp.maximum(pooled, window)
-    return pooled
+    return reduce(jnp.maximum, windows)
 
 
 def dense(size: int, gain: float = math.sqrt(2.0), name: str | None = None) -> nn.Dense:
@@ -130,58 +122,43 @@ class Impala(nn.Module):
         return nn.relu(dense(256)(_flat(nn.relu(x))))
 
 
-class Nature(nn.Module):
-    """The network of DQN (Mnih et al., Nature 518, 2015)."""
+class Stack(nn.Module):
+    """Convolutions without padding, and a dense layer.
+
+    Attributes:
+        layers: (channels, size, stride) of each convolution.
+        features: number of features F.
+        center: number that is subtracted from the input. Positive inputs give all weights of a
+            filter gradients of the same sign, and large steps then turn most filters off.
+        bounded: whether features are normalised and pass ``tanh`` instead of ``relu``.
+    """
+
+    layers: tuple[tuple[int, int, int], ...]
+    features: int
+    center: float = 0.0
+    bounded: bool = False
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
-        """Map (B, H, W, C) float32 to (B, 512) features."""
-        for channels, size, stride in ((32, 8, 4), (64, 4, 2), (64, 3, 1)):
+        """Map (B, H, W, C) float32 to (B, F) features."""
+        if self.center:
+            x = x - self.center
+        for channels, size, stride in self.layers:
             x = nn.relu(Conv(channels, size, stride)(x))
-        return nn.relu(dense(512)(_flat(x)))
-
-
-class DrQ(nn.Module):
-    """The network of DrQ (Kostrikov et al., arXiv 2004.13649)."""
-
-    @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
-        """Map (B, H, W, C) float32 to (B, 50) features."""
-        for stride in (2, 1, 1, 1):
-            x = nn.relu(Conv(32, 3, stride)(x))
-        return jnp.tanh(nn.LayerNorm()(dense(50)(_flat(x))))
-
-
-class Small(nn.Module):
-    """Three convolutions for small images and slow processors."""
-
-    @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
-        """Map (B, H, W, C) float32 to (B, 128) features."""
-        x = x - _GREY
-        for channels, size, stride in ((16, 4, 2), (32, 4, 2), (32, 3, 1)):
-            x = nn.relu(Conv(channels, size, stride)(x))
-        return nn.relu(dense(128)(_flat(x)))
-
-
-class Patch(nn.Module):
-    """Three convolutions, first over disjoint patches (Dosovitskiy et al., arXiv 2010.11929)."""
-
-    @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
-        """Map (B, H, W, C) float32 to (B, 256) features."""
-        x = x - _GREY
-        for channels, size, stride in ((32, 4, 4), (32, 2, 2), (32, 3, 1)):
-            x = nn.relu(Conv(channels, size, stride)(x))
-        return nn.relu(dense(256)(_flat(x)))
+        x = dense(self.features)(_flat(x))
+        return jnp.tanh(nn.LayerNorm()(x)) if self.bounded else nn.relu(x)
 
 
 ENCODERS: dict[str, Callable[[], nn.Module]] = {
     "impala": Impala,
-    "nature": Nature,
-    "drq": DrQ,
-    "small": Small,
-    "patch": Patch,
+    # DQN's (Mnih et al., Nature 518, 2015).
+    "nature": partial(Stack, ((32, 8, 4), (64, 4, 2), (64, 3, 1)), 512, name="Nature_0"),
+    # Kostrikov et al., arXiv 2004.13649.
+    "drq": partial(Stack, ((32, 3, 2), *[(32, 3, 1)] * 3), 50, bounded=True, name="DrQ_0"),
+    # For small images and slow processors.
+    "small": partial(Stack, ((16, 4, 2), (32, 4, 2), (32, 3, 1)), 128, 0.5, name="Small_0"),
+    # First over disjoint patches (Dosovitskiy et al., arXiv 2010.11929).
+    "patch": partial(Stack, ((32, 4, 4), (32, 2, 2), (32, 3, 1)), 256, 0.5, name="Patch_0"),
 }
 
 SMALLEST = {"impala": 1, "nature": 36, "drq": 15, "small": 18, "patch": 24}

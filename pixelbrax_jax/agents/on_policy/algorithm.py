@@ -18,13 +18,14 @@ from pixelbrax_jax.agents.on_policy.losses import Batch, RewardScaler, gae, mean
 from pixelbrax_jax.agents.optimizer import Optimizer
 from pixelbrax_jax.agents.rollout import Rollout, at_times, collect, observations, split_obs
 from pixelbrax_jax.agents.train_state import (
+    ACTIONS,
+    ENVS,
+    NETWORKS,
     Metrics,
     Networks,
     TrainState,
-    action_key,
     as_declared,
-    env_key,
-    network_key,
+    stream_key,
     without_envs,
 )
 from pixelbrax_jax.flags import under_default_flags
@@ -83,8 +84,8 @@ class OnPolicy(Algorithm):
         ``detach`` stops gradients of a shared value at the encoder.
         """
         config = self.config
-        action_size = self.envs.env.action_size
-        actor = Actor(config.encoder, action_size, config.policy, config.initial_std, has_value)
+        size = self.envs.env.action_size
+        actor = Actor(config.encoder, size, config.policy, config.initial_std, has_value)
         critic = None if shared else Critic(config.encoder, sees_state=config.state_critic)
         return ActorCritic(actor, critic, detach)
 
@@ -95,8 +96,8 @@ class OnPolicy(Algorithm):
     @under_default_flags
     def init(self, key: jax.Array, env_params: EnvParams) -> OnPolicyState:
         """See ``Algorithm.init``."""
-        networks = self.init_networks(network_key(key))
-        env_state, _ = self.envs.reset(env_key(key), env_params)
+        networks = self.init_networks(jax.random.fold_in(key, NETWORKS))
+        env_state, _ = self.envs.reset(jax.random.fold_in(key, ENVS), env_params)
         return OnPolicyState(
             networks=networks,
             opt_state=Optimizer(self.config).init(networks),
@@ -120,7 +121,8 @@ class OnPolicy(Algorithm):
     @under_default_flags
     def act(self, networks: Networks, pixels: jax.Array, key: jax.Array | None = None) -> jax.Array:
         """See ``Algorithm.act``; without a key the actions are the mean actions."""
-        return self.agent.act(networks, pixels, key)
+        policy = self.agent.actor(networks["actor"], pixels).policy
+        return policy.action(policy.mean if key is None else policy.sample(key))
 
     def gather(
         self, state: OnPolicyState, env_params: EnvParams
@@ -134,27 +136,14 @@ class OnPolicy(Algorithm):
             decision = Decision(unclipped, policy.log_prob(unclipped), value)
             return policy.action(unclipped), decision
 
-        env_state, rollout = collect(
-            self.envs,
-            state.env_state,
-            env_params,
-            choose,
-            action_key(state),
-            config.num_steps,
-            config.random_shift,
-        )
+        key, sizes = stream_key(state, ACTIONS), (config.num_steps, config.random_shift)
+        env_state, rollout = collect(self.envs, state.env_state, env_params, choose, key, *sizes)
         scaler, reward = state.scaler, rollout.reward
         if config.normalize_reward:
             scaler, reward = scaler(reward, rollout.done, rollout.valid, config.gamma)
-        advantage, returns = gae(
-            reward,
-            rollout.choice.value,
-            rollout.last_choice.value,
-            rollout.terminated,
-            rollout.truncated,
-            config.gamma,
-            config.gae_lambda,
-        )
+        values = rollout.choice.value, rollout.last_choice.value
+        ends = rollout.terminated, rollout.truncated
+        advantage, returns = gae(reward, *values, *ends, config.gamma, config.gae_lambda)
         weight = rollout.valid.astype(jnp.float32)
         metrics = rollout.episode_metrics() | _metrics(rollout.choice, advantage, returns, weight)
         metrics["reward/scale"] = scaler.scale if config.normalize_reward else jnp.float32(1.0)
@@ -199,19 +188,14 @@ class OnPolicy(Algorithm):
             gradients, metrics = jax.grad(loss, has_aux=True)(networks, batch, key)
             # Adam's momentum moves parameters even at a gradient of 0, so the others get none.
             gradients = {name: gradients[name] for name in opt_state}
-            new, new_opt_state, norms = optimizer.step(
-                networks, opt_state, gradients, state.iteration
-            )
+            old = networks, opt_state
+            *new, norms = optimizer.step(networks, opt_state, gradients, state.iteration)
             metrics |= {f"grad_norm/{name}": norm for name, norm in norms.items()}
             if target_kl is None:
-                return (new, new_opt_state, stopped), (metrics, jnp.float32(1.0))
+                return (*new, stopped), (metrics, jnp.float32(1.0))
             # This minibatch still counts, because its divergence is known only after the step.
             used = jnp.where(stopped, 0.0, 1.0)
-            keep = jax.tree.map(
-                lambda old, new: jnp.where(stopped, old, new),
-                (networks, opt_state),
-                (new, new_opt_state),
-            )
+            keep = jax.tree.map(lambda old, new: jnp.where(stopped, old, new), old, tuple(new))
             return (*keep, stopped | (metrics["policy/approx_kl"] > target_kl)), (metrics, used)
 
         networks = {name: state.networks[name] for name in state.opt_state}
@@ -221,10 +205,8 @@ class OnPolicy(Algorithm):
             step, carry, key, num_epochs, config.num_steps, config.num_envs, config.num_minibatches
         )
         metrics = {name: jnp.sum(x * used) / jnp.sum(used) for name, x in metrics.items()}
-        state = state.replace(
-            networks=state.networks | networks, opt_state=state.opt_state | opt_state
-        )
-        return state, metrics
+        opt_state = state.opt_state | opt_state
+        return state.replace(networks=state.networks | networks, opt_state=opt_state), metrics
 
 
 def passes(

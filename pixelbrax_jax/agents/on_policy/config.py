@@ -6,9 +6,17 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar
 
-from pixelbrax_jax.agents.config import TrainConfig, check_count, check_divides, check_positive
+from pixelbrax_jax.agents.config import (
+    Count,
+    Fraction,
+    NotNegative,
+    Positive,
+    PositiveInt,
+    TrainConfig,
+    check_divides,
+)
 from pixelbrax_jax.agents.networks.actor_critic import LOG_STD_RANGE, POLICIES
-from pixelbrax_jax.validation import check_choice, check_fraction, check_positive_int
+from pixelbrax_jax.validation import check_choice
 
 ADVANTAGE_NORMS = ("batch", "minibatch", "none")
 
@@ -19,22 +27,22 @@ class OnPolicyConfig(TrainConfig):
 
     memory_settings: ClassVar[tuple[str, ...]] = ("num_envs", "num_steps")
 
-    num_steps: int = 64
+    num_steps: PositiveInt = 64
     """Number of steps T of each environment in a rollout."""
-    random_shift: int = 0
+    random_shift: Count = 0
     """Shifts images randomly by up to this many pixels, once per rollout."""
     policy: str = "gaussian"
     """Distribution of the actions: ``gaussian``, ``tanh_gaussian`` or ``deacrep``."""
-    initial_std: float = 1.0
+    initial_std: Positive = 1.0
     """Initial standard deviation of a ``gaussian`` or ``tanh_gaussian`` policy."""
 
-    gae_lambda: float = 0.95
+    gae_lambda: Fraction = 0.95
     """Lambda of generalised advantage estimation."""
-    num_minibatches: int = 8
+    num_minibatches: PositiveInt = 8
     """Number of minibatches per epoch, with T / num_minibatches steps of every environment each."""
-    clip_coef: float = 0.2
+    clip_coef: Fraction = 0.2
     """Epsilon of PPO's clipped ratio."""
-    ent_coef: float = 0.001
+    ent_coef: NotNegative = 0.001
     """Weight of the entropy bonus."""
     normalize_advantage: str = "batch"
     """Normalises advantages over the ``batch`` or the ``minibatch``, or not at all: ``none``."""
@@ -44,16 +52,9 @@ class OnPolicyConfig(TrainConfig):
     def __post_init__(self) -> None:
         """Check the settings."""
         super().__post_init__()
-        check_positive_int("num_steps", self.num_steps)
-        check_positive_int("num_minibatches", self.num_minibatches)
         check_divides("num_steps", self.num_steps, "num_minibatches", self.num_minibatches)
         check_choice("policy", self.policy, POLICIES)
         check_choice("normalize_advantage", self.normalize_advantage, ADVANTAGE_NORMS)
-        check_fraction("gae_lambda", self.gae_lambda)
-        check_fraction("clip_coef", self.clip_coef)
-        check_positive("initial_std", self.initial_std)
-        check_positive("ent_coef", self.ent_coef, or_zero=True)
-        check_count("random_shift", self.random_shift)
         low, high = (math.exp(x) for x in LOG_STD_RANGE)
         if not low < self.initial_std < high:
             raise ValueError(

@@ -10,42 +10,38 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
-from pixelbrax_jax.agents.config import TrainConfig, check_positive
+from pixelbrax_jax.agents.config import Fraction, NotNegative, PositiveInt, TrainConfig
 from pixelbrax_jax.agents.networks.actor_critic import ActorCritic
 from pixelbrax_jax.agents.networks.encoders import dense
 from pixelbrax_jax.agents.on_policy.algorithm import Experience, OnPolicyState
 from pixelbrax_jax.agents.on_policy.losses import Batch, mean, policy_loss, value_loss
 from pixelbrax_jax.agents.on_policy.phasic import Chunk, Phasic, PhasicConfig
-from pixelbrax_jax.agents.train_state import Metrics, Networks, update_key
-from pixelbrax_jax.validation import check_fraction, check_positive_int
+from pixelbrax_jax.agents.train_state import UPDATES, Metrics, Networks, stream_key
+from pixelbrax_jax.validation import check_positive_int
 
 
 @dataclass(frozen=True)
 class DCPGConfig(PhasicConfig):
     """Settings of DCPG, or of DDCPG with ``dynamics_coef=1``."""
 
-    update_epochs: int = 1
+    update_epochs: PositiveInt = 1
     """Number of passes over a rollout in the policy phase."""
-    value_distill_coef: float = 1.0
+    value_distill_coef: NotNegative = 1.0
     """Weight lambda_V of the loss that keeps values constant in the policy phase."""
-    dynamics_coef: float = 0.0
+    dynamics_coef: NotNegative = 0.0
     """Weight c_f of DDCPG's dynamics loss in the delayed phase; 0 omits the dynamics head."""
     decoupled: bool = False
     """Computes advantages with a separate critic that learns in every policy phase."""
-    vf_coef: float = 1.0
+    vf_coef: NotNegative = 1.0
     """Weight of the separate critic's loss."""
-    target_rate: float = 0.05
+    target_rate: Fraction = 0.05
     """Rate tau of the averaged actor that provides the old values in the decoupled variant."""
 
     def __post_init__(self) -> None:
         """Check the settings."""
         super().__post_init__()
-        check_positive_int("update_epochs", self.update_epochs)
         # Values learn only in the delayed phase.
         check_positive_int("aux_epochs", self.aux_epochs)
-        for name in ("value_distill_coef", "dynamics_coef", "vf_coef"):
-            check_positive(name, getattr(self, name), or_zero=True)
-        check_fraction("target_rate", self.target_rate)
         if self.state_critic and not self.decoupled:
             raise ValueError(
                 "state_critic needs decoupled=True, got False: only the decoupled variant has a "
@@ -122,7 +118,7 @@ class DCPG(Phasic):
             return loss + config.value_distill_coef * distance, metrics
 
         state, metrics = self.update(
-            state, loss, experience, config.update_epochs, update_key(state)
+            state, loss, experience, config.update_epochs, stream_key(state, UPDATES)
         )
         return self.remember(state, experience), metrics
 

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from pixelbrax_jax.agents.config import check_count, check_divides, check_positive
+from pixelbrax_jax.agents.config import Count, NotNegative, PositiveInt, check_divides
 from pixelbrax_jax.agents.networks.actor_critic import ActorOutput
 from pixelbrax_jax.agents.networks.distributions import Normal
 from pixelbrax_jax.agents.on_policy.algorithm import (
@@ -24,15 +24,15 @@ from pixelbrax_jax.agents.on_policy.losses import mean, value_loss
 from pixelbrax_jax.agents.optimizer import Optimizer
 from pixelbrax_jax.agents.rollout import Frames, observations
 from pixelbrax_jax.agents.train_state import (
+    AUXILIARY,
     Metrics,
     Networks,
     along_envs,
     as_declared,
-    auxiliary_key,
+    stream_key,
 )
 from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.types import EnvParams
-from pixelbrax_jax.validation import check_positive_int
 
 
 @dataclass(frozen=True)
@@ -41,23 +41,19 @@ class PhasicConfig(OnPolicyConfig):
 
     memory_settings: ClassVar[tuple[str, ...]] = ("num_envs", "num_steps", "num_policy_phases")
 
-    num_policy_phases: int = 16
+    num_policy_phases: PositiveInt = 16
     """Number N_pi of rollouts between auxiliary phases (DCPG: delayed phases)."""
-    aux_epochs: int = 4
+    aux_epochs: Count = 4
     """Number E_aux of passes over the buffer in an auxiliary phase."""
-    aux_minibatches: int = 16
+    aux_minibatches: PositiveInt = 16
     """Number of minibatches per pass, a multiple of ``num_policy_phases``."""
-    beta_clone: float = 1.0
+    beta_clone: NotNegative = 1.0
     """Weight of KL(old policy || policy) in the auxiliary phase."""
 
     def __post_init__(self) -> None:
         """Check the settings."""
         super().__post_init__()
-        check_count("aux_epochs", self.aux_epochs)
-        check_positive("beta_clone", self.beta_clone, or_zero=True)
         phases, minibatches = self.num_policy_phases, self.aux_minibatches
-        check_positive_int("num_policy_phases", phases)
-        check_positive_int("aux_minibatches", minibatches)
         if self.aux_epochs and self.num_iterations < phases:
             raise ValueError(
                 f"the auxiliary phase would never run: it comes after every {phases} rollouts, and "
@@ -154,7 +150,8 @@ class Phasic(OnPolicy):
     @under_default_flags
     def auxiliary(self, state: OnPolicyState) -> tuple[OnPolicyState, Metrics]:
         """Learn from the full buffer with a separate optimiser state; average the metrics."""
-        config, optimizer, key = self.config, Optimizer(self.config), auxiliary_key(state)
+        config, optimizer = self.config, Optimizer(self.config)
+        key = stream_key(state, AUXILIARY)
         num_chunks = config.aux_minibatches
         # Uses the step size of the previous iteration, because an annealed one ends at 0.
         iteration = state.iteration - 1

@@ -9,13 +9,13 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
-from pixelbrax_jax.agents.config import TrainConfig, check_positive
+from pixelbrax_jax.agents.config import NotNegative, PositiveInt, TrainConfig
 from pixelbrax_jax.agents.networks.actor_critic import ActorCritic
 from pixelbrax_jax.agents.on_policy.algorithm import Experience, OnPolicyState
 from pixelbrax_jax.agents.on_policy.losses import Batch, policy_loss, value_loss
 from pixelbrax_jax.agents.on_policy.phasic import Chunk, Phasic, PhasicConfig
-from pixelbrax_jax.agents.train_state import Metrics, Networks, update_key
-from pixelbrax_jax.validation import check_choice, check_positive_int
+from pixelbrax_jax.agents.train_state import UPDATES, Metrics, Networks, stream_key
+from pixelbrax_jax.validation import check_choice
 
 LAYOUTS = ("dual", "detach", "shared")
 
@@ -27,23 +27,19 @@ class PPGConfig(PhasicConfig):
     layout: str = "dual"
     """Encoders of policy and value: ``dual`` (separate), ``shared``, or ``detach`` (shared, without
     gradients of the value in policy phases)."""
-    policy_epochs: int = 1
+    policy_epochs: PositiveInt = 1
     """Number E_pi of passes over a rollout for the policy."""
-    value_epochs: int = 1
+    value_epochs: PositiveInt = 1
     """Number E_V of passes over a rollout for the value."""
-    vf_coef: float = 1.0
+    vf_coef: NotNegative = 1.0
     """Weight of the value loss, which is half the mean squared error."""
-    aux_value_coef: float = 1.0
+    aux_value_coef: NotNegative = 1.0
     """Weight of the separate critic's loss in the auxiliary phase."""
 
     def __post_init__(self) -> None:
         """Check the settings."""
         super().__post_init__()
         check_choice("layout", self.layout, LAYOUTS)
-        check_positive_int("policy_epochs", self.policy_epochs)
-        check_positive_int("value_epochs", self.value_epochs)
-        check_positive("vf_coef", self.vf_coef, or_zero=True)
-        check_positive("aux_value_coef", self.aux_value_coef, or_zero=True)
         if self.layout != "dual" and self.policy_epochs != self.value_epochs:
             raise ValueError(
                 f"policy_epochs={self.policy_epochs} and value_epochs={self.value_epochs} may "
@@ -73,7 +69,7 @@ class PPG(Phasic):
 
     def learn(self, state: OnPolicyState, experience: Experience) -> tuple[OnPolicyState, Metrics]:
         """Run the policy phase: learn like PPO and store the rollout."""
-        config, agent, key = self.config, self.agent, update_key(state)
+        config, agent, key = self.config, self.agent, stream_key(state, UPDATES)
 
         def loss(
             of_policy: bool, of_value: bool, networks: Networks, batch: Batch, key: jax.Array

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import jax
 
-from pixelbrax_jax.agents.config import TrainConfig, check_positive
+from pixelbrax_jax.agents.config import NotNegative, PositiveInt, TrainConfig, check_positive
 from pixelbrax_jax.agents.networks.actor_critic import ActorCritic
 from pixelbrax_jax.agents.on_policy.algorithm import Experience, OnPolicy, OnPolicyState
 from pixelbrax_jax.agents.on_policy.config import OnPolicyConfig
@@ -18,8 +18,8 @@ from pixelbrax_jax.agents.on_policy.losses import (
     policy_loss,
     value_loss,
 )
-from pixelbrax_jax.agents.train_state import Metrics, Networks, update_key
-from pixelbrax_jax.validation import check_choice, check_positive_int
+from pixelbrax_jax.agents.train_state import UPDATES, Metrics, Networks, stream_key
+from pixelbrax_jax.validation import check_choice
 
 LAYOUTS = ("separate", "shared")
 
@@ -30,9 +30,9 @@ class PPOConfig(OnPolicyConfig):
 
     layout: str = "separate"
     """Encoders of policy and value: ``separate`` or ``shared``."""
-    update_epochs: int = 3
+    update_epochs: PositiveInt = 3
     """Number of passes over a rollout."""
-    vf_coef: float = 0.5
+    vf_coef: NotNegative = 0.5
     """Weight of the value loss, which is half the mean squared error."""
     clip_value: bool = False
     """Limits the change of the value with ``clip_coef``, like that of the policy."""
@@ -43,8 +43,6 @@ class PPOConfig(OnPolicyConfig):
         """Check the settings."""
         super().__post_init__()
         check_choice("layout", self.layout, LAYOUTS)
-        check_positive_int("update_epochs", self.update_epochs)
-        check_positive("vf_coef", self.vf_coef, or_zero=True)
         if self.target_kl is not None:
             check_positive("target_kl", self.target_kl)
         if self.state_critic and self.layout == "shared":
@@ -76,7 +74,7 @@ class PPO(OnPolicy):
             self.loss,
             experience,
             config.update_epochs,
-            update_key(state),
+            stream_key(state, UPDATES),
             target_kl=config.target_kl,
         )
 

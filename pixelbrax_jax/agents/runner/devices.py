@@ -27,22 +27,15 @@ def state_shardings(mesh: Mesh, template: Any, num_seeds: int = 1) -> Any:
     """Return the shardings of a ``TrainState``: environments over the mesh, the rest replicated."""
 
     def sharding(axis: int) -> NamedSharding:
-        if axis < 0:
-            return replicated(mesh)
-        return NamedSharding(mesh, PartitionSpec(*[None] * (axis + (num_seeds > 1)), AXIS))
+        places = (*[None] * (axis + (num_seeds > 1)), AXIS) if axis >= 0 else ()
+        return NamedSharding(mesh, PartitionSpec(*places))
 
     return jax.tree.map(sharding, env_axes(template))
 
 
-def replicated(mesh: Mesh) -> NamedSharding:
-    """Return the sharding of values that are equal on all devices."""
-    return NamedSharding(mesh, PartitionSpec())
-
-
 def replicate(mesh: Mesh, tree: Any) -> Any:
     """Copy values to all devices of all processes."""
-    same = replicated(mesh)
-    return jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf), same), tree)
+    return jax.device_put(jax.tree.map(np.asarray, tree), NamedSharding(mesh, PartitionSpec()))
 
 
 def any_process(here: bool) -> bool:
@@ -62,7 +55,11 @@ def check_memory(algorithm: Algorithm, template: TrainState, report: Report) -> 
     """Report the memory of a state like ``template``; raise a MemoryError if it does not fit."""
     config = algorithm.config
     frames = config.bytes_per_iteration * template.iteration.size
-    memories, total = _memories(algorithm), _nbytes(template)
+    # Devices of a CPU share one memory.
+    mesh = mesh_of(algorithm)
+    sharing = 1 if mesh is None else int(mesh.size)
+    memories = min(sharing, jax.process_count()) if jax.default_backend() == "cpu" else sharing
+    total = _nbytes(template)
     parts = {field.name: _nbytes(getattr(template, field.name)) for field in fields(template)}
     large = (f", {name} {n / 1e9:.2f} GB" for name, n in parts.items() if n > 0.01 * total)
     report(
@@ -86,11 +83,3 @@ def check_memory(algorithm: Algorithm, template: TrainState, report: Report) -> 
 
 def _nbytes(tree: Any) -> int:
     return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
-
-
-def _memories(algorithm: Algorithm) -> int:
-    """Return the number of memories that hold environments; CPU devices share one."""
-    mesh = mesh_of(algorithm)
-    if mesh is None:
-        return 1
-    return jax.process_count() if jax.default_backend() == "cpu" else int(mesh.size)

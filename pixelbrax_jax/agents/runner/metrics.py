@@ -7,7 +7,8 @@ import os
 import socket
 import struct
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -78,28 +79,31 @@ class AppendedFile:
 
 @dataclass
 class _Output:
-    """A destination of records; both functions may raise."""
+    """A destination of records, whose functions may raise.
+
+    Attributes:
+        write: receives steps, seconds and the record.
+        retries: whether ``write`` keeps failed records and retries them.
+        failure: why records are missing, or empty.
+        last: steps of the last record that was written.
+    """
 
     name: str
     write: Callable[[int, float, Mapping[str, float]], None]
-    """Receives steps, seconds and the record."""
     close: Callable[[], None]
+    last: int
     retries: bool = True
-    """Whether ``write`` keeps failed records and retries them."""
     failure: str = ""
-    """Why records are missing, or empty."""
-    last: int = 0
-    """Steps of the last record that was written."""
 
 
-def _lines(path: Path) -> _Output:
+def _lines(path: Path, first_step: int) -> _Output:
     file = AppendedFile(path)
 
     def write(steps: int, seconds: float, record: Mapping[str, float]) -> None:
         line = {"steps": steps, "seconds": round(seconds, 3)} | dict(record)
         file.append(json.dumps(line).encode() + b"\n")
 
-    return _Output(str(path), write, file.close)
+    return _Output(str(path), write, file.close, first_step)
 
 
 def _tensorboard(folder: Path, first_step: int) -> _Output:
@@ -108,10 +112,9 @@ def _tensorboard(folder: Path, first_step: int) -> _Output:
     name = f"events.out.tfevents.{int(time.time())}.{socket.gethostname()}.{os.getpid()}"
     file = AppendedFile(folder / name)
 
-    def add(event: Any) -> None:
+    def add(**event: Any) -> None:
         """Append an event in the TFRecord format: length and bytes, each with a checksum."""
-        event.wall_time = time.time()
-        data = event.SerializeToString()
+        data = Event(wall_time=time.time(), **event).SerializeToString()
         length = struct.pack("<Q", len(data))
         ends = [struct.pack("<I", masked_crc32c(part)) for part in (length, data)]
         file.append(length + ends[0] + data + ends[1])
@@ -119,16 +122,16 @@ def _tensorboard(folder: Path, first_step: int) -> _Output:
     def write(steps: int, seconds: float, record: Mapping[str, float]) -> None:
         del seconds
         values = [Summary.Value(tag=name, simple_value=value) for name, value in record.items()]
-        add(Event(step=steps, summary=Summary(value=values)))
+        add(step=steps, summary=Summary(value=values))
 
     # A SessionLog tells TensorBoard to drop the records of an earlier attempt after this step.
-    first_step = first_step + 1 if first_step else 0
-    add(Event(step=first_step, file_version="brain.Event:2"))
-    add(Event(step=first_step, session_log=SessionLog(status=SessionLog.START)))
-    return _Output(str(folder), write, file.close)
+    start = first_step + 1 if first_step else 0
+    add(step=start, file_version="brain.Event:2")
+    add(step=start, session_log=SessionLog(status=SessionLog.START))
+    return _Output(str(folder), write, file.close, first_step)
 
 
-def _wandb(project: str, config: dict[str, Any], folder: Path) -> _Output:
+def _wandb(project: str, config: dict[str, Any], folder: Path, first_step: int) -> _Output:
     try:
         import wandb
     except ImportError as error:
@@ -141,21 +144,15 @@ def _wandb(project: str, config: dict[str, Any], folder: Path) -> _Output:
         del seconds
         run.log(dict(record) | {"steps": steps})
 
-    return _Output("Weights & Biases", write, run.finish, retries=False)
+    return _Output("Weights & Biases", write, run.finish, first_step, retries=False)
 
 
 class MetricsWriter:
     """Writes records to all outputs; never raises, and reports the first error of each output."""
 
-    def __init__(
-        self,
-        report: Report,
-        outputs: Sequence[_Output] = (),
-        seconds: float = 0.0,
-    ) -> None:
+    def __init__(self, report: Report, outputs: Sequence[_Output] = (), seconds: float = 0) -> None:
         """Start the clock at ``seconds``."""
-        self._report = report
-        self._outputs = outputs
+        self._report, self._outputs = report, outputs
         self._began = time.monotonic() - seconds
 
     def write(self, steps: int, record: Mapping[str, float]) -> None:
@@ -164,24 +161,18 @@ class MetricsWriter:
         for output in self._outputs:
             if output.failure and not output.retries:
                 continue
-            try:
+            with self._watched(output):
                 output.write(steps, seconds, record)
-            except Exception as error:
-                self._fail(output, error)
-                continue
-            output.last = steps
-            if output.failure:
-                output.failure = ""
-                self._report(f"{output.name} can be written again; missing records were added")
+                output.last = steps
+                if output.failure:
+                    output.failure = ""
+                    self._report(f"{output.name} can be written again; missing records were added")
 
     def close(self) -> None:
         """Close the files."""
         for output in self._outputs:
-            try:
+            with self._watched(output):
                 output.close()
-            except Exception as error:
-                self._fail(output, error)
-            else:
                 if output.retries:
                     output.failure = ""
 
@@ -193,14 +184,21 @@ class MetricsWriter:
             if output.failure
         ]
 
-    def _fail(self, output: _Output, error: Exception) -> None:
-        if not output.failure:
-            lines = self._outputs[0].name
-            then = "its records wait in memory" if output.retries else f"{lines} has all records"
-            self._report(
-                f"cannot write to {output.name}: {reason(error)}; training continues, {then}"
-            )
-        output.failure = reason(error)
+    @contextmanager
+    def _watched(self, output: _Output) -> Iterator[None]:
+        """Store an error, and report the first one."""
+        try:
+            yield
+        except Exception as error:
+            if not output.failure:
+                lines = self._outputs[0].name
+                then = (
+                    "its records wait in memory" if output.retries else f"{lines} has all records"
+                )
+                self._report(
+                    f"cannot write to {output.name}: {reason(error)}; training continues, {then}"
+                )
+            output.failure = reason(error)
 
 
 def open_metrics(
@@ -220,11 +218,9 @@ def open_metrics(
     (folder / "config.json").write_text(json.dumps(config, indent=2) + "\n", "utf-8")
     path = folder / "metrics.jsonl"
     seconds = _keep_until(path, first_step)
-    outputs = [_lines(path), _tensorboard(folder / "tensorboard", first_step)]
+    outputs = [_lines(path, first_step), _tensorboard(folder / "tensorboard", first_step)]
     if wandb_project is not None:
-        outputs.append(_wandb(wandb_project, config, folder))
-    for output in outputs:
-        output.last = first_step
+        outputs.append(_wandb(wandb_project, config, folder, first_step))
     return MetricsWriter(report, outputs, seconds)
 
 

@@ -8,10 +8,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.sharding import NamedSharding, PartitionSpec
 
 from pixelbrax_jax._platform.batches import map_runs
 from pixelbrax_jax.agents.algorithm import Algorithm
-from pixelbrax_jax.agents.runner.devices import mesh_of, replicated, state_shardings
+from pixelbrax_jax.agents.runner.devices import mesh_of, state_shardings
 from pixelbrax_jax.agents.train_state import Metrics, TrainState
 from pixelbrax_jax.compilation import jit
 from pixelbrax_jax.flags import under_default_flags
@@ -64,11 +65,8 @@ class Runs:
         mesh = mesh_of(self.algorithm)
         if mesh is None:
             return template
-        return jax.tree.map(
-            lambda leaf, sharding: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding),
-            template,
-            state_shardings(mesh, template, self.num_seeds),
-        )
+        shardings = state_shardings(mesh, template, self.num_seeds)
+        return jax.tree.map(lambda leaf, place: leaf.update(sharding=place), template, shardings)
 
     def split(self, tree: Any) -> list[Any]:
         """Split a tree into the parts of each run."""
@@ -79,11 +77,7 @@ class Runs:
     def _each(self, function: Callable[..., Any], first: Any, *others: Any) -> Any:
         if self.num_seeds == 1:
             return function(first, *others)
-
-        def one(first: Any) -> Any:
-            return function(first, *others)
-
-        return map_runs(one, first)
+        return map_runs(lambda first: function(first, *others), first)
 
     def _spread(self, state: TrainState, metrics: Metrics) -> tuple[TrainState, Metrics]:
         """Shard the state over the devices and replicate the metrics."""
@@ -92,4 +86,5 @@ class Runs:
             return state, metrics
         shardings = state_shardings(mesh, state, self.num_seeds)
         state = jax.lax.with_sharding_constraint(state, shardings)
-        return state, jax.lax.with_sharding_constraint(metrics, replicated(mesh))
+        same = NamedSharding(mesh, PartitionSpec())
+        return state, jax.lax.with_sharding_constraint(metrics, same)

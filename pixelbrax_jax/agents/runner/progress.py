@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
+from typing import Any
 
 from tqdm import tqdm
 
@@ -37,40 +38,33 @@ class Messages:
             self.failure = self.failure or reason(error)
 
 
-class Bar:
-    """An optional tqdm progress bar; ``failure`` is its error, or empty."""
+class Bar(tqdm):
+    """An optional progress bar, gone after an error; ``failure`` is the error, or empty."""
 
     def __init__(self, shown: bool, total: int, report: Report) -> None:
         """Show a bar of ``total`` iterations."""
-        self._report = report
-        self.failure = ""
-        self._bar = tqdm(disable=True)
+        self.failure, self._report = "", report
         with self._watched():
-            self._bar = tqdm(total=total, unit="iteration", disable=not shown)
+            super().__init__(total=total, unit="iteration", disable=not shown)
 
-    def update(self, number: int, record: dict[str, float] | None = None) -> None:
-        """Add iterations, and show the return in a record."""
+    def display(self, *arguments: Any, **options: Any) -> None:
+        """Draw the bar."""
         with self._watched():
-            self._bar.update(number)
-            if record and "episode/return" in record:
-                self._bar.set_postfix(episode_return=f"{record['episode/return']:.1f}")
+            super().display(*arguments, **options)
 
     def close(self) -> None:
         """Draw the bar for the last time."""
         with self._watched():
-            self._bar.close()
+            super().close()
 
     @contextmanager
     def _watched(self) -> Iterator[None]:
-        """Remove the bar after an error."""
         try:
             yield
         except Exception as error:
-            bar, self._bar = self._bar, tqdm(disable=True)
-            # An open bar would be redrawn after every message.
-            with suppress(Exception):
-                bar.close()
-            self.failure = reason(error)
-            self._report(
-                f"the progress bar cannot be drawn: {self.failure}; the run continues without it"
-            )
+            self.disable = True
+            if not self.failure:
+                self.failure = why = reason(error)
+                self._report(
+                    f"the progress bar cannot be drawn: {why}; the run continues without it"
+                )

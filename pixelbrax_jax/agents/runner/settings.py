@@ -6,19 +6,24 @@ import hashlib
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import dataclass, field
 from importlib import metadata
 from typing import Any
 
 import jax
-import numpy as np
 
 from pixelbrax_jax.agents.algorithm import Algorithm
-from pixelbrax_jax.agents.config import TrainConfig, check_count, check_positive, describe
+from pixelbrax_jax.agents.config import (
+    Count,
+    NotNegative,
+    PositiveInt,
+    TrainConfig,
+    check_annotated,
+    describe,
+)
 from pixelbrax_jax.cache import whole_path
-from pixelbrax_jax.config import ENV_OPTIONS
 from pixelbrax_jax.types import Clips
-from pixelbrax_jax.validation import check_choice, check_positive_int
+from pixelbrax_jax.validation import check_choice
 
 RESUME = ("never", "latest")
 
@@ -38,50 +43,42 @@ _FREE = ("total_steps", "memory_budget_gb")
 """Settings that may change when a run continues."""
 
 
-def _on_terminal() -> bool:
-    return bool(getattr(sys.stderr, "isatty", bool)())
-
-
 @dataclass(frozen=True)
 class RunConfig:
     """Seeds, and settings of logs, checkpoints and evaluation, which do not affect the training."""
 
     output_dir: str = "runs/train"
     """Folder for logs, checkpoints and the policy."""
-    seed: int = 0
+    seed: Count = 0
     """Seed of the run."""
-    seeds: int = 1
+    seeds: PositiveInt = 1
     """Number of runs in one program, with the seeds ``seed``, ``seed`` + 1, ..."""
     resume: str = "never"
     """``latest`` continues from the latest checkpoint in the folder, if it has one."""
     log_training_metrics: bool = True
     """Logs the metrics of the training."""
-    log_every: int = 1
+    log_every: PositiveInt = 1
     """Number of iterations that one record summarises."""
-    num_evals: int = 0
+    num_evals: Count = 0
     """Number of evaluations, evenly over the run, the last one at its end; 0 disables them."""
-    eval_episodes: int = 32
+    eval_episodes: PositiveInt = 32
     """Number of episodes per evaluation and split."""
-    checkpoint_every: int = 0
+    checkpoint_every: Count = 0
     """Writes a checkpoint every so many control steps, besides those by the clock, at evaluations
     and at the end; 0 disables it."""
-    checkpoint_minutes: float = 10.0
+    checkpoint_minutes: NotNegative = 10.0
     """Writes a checkpoint after this many minutes without one; 0 ignores the clock."""
-    keep_checkpoints: int = 3
+    keep_checkpoints: PositiveInt = 3
     """Number of latest checkpoints to keep, in addition to the best one."""
     wandb_project: str | None = None
     """Logs to this project of Weights & Biases; None disables it."""
-    progress: bool = field(default_factory=_on_terminal)
+    progress: bool = field(default_factory=lambda: bool(getattr(sys.stderr, "isatty", bool)()))
     """Shows a progress bar; default: only if stderr is a terminal."""
 
     def __post_init__(self) -> None:
         """Check the settings."""
         check_choice("resume", self.resume, RESUME)
-        for name in ("seeds", "log_every", "eval_episodes", "keep_checkpoints"):
-            check_positive_int(name, getattr(self, name))
-        for name in ("seed", "num_evals", "checkpoint_every"):
-            check_count(name, getattr(self, name))
-        check_positive("checkpoint_minutes", self.checkpoint_minutes, or_zero=True)
+        check_annotated(self)
         if self.seed + self.seeds > 2**32:
             raise ValueError(
                 f"seeds must be below 2**32, got seed={self.seed} and seeds={self.seeds}."
@@ -108,11 +105,8 @@ def describe_run(
 
 def former_settings(kind: type[TrainConfig]) -> dict[str, Any]:
     """Return the values, by name, that settings of class ``kind`` have if a run lacks them."""
-    defaults = {field.name: field.default for field in (*fields(kind), *fields(RunConfig))}
-    names = {*ENV_OPTIONS, *(field.name for field in fields(kind)), *OF_RUNS} - {"env"}
-    known = vars(defaults["env"]) | defaults | FORMER_DEFAULTS
-    plain = {n: list(v) if isinstance(v, tuple) else v for n, v in known.items() if n in names}
-    return {name: value for name, value in plain.items() if value is not MISSING}
+    known = describe(kind()) | {name: getattr(RunConfig(), name) for name in OF_RUNS}
+    return {name: FORMER_DEFAULTS.get(name, value) for name, value in known.items()}
 
 
 def versions() -> dict[str, str]:
@@ -163,13 +157,9 @@ def clip_digests(clips: Clips | None) -> list[str]:
     if clips is None:
         return []
     pixels, *parts = jax.device_get((clips.packed, clips.first, clips.length))
-    found = []
-    for first, length in zip(*parts, strict=True):
-        frames = np.ascontiguousarray(pixels[first : first + length])
-        digest = hashlib.sha256(repr(frames.shape).encode())
-        digest.update(frames.data)
-        found.append(digest.hexdigest()[:32])
-    return found
+    frames = [pixels[first : first + length] for first, length in zip(*parts, strict=True)]
+    contents = [repr(clip.shape).encode() + clip.tobytes() for clip in frames]
+    return [hashlib.sha256(content).hexdigest()[:32] for content in contents]
 
 
 def place_of(clips: str | None) -> str | None:

@@ -8,8 +8,6 @@ from typing import Any
 from pixelbrax_jax.agents.config import TrainConfig, make_env
 from pixelbrax_jax.agents.runner.progress import Report, silent
 from pixelbrax_jax.agents.runner.settings import clip_digests
-from pixelbrax_jax.cache import whole_path
-from pixelbrax_jax.distractors import folders, procedural
 from pixelbrax_jax.distractors.presets import resolve
 from pixelbrax_jax.distractors.video import Video
 from pixelbrax_jax.envs.pixel_env import PixelEnv
@@ -98,9 +96,11 @@ def make_split(
             )
         return env, params
     split = HELD_OUT.get(config.env.split, config.env.split)
-    _check_there(config, split)
+    try:
+        env, params = make_env(config, obs_mode="pixels", split=split)
+    except (ValueError, FileNotFoundError) as error:
+        raise NoSplitError(str(error)) from error
     shown = shown or clip_digests(_make(config)[1].clips)
-    env, params = _make(config, split=split)
     played = clip_digests(params.clips)
     if shared := sum(digest in shown for digest in played):
         raise NoSplitError(
@@ -120,17 +120,6 @@ def _make(config: TrainConfig, **changes: Any) -> tuple[PixelEnv, EnvParams]:
         raise FileNotFoundError(
             f"the clips of the run are missing; set their folder with --clips: {error}"
         ) from error
-
-
-def _check_there(config: TrainConfig, split: str) -> None:
-    """Raise a NoSplitError that lists the splits of the clips unless this one exists."""
-    try:
-        if _source(config) == "procedural":
-            check_choice("split of procedural clips", split, procedural.SPLITS)
-        else:
-            folders.find(whole_path(_source(config)), split)
-    except (ValueError, FileNotFoundError) as error:
-        raise NoSplitError(str(error)) from error
 
 
 def _source(config: TrainConfig) -> str:

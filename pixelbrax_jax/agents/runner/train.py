@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
-from contextlib import closing, suppress
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
+from signal import Signals
 from typing import Any
 
 import jax
@@ -14,7 +15,7 @@ import numpy as np
 from pixelbrax_jax.agents.algorithm import Algorithm
 from pixelbrax_jax.agents.config import TrainConfig, make_env
 from pixelbrax_jax.agents.registry import make_algorithm
-from pixelbrax_jax.agents.runner.checkpoint import CheckpointError
+from pixelbrax_jax.agents.runner.checkpoint import CheckpointError, Checkpoints, latest_steps
 from pixelbrax_jax.agents.runner.devices import (
     any_process,
     check_memory,
@@ -26,7 +27,6 @@ from pixelbrax_jax.agents.runner.evaluate import Evaluator, Result, together
 from pixelbrax_jax.agents.runner.metrics import MetricsWriter, open_metrics, summarize
 from pixelbrax_jax.agents.runner.programs import Runs
 from pixelbrax_jax.agents.runner.progress import Bar, Messages, Report, reason, silent
-from pixelbrax_jax.agents.runner.saving import Checkpoints
 from pixelbrax_jax.agents.runner.settings import (
     RunConfig,
     clip_digests,
@@ -39,13 +39,8 @@ from pixelbrax_jax.agents.train_state import TrainState, kept, parts_not_kept
 from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.envs.sharded import ShardedVectorEnv, make_env_mesh
 from pixelbrax_jax.envs.vector import VectorPixelEnv
-from pixelbrax_jax.stop_signals import StopRequest, signal_name, stop_requests
+from pixelbrax_jax.stop_signals import StopRequest, stop_requests
 from pixelbrax_jax.types import EnvParams
-
-__all__ = ["Outcome", "TrainingDivergedError", "run", "train"]
-
-Splits = dict[str, tuple[PixelEnv, EnvParams]]
-"""Evaluation environments and their parameters, by name."""
 
 
 class TrainingDivergedError(RuntimeError):
@@ -59,14 +54,13 @@ class Outcome:
     Attributes:
         metrics: the last record of the training, or empty.
         evaluations: the last results by split.
-        interrupted, signal: whether a signal stopped the run, and its number or 0.
+        signal: number of the signal that stopped the run, or 0.
         incomplete: lines about messages and records that could not be written.
     """
 
     state: TrainState
     metrics: dict[str, float]
     evaluations: dict[str, Result]
-    interrupted: bool
     signal: int = 0
     incomplete: tuple[str, ...] = ()
 
@@ -79,13 +73,12 @@ def train(config: TrainConfig, options: RunConfig, report: Report = silent) -> O
     if devices > 1:
         envs = ShardedVectorEnv(env, config.num_envs, make_env_mesh())
     algorithm = make_algorithm(config, envs)
-    with suppress(Exception):  # as in `run`
-        report(
-            f"{algorithm.name} on {config.env.task}, {config.num_envs} environments, {devices} "
-            f"{jax.default_backend()} device{'s' * (devices > 1)}, {config.num_iterations} "
-            f"iterations of {config.steps_per_iteration} control steps; "
-            f"into {Path(options.output_dir).resolve()}"
-        )
+    Messages(report)(
+        f"{algorithm.name} on {config.env.task}, {config.num_envs} environments, {devices} "
+        f"{jax.default_backend()} device{'s' * (devices > 1)}, {config.num_iterations} "
+        f"iterations of {config.steps_per_iteration} control steps; "
+        f"into {Path(options.output_dir).resolve()}"
+    )
     return run(algorithm, env_params, options, report=report)
 
 
@@ -95,7 +88,7 @@ def run(
     options: RunConfig,
     *,
     report: Report = silent,
-    splits: Splits | None = None,
+    splits: dict[str, tuple[PixelEnv, EnvParams]] | None = None,
 ) -> Outcome:
     """Train to the end or until an interruption.
 
@@ -140,8 +133,7 @@ def run(
             if not options.num_evals:
                 splits = {}
             elif splits is None:
-                made = make_splits(algorithm.config, shown=shown, report=messages)
-                splits = dict(made)
+                splits = dict(make_splits(algorithm.config, shown=shown, report=messages))
             evaluators = {
                 name: Evaluator(algorithm, env, params, num_episodes=options.eval_episodes)
                 for name, (env, params) in splits.items()
@@ -152,7 +144,7 @@ def run(
 
 def _goes_on(checkpoints: Checkpoints, options: RunConfig, report: Report) -> bool:
     """Return whether the run continues from a checkpoint, or raise if it may not."""
-    found = bool(checkpoints.steps())
+    found = latest_steps(checkpoints.folder) is not None
     if any_process(found) and any_process(not found):
         raise CheckpointError(
             f"only some processes see checkpoints in {checkpoints.folder}; they must share "
@@ -172,9 +164,10 @@ def _restored(
     checkpoints: Checkpoints, template: TrainState, algorithm: Algorithm, report: Report
 ) -> TrainState:
     """Restore the latest checkpoint, or raise if it is from another run."""
-    state = checkpoints.restore(kept(template))
-    steps, config = _steps(algorithm, state), algorithm.config
-    if steps > config.num_iterations * config.steps_per_iteration:
+    state, config = checkpoints.restore(kept(template)), algorithm.config
+    iterations = _iterations(state)
+    steps = iterations * config.steps_per_iteration
+    if iterations > config.num_iterations:
         raise CheckpointError(
             f"total_steps={config.total_steps} must be at least {steps}, the steps already "
             f"trained in {checkpoints.folder}; raise total_steps, or use another --output-dir."
@@ -200,9 +193,8 @@ class _Run:
     """Metrics of iterations since the last record."""
     record: dict[str, float] = field(default_factory=dict)
     results: dict[str, Result] = field(default_factory=dict)
-    evaluated_steps: int = -1
-    timed_steps: int = 0
-    timed_since: float = 0.0
+    since: tuple[float, int] = (0.0, 0)
+    """Time and steps at the last record."""
 
     def __post_init__(self) -> None:
         self.algorithm = self.runs.algorithm
@@ -211,14 +203,15 @@ class _Run:
         self.is_first = jax.process_index() == 0
 
     def train(self, state: TrainState) -> Outcome:
-        began = steps = _steps(self.algorithm, state)
-        self.writer = self.open_writer(steps)
+        began = _iterations(state)
+        self.writer = self.open_writer(began * self.config.steps_per_iteration)
         try:
             shown = self.options.progress and self.is_first
             self.bar = Bar(shown, self.config.num_iterations, self.report)
             with closing(self.bar):
-                state, steps, stopped_by = self.iterations(state, steps)
-            if self.is_first and (not stopped_by or steps > began):
+                state, stopped_by = self.iterations(state, began)
+            steps = _iterations(state) * self.config.steps_per_iteration
+            if self.is_first and (not stopped_by or _iterations(state) > began):
                 self.export(state, steps)
         finally:
             self.writer.close()
@@ -228,9 +221,7 @@ class _Run:
             self.report(f"done after {steps} steps; checkpoints and policy in {self.folder}")
         failed = {"the progress bar": self.bar.failure, "messages": self.report.failure}
         hidden = [f"{name} could not be shown: {why}" for name, why in failed.items() if why]
-        incomplete = (*missing, *hidden)
-        interrupted = bool(stopped_by)
-        return Outcome(state, self.record, self.results, interrupted, stopped_by, incomplete)
+        return Outcome(state, self.record, self.results, stopped_by, (*missing, *hidden))
 
     def open_writer(self, steps: int) -> MetricsWriter:
         """Open the logs in the first process; an error raises in all processes."""
@@ -251,22 +242,22 @@ class _Run:
             raise failure or RuntimeError("process 0 cannot write metrics; see its message.")
         return writer
 
-    def iterations(self, state: TrainState, steps: int) -> tuple[TrainState, int, int]:
-        """Train to the end or to a signal; return state, steps and the signal's number or 0."""
+    def iterations(self, state: TrainState, done: int) -> tuple[TrainState, int]:
+        """Train to the end or to a signal; return the state, and the signal's number or 0."""
         per_iteration, total = self.config.steps_per_iteration, self.config.num_iterations
-        done = steps // per_iteration
+        steps = done * per_iteration
         self.bar.update(done)
         if done >= total:
             self.report(f"the run is already complete with {steps} steps")
-            return state, steps, 0
+            return state, 0
         if stopped_by := highest(self.stop.signal)[0]:
             left = (
                 f"continue from {steps} steps with --resume latest" if steps else "nothing is lost"
             )
-            self.report(f"stopped by {signal_name(stopped_by)} before the first iteration; {left}")
-            return state, steps, stopped_by
+            self.report(f"stopped by {Signals(stopped_by).name} before the first iteration; {left}")
+            return state, stopped_by
         self.report("compiling")
-        self.restart_timer(steps)
+        self.since = time.perf_counter(), steps
         for number in range(done + 1, total + 1):
             state, steps = self.iterate(state, number), number * per_iteration
             self.bar.update(1)
@@ -280,15 +271,17 @@ class _Run:
             logs = saves or number % self.options.log_every == 0
             if logs:
                 self.log(steps)
+            score = None if self.options.num_evals else self.record.get("episode/return")
             if evaluates and not stopped_by:
                 self.evaluate(state, steps)
+                score = self.results["clean"].mean
             if saves:
-                self.checkpoints.save(kept(state), steps, self.score(steps), last=last)
+                self.checkpoints.save(kept(state), steps, score, last=last)
             else:
                 self.checkpoints.look_after()
             if stopped_by:
                 self.report(
-                    f"stopped by {signal_name(stopped_by)} after {steps} steps; continue with "
+                    f"stopped by {Signals(stopped_by).name} after {steps} steps; continue with "
                     "--resume latest"
                 )
                 # Comes after the checkpoint, because the process may soon be killed.
@@ -296,8 +289,8 @@ class _Run:
                     self.evaluate(state, steps)
                 break
             if logs:
-                self.restart_timer(steps)
-        return state, steps, stopped_by
+                self.since = time.perf_counter(), steps
+        return state, stopped_by
 
     def iterate(self, state: TrainState, number: int) -> TrainState:
         state, metrics = self.runs.iterate(state, self.env_params)
@@ -311,22 +304,19 @@ class _Run:
         jax.block_until_ready(self.pending[-2:-1])
         return state
 
-    def restart_timer(self, steps: int) -> None:
-        self.timed_since, self.timed_steps = time.perf_counter(), steps
-
     def log(self, steps: int) -> None:
         """Write the metrics since the last record, or raise a TrainingDivergedError."""
-        if self.pending:
-            records = jax.device_get(self.pending)
-            self.pending = []
-            for record in records:
-                self.check_finite(record, steps)
-            self.record = summarize(records)
+        records, self.pending = jax.device_get(self.pending), []
+        for record in records:
+            self.check_finite(record, steps)
+        self.record = summarize(records)
         if self.options.log_training_metrics:
-            seconds = time.perf_counter() - self.timed_since
-            self.record["speed/steps_per_second"] = (steps - self.timed_steps) / seconds
+            then, steps_then = self.since
+            speed = (steps - steps_then) / (time.perf_counter() - then)
+            self.record["speed/steps_per_second"] = speed
             self.writer.write(steps, self.record)
-        self.bar.update(0, self.record)
+        if "episode/return" in self.record:
+            self.bar.set_postfix(episode_return=f"{self.record['episode/return']:.1f}")
 
     def check_finite(self, record: dict[str, Any], steps: int) -> None:
         wrong = {name: ~np.isfinite(value) for name, value in record.items()}
@@ -338,7 +328,7 @@ class _Run:
             those = np.flatnonzero(np.any(list(wrong.values()), axis=0))
             seeds = f" of seed {', '.join(str(self.options.seed + int(i)) for i in those)}"
         self.checkpoints.look_after(wait=True)
-        latest = self.checkpoints.latest()
+        latest = latest_steps(self.checkpoints.folder)
         good = (
             "No checkpoint exists"
             if latest is None
@@ -361,14 +351,7 @@ class _Run:
             if "standard_error" in logged:
                 line += f" +- {result.standard_error:.1f} (standard error)"
             self.report(line)
-        self.evaluated_steps = steps
         self.writer.write(steps, record)
-
-    def score(self, steps: int) -> float | None:
-        """Return the score of a checkpoint: the evaluated return, or the training return."""
-        if self.options.num_evals:
-            return self.results["clean"].mean if self.evaluated_steps == steps else None
-        return self.record.get("episode/return")
 
     def export(self, state: TrainState, steps: int) -> None:
         for i, networks in enumerate(self.runs.split(jax.device_get(state.networks))):
@@ -389,6 +372,6 @@ def is_due(number: int, times: int, total: int) -> bool:
     return number * times // total > (number - 1) * times // total
 
 
-def _steps(algorithm: Algorithm, state: TrainState) -> int:
-    """Return the control steps so far, which are equal for all seeds."""
-    return int(np.ravel(state.iteration)[0]) * algorithm.config.steps_per_iteration
+def _iterations(state: TrainState) -> int:
+    """Return the number of iterations so far, which is equal for all seeds."""
+    return int(np.ravel(state.iteration)[0])

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from pixelbrax_jax.agents.algorithm import Algorithm
 from pixelbrax_jax.agents.config import TrainConfig, make_env
 from pixelbrax_jax.agents.registry import ALGORITHMS
+from pixelbrax_jax.agents.rollout import split_obs
 from pixelbrax_jax.agents.runner.checkpoint import (
     CheckpointError,
     best_steps,
@@ -34,24 +35,6 @@ from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.policy import Policy, load_policy, read_pretrained
 
-PLATFORMS = ("cpu", "cuda", "tpu")
-"""Platforms of an exported policy."""
-
-
-class Player(Protocol):
-    """The hashable part of an ``Algorithm`` that chooses actions."""
-
-    @property
-    def acting(self) -> tuple[str, ...]:
-        """See ``Algorithm.acting``."""
-
-    @property
-    def config(self) -> TrainConfig:
-        """Settings of the training."""
-
-    def act(self, networks: Networks, pixels: jax.Array, key: jax.Array | None = None) -> jax.Array:
-        """See ``Algorithm.act``."""
-
 
 @dataclass(frozen=True, eq=False)
 class Pretrained:
@@ -62,12 +45,14 @@ class Pretrained:
     acting: ClassVar[tuple[str, ...]] = ()
 
     @under_default_flags
-    def act(self, networks: Networks, pixels: jax.Array, key: jax.Array | None = None) -> jax.Array:
-        """Return mean actions; a key is a ValueError, because the policy cannot sample."""
+    def act(self, networks: Networks, pixels: jax.Array) -> jax.Array:
+        """Return mean actions; without networks, because the policy contains them."""
         del networks
-        if key is not None:
-            raise ValueError("a pretrained policy has only mean actions: key must be None.")
         return self.policy(pixels)
+
+
+Player = Algorithm | Pretrained
+"""What chooses actions: an ``Algorithm`` with its networks, or a policy."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +67,7 @@ class Trained:
     networks: Networks
     steps: int
     seed: int = 0
-    clips: tuple[str, ...] | None = None
+    clips: Sequence[str] | None = None
 
 
 def load_pretrained(name: str) -> Trained:
@@ -90,24 +75,6 @@ def load_pretrained(name: str) -> Trained:
     about = read_pretrained(name)
     player = Pretrained(load_config(about), load_policy(name))
     return Trained(player, {}, about["steps"], about["config"].get("seed", 0))
-
-
-def load_agent(
-    folder: str | Path | None,
-    pretrained: str | None,
-    *,
-    steps: int | None = None,
-    best: bool = False,
-    run: int = 0,
-) -> Trained:
-    """Load an agent from a folder (`load_trained`) or by name (`load_pretrained`)."""
-    if folder is not None and pretrained is None:
-        return load_trained(folder, steps=steps, best=best, run=run)
-    if folder is not None or pretrained is None:
-        raise ValueError("give either the folder of a run or --pretrained with a name.")
-    if steps is not None or best or run:
-        raise ValueError("--steps, --best and --run need the folder of a run, not --pretrained.")
-    return load_pretrained(pretrained)
 
 
 def load_trained(
@@ -125,12 +92,10 @@ def load_trained(
     checkpoints = Path(folder) / "checkpoints"
     if best and steps is not None:
         raise ValueError(f"give best or steps, not both; got steps={steps}.")
-    if best:
-        steps = best_steps(checkpoints)
-        if steps is None:
-            raise CheckpointError(
-                f"no checkpoint in {checkpoints} has a score yet; omit --best to load the latest."
-            )
+    if best and (steps := best_steps(checkpoints)) is None:
+        raise CheckpointError(
+            f"no checkpoint in {checkpoints} has a score yet; omit --best to load the latest."
+        )
     about = read_about(checkpoints, steps)
     config = load_config(about)
     num_seeds = about["config"].get("seeds", 1)
@@ -142,17 +107,11 @@ def load_trained(
     runs = Runs(algorithm, num_seeds)
     template = runs.template(params).networks
     networks = runs.split(read_networks(checkpoints, template, about["steps"]))[run]
-    clips = about.get("clips")
-    return Trained(
-        algorithm,
-        networks,
-        about["steps"],
-        about["config"].get("seed", 0) + run,
-        None if clips is None else tuple(clips),
-    )
+    seed = about["config"].get("seed", 0) + run
+    return Trained(algorithm, networks, about["steps"], seed, about.get("clips"))
 
 
-def with_clips(agent: Trained, clips: str | None) -> tuple[TrainConfig, tuple[str, ...] | None]:
+def with_clips(agent: Trained, clips: str | None) -> tuple[TrainConfig, Sequence[str] | None]:
     """Return an agent's settings with other ``clips``, and digests of its training's clips.
 
     ``clips`` is a folder or ``"procedural"``; None keeps the training's. The digests are None if
@@ -171,7 +130,7 @@ def with_clips(agent: Trained, clips: str | None) -> tuple[TrainConfig, tuple[st
         )
     if shown is None:
         with suppress(FileNotFoundError):
-            shown = tuple(clip_digests(make_env(config)[1].clips))
+            shown = clip_digests(make_env(config)[1].clips)
     return config.replace(clips=clips), shown
 
 
@@ -197,12 +156,11 @@ def save_policy(algorithm: Algorithm, networks: Networks, path: str | Path) -> P
     The file contains program and parameters, and needs only JAX on CPU, CUDA or TPU:
     ``jax.export.deserialize(bytes).call(pixels)`` for any number of observations.
     """
-    spec = algorithm.envs.env.obs_spec
-    spec = spec["pixels"] if isinstance(spec, dict) else spec
+    spec, _ = split_obs(algorithm.envs.env.obs_spec)
     acting = {name: networks[name] for name in algorithm.acting}
     (batch,) = jax.export.symbolic_shape("batch")
     exported = jax.export.export(
-        jax.jit(lambda pixels: algorithm.act(acting, pixels)), platforms=PLATFORMS
+        jax.jit(lambda pixels: algorithm.act(acting, pixels)), platforms=("cpu", "cuda", "tpu")
     )(jax.ShapeDtypeStruct((batch, *spec.shape), jnp.uint8))
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
