@@ -16,13 +16,13 @@ from pixelbrax_jax.physics.geometry import (
     geom_shapes,
     material_name,
     resolve_rgba,
-    shown_geoms,
     site_shapes,
 )
-from pixelbrax_jax.physics.lighting import checker, mean_color, read_look
+from pixelbrax_jax.physics.lighting import checker, mean_color, read_lamps, read_look
 from pixelbrax_jax.physics.opengl import mujoco
 from pixelbrax_jax.physics.viewpoints import read_rigs
 from pixelbrax_jax.physics.viewpoints import tracked_body as tracked_body
+from pixelbrax_jax.spatial import f32
 from pixelbrax_jax.types import CameraRig, GeomKind, Geoms, Look, String
 from pixelbrax_jax.validation import check_choice
 
@@ -75,28 +75,21 @@ def read_scene(
     """
     _check_movable(model, movable)
     links = [COM_LINK] if tracked_body(model) >= 0 else []
-    shapes = [*_textured_geoms(model), *site_shapes(model)]
+    com_link = model.nbody - 1 if links else -1
+    target = model.nbody - 1 + len(links)
+    shapes, lamps = [*_textured_geoms(model), *site_shapes(model)], read_lamps(model, com_link)
+    moving = [i for i, s in enumerate(shapes) if s.name.removeprefix("site/") in movable]
+    if moving:
+        links.append(TARGET_LINK)
+        anchor = f32(shapes[moving[0]].pos)
+        for i in moving:
+            shapes[i] = shapes[i]._replace(link=target, pos=f32(shapes[i].pos) - anchor)
+        for name in set(movable) & set(lamps):
+            lamps[name] = lamps[name].replace(link=target, pos=lamps[name].pos - anchor)
     pieces, strings = _strings(model, len(shapes))
     geoms = as_geoms([*shapes, *pieces]).replace(strings=tuple(strings))
-    target = model.nbody - 1 + len(links)
-    moved = [g for g, name in enumerate(geoms.name) if name.removeprefix("site/") in movable]
-    anchor = np.zeros(3)
-    if moved:
-        links.append(TARGET_LINK)
-        anchor = np.asarray(geoms.pos[moved[0]])
-        geoms = geoms.replace(
-            link=tuple(target if g in moved else link for g, link in enumerate(geoms.link)),
-            pos=geoms.pos.at[np.array(moved)].add(-anchor),
-        )
-    com_link = model.nbody - 1 if COM_LINK in links else -1
     rigs = read_rigs(model, com_link)
-    look = read_look(
-        model,
-        com_link=com_link,
-        movable=movable,
-        target_link=target if moved else -1,
-        anchor=anchor,
-    )
+    look = read_look(model).replace(lamps=tuple(lamps.values()))
     return ModelScene(geoms, rigs[_camera_name(model, camera, rigs)], rigs, look, tuple(links))
 
 
@@ -124,13 +117,12 @@ def _check_movable(model: mujoco.MjModel, movable: Collection[str]) -> None:
 
 def _textured_geoms(model: mujoco.MjModel) -> Iterator[Shape]:
     """Yield the geoms with finite planes and checkers; other textures become their mean color."""
-    for i, shape in zip(shown_geoms(model), geom_shapes(model), strict=True):
+    for shape in geom_shapes(model):
         is_plane = shape.kind == GeomKind.PLANE
         yield shape._replace(
-            rgb=mean_color(model, i) or shape.rgb,
-            material=material_name(model, model.geom_matid[i]),
-            bounded=bool(is_plane and (model.geom_size[i, :2] > 0).any()),
-            patterned=is_plane and checker(model, i) is not None,
+            rgb=mean_color(model, shape.index, shape.rgb),
+            bounded=bool(is_plane and (shape.size[:2] > 0).any()),
+            patterned=is_plane and checker(model, shape.index) is not None,
         )
 
 

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from pixelbrax_jax.physics.opengl import mujoco
+from pixelbrax_jax.spatial import make_rig
 from pixelbrax_jax.types import CameraRig
 
 _TRACK = int(mujoco.mjtCamLight.mjCAMLIGHT_TRACK)
@@ -76,7 +75,12 @@ def read_rigs(model: mujoco.MjModel, com_link: int) -> dict[str, CameraRig]:
         else:
             link, subject = -1, data.subtree_com[0]
             eye, axes = data.cam_xpos[camera], data.cam_xmat[camera]
-        rigs[name] = _rig(link, eye, axes.reshape(3, 3), subject, float(model.cam_fovy[camera]))
+        axes = axes.reshape(3, 3)
+        forward, up, fovy = -axes[:, 2], axes[:, 1], float(model.cam_fovy[camera])
+        depth = float((subject - eye) @ forward)
+        # A camera that looks away from the subject also needs a target.
+        target = eye + (depth if depth > 1e-3 else 1.0) * forward
+        rigs[name] = make_rig(eye, target, fovy, link=link, track=(1.0, 1.0, 1.0), up=up)
     return rigs
 
 
@@ -104,23 +108,3 @@ def unfit_cameras(model: mujoco.MjModel) -> dict[str, str]:
 
 def _name(model: mujoco.MjModel, camera: int) -> str:
     return model.camera(camera).name or f"camera/{camera}"
-
-
-def _rig(
-    link: int, eye: np.ndarray, axes: np.ndarray, subject: np.ndarray, fovy: float
-) -> CameraRig:
-    forward = -axes[:, 2]
-    depth = float((subject - eye) @ forward)
-    return CameraRig(
-        link=link,
-        track=_f32([float(link >= 0)] * 3),
-        eye=_f32(eye),
-        # A camera that looks away from the subject also needs a target.
-        target=_f32(eye + (depth if depth > 1e-3 else 1.0) * forward),
-        up=_f32(axes[:, 1]),
-        fovy=_f32(fovy),
-    )
-
-
-def _f32(values: Any) -> Any:
-    return np.asarray(values, np.float32)

@@ -42,7 +42,7 @@ _NO_WHEELS = (3, 13)
 
 _INCLUDED = ("common/materials.xml", "common/skybox.xml", "common/visual.xml")
 
-_TO_MAKE = 8
+_TO_MAKE = 7
 """Stack level from a warning here to the caller of ``pixelbrax_jax.make``."""
 
 _warned: list[str] = []
