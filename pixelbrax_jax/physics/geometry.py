@@ -22,7 +22,7 @@ _DEFAULT_RGBA = np.array([0.5, 0.5, 0.5, 1.0], np.float32)
 class Shape(NamedTuple):
     """One visible shape; fields as in ``Geoms``, with its color and its material's name.
 
-    ``index`` is its row among the model's geoms or sites.
+    ``row`` is its place among the model's geoms or sites.
     """
 
     kind: GeomKind
@@ -35,7 +35,7 @@ class Shape(NamedTuple):
     material: str = ""
     bounded: bool = False
     patterned: bool = False
-    index: int = -1
+    row: int = -1
 
 
 def as_geoms(shapes: Sequence[Shape]) -> Geoms:
@@ -157,7 +157,7 @@ def _shown(model: mujoco.MjModel, element: str, groups: Collection[int]) -> Iter
             quat=field("quat"),
             rgb=tuple(rgba[:3]),
             material=material_name(model, field("matid")),
-            index=i,
+            row=i,
         )
 
 

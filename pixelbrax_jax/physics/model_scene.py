@@ -20,11 +20,10 @@ from pixelbrax_jax.physics.geometry import (
 )
 from pixelbrax_jax.physics.lighting import checker, mean_color, read_lamps, read_look
 from pixelbrax_jax.physics.opengl import mujoco
-from pixelbrax_jax.physics.viewpoints import read_rigs
+from pixelbrax_jax.physics.viewpoints import camera_name, read_rigs
 from pixelbrax_jax.physics.viewpoints import tracked_body as tracked_body
 from pixelbrax_jax.spatial import f32
 from pixelbrax_jax.types import CameraRig, GeomKind, Geoms, Look, String
-from pixelbrax_jax.validation import check_choice
 
 COM_LINK = "camera/com"
 TARGET_LINK = "target"
@@ -58,22 +57,14 @@ class ModelScene(NamedTuple):
 
 
 def read_scene(
-    model: mujoco.MjModel, camera: int | str = 0, *, movable: Collection[str] = ()
+    model: mujoco.MjModel, camera: int = 0, *, movable: Collection[str] = ()
 ) -> ModelScene:
     """Read what MuJoCo's renderer shows of a model by default.
 
-    Args:
-        model: a compiled model; link i is its body i + 1.
-        camera: name of a camera, or index in the model.
-        movable: names of geoms, sites and lamps of the world that move together with the link
-            ``target``, whose origin is the first visible geom or site.
-
-    Raises:
-        ValueError: there is no such camera, or its orientation follows a body; a name of
-            ``movable`` is unknown or not of the world; the renderer does not support something
-            visible.
+    Link i is body i + 1. ``camera`` is the index of one that can be a rig. Geoms, sites and lamps
+    of the world that ``movable`` names move together with the link ``target``, whose origin is the
+    first visible geom or site. A ValueError names something visible that cannot be rendered.
     """
-    _check_movable(model, movable)
     links = [COM_LINK] if tracked_body(model) >= 0 else []
     com_link = model.nbody - 1 if links else -1
     target = model.nbody - 1 + len(links)
@@ -90,29 +81,7 @@ def read_scene(
     geoms = as_geoms([*shapes, *pieces]).replace(strings=tuple(strings))
     rigs = read_rigs(model, com_link)
     look = read_look(model).replace(lamps=tuple(lamps.values()))
-    return ModelScene(geoms, rigs[_camera_name(model, camera, rigs)], rigs, look, tuple(links))
-
-
-def _camera_name(model: mujoco.MjModel, camera: int | str, rigs: dict[str, CameraRig]) -> str:
-    if isinstance(camera, str):
-        return check_choice("camera", camera, rigs)
-    if not 0 <= camera < model.ncam:
-        raise ValueError(f"the model has no camera {camera}; it has {model.ncam}.")
-    return check_choice("camera", model.camera(camera).name or f"camera/{camera}", rigs)
-
-
-def _check_movable(model: mujoco.MjModel, movable: Collection[str]) -> None:
-    bodies: dict[str, int] = {}
-    for count, of, body in (
-        (model.ngeom, model.geom, model.geom_bodyid),
-        (model.nsite, model.site, model.site_bodyid),
-        (model.nlight, model.light, model.light_bodyid),
-    ):
-        bodies |= {of(i).name: int(body[i]) for i in range(count) if of(i).name}
-    for name in movable:
-        check_choice("geom, site or light", name, bodies)
-        if bodies[name] != 0:
-            raise ValueError(f"{name!r} cannot be movable: it is fixed to a body that moves.")
+    return ModelScene(geoms, rigs[camera_name(model, camera)], rigs, look, tuple(links))
 
 
 def _textured_geoms(model: mujoco.MjModel) -> Iterator[Shape]:
@@ -120,9 +89,9 @@ def _textured_geoms(model: mujoco.MjModel) -> Iterator[Shape]:
     for shape in geom_shapes(model):
         is_plane = shape.kind == GeomKind.PLANE
         yield shape._replace(
-            rgb=mean_color(model, shape.index, shape.rgb),
+            rgb=mean_color(model, shape.row, shape.rgb),
             bounded=bool(is_plane and (shape.size[:2] > 0).any()),
-            patterned=is_plane and checker(model, shape.index) is not None,
+            patterned=is_plane and checker(model, shape.row) is not None,
         )
 
 

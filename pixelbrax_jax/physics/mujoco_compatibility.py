@@ -6,7 +6,6 @@ Importing it loads neither MuJoCo XLA nor Brax.
 from __future__ import annotations
 
 import contextlib
-import inspect
 import io
 import sys
 import warnings
@@ -95,8 +94,7 @@ def accept_old_clip(module: ModuleType) -> None:
     def clip(a: Any, a_min: Any = None, a_max: Any = None) -> jax.Array:
         return jnp.clip(a, a_min, a_max)
 
-    if "a_min" not in inspect.signature(jnp.clip).parameters:
-        _replace_in(module, "jp", jnp, clip=clip)
+    _replace_in(module, "jp", jnp, clip=clip)
 
 
 def accept_device_put_replicated(module: ModuleType) -> None:
@@ -112,8 +110,7 @@ def accept_device_put_replicated(module: ModuleType) -> None:
 
         return jax.tree.map(put, x)
 
-    if not hasattr(jax, "device_put_replicated"):
-        _replace_in(module, "jax", jax, device_put_replicated=device_put_replicated)
+    _replace_in(module, "jax", jax, device_put_replicated=device_put_replicated)
 
 
 def _replace_in(module: ModuleType, name: str, imported: ModuleType, **functions: Any) -> None:

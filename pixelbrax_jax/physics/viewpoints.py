@@ -53,16 +53,16 @@ def followed_body(model: mujoco.MjModel) -> int:
 def read_rigs(model: mujoco.MjModel, com_link: int) -> dict[str, CameraRig]:
     """Return rigs of a model's cameras by name, without ``unfit_cameras``, in the model's order.
 
-    A camera without a name is ``camera/<index>``. ``com_link`` is the link at the tracked center of
-    mass, -1 for none. A rig's target lies on the camera's axis, at the depth of the tracked point
-    or of the model's center of mass: camera distractors turn about it.
+    ``com_link`` is the link at the tracked center of mass, -1 for none. A rig's target lies on the
+    camera's axis, at the depth of the tracked point or of the model's center of mass: camera
+    distractors turn about it.
     """
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     rigs = {}
     unfit = unfit_cameras(model)
     for camera in range(model.ncam):
-        name = _name(model, camera)
+        name = camera_name(model, camera)
         if name in unfit:
             continue
         mode, body = int(model.cam_mode[camera]), int(model.cam_bodyid[camera])
@@ -102,9 +102,10 @@ def unfit_cameras(model: mujoco.MjModel) -> dict[str, str]:
             target = int(model.cam_targetbodyid[camera])
             reason = f"it turns towards body {model.body(target).name or target!r}"
         if reason:
-            reasons[_name(model, camera)] = reason
+            reasons[camera_name(model, camera)] = reason
     return reasons
 
 
-def _name(model: mujoco.MjModel, camera: int) -> str:
+def camera_name(model: mujoco.MjModel, camera: int) -> str:
+    """Return a camera's name, ``camera/<index>`` without one."""
     return model.camera(camera).name or f"camera/{camera}"

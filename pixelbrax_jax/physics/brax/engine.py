@@ -163,10 +163,7 @@ class BraxPhysics(GuardedPhysics):
         return self._guard_first(self._first_state(_changed(self._source, pipeline_init=init), key))
 
     def _step(self, state: PhysicsState, action: jax.Array) -> PhysicsState:
-        control = action = jnp.asarray(action, jnp.float32)
-        if self._control_range is not None:
-            low, high = self._control_range
-            control = (action - low) / (high - low) * 2 - 1
+        action = jnp.asarray(action, jnp.float32)
         carry = state.engine
         # Brax updates these dicts in place.
         metrics, info = jax.tree.map(lambda leaf: leaf, (carry.metrics, carry.info))
@@ -180,7 +177,7 @@ class BraxPhysics(GuardedPhysics):
                     metrics=metrics,
                     info=info,
                 ),
-                control,
+                self._unscale(action),
             )
         reward = after.reward
         if self._reward is not None:
@@ -190,6 +187,12 @@ class BraxPhysics(GuardedPhysics):
         # A NaN in the done flag makes the reward NaN, which the guard watches.
         reward = jnp.where(jnp.abs(done) < jnp.inf, jnp.asarray(reward, jnp.float32), jnp.nan)
         return self._state(after, reward, done > 0.5)
+
+    def _unscale(self, action: jax.Array) -> jax.Array:
+        if self._control_range is None:
+            return action
+        low, high = self._control_range
+        return (action - low) / (high - low) * 2 - 1
 
     def _watched(self, state: PhysicsState) -> Any:
         pipeline = state.engine.pipeline
@@ -204,7 +207,8 @@ class BraxPhysics(GuardedPhysics):
         self, brax_state: envs.State, reward: jax.Array, terminated: jax.Array
     ) -> PhysicsState:
         carry = _carry(brax_state)
-        if jax.tree.structure(carry) != jax.tree.structure(self._dtypes):
+        tree: Any = jax.tree.structure(self._dtypes)
+        if jax.tree.structure(carry) != tree:
             raise ValueError("step changes the tree of the environment's state")
         # Brax writes Python numbers into some fields. With fixed dtypes a jitted step is not
         # traced again for its own output.

@@ -41,12 +41,7 @@ class MjxPhysics(GuardedPhysics):
 
     @default_flags()
     def __init__(self, formulas: Formulas, model: mujoco.MjModel, *, identity: Hashable):
-        """Put the model on the device, edited for the task, and read its scene; compile nothing.
-
-        Raises:
-            ValueError: the renderer does not support something visible.
-            NotImplementedError: the model has features that MuJoCo XLA lacks.
-        """
+        """Put the model on the device, edited for the task, and read its scene; compile nothing."""
         formulas.edit(model)
         scene = read_scene(model, formulas.camera, movable=formulas.movable)
         self.geoms, self.look = scene.geoms, scene.look
@@ -143,11 +138,7 @@ class MjxPhysics(GuardedPhysics):
 # Loading a model takes a second. A model that is loaded again equals the first one.
 @lru_cache(maxsize=16)
 def make_physics(task: str) -> MjxPhysics:
-    """Make the physics of a task in ``TASKS``; equal and usually the same for one task.
-
-    Raises:
-        ImportError: dm_control is not installed; the message has the command that installs it.
-    """
+    """Make the physics of a task in ``TASKS``; equal and usually the same for one task."""
     formulas = FORMULAS[task]
     model = load_model(TASKS[task].domain, **formulas.options)
     return MjxPhysics(formulas, model, identity=Recipe(make_physics, (task,)))

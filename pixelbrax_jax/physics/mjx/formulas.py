@@ -118,13 +118,8 @@ def tolerance(
     The formulas are those of section 4.3 of arXiv 1801.00690 and of
     ``dm_control.utils.rewards.tolerance``, with the sigmoids that the suite uses.
 
-    Args:
-        x: the quantity, of any shape.
-        bounds: lower and upper bound; may be infinite.
-        margin: distance from the bounds at which the result is ``value_at_margin``; with 0 the
-            result is 0 outside.
-        sigmoid: ``gaussian``, ``long_tail``, ``linear`` or ``quadratic``.
-        value_at_margin: in [0, 1), and not 0 for ``gaussian`` and ``long_tail``.
+    Bounds may be infinite. At ``margin`` from them the result is ``value_at_margin``: in [0, 1),
+    and not 0 for ``gaussian`` and ``long_tail``. With ``margin`` 0 it is 0 outside.
     """
     lower, upper = bounds
     inside = (x >= lower) & (x <= upper)

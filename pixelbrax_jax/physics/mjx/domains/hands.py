@@ -59,8 +59,8 @@ def _start_cup(dynamics: Dynamics, key: jax.Array) -> Start:
         del before
         low, high = jnp.array([-0.2, 0.2]), jnp.array([0.2, 0.5])
         place = jax.random.uniform(key, (2,), minval=low, maxval=high)
-        ball = jnp.array(_positions(model, "ball_x", "ball_z"))
-        return Start(jnp.asarray(model.qpos0, jnp.float32).at[ball].set(place))
+        qpos = jnp.asarray(model.qpos0, jnp.float32)
+        return Start(qpos.at[jnp.array(_positions(model, "ball_x", "ball_z"))].set(place))
 
     return free_of_contact(dynamics, key, sample)
 
