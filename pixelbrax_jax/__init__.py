@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from pixelbrax_jax.policy import load_policy as load_policy
     from pixelbrax_jax.registry import list_envs as list_envs
     from pixelbrax_jax.registry import register as register
-    from pixelbrax_jax.scene.cameras import make_rig as make_rig
     from pixelbrax_jax.scene.look import make_look as make_look
+    from pixelbrax_jax.spatial import make_rig as make_rig
     from pixelbrax_jax.types import Camera as Camera
     from pixelbrax_jax.types import CameraRig as CameraRig
     from pixelbrax_jax.types import EnvParams as EnvParams
@@ -53,8 +53,8 @@ _PUBLIC = {
     "physics.brax.mjcf": "mjcf_physics",
     "policy": "list_pretrained load_policy",
     "registry": "list_envs register",
-    "scene.cameras": "make_rig",
     "scene.look": "make_look",
+    "spatial": "make_rig",
     "types": "Camera CameraRig EnvParams EnvState GeomKind Geoms Look PhysicsState Timestep",
 }
 _LAZY = {

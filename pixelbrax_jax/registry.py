@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cached_property
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -16,18 +15,8 @@ from pixelbrax_jax.tasks import SUITES, TASKS
 from pixelbrax_jax.types import Camera, CameraRig
 from pixelbrax_jax.validation import check_choice, suggest
 
-
-@dataclass
-class _OwnTask:
-    make_physics: Callable[[], Physics]
-    camera: CameraRig | Camera | None
-
-    @cached_property
-    def physics(self) -> Physics:
-        return check_physics(self.make_physics())
-
-
-_OWN_TASKS: dict[str, _OwnTask] = {}
+_OWN_TASKS: dict[str, tuple[Callable[[], Physics], CameraRig | Camera | None]] = {}
+"""Registered tasks: functions that make physics at the first call, and viewpoints."""
 
 
 def list_envs(suite: str | None = None) -> tuple[str, ...]:
@@ -69,7 +58,7 @@ def register(
         raise TypeError("make_physics must be a function that returns a Physics.")
     if not isinstance(camera, CameraRig | Camera | None):
         raise TypeError(f"camera must be a CameraRig, a Camera or None, got {camera!r}.")
-    _OWN_TASKS[name] = _OwnTask(make_physics, camera)
+    _OWN_TASKS[name] = cache(lambda: check_physics(make_physics())), camera
 
 
 @default_flags()
@@ -94,7 +83,7 @@ def make_physics(task: str, **options: Any) -> Physics:
                 f"{task!r}: {fix}."
             )
     if own is not None:
-        return own.physics
+        return own[0]()
     assert suite is not None
     physics: Physics = importlib.import_module(suite.loader).make_physics(task, **options)
     return physics
@@ -102,7 +91,7 @@ def make_physics(task: str, **options: Any) -> Physics:
 
 def registered_camera(task: str) -> CameraRig | Camera | None:
     """Return the viewpoint that a task was registered with."""
-    return _OWN_TASKS[task].camera if task in _OWN_TASKS else None
+    return _OWN_TASKS.get(task, (None, None))[1]
 
 
 def find_task(task: str) -> str:

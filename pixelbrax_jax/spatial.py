@@ -1,9 +1,23 @@
-"""Rotations and frames in float32. Quaternions are ``(w, x, y, z)``, as in MuJoCo and Brax."""
+"""Rotations, frames and camera rigs in float32.
+
+Quaternions are ``(w, x, y, z)``, as in MuJoCo and Brax.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import jax
 import jax.numpy as jnp
+import numpy as np
+
+from pixelbrax_jax.types import CameraRig
+
+
+def f32(values: Any) -> Any:
+    """Return a float32 array of NumPy: importing the package must not start a device."""
+    return np.asarray(values, np.float32)
 
 
 def quat_multiply(a: jax.Array, b: jax.Array) -> jax.Array:
@@ -62,3 +76,43 @@ def look_at(eye: jax.Array, target: jax.Array, up: jax.Array) -> jax.Array:
     back = unit(eye - target)
     right = unit(jnp.cross(up, back))
     return jnp.stack([right, jnp.cross(back, right), back], axis=-1)
+
+
+def make_rig(
+    eye: Sequence[float] | np.ndarray,
+    target: Sequence[float] | np.ndarray,
+    fovy: float,
+    *,
+    link: int = -1,
+    track: Sequence[float] = (1.0, 1.0, 0.0),
+    up: Sequence[float] | np.ndarray = (0.0, 0.0, 1.0),
+) -> CameraRig:
+    """Make a camera rig from plain numbers.
+
+    Args:
+        eye: metres; relative to the followed link along tracked axes, absolute along others.
+        target: metres, likewise; the point the camera looks at.
+        fovy: vertical field of view, degrees, between 0 and 180.
+        link: index of the followed link, -1 for none.
+        track: fraction of the link's position to follow, per world axis.
+        up: the world direction that is up in the image.
+
+    Raises:
+        ValueError: eye and target coincide, ``up`` is parallel to the view, or ``fovy`` is wrong.
+    """
+    if not 0.0 < fovy < 180.0:
+        raise ValueError(f"fovy must lie between 0 and 180 degrees, got {fovy}.")
+    view = np.subtract(target, eye)
+    if np.linalg.norm(np.cross(view, up)) < 1e-6 * max(float(np.linalg.norm(view)), 1e-6):
+        raise ValueError(
+            f"a camera at {eye} cannot look at {target} with up={up}: the two points must "
+            "differ and 'up' must not be parallel to the view."
+        )
+    return CameraRig(
+        link=link,
+        track=f32(track if link >= 0 else (0.0, 0.0, 0.0)),
+        eye=f32(eye),
+        target=f32(target),
+        up=f32(up),
+        fovy=f32(fovy),
+    )

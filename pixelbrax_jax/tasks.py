@@ -38,7 +38,7 @@ SUITES: Mapping[str, Suite] = MappingProxyType(
             tuple(option.name for option in fields(BraxOptions)),
         ),
         "dmc": Suite(
-            "tasks of the DM Control Suite", DMC_TASKS, "pixelbrax_jax.physics.mjx.loading"
+            "tasks of the DM Control Suite", DMC_TASKS, "pixelbrax_jax.physics.mjx.engine"
         ),
     }
 )

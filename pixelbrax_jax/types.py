@@ -11,9 +11,8 @@ be traced. All other fields are arrays and may be differentiated, batched or ran
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
 from enum import IntEnum
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
 import numpy as np
@@ -51,9 +50,7 @@ class GeomKind(IntEnum):
         is_long: bool = False,
         has_far_form: bool = False,
     ) -> GeomKind:
-        """Make a row; raise TypeError if ``num_sizes`` or ``reach`` is invalid."""
-        if not 1 <= num_sizes <= 3 or reach not in ("first", "largest", "diagonal", "all"):
-            raise TypeError(f"GeomKind {number} needs a number of sizes and a reach.")
+        """Make a row."""
         kind = int.__new__(cls, number)
         kind._value_ = number
         kind.num_sizes, kind.reach = num_sizes, reach
@@ -66,23 +63,6 @@ class GeomKind(IntEnum):
     ELLIPSOID = 4, 3, "largest"
     CYLINDER = 5, 2, "first", True
     BOX = 6, 3, "diagonal"
-
-
-_Formula = TypeVar("_Formula")
-
-
-def for_each_kind(
-    what: str, formulas: Mapping[GeomKind, _Formula], kinds: Iterable[GeomKind] = GeomKind
-) -> Mapping[GeomKind, _Formula]:
-    """Return ``formulas``; raise TypeError unless it has exactly one entry for each of ``kinds``.
-
-    ``what`` is the name of the table in the message.
-    """
-    wrong = set(kinds) ^ set(formulas)
-    if wrong:
-        names = ", ".join(sorted(kind.name for kind in wrong))
-        raise TypeError(f"{what} must have one entry for each kind of geom; wrong for {names}.")
-    return formulas
 
 
 class String(struct.PyTreeNode):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,7 +20,10 @@ _DEFAULT_RGBA = np.array([0.5, 0.5, 0.5, 1.0], np.float32)
 
 
 class Shape(NamedTuple):
-    """One visible shape; fields as in ``Geoms``, with its color and its material's name."""
+    """One visible shape; fields as in ``Geoms``, with its color and its material's name.
+
+    ``row`` is its place among the model's geoms or sites.
+    """
 
     kind: GeomKind
     link: int
@@ -32,6 +35,7 @@ class Shape(NamedTuple):
     material: str = ""
     bounded: bool = False
     patterned: bool = False
+    row: int = -1
 
 
 def as_geoms(shapes: Sequence[Shape]) -> Geoms:
@@ -85,7 +89,8 @@ def geom_shapes(
         ValueError: a name or value in ``colors`` or ``drawn_radius`` is wrong, the renderer does
             not support a visible geom, flex or skin, or nothing is visible.
     """
-    names = [_name(model, i) for i in range(model.ngeom)]
+    kinds = [_kind_name(kind) for kind in model.geom_type]
+    names = [model.geom(i).name or f"{kind}/{i}" for i, kind in enumerate(kinds)]
     colors, drawn_radius = dict(colors or {}), dict(drawn_radius or {})
     for name, color in colors.items():
         check_choice("geom", name, names)
@@ -95,31 +100,18 @@ def geom_shapes(
             )
     for name, radius in drawn_radius.items():
         check_choice("geom", name, names)
-        shape = _kind_name(model, names.index(name))
-        if shape != "sphere" or not radius > 0:
+        kind = kinds[names.index(name)]
+        if kind != "sphere" or not radius > 0:
             raise ValueError(
                 f"drawn_radius must be a positive number for a sphere, got {radius!r} for geom "
-                f"{name!r}, a {shape}."
+                f"{name!r}, a {kind}."
             )
     _check_surfaces(model, geom_groups)
     shapes = []
-    for i in shown_geoms(model, geom_groups):
-        kind, name = _kind(model, i, names[i]), names[i]
-        size = sizes(kind, model.geom_size[i])
-        size[0] = drawn_radius.get(name, size[0])
-        shapes.append(
-            Shape(
-                kind=kind,
-                # Link 0 is MuJoCo's body 1, because the world is not a link.
-                link=int(model.geom_bodyid[i]) - 1,
-                name=name,
-                size=size,
-                pos=model.geom_pos[i],
-                quat=model.geom_quat[i],
-                rgb=colors.get(name, tuple(geom_rgba(model, i)[:3])),
-                patterned=kind == GeomKind.PLANE,
-            )
-        )
+    for shape in _shown(model, "geom", geom_groups):
+        shape.size[0] = drawn_radius.get(shape.name, shape.size[0])
+        rgb = colors.get(shape.name, shape.rgb)
+        shapes.append(shape._replace(rgb=rgb, patterned=shape.kind == GeomKind.PLANE))
     if not shapes:
         raise ValueError(
             f"no geom is visible: all have alpha 0 or a group outside {tuple(geom_groups)}"
@@ -127,30 +119,46 @@ def geom_shapes(
     return shapes
 
 
-def site_shapes(model: mujoco.MjModel, groups: Collection[int] = VISIBLE_GROUPS) -> Iterator[Shape]:
-    """Yield the sites that MuJoCo's viewer shows, as ``site/<name>``."""
-    for i in range(model.nsite):
-        rgba = resolve_rgba(model, model.site_rgba[i], model.site_matid[i])
-        if model.site_group[i] not in groups or not rgba[3] > 0:
+def site_shapes(model: mujoco.MjModel, groups: Collection[int] = VISIBLE_GROUPS) -> list[Shape]:
+    """Return the sites that MuJoCo's viewer shows, as ``site/<name>``."""
+    return list(_shown(model, "site", groups))
+
+
+def _shown(model: mujoco.MjModel, element: str, groups: Collection[int]) -> Iterator[Shape]:
+    """Yield the visible elements, ``geom`` or ``site``, in the model's order."""
+
+    def field(name: str) -> Any:
+        return getattr(model, f"{element}_{name}")[i]
+
+    for i in range(getattr(model, f"n{element}")):
+        rgba = resolve_rgba(model, field("rgba"), field("matid"))
+        if field("group") not in groups or not rgba[3] > 0:
             continue
-        kind = GeomKind(int(model.site_type[i]))
+        kind_name, own_name = _kind_name(field("type")), getattr(model, element)(i).name
+        prefix = "site" if element == "site" else kind_name
+        name = own_name if own_name and element == "geom" else f"{prefix}/{own_name or i}"
+        if kind_name.upper() not in GeomKind.__members__:
+            raise ValueError(
+                f"geom {name!r} is a {kind_name}, which cannot be rendered; supported: "
+                f"{', '.join(kind.name.lower() for kind in GeomKind)}. Replace it by these "
+                f"primitives, hide it with alpha 0, or leave its group ({int(field('group'))}) out "
+                "of geom_groups."
+            )
+        kind = GeomKind[kind_name.upper()]
+        size = np.array(field("size"), np.float32)
+        size[kind.num_sizes :] = 0
         yield Shape(
             kind=kind,
-            link=int(model.site_bodyid[i]) - 1,
-            name=f"site/{model.site(i).name or i}",
-            size=sizes(kind, model.site_size[i]),
-            pos=model.site_pos[i],
-            quat=model.site_quat[i],
+            # Link 0 is MuJoCo's body 1, because the world is not a link.
+            link=int(field("bodyid")) - 1,
+            name=name,
+            size=size,
+            pos=field("pos"),
+            quat=field("quat"),
             rgb=tuple(rgba[:3]),
-            material=material_name(model, model.site_matid[i]),
+            material=material_name(model, field("matid")),
+            row=i,
         )
-
-
-def sizes(kind: GeomKind, numbers: np.ndarray) -> np.ndarray:
-    """Return (3,) float32 sizes, with 0 for unused entries."""
-    size = np.array(numbers, np.float32)
-    size[kind.num_sizes :] = 0
-    return size
 
 
 def material_name(model: mujoco.MjModel, index: int) -> str:
@@ -158,24 +166,8 @@ def material_name(model: mujoco.MjModel, index: int) -> str:
     return str(model.material(index).name) if index >= 0 else ""
 
 
-def _name(model: mujoco.MjModel, index: int) -> str:
-    return model.geom(index).name or f"{_kind_name(model, index)}/{index}"
-
-
-def _kind_name(model: mujoco.MjModel, index: int) -> str:
-    return mujoco.mjtGeom(int(model.geom_type[index])).name.removeprefix("mjGEOM_").lower()
-
-
-def _kind(model: mujoco.MjModel, index: int, name: str) -> GeomKind:
-    kind = _kind_name(model, index)
-    if kind.upper() not in GeomKind.__members__:
-        raise ValueError(
-            f"geom {name!r} is a {kind}, which cannot be rendered; supported: "
-            f"{', '.join(k.name.lower() for k in GeomKind)}. Replace it by these primitives, "
-            f"hide it with alpha 0, or leave its group ({int(model.geom_group[index])}) out of "
-            "geom_groups."
-        )
-    return GeomKind[kind.upper()]
+def _kind_name(number: int) -> str:
+    return mujoco.mjtGeom(int(number)).name.removeprefix("mjGEOM_").lower()
 
 
 def _check_surfaces(model: mujoco.MjModel, groups: Collection[int]) -> None:
@@ -190,19 +182,6 @@ def _check_surfaces(model: mujoco.MjModel, groups: Collection[int]) -> None:
                     f"{kind} {name!r} cannot be rendered: hide it with alpha 0, leave its group "
                     f"({int(group[i])}) out of geom_groups, or remove it from the model."
                 )
-
-
-def shown_geoms(model: mujoco.MjModel, geom_groups: Collection[int] = VISIBLE_GROUPS) -> list[int]:
-    """Return indices of the geoms that ``geom_shapes`` returns, in its order."""
-    groups = model.geom_group
-    return [
-        i for i in range(model.ngeom) if groups[i] in geom_groups and geom_rgba(model, i)[3] > 0
-    ]
-
-
-def geom_rgba(model: mujoco.MjModel, index: int) -> np.ndarray:
-    """Return (4,) float32, the color of a geom or of its material."""
-    return resolve_rgba(model, model.geom_rgba[index], int(model.geom_matid[index]))
 
 
 def resolve_rgba(model: mujoco.MjModel, own: np.ndarray, material: int) -> np.ndarray:

@@ -7,14 +7,14 @@ and a white highlight.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Collection
 from typing import Any
 
 import numpy as np
 
-from pixelbrax_jax.physics.geometry import geom_rgba
 from pixelbrax_jax.physics.opengl import mujoco
+from pixelbrax_jax.physics.task import Color
 from pixelbrax_jax.physics.viewpoints import follows_tracked
+from pixelbrax_jax.spatial import f32
 from pixelbrax_jax.types import Lamp, Look
 
 _DIRECTIONAL = int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
@@ -30,71 +30,81 @@ _SHININESS = 16
 and viewer, and Phong's mirrored vector turns twice as fast."""
 
 
-def read_look(
-    model: mujoco.MjModel,
-    *,
-    com_link: int,
-    movable: Collection[str] = (),
-    target_link: int = -1,
-    anchor: np.ndarray | None = None,
-) -> Look:
-    """Return the look of a model.
+def read_look(model: mujoco.MjModel) -> Look:
+    """Return the look of a model, without its lamps.
 
-    Lights become grey, a lamp on a body follows but does not turn, and the sky's texture becomes
-    its best fit by three colors. Lamps that follow another center of mass than the camera are left
-    out, and so are, with a warning, directional lights after the first.
-
-    Args:
-        model: the compiled model; link i is its body i + 1.
-        com_link: index of the link at the tracked center of mass, -1 for none.
-        movable: names of lamps that move with the target.
-        target_link: index of the target's link, -1 for none.
-        anchor: (3,) metres, position of the target in the model.
+    Lights become grey, and the sky's texture becomes its best fit by three colors. Directional
+    lights after the first are left out, with a warning.
     """
-    active = [i for i in range(model.nlight) if model.light_active[i]]
-    suns = [i for i in active if model.light_type[i] == _DIRECTIONAL]
+    suns = [i for i in _active(model) if model.light_type[i] == _DIRECTIONAL]
     if len(suns) > 1:
         warnings.warn(
             f"of {len(suns)} directional lights only the first, "
             f"{model.light(suns[0]).name or suns[0]!r}, is rendered.",
             stacklevel=2,
         )
-    headlight = model.vis.headlight
-    has_headlight = bool(headlight.active)
-    ambient = _ambient(model)
     sun = suns[0] if suns else None
-    lamps = []
-    for i in active:
-        if model.light_type[i] == _DIRECTIONAL:
-            continue
-        lamp = _lamp(model, i, com_link)
-        if lamp is not None and target_link >= 0 and model.light(i).name in movable:
-            lamp = lamp.replace(link=target_link, pos=lamp.pos - _f32(anchor))
-        lamps.append(lamp)
+    headlight = model.vis.headlight
     pitch, colors = _ground(model)
     return Look(
         ground="checker",
         shadows=True,
         shininess=_SHININESS,
-        light=None if sun is None else _f32(-model.light_dir[sun]),
-        ambient=_f32(ambient),
-        diffuse=_f32(0.0 if sun is None else model.light_diffuse[sun].mean()),
-        specular=_f32(0.0),
-        highlight=_f32(0.0 if sun is None else _SPECULAR * model.light_specular[sun].mean()),
+        light=None if sun is None else f32(-model.light_dir[sun]),
+        ambient=f32(_ambient(model)),
+        diffuse=f32(0.0 if sun is None else model.light_diffuse[sun].mean()),
+        specular=f32(0.0),
+        highlight=f32(0.0 if sun is None else _SPECULAR * model.light_specular[sun].mean()),
         sky=_sky(model),
         ground_rgb=colors,
         ground_pitch=pitch,
-        headlight=_f32(headlight.diffuse.mean()) if has_headlight else None,
-        lamps=tuple(lamp for lamp in lamps if lamp is not None),
+        headlight=f32(headlight.diffuse.mean()) if headlight.active else None,
     )
 
 
+def read_lamps(model: mujoco.MjModel, com_link: int) -> dict[str, Lamp]:
+    """Return the model's lamps by name.
+
+    A lamp on a body follows but does not turn. Lamps that follow another center of mass than the
+    camera are left out. ``com_link`` is the link at the tracked center of mass, -1 for none.
+    """
+    lamps = {}
+    for light in _active(model):
+        mode, body = int(model.light_mode[light]), int(model.light_bodyid[light])
+        is_unfit = mode == _TRACKCOM and not follows_tracked(model, body)
+        if model.light_type[light] == _DIRECTIONAL or is_unfit:
+            continue
+        link, pos, axis = body - 1, model.light_pos0[light], model.light_dir0[light]
+        if body == 0:
+            # These are up to date even if the model was edited after it was compiled.
+            pos, axis = model.light_pos[light], model.light_dir[light]
+        if mode == _TRACKCOM:
+            link, pos = com_link, model.light_poscom0[light]
+        cutoff, exponent = float(model.light_cutoff[light]), float(model.light_exponent[light])
+        if model.light_type[light] == _POINT:
+            cutoff, exponent = 180.0, 0.0
+        lamps[model.light(light).name or f"light/{light}"] = Lamp(
+            link=link,
+            exponent=round(exponent),
+            pos=f32(pos),
+            axis=f32(axis),
+            cos_cutoff=f32(-1.0 if cutoff >= 180.0 else np.cos(np.deg2rad(cutoff))),
+            diffuse=f32(model.light_diffuse[light].mean()),
+            highlight=f32(_SPECULAR * model.light_specular[light].mean()),
+        )
+    return lamps
+
+
+def _active(model: mujoco.MjModel) -> list[int]:
+    return np.flatnonzero(model.light_active).tolist()
+
+
 def _ambient(model: mujoco.MjModel) -> float:
-    active = np.flatnonzero(model.light_active)
+    active = _active(model)
     ambient = float(sum((model.light_ambient[i].mean() for i in active), 0.0))
     if model.vis.headlight.active:
         ambient += float(model.vis.headlight.ambient.mean())
-    elif not len(active):
+    elif not active:
         ambient = 0.3  # MuJoCo's own, where there is no light at all
     return ambient
 
@@ -113,19 +123,18 @@ def checker(model: mujoco.MjModel, geom: int) -> np.ndarray | None:
     return np.stack([a, b]) / 255.0 * model.mat_rgba[model.geom_matid[geom], :3]
 
 
-def mean_color(model: mujoco.MjModel, geom: int) -> tuple[float, float, float] | None:
-    """Return the mean color of a geom's texture, red, green, blue in [0, 1]; None for none.
+def mean_color(model: mujoco.MjModel, geom: int, color: Color) -> Color:
+    """Return the mean color of a geom's texture times ``color``; ``color`` for none.
 
     MuJoCo limits the light on a texture to 1. The color is darkened by the excess of ambient light
     and headlight on a surface that faces the camera.
     """
     texture = _texture(model, geom)
     if texture < 0:
-        return None
-    rgba = geom_rgba(model, geom)
+        return color
     headlight = model.vis.headlight
     light = _ambient(model) + (float(headlight.diffuse.mean()) if headlight.active else 0.0)
-    mean = _pixels(model, texture).mean((0, 1)) / 255.0 * rgba[:3]
+    mean = _pixels(model, texture).mean((0, 1)) / 255.0 * color
     red, green, blue = mean / max(light, 1.0)
     return float(red), float(green), float(blue)
 
@@ -133,30 +142,6 @@ def mean_color(model: mujoco.MjModel, geom: int) -> tuple[float, float, float] |
 def _texture(model: mujoco.MjModel, geom: int) -> int:
     material = int(model.geom_matid[geom])
     return int(model.mat_texid[material, _RGB]) if material >= 0 else -1
-
-
-def _lamp(model: mujoco.MjModel, light: int, com_link: int) -> Lamp | None:
-    mode, body = int(model.light_mode[light]), int(model.light_bodyid[light])
-    link, pos, axis = body - 1, model.light_pos0[light], model.light_dir0[light]
-    if body == 0:
-        # These are up to date even if the model was edited after it was compiled.
-        pos, axis = model.light_pos[light], model.light_dir[light]
-    if mode == _TRACKCOM:
-        if not follows_tracked(model, body):
-            return None
-        link, pos = com_link, model.light_poscom0[light]
-    cutoff, exponent = float(model.light_cutoff[light]), float(model.light_exponent[light])
-    if model.light_type[light] == _POINT:
-        cutoff, exponent = 180.0, 0.0
-    return Lamp(
-        link=link,
-        exponent=round(exponent),
-        pos=_f32(pos),
-        axis=_f32(axis),
-        cos_cutoff=_f32(-1.0 if cutoff >= 180.0 else np.cos(np.deg2rad(cutoff))),
-        diffuse=_f32(model.light_diffuse[light].mean()),
-        highlight=_f32(_SPECULAR * model.light_specular[light].mean()),
-    )
 
 
 def _ground(model: mujoco.MjModel) -> tuple[Any, Any]:
@@ -168,19 +153,19 @@ def _ground(model: mujoco.MjModel) -> tuple[Any, Any]:
             repeat = float(model.mat_texrepeat[material, 0])
             if not model.mat_texuniform[material]:
                 repeat /= max(float(model.geom_size[geom, 0]), 1e-6)
-            return _f32(1.0 / repeat), _f32(colors)
-    return _f32(1.0), _f32([[0.1, 0.2, 0.3], [0.2, 0.3, 0.4]])
+            return f32(1.0 / repeat), f32(colors)
+    return f32(1.0), f32([[0.1, 0.2, 0.3], [0.2, 0.3, 0.4]])
 
 
 def _sky(model: mujoco.MjModel) -> Any:
     """Return (3, 3), colors at the horizon, above and below that fit the sky's texture best."""
     skies = np.flatnonzero(model.tex_type == int(mujoco.mjtTexture.mjTEXTURE_SKYBOX))
     if not len(skies):
-        return _f32(np.zeros((3, 3)))
+        return f32(np.zeros((3, 3)))
     pixels = _pixels(model, int(skies[0]))
     size = pixels.shape[1]
     if pixels.shape[0] != 6 * size:
-        return _f32([pixels.reshape(-1, 3).mean(0) / 255.0] * 3)
+        return f32([pixels.reshape(-1, 3).mean(0) / 255.0] * 3)
     step = max(size // 50, 1)
     middle = 2.0 * (np.arange(size) + 0.5) / size - 1.0
     across, down = np.meshgrid(middle, middle)
@@ -192,7 +177,7 @@ def _sky(model: mujoco.MjModel) -> Any:
     colors = pixels.reshape(6, size, size, 3)[:, ::step, ::step].reshape(-1, 3) / 255.0
     weights = np.stack([1.0 - np.abs(rise), np.maximum(rise, 0.0), np.maximum(-rise, 0.0)], -1)
     fit, *_ = np.linalg.lstsq(weights, colors, rcond=None)
-    return _f32(np.clip(fit, 0.0, 1.0))
+    return f32(np.clip(fit, 0.0, 1.0))
 
 
 def _pixels(model: mujoco.MjModel, texture: int) -> np.ndarray:
@@ -200,7 +185,3 @@ def _pixels(model: mujoco.MjModel, texture: int) -> np.ndarray:
     channels, first = int(model.tex_nchannel[texture]), int(model.tex_adr[texture])
     pixels = model.tex_data[first : first + height * width * channels]
     return pixels.reshape(height, width, channels)[..., :3]
-
-
-def _f32(values: Any) -> Any:
-    return np.asarray(values, np.float32)

@@ -16,15 +16,14 @@ from pixelbrax_jax.physics.geometry import (
     geom_shapes,
     material_name,
     resolve_rgba,
-    shown_geoms,
     site_shapes,
 )
-from pixelbrax_jax.physics.lighting import checker, mean_color, read_look
+from pixelbrax_jax.physics.lighting import checker, mean_color, read_lamps, read_look
 from pixelbrax_jax.physics.opengl import mujoco
-from pixelbrax_jax.physics.viewpoints import read_rigs
+from pixelbrax_jax.physics.viewpoints import camera_name, read_rigs
 from pixelbrax_jax.physics.viewpoints import tracked_body as tracked_body
+from pixelbrax_jax.spatial import f32
 from pixelbrax_jax.types import CameraRig, GeomKind, Geoms, Look, String
-from pixelbrax_jax.validation import check_choice
 
 COM_LINK = "camera/com"
 TARGET_LINK = "target"
@@ -58,79 +57,41 @@ class ModelScene(NamedTuple):
 
 
 def read_scene(
-    model: mujoco.MjModel, camera: int | str = 0, *, movable: Collection[str] = ()
+    model: mujoco.MjModel, camera: int = 0, *, movable: Collection[str] = ()
 ) -> ModelScene:
     """Read what MuJoCo's renderer shows of a model by default.
 
-    Args:
-        model: a compiled model; link i is its body i + 1.
-        camera: name of a camera, or index in the model.
-        movable: names of geoms, sites and lamps of the world that move together with the link
-            ``target``, whose origin is the first visible geom or site.
-
-    Raises:
-        ValueError: there is no such camera, or its orientation follows a body; a name of
-            ``movable`` is unknown or not of the world; the renderer does not support something
-            visible.
+    Link i is body i + 1. ``camera`` is the index of one that can be a rig. Geoms, sites and lamps
+    of the world that ``movable`` names move together with the link ``target``, whose origin is the
+    first visible geom or site. A ValueError names something visible that cannot be rendered.
     """
-    _check_movable(model, movable)
     links = [COM_LINK] if tracked_body(model) >= 0 else []
-    shapes = [*_textured_geoms(model), *site_shapes(model)]
+    com_link = model.nbody - 1 if links else -1
+    target = model.nbody - 1 + len(links)
+    shapes, lamps = [*_textured_geoms(model), *site_shapes(model)], read_lamps(model, com_link)
+    moving = [i for i, s in enumerate(shapes) if s.name.removeprefix("site/") in movable]
+    if moving:
+        links.append(TARGET_LINK)
+        anchor = f32(shapes[moving[0]].pos)
+        for i in moving:
+            shapes[i] = shapes[i]._replace(link=target, pos=f32(shapes[i].pos) - anchor)
+        for name in set(movable) & set(lamps):
+            lamps[name] = lamps[name].replace(link=target, pos=lamps[name].pos - anchor)
     pieces, strings = _strings(model, len(shapes))
     geoms = as_geoms([*shapes, *pieces]).replace(strings=tuple(strings))
-    target = model.nbody - 1 + len(links)
-    moved = [g for g, name in enumerate(geoms.name) if name.removeprefix("site/") in movable]
-    anchor = np.zeros(3)
-    if moved:
-        links.append(TARGET_LINK)
-        anchor = np.asarray(geoms.pos[moved[0]])
-        geoms = geoms.replace(
-            link=tuple(target if g in moved else link for g, link in enumerate(geoms.link)),
-            pos=geoms.pos.at[np.array(moved)].add(-anchor),
-        )
-    com_link = model.nbody - 1 if COM_LINK in links else -1
     rigs = read_rigs(model, com_link)
-    look = read_look(
-        model,
-        com_link=com_link,
-        movable=movable,
-        target_link=target if moved else -1,
-        anchor=anchor,
-    )
-    return ModelScene(geoms, rigs[_camera_name(model, camera, rigs)], rigs, look, tuple(links))
-
-
-def _camera_name(model: mujoco.MjModel, camera: int | str, rigs: dict[str, CameraRig]) -> str:
-    if isinstance(camera, str):
-        return check_choice("camera", camera, rigs)
-    if not 0 <= camera < model.ncam:
-        raise ValueError(f"the model has no camera {camera}; it has {model.ncam}.")
-    return check_choice("camera", model.camera(camera).name or f"camera/{camera}", rigs)
-
-
-def _check_movable(model: mujoco.MjModel, movable: Collection[str]) -> None:
-    bodies: dict[str, int] = {}
-    for count, of, body in (
-        (model.ngeom, model.geom, model.geom_bodyid),
-        (model.nsite, model.site, model.site_bodyid),
-        (model.nlight, model.light, model.light_bodyid),
-    ):
-        bodies |= {of(i).name: int(body[i]) for i in range(count) if of(i).name}
-    for name in movable:
-        check_choice("geom, site or light", name, bodies)
-        if bodies[name] != 0:
-            raise ValueError(f"{name!r} cannot be movable: it is fixed to a body that moves.")
+    look = read_look(model).replace(lamps=tuple(lamps.values()))
+    return ModelScene(geoms, rigs[camera_name(model, camera)], rigs, look, tuple(links))
 
 
 def _textured_geoms(model: mujoco.MjModel) -> Iterator[Shape]:
     """Yield the geoms with finite planes and checkers; other textures become their mean color."""
-    for i, shape in zip(shown_geoms(model), geom_shapes(model), strict=True):
+    for shape in geom_shapes(model):
         is_plane = shape.kind == GeomKind.PLANE
         yield shape._replace(
-            rgb=mean_color(model, i) or shape.rgb,
-            material=material_name(model, model.geom_matid[i]),
-            bounded=bool(is_plane and (model.geom_size[i, :2] > 0).any()),
-            patterned=is_plane and checker(model, i) is not None,
+            rgb=mean_color(model, shape.row, shape.rgb),
+            bounded=bool(is_plane and (shape.size[:2] > 0).any()),
+            patterned=is_plane and checker(model, shape.row) is not None,
         )
 
 

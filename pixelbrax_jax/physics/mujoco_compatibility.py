@@ -1,4 +1,7 @@
-"""Silenced warnings and prints of MuJoCo, MuJoCo XLA and Brax."""
+"""What MuJoCo, MuJoCo XLA and Brax print, warn of, and need of JAX.
+
+Importing it loads neither MuJoCo XLA nor Brax.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +9,15 @@ import contextlib
 import io
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from functools import partial
 from types import ModuleType
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from pixelbrax_jax.physics.opengl import mujoco
 
@@ -72,17 +79,43 @@ def loading_silenced() -> Iterator[None]:
             warnings.warn(f"MuJoCo: {message}", UserWarning, stacklevel=3)
 
 
-class _JaxOfThisProcess:
-    devices = staticmethod(jax.local_devices)
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(jax, name)
-
-
 def load_onto_own_device(module: ModuleType) -> None:
     """Let a module that uses ``jax`` put arrays on a device of this process.
 
     MuJoCo XLA uses ``jax.devices()[0]``, which in a run of several processes belongs to the first.
     """
-    if jax.process_count() > 1 and vars(module)["jax"] is jax:
-        vars(module)["jax"] = _JaxOfThisProcess()
+    if jax.process_count() > 1:
+        _replace_in(module, "jax", jax, devices=jax.local_devices)
+
+
+def accept_old_clip(module: ModuleType) -> None:
+    """Let a module call ``jp.clip(x, a_min=...)``, as Brax's fluid forces do."""
+
+    def clip(a: Any, a_min: Any = None, a_max: Any = None) -> jax.Array:
+        return jnp.clip(a, a_min, a_max)
+
+    _replace_in(module, "jp", jnp, clip=clip)
+
+
+def accept_device_put_replicated(module: ModuleType) -> None:
+    """Let a module call ``jax.device_put_replicated``, as Brax's trainers do."""
+
+    def device_put_replicated(x: Any, devices: Sequence[jax.Device]) -> Any:
+        """Return ``x`` with a new leading axis, one row on each device."""
+        sharding = NamedSharding(Mesh(np.array(devices), ("row",)), PartitionSpec("row"))
+
+        def put(leaf: jax.typing.ArrayLike) -> jax.Array:
+            rows = jnp.broadcast_to(leaf, (len(devices), *jnp.shape(leaf)))
+            return jax.device_put(rows, sharding)
+
+        return jax.tree.map(put, x)
+
+    _replace_in(module, "jax", jax, device_put_replicated=device_put_replicated)
+
+
+def _replace_in(module: ModuleType, name: str, imported: ModuleType, **functions: Any) -> None:
+    """Replace functions of an ``imported`` module, which only ``module`` sees, as its ``name``."""
+    if vars(module)[name] is imported:
+        changed = ModuleType(imported.__name__)
+        vars(changed).update(functions, __getattr__=partial(getattr, imported))
+        vars(module)[name] = changed

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import importlib
-import importlib.util
 import os
 import sys
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -22,33 +19,21 @@ def import_mujoco() -> None:
 
     MuJoCo loads OpenGL only at import, and fails if it is missing. A ``__getattr__`` in its modules
     therefore loads ``mujoco.GLContext`` at its first use, also by ``mujoco.Renderer``, with
-    MuJoCo's own errors. A MuJoCo that loads OpenGL elsewhere is not changed.
+    MuJoCo's own errors.
     """
-    if "mujoco" in sys.modules or not _is_there():
+    if "mujoco" in sys.modules:
         return
     chosen = os.environ.get(_VARIABLE)
     os.environ[_VARIABLE] = "disable"
     try:
-        modules = [importlib.import_module("mujoco")]
-        with contextlib.suppress(ImportError):
-            modules.append(importlib.import_module("mujoco.gl_context"))
+        modules = [importlib.import_module(name) for name in ("mujoco", "mujoco.gl_context", _HOME)]
     finally:
         if chosen is None:
             del os.environ[_VARIABLE]
         else:
             os.environ[_VARIABLE] = chosen
-    home = sys.modules.get(_HOME)
-    if home is not None:
-        for module in (*modules, home):
-            vars(module)["__getattr__"] = _load_of(module, home)
-
-
-def _is_there() -> bool:
-    """Return whether MuJoCo has the module that loads OpenGL, without importing it."""
-    spec = importlib.util.find_spec("mujoco")
-    folders = (spec and spec.submodule_search_locations) or ()
-    place = Path(*_HOME.split(".")[1:]).with_suffix(".py")
-    return any(Path(folder, place).is_file() for folder in folders)
+    for module in modules:
+        vars(module)["__getattr__"] = _load_of(module, modules[-1])
 
 
 def _load_of(module: ModuleType, home: ModuleType) -> Any:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from pixelbrax_jax.physics.opengl import mujoco
+from pixelbrax_jax.spatial import make_rig
 from pixelbrax_jax.types import CameraRig
 
 _TRACK = int(mujoco.mjtCamLight.mjCAMLIGHT_TRACK)
@@ -54,16 +53,16 @@ def followed_body(model: mujoco.MjModel) -> int:
 def read_rigs(model: mujoco.MjModel, com_link: int) -> dict[str, CameraRig]:
     """Return rigs of a model's cameras by name, without ``unfit_cameras``, in the model's order.
 
-    A camera without a name is ``camera/<index>``. ``com_link`` is the link at the tracked center of
-    mass, -1 for none. A rig's target lies on the camera's axis, at the depth of the tracked point
-    or of the model's center of mass: camera distractors turn about it.
+    ``com_link`` is the link at the tracked center of mass, -1 for none. A rig's target lies on the
+    camera's axis, at the depth of the tracked point or of the model's center of mass: camera
+    distractors turn about it.
     """
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     rigs = {}
     unfit = unfit_cameras(model)
     for camera in range(model.ncam):
-        name = _name(model, camera)
+        name = camera_name(model, camera)
         if name in unfit:
             continue
         mode, body = int(model.cam_mode[camera]), int(model.cam_bodyid[camera])
@@ -76,7 +75,12 @@ def read_rigs(model: mujoco.MjModel, com_link: int) -> dict[str, CameraRig]:
         else:
             link, subject = -1, data.subtree_com[0]
             eye, axes = data.cam_xpos[camera], data.cam_xmat[camera]
-        rigs[name] = _rig(link, eye, axes.reshape(3, 3), subject, float(model.cam_fovy[camera]))
+        axes = axes.reshape(3, 3)
+        forward, up, fovy = -axes[:, 2], axes[:, 1], float(model.cam_fovy[camera])
+        depth = float((subject - eye) @ forward)
+        # A camera that looks away from the subject also needs a target.
+        target = eye + (depth if depth > 1e-3 else 1.0) * forward
+        rigs[name] = make_rig(eye, target, fovy, link=link, track=(1.0, 1.0, 1.0), up=up)
     return rigs
 
 
@@ -98,29 +102,10 @@ def unfit_cameras(model: mujoco.MjModel) -> dict[str, str]:
             target = int(model.cam_targetbodyid[camera])
             reason = f"it turns towards body {model.body(target).name or target!r}"
         if reason:
-            reasons[_name(model, camera)] = reason
+            reasons[camera_name(model, camera)] = reason
     return reasons
 
 
-def _name(model: mujoco.MjModel, camera: int) -> str:
+def camera_name(model: mujoco.MjModel, camera: int) -> str:
+    """Return a camera's name, ``camera/<index>`` without one."""
     return model.camera(camera).name or f"camera/{camera}"
-
-
-def _rig(
-    link: int, eye: np.ndarray, axes: np.ndarray, subject: np.ndarray, fovy: float
-) -> CameraRig:
-    forward = -axes[:, 2]
-    depth = float((subject - eye) @ forward)
-    return CameraRig(
-        link=link,
-        track=_f32([float(link >= 0)] * 3),
-        eye=_f32(eye),
-        # A camera that looks away from the subject also needs a target.
-        target=_f32(eye + (depth if depth > 1e-3 else 1.0) * forward),
-        up=_f32(axes[:, 1]),
-        fovy=_f32(fovy),
-    )
-
-
-def _f32(values: Any) -> Any:
-    return np.asarray(values, np.float32)

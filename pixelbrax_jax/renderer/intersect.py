@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from pixelbrax_jax.types import GeomKind, for_each_kind
+from pixelbrax_jax.types import GeomKind
 
 Vector = Sequence[Any]
 Axes = tuple[Vector, Vector, Vector]
@@ -196,23 +196,17 @@ def _box(ray: Vector, pos: Vector, axes: Axes, size: Vector) -> Hit:
     return Hit(t, normal_dot)
 
 
-_BY_KIND = for_each_kind(
-    "renderer.intersect",
-    {
-        GeomKind.PLANE: _plane,
-        GeomKind.SPHERE: _sphere,
-        GeomKind.CAPSULE: _capsule,
-        GeomKind.ELLIPSOID: _ellipsoid,
-        GeomKind.CYLINDER: _cylinder,
-        GeomKind.BOX: _box,
-    },
-)
+_BY_KIND = {
+    GeomKind.PLANE: _plane,
+    GeomKind.SPHERE: _sphere,
+    GeomKind.CAPSULE: _capsule,
+    GeomKind.ELLIPSOID: _ellipsoid,
+    GeomKind.CYLINDER: _cylinder,
+    GeomKind.BOX: _box,
+}
 
-_FAR_FORMS = for_each_kind(
-    "renderer.intersect for distant cameras",
-    {GeomKind.SPHERE: _distant_sphere, GeomKind.CAPSULE: _distant_capsule},
-    [kind for kind in GeomKind if kind.has_far_form],
-)
+_FAR_FORMS = {GeomKind.SPHERE: _distant_sphere, GeomKind.CAPSULE: _distant_capsule}
+"""For distant cameras."""
 
 
 def intersect(

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from pixelbrax_jax import spatial
 from pixelbrax_jax.renderer import shading
-from pixelbrax_jax.types import FAR, Camera, Frame, GeomKind, Lamp, Scene, for_each_kind
+from pixelbrax_jax.types import FAR, Camera, Frame, GeomKind, Lamp, Scene
 
 
 def render(
@@ -214,17 +214,14 @@ def _box(o: jax.Array, d: jax.Array, size: jax.Array) -> tuple[jax.Array, jax.Ar
     return t, jax.nn.one_hot(face, 3, dtype=d.dtype) * outward
 
 
-_LOCAL = for_each_kind(
-    "renderer.reference",
-    {
-        GeomKind.PLANE: _plane,
-        GeomKind.SPHERE: _sphere,
-        GeomKind.CAPSULE: _capsule,
-        GeomKind.ELLIPSOID: _ellipsoid,
-        GeomKind.CYLINDER: _cylinder,
-        GeomKind.BOX: _box,
-    },
-)
+_LOCAL = {
+    GeomKind.PLANE: _plane,
+    GeomKind.SPHERE: _sphere,
+    GeomKind.CAPSULE: _capsule,
+    GeomKind.ELLIPSOID: _ellipsoid,
+    GeomKind.CYLINDER: _cylinder,
+    GeomKind.BOX: _box,
+}
 
 
 def _ground_color(scene: Scene, g: int, rays: jax.Array, height: int) -> jax.Array:

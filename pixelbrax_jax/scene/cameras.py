@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pixelbrax_jax import spatial
+from pixelbrax_jax.spatial import f32, look_at, make_rig, rotate
 from pixelbrax_jax.types import Camera, CameraRig, GeomKind, Geoms
 from pixelbrax_jax.validation import check_choice
 
@@ -19,78 +17,30 @@ _DISTANT = 1000
 radius."""
 
 
-class _Side(NamedTuple):
-    """A view of the default's target from the default's distance: direction to the eye, and up."""
+_Direction = tuple[float, float, float]
 
-    direction: tuple[float, float, float]
-    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
-
-
-SIDES: Mapping[str, _Side] = {
-    "side": _Side((0.0, -1.0, 0.15)),
-    "front": _Side((1.0, 0.0, 0.15)),
-    "top": _Side((0.0, 0.0, 1.0), up=(0.0, 1.0, 0.0)),
+_SIDES: Mapping[str, tuple[_Direction, _Direction]] = {
+    "side": ((0.0, -1.0, 0.15), (0.0, 0.0, 1.0)),
+    "front": ((1.0, 0.0, 0.15), (0.0, 0.0, 1.0)),
+    "top": ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0)),
 }
-"""Views that every task has besides ``default``."""
-
-
-def _f32(values: Any) -> Any:
-    # NumPy, not JAX: importing this package must not start a device.
-    return np.asarray(values, np.float32)
-
-
-def make_rig(
-    eye: Sequence[float],
-    target: Sequence[float],
-    fovy: float,
-    *,
-    link: int = -1,
-    track: Sequence[float] = (1.0, 1.0, 0.0),
-    up: Sequence[float] = (0.0, 0.0, 1.0),
-) -> CameraRig:
-    """Make a camera rig from plain numbers.
-
-    Args:
-        eye: metres; relative to the followed link along tracked axes, absolute along others.
-        target: metres, likewise; the point the camera looks at.
-        fovy: vertical field of view, degrees, between 0 and 180.
-        link: index of the followed link, -1 for none.
-        track: fraction of the link's position to follow, per world axis.
-        up: the world direction that is up in the image.
-
-    Raises:
-        ValueError: eye and target coincide, ``up`` is parallel to the view, or ``fovy`` is wrong.
-    """
-    if not 0.0 < fovy < 180.0:
-        raise ValueError(f"fovy must lie between 0 and 180 degrees, got {fovy}.")
-    view = np.subtract(target, eye)
-    if np.linalg.norm(np.cross(view, up)) < 1e-6 * max(float(np.linalg.norm(view)), 1e-6):
-        raise ValueError(
-            f"a camera at {eye} cannot look at {target} with up={up}: the two points must "
-            "differ and 'up' must not be parallel to the view."
-        )
-    return CameraRig(
-        link=link,
-        track=_f32(track if link >= 0 else (0.0, 0.0, 0.0)),
-        eye=_f32(eye),
-        target=_f32(target),
-        up=_f32(up),
-        fovy=_f32(fovy),
-    )
+"""Views of every task besides ``default``, with its target and distance: direction to the eye, up.
+"""
 
 
 def with_sides(rigs: Mapping[str, CameraRig]) -> dict[str, CameraRig]:
-    """Return a task's ``default``, ``SIDES`` and its other rigs, which override ``SIDES``."""
+    """Return a task's ``default``, views from its sides, and its other rigs, which override them.
+
+    The sides are ``side``, ``front`` and ``top``.
+    """
     default = rigs["default"]
-    sides = {name: _seen_from_side(default, side) for name, side in SIDES.items()}
+    distance = np.float32(np.linalg.norm(default.eye - default.target))
+    sides = {}
+    for name, (direction, up) in _SIDES.items():
+        away = np.array(direction) / np.linalg.norm(direction)
+        eye = default.target + distance * away.astype(np.float32)
+        sides[name] = default.replace(eye=eye, up=f32(up))
     return {"default": default, **sides, **rigs}
-
-
-def _seen_from_side(base: CameraRig, side: _Side) -> CameraRig:
-    away = np.array(side.direction) / np.linalg.norm(side.direction)
-    distance = np.linalg.norm(base.eye - base.target)
-    eye = base.target + np.float32(distance) * away.astype(np.float32)
-    return dataclasses.replace(base, eye=eye, up=_f32(side.up))
 
 
 def choose_rig(
@@ -105,7 +55,8 @@ def choose_rig(
     if isinstance(camera, CameraRig):
         return camera
     if isinstance(camera, Camera):
-        return rig_at_rest(camera)
+        pos, xmat = f32(camera.pos), f32(camera.xmat)
+        return make_rig(pos, pos - xmat[:, 2], float(camera.fovy), up=xmat[:, 1])
     if not isinstance(camera, str):
         raise TypeError(
             "camera must be a name, a pixelbrax_jax.CameraRig or a pixelbrax_jax.Camera, "
@@ -114,25 +65,11 @@ def choose_rig(
     return rigs[check_choice(f"camera of task {task!r}", camera, rigs)]
 
 
-def rig_at_rest(camera: Camera) -> CameraRig:
-    """Return the rig of a fixed camera."""
-    pos = _f32(camera.pos)
-    xmat = _f32(camera.xmat)
-    return CameraRig(
-        link=-1,
-        track=_f32([0.0] * 3),
-        eye=pos,
-        target=pos - xmat[:, 2],
-        up=xmat[:, 1],
-        fovy=_f32(camera.fovy),
-    )
-
-
 def aim(rig: CameraRig, xpos: jax.Array) -> Camera:
     """Return the camera of a rig in the world frame, for link origins ``xpos`` (L, 3) in metres."""
     follow = rig.track * xpos[rig.link] if rig.link >= 0 else jnp.zeros(3)
     eye, target = rig.eye + follow, rig.target + follow
-    return Camera(pos=eye, xmat=spatial.look_at(eye, target, rig.up), fovy=jnp.asarray(rig.fovy))
+    return Camera(pos=eye, xmat=look_at(eye, target, rig.up), fovy=jnp.asarray(rig.fovy))
 
 
 def seen_from(geoms: Geoms, rig: CameraRig) -> Geoms:
@@ -150,7 +87,7 @@ def rig_from_corner(geoms: Geoms, xpos: np.ndarray, xquat: np.ndarray, link: int
     poses of the links in the world frame.
     """
     points = [
-        geoms.pos[g] if of < 0 else xpos[of] + spatial.rotate(xquat[of], geoms.pos[g])
+        geoms.pos[g] if of < 0 else xpos[of] + rotate(xquat[of], geoms.pos[g])
         for g, of in enumerate(geoms.link)
         if geoms.kind[g] != GeomKind.PLANE
     ]

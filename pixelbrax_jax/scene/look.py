@@ -3,18 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
-import numpy as np
-
+from pixelbrax_jax.spatial import f32
 from pixelbrax_jax.types import Look
 from pixelbrax_jax.validation import check_bool, check_choice
-
-
-def _f32(values: Any) -> Any:
-    # NumPy, not JAX: importing this package must not start a device.
-    return np.asarray(values, np.float32)
-
 
 LOOKS: dict[str, Look] = {
     # Cool ground and sky, so that the warm colors of the models stand out.
@@ -22,14 +14,14 @@ LOOKS: dict[str, Look] = {
         ground="checker",
         shadows=False,
         shininess=16,
-        light=_f32([-0.35, -0.55, 1.0]),
-        ambient=_f32(0.6),
-        diffuse=_f32(0.8),
-        specular=_f32(0.0),
-        highlight=_f32(0.25),
-        sky=_f32([[0.86, 0.91, 0.97], [0.35, 0.55, 0.82]]),
-        ground_rgb=_f32([[0.58, 0.62, 0.66], [0.42, 0.46, 0.51]]),
-        ground_pitch=_f32(0.5),
+        light=f32([-0.35, -0.55, 1.0]),
+        ambient=f32(0.6),
+        diffuse=f32(0.8),
+        specular=f32(0.0),
+        highlight=f32(0.25),
+        sky=f32([[0.86, 0.91, 0.97], [0.35, 0.55, 0.82]]),
+        ground_rgb=f32([[0.58, 0.62, 0.66], [0.42, 0.46, 0.51]]),
+        ground_pitch=f32(0.5),
     ),
     # Light, coefficients and colors of the original renderer (arXiv 2502.00021): white
     # background, thin grid of pitch 2000/2048 m, a light so bright that the ground is white.
@@ -37,14 +29,14 @@ LOOKS: dict[str, Look] = {
         ground="grid",
         shadows=False,
         shininess=2,
-        light=_f32([0.577, -0.577, 0.577]),
-        ambient=_f32(0.8),
-        diffuse=_f32(0.8),
-        specular=_f32(0.6),
-        highlight=_f32(0.0),
-        sky=_f32([[1.0, 1.0, 1.0]] * 2),
-        ground_rgb=_f32([[200 / 255] * 3, [0.0] * 3]),
-        ground_pitch=_f32(2000 / 2048),
+        light=f32([0.577, -0.577, 0.577]),
+        ambient=f32(0.8),
+        diffuse=f32(0.8),
+        specular=f32(0.6),
+        highlight=f32(0.0),
+        sky=f32([[1.0, 1.0, 1.0]] * 2),
+        ground_rgb=f32([[200 / 255] * 3, [0.0] * 3]),
+        ground_pitch=f32(2000 / 2048),
     ),
     # Headlight, checker and sky of the DM Control Suite (common/visual.xml, materials.xml,
     # skybox.xml), and its models' light from above. Tasks of the suite have a variant of this look
@@ -53,15 +45,15 @@ LOOKS: dict[str, Look] = {
         ground="checker",
         shadows=True,
         shininess=16,
-        light=_f32([0.0, 0.0, 1.0]),
-        ambient=_f32(0.4),
-        diffuse=_f32(0.6),
-        specular=_f32(0.0),
-        highlight=_f32(0.15),
-        sky=_f32([[0.20, 0.31, 0.40], [0.39, 0.58, 0.77], [0.03, 0.04, 0.05]]),
-        ground_rgb=_f32([[0.1, 0.2, 0.3], [0.2, 0.3, 0.4]]),
-        ground_pitch=_f32(1.0),
-        headlight=_f32(0.8),
+        light=f32([0.0, 0.0, 1.0]),
+        ambient=f32(0.4),
+        diffuse=f32(0.6),
+        specular=f32(0.0),
+        highlight=f32(0.15),
+        sky=f32([[0.20, 0.31, 0.40], [0.39, 0.58, 0.77], [0.03, 0.04, 0.05]]),
+        ground_rgb=f32([[0.1, 0.2, 0.3], [0.2, 0.3, 0.4]]),
+        ground_pitch=f32(1.0),
+        headlight=f32(0.8),
     ),
 }
 

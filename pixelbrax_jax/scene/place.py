@@ -1,4 +1,4 @@
-"""Scenes from the poses of links."""
+"""Scenes from the poses of links, with strings: straight if stretched, else catenaries."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ import numpy as np
 
 from pixelbrax_jax import spatial
 from pixelbrax_jax.flags import under_default_flags
-from pixelbrax_jax.scene import strings
 from pixelbrax_jax.scene.cameras import aim
-from pixelbrax_jax.types import CameraRig, Geoms, Look, Scene
+from pixelbrax_jax.types import CameraRig, Geoms, Look, Scene, String
+
+_NEWTON_STEPS = 8
 
 
 @under_default_flags
@@ -37,7 +38,7 @@ def place(geoms: Geoms, rig: CameraRig, look: Look, xpos: jax.Array, xquat: jax.
             for link, end in zip(string.link, string.ends, strict=True)
         ]
         rows = np.array(string.geoms)
-        centers, axes, half = strings.pieces(string, jnp.stack(ends), len(rows))
+        centers, axes, half = _pieces(string, jnp.stack(ends), len(rows))
         pos, xmat = pos.at[rows].set(centers), xmat.at[rows].set(axes)
         geoms = geoms.replace(size=jnp.asarray(geoms.size).at[rows, 1].set(half))
     lamps = tuple(
@@ -46,3 +47,54 @@ def place(geoms: Geoms, rig: CameraRig, look: Look, xpos: jax.Array, xquat: jax.
     )
     look = look.replace(lamps=lamps)
     return Scene(geoms=geoms, pos=pos, xmat=xmat, camera=aim(rig, xpos), look=look)
+
+
+def _pieces(string: String, ends: jax.Array, num: int) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Return ``num`` capsules that cover a string with ends (2, 3) in metres in the world frame.
+
+    Returns:
+        (num, 3) centers, (num, 3, 3) orientations whose third columns point along the string,
+        (num,) half lengths.
+    """
+    points = hang(ends, string.length, num)
+    along = points[1:] - points[:-1]
+    z = spatial.unit(along)
+    # Any direction that is not parallel.
+    aside = jnp.where(jnp.abs(z[:, :1]) < 0.9, jnp.eye(3)[0], jnp.eye(3)[1])
+    x = spatial.unit(jnp.cross(aside, z))
+    half = 0.5 * jnp.sqrt(jnp.maximum(jnp.sum(along * along, -1), 1e-12))
+    return 0.5 * (points[1:] + points[:-1]), jnp.stack([x, jnp.cross(z, x), z], axis=-1), half
+
+
+def hang(ends: jax.Array, length: jax.Array, num: int) -> jax.Array:
+    """Return (num + 1, 3) points at equal distances along a string under gravity in -z.
+
+    A catenary is z = a cosh(x / a) + const. With h and v the horizontal and vertical distance of
+    its ends and u = h / 2a, its length obeys ``sqrt(length^2 - v^2) / h = sinh(u) / u``, and x / a
+    in the middle between the ends is ``artanh(v / length)``. Ends (2, 3) and length () are in
+    metres; a string shorter than the distance of its ends is straight.
+    """
+    start, end = ends[0], ends[1]
+    way = end - start
+    fraction = jnp.linspace(0.0, 1.0, num + 1)
+    straight = start + fraction[:, None] * way
+    distance = jnp.sqrt(jnp.maximum(jnp.sum(way * way), 1e-12))
+    slack = distance < 0.999 * length
+    # For a stretched string: any values with finite derivatives.
+    length = jnp.where(slack, length, 1.01 * distance)
+
+    flat = way * jnp.array([1.0, 1.0, 0.0])
+    h = jnp.sqrt(jnp.maximum(jnp.sum(flat * flat), (1e-3 * length) ** 2))
+    v = jnp.clip(way[2], -0.999 * length, 0.999 * length)
+    ratio = jnp.maximum(jnp.sqrt(length * length - v * v) / h, 1.0 + 1e-4)
+    u = jnp.sqrt(6.0 * (ratio - 1.0))
+    for _ in range(_NEWTON_STEPS):
+        excess = u + jnp.log(-jnp.expm1(-2.0 * u) / (2.0 * u)) - jnp.log(ratio)
+        u = jnp.maximum(u - excess / (1.0 / jnp.tanh(u) - 1.0 / u), 1e-2)
+    a = h / (2.0 * u)
+    first = jnp.arctanh(v / length) - u
+    place = jnp.arcsinh(jnp.sinh(first) + fraction * length / a)
+    along = (place - first) / (2.0 * u)
+    height = a * (jnp.cosh(place) - jnp.cosh(first))
+    hanging = start + along[:, None] * flat + height[:, None] * jnp.array([0.0, 0.0, 1.0])
+    return jnp.where(slack, hanging, straight)

@@ -9,8 +9,9 @@ import pytest
 
 from pixelbrax_jax import distractors, make
 from pixelbrax_jax.physics.brax.loading import rigs_of
-from pixelbrax_jax.scene.cameras import aim, make_rig, with_sides
+from pixelbrax_jax.scene.cameras import aim, with_sides
 from pixelbrax_jax.scene.place import place
+from pixelbrax_jax.spatial import make_rig
 from pixelbrax_jax.tasks import BRAX_TASKS
 from tests.distractors.conftest import walk
 from tests.envs.toy import PARAMS

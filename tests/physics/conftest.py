@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache, cached_property
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -27,37 +27,25 @@ class Program:
     def __init__(self, physics: Any):
         self.physics = physics
         self.traces = 0
+        self.reset, self.from_qpos, self.step = (
+            jax.jit(function, compiler_options=_HASTY)
+            for function in (physics.reset, physics.from_qpos, self._counted_step)
+        )
 
-    @cached_property
-    def reset(self) -> Callable:
-        return jax.jit(self.physics.reset, compiler_options=_HASTY)
-
-    @cached_property
-    def from_qpos(self) -> Callable:
-        return jax.jit(self.physics.from_qpos, compiler_options=_HASTY)
-
-    @cached_property
-    def step(self) -> Callable:
-        def counted(state: Any, action: Any) -> Any:
-            self.traces += 1
-            return self.physics.step(state, action)
-
-        return jax.jit(counted, compiler_options=_HASTY)
-
-
-@cache
-def _program(task: str, backend: str | None, reward_preset: str) -> Program:
-    return Program(make_physics(task, backend=backend, reward_preset=reward_preset))
+    def _counted_step(self, state: Any, action: Any) -> Any:
+        self.traces += 1
+        return self.physics.step(state, action)
 
 
 @pytest.fixture(scope="session")
 def program() -> Callable[..., Program]:
-    """``program(task, backend=None, reward_preset="brax")``, the same one every time."""
+    """``program(task, backend=None, preset="brax")``, the same one every time."""
 
-    def build(task: str, backend: str | None = None, reward_preset: str = "brax") -> Program:
-        return _program(task, backend, reward_preset)
+    @cache
+    def cached(task: str, backend: str | None, reward_preset: str) -> Program:
+        return Program(make_physics(task, backend=backend, reward_preset=reward_preset))
 
-    return build
+    return lambda task, backend=None, preset="brax": cached(task, backend, preset)
 
 
 @pytest.fixture(scope="session")
@@ -88,15 +76,15 @@ def geom_pose() -> Callable[[Geoms, Any, int], tuple[np.ndarray, np.ndarray]]:
     return pose
 
 
-@cache
-def _unfused_model(task: str) -> mujoco.MjModel:
-    name = {"halfcheetah": "half_cheetah"}.get(task, task)
-    (folder,) = find_spec("brax").submodule_search_locations
-    with loading_silenced():
-        return mujoco.MjModel.from_xml_path(str(Path(folder) / "envs" / "assets" / f"{name}.xml"))
-
-
 @pytest.fixture(scope="session")
 def unfused_model() -> Callable[[str], mujoco.MjModel]:
     """A task's model as MuJoCo reads it, without Brax's rewriting."""
-    return _unfused_model
+
+    @cache
+    def read(task: str) -> mujoco.MjModel:
+        name = {"halfcheetah": "half_cheetah"}.get(task, task)
+        path = Path(find_spec("brax").origin).parent / "envs" / "assets" / f"{name}.xml"
+        with loading_silenced():
+            return mujoco.MjModel.from_xml_path(str(path))
+
+    return read

@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 
 from pixelbrax_jax.physics.geometry import as_geoms, geom_shapes
+from pixelbrax_jax.renderer import intersect, reference
 from pixelbrax_jax.tasks import BRAX_TASKS
-from pixelbrax_jax.types import GeomKind, for_each_kind
+from pixelbrax_jax.types import GeomKind
 
-LOOKS = """
+LOOKS = mujoco.MjModel.from_xml_string("""
 <mujoco>
   <asset>
     <material name="green" rgba="0 1 0 1"/>
@@ -31,7 +32,7 @@ LOOKS = """
     <geom type="capsule" size=".1 .2"/>
   </worldbody>
 </mujoco>
-"""
+""")
 
 
 def read_geoms(model, **options):
@@ -60,9 +61,8 @@ def assert_as_in_viewer(model, geoms):
 
 
 def test_colors_and_visibility():
-    model = mujoco.MjModel.from_xml_string(LOOKS)
-    geoms = read_geoms(model)
-    assert_as_in_viewer(model, geoms)
+    geoms = read_geoms(LOOKS)
+    assert_as_in_viewer(LOOKS, geoms)
     assert geoms.name[-4:] == ("box/10", "ellipsoid/11", "cylinder/12", "capsule/13")
     assert "hidden group" not in geoms.name
     np.testing.assert_allclose(geoms.size[geoms.name.index("capsule/13")], [0.1, 0.2, 0])
@@ -76,7 +76,7 @@ def test_colors_of_the_tasks(task, unfused_model):
 
 
 def test_equal_colors_share_a_material_but_a_ground_has_its_own():
-    geoms = read_geoms(mujoco.MjModel.from_xml_string(LOOKS))
+    geoms = read_geoms(LOOKS)
     row = dict(zip(geoms.name, geoms.material, strict=True))
     assert row["own over material"] == row["own over clear"] == row["glass"]
     assert row["default"] == row["box/10"]
@@ -86,15 +86,13 @@ def test_equal_colors_share_a_material_but_a_ground_has_its_own():
 
 
 def test_chosen_groups():
-    model = mujoco.MjModel.from_xml_string(LOOKS)
-    assert read_geoms(model, geom_groups=(3,)).name == ("hidden group",)
+    assert read_geoms(LOOKS, geom_groups=(3,)).name == ("hidden group",)
     with pytest.raises(ValueError, match=r"no geom is visible: .* outside \(4,\)"):
-        read_geoms(model, geom_groups=(4,))
+        read_geoms(LOOKS, geom_groups=(4,))
 
 
 def test_replaced_color():
-    model = mujoco.MjModel.from_xml_string(LOOKS)
-    geoms = read_geoms(model, colors={"ground": (0.25, 0.5, 0.75), "box/10": (1, 0, 0)})
+    geoms = read_geoms(LOOKS, colors={"ground": (0.25, 0.5, 0.75), "box/10": (1, 0, 0)})
     row = dict(zip(geoms.name, geoms.material, strict=True))
     np.testing.assert_array_equal(geoms.rgb[row["ground"]], [0.25, 0.5, 0.75])
     assert row["box/10"] == row["glass"]
@@ -102,11 +100,10 @@ def test_replaced_color():
 
 @pytest.mark.parametrize("color", [(0, 0, 2), (0, 0), (0, 0, float("nan")), (255, 0, 0)])
 def test_bad_color(color):
-    model = mujoco.MjModel.from_xml_string(LOOKS)
     with pytest.raises(ValueError, match=r"color of geom 'ground' .* \[0, 1\], got"):
-        read_geoms(model, colors={"ground": color})
+        read_geoms(LOOKS, colors={"ground": color})
     with pytest.raises(ValueError, match=r"unknown geom: 'grund'.*Did you mean 'ground'"):
-        read_geoms(model, colors={"grund": (0, 0, 0)})
+        read_geoms(LOOKS, colors={"grund": (0, 0, 0)})
 
 
 MESH = """
@@ -229,10 +226,10 @@ def test_kinds_are_mujocos_numbers():
         assert int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind.name}")) == kind
 
 
-def test_a_kind_without_a_formula_is_an_error():
-    """Which each table raises when it is imported."""
-    with pytest.raises(TypeError, match=r"formulas must have one entry for each .* wrong for BOX"):
-        for_each_kind("formulas", dict.fromkeys(set(GeomKind) - {GeomKind.BOX}))
-    for numbers in ((6,), (6, 3), (6, 3, "far"), (6, 0, "first")):
-        with pytest.raises(TypeError, match="GeomKind 6 needs a number of sizes and a reach"):
-            GeomKind.__new_member__(GeomKind, *numbers)
+def test_every_kind_has_its_formulas():
+    for table in (intersect._BY_KIND, reference._LOCAL):
+        assert set(table) == set(GeomKind)
+    assert set(intersect._FAR_FORMS) == {kind for kind in GeomKind if kind.has_far_form}
+    for kind in GeomKind:
+        assert 1 <= kind.num_sizes <= 3
+        assert kind.reach in ("first", "largest", "diagonal", "all")

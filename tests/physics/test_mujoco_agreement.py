@@ -44,6 +44,7 @@ TREE = """
     <position joint="a" kp="5" kv=".2" gear="2" forcerange="-1 1" ctrlrange="-1 1"/>
     <velocity joint="b" kv=".3" ctrlrange="-1 1"/>
     <motor joint="x" ctrlrange="-3 1"/>
+    <motor joint="z"/>
   </actuator>
 </mujoco>
 """
@@ -87,7 +88,9 @@ def test_motion(name, backend):
     physics = mjcf_physics(
         MODELS[name], reward=lambda *_: jnp.zeros(()), n_frames=1, backend=backend
     )
-    low, high = model.actuator_ctrlrange.T
+    # An action is between the ends of the control range, or the control where there is none.
+    limited = model.actuator_ctrllimited.astype(bool)
+    low, high = np.where(limited, model.actuator_ctrlrange.T, [[-1.0], [1.0]])
     steps = round(SECONDS / model.opt.timestep)
     actions = np.where(np.arange(steps)[:, None] < steps // 2, 0.7, -0.4) * np.ones(model.nu)
     start = np.full(model.nv, 0.3)

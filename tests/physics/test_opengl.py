@@ -74,12 +74,3 @@ def test_a_renderer_that_is_chosen_later():
         "module 'mujoco' has no attribute 'absent'",
         "False",
     ]
-
-
-def test_a_mujoco_that_loads_opengl_elsewhere_is_left_as_it_is(tmp_path):
-    (tmp_path / "mujoco").mkdir()
-    own = "import os; GLContext = os.environ['MUJOCO_GL']"
-    (tmp_path / "mujoco" / "__init__.py").write_text(own)
-    code = f"import sys\nsys.path.insert(0, {str(tmp_path)!r})\n" + MUJOCO
-    code += "import mujoco\nprint(mujoco.GLContext, hasattr(mujoco, '__getattr__'))"
-    assert output(code, "egl") == "egl False"

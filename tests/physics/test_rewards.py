@@ -1,19 +1,22 @@
 """Rewards and terminations, recomputed in NumPy from the poses before and after a step."""
 
+from functools import partial
+
 import jax
 import numpy as np
 import pytest
 
 from pixelbrax_jax.tasks import BRAX_TASKS
+from tests.physics.conftest import rotation_matrix
 
 
-def step_once(program, task, preset="brax", backend=None, scale=1.0):
+def step_once(program, task, preset="brax"):
     """States before and after one step (from one that is itself no reset), and the action."""
-    compiled = program(task, backend, preset)
+    compiled = program(task, None, preset)
     # The presets share their resets; one program serves both.
-    state = program(task, backend).reset(jax.random.key(3))
+    state = program(task).reset(jax.random.key(3))
     actions = jax.random.uniform(
-        jax.random.key(4), (2, compiled.physics.action_size), minval=-scale, maxval=scale
+        jax.random.key(4), (2, compiled.physics.action_size), minval=-1.0, maxval=1.0
     )
     before = compiled.step(state, actions[0])
     return compiled.physics, before, compiled.step(before, actions[1]), np.asarray(actions[1])
@@ -31,24 +34,78 @@ def joints(state):
     return np.asarray(state.engine.pipeline.q, np.float64)
 
 
-@pytest.mark.parametrize(("preset", "weight"), [("brax", 1), ("paper", 10)])
-def test_walker2d(preset, weight, program):
-    physics, before, after, action = step_once(program, "walker2d", preset)
-    expected = weight * x_velocity(physics, before, after) + 1 - 1e-3 * cost(action)
-    np.testing.assert_allclose(after.reward, expected, atol=1e-4 * weight)
+def runner(physics, before, after, action, speed, alive, control):
+    return speed * x_velocity(physics, before, after) + alive - control * cost(action)
 
 
-def test_swimmer_of_brax(program):
-    physics, before, after, action = step_once(program, "swimmer")
-    velocity = (joints(after)[0] - joints(before)[0]) / physics.dt
-    np.testing.assert_allclose(after.reward, velocity - 1e-4 * cost(action), atol=1e-4)
+def swimmer(physics, before, after, action):
+    return (joints(after)[0] - joints(before)[0]) / physics.dt - 1e-4 * cost(action)
 
 
-def test_swimmer_of_the_paper(program):
-    _, _, after, action = step_once(program, "swimmer", "paper")
-    expected = np.hypot(*joints(after)[:2]) - 1e-9 * cost(action)
-    np.testing.assert_allclose(after.reward, expected, rtol=1e-5)
-    assert after.reward > 0
+def swimmer_of_the_paper(physics, before, after, action):
+    return np.hypot(*joints(after)[:2]) - 1e-9 * cost(action)
+
+
+def humanoid(physics, before, after, action, scale):
+    # The center of mass by Brax's own inertias. In its maximal engines a link weighs its mass to
+    # the power 1 - spring_mass_scale.
+    system = physics._env.sys
+    mass = np.asarray(system.link.inertia.mass, np.float64) ** (1 - system.spring_mass_scale)
+    offset = np.asarray(system.link.inertia.transform.pos, np.float64)
+
+    def center_of_mass(state):
+        points = [link_point(state, i, offset[i]) for i in range(len(mass))]
+        return np.average(points, axis=0, weights=mass)
+
+    forward = (center_of_mass(after) - center_of_mass(before))[0] / physics.dt
+    return 1.25 * forward + 5 - 0.1 * scale**2 * cost(action)
+
+
+def humanoidstandup(physics, before, after, action, scale):
+    return float(after.xpos[0, 2]) / physics.dt + 1 - 0.01 * scale**2 * cost(action)
+
+
+def pusher(physics, before, after, action, scale):
+    # Brax measures the distances before the step, from the links' centers of mass.
+    links = [physics.link_names.index(n) for n in ("r_wrist_flex_link", "object", "goal")]
+    offsets = physics._model.body_ipos[1:]
+    tip, thing, goal = (link_point(before, link, offsets[link]) for link in links)
+    near, far = np.linalg.norm(thing - goal), np.linalg.norm(thing - tip)
+    return -near - 0.1 * scale**2 * cost(action) - 0.5 * far
+
+
+def link_point(state, link, point):
+    return np.asarray(state.xpos[link], np.float64) + rotation_matrix(state.xquat[link]) @ point
+
+
+FORMULAS = [
+    ("walker2d", "brax", partial(runner, speed=1, alive=1, control=1e-3), 1e-4),
+    ("walker2d", "paper", partial(runner, speed=10, alive=1, control=1e-3), 1e-3),
+    ("swimmer", "brax", swimmer, 1e-4),
+    ("swimmer", "paper", swimmer_of_the_paper, 1e-6),
+    ("ant", "brax", partial(runner, speed=1, alive=1, control=0.5), 1e-4),
+    ("halfcheetah", "brax", partial(runner, speed=1, alive=0, control=0.1), 1e-4),
+    ("hopper", "brax", partial(runner, speed=1, alive=1, control=1e-3), 1e-4),
+    ("humanoid", "brax", partial(humanoid, scale=0.4), 2e-3),
+    ("humanoid", "paper", partial(humanoid, scale=1), 2e-3),
+    ("humanoidstandup", "brax", partial(humanoidstandup, scale=0.4), 1e-4),
+    ("humanoidstandup", "paper", partial(humanoidstandup, scale=1), 1e-4),
+    ("pusher", "brax", partial(pusher, scale=2), 1e-4),
+    ("pusher", "paper", partial(pusher, scale=1), 1e-4),
+]
+
+
+@pytest.mark.parametrize(
+    ("task", "preset", "expected", "tolerance"),
+    [
+        pytest.param(*row, marks=() if row[0] in ("walker2d", "swimmer") else pytest.mark.slow)
+        for row in FORMULAS
+    ],
+)
+def test_formulas(task, preset, expected, tolerance, program):
+    physics, before, after, action = step_once(program, task, preset)
+    wanted = expected(physics, before, after, action)
+    np.testing.assert_allclose(after.reward, wanted, atol=tolerance)
 
 
 def test_reacher(program, geom_pose):
@@ -78,91 +135,9 @@ def test_actions_of_the_paper_are_not_rescaled(program):
     brax, paper = program("inverted_pendulum"), program("inverted_pendulum", None, "paper")
     state = brax.reset(jax.random.key(5))
     action = np.array([0.6], np.float32)
-    for leaf, same, other in zip(
-        *map(jax.tree.leaves, (
-            paper.step(state, action).obs,
-            brax.step(state, action / 3).obs,
-            brax.step(state, action).obs,
-        )),
-        strict=True,
-    ):  # fmt: skip
-        np.testing.assert_allclose(leaf, same, atol=1e-5)
-        assert np.abs(leaf - other).max() > 1e-2
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("task", "weight"), [("ant", 0.5), ("halfcheetah", 0.1), ("hopper", 1e-3)])
-@pytest.mark.parametrize("preset", ["brax", "paper"])
-def test_runners(task, weight, preset, program):
-    physics, before, after, action = step_once(program, task, preset)
-    alive = 0 if task == "halfcheetah" else 1
-    expected = x_velocity(physics, before, after) + alive - weight * cost(action)
-    np.testing.assert_allclose(after.reward, expected, atol=1e-4)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("preset", "scale"), [("brax", 0.4), ("paper", 1)])
-def test_humanoid(preset, scale, program):
-    physics, before, after, action = step_once(program, "humanoid", preset)
-    # The center of mass by Brax's own inertias. In its maximal engines a link weighs its mass to
-    # the power 1 - spring_mass_scale.
-    system = physics._env.sys
-    mass = np.asarray(system.link.inertia.mass, np.float64) ** (1 - system.spring_mass_scale)
-    offset = np.asarray(system.link.inertia.transform.pos, np.float64)
-
-    def center_of_mass(state):
-        points = [link_point(state, i, offset[i]) for i in range(len(mass))]
-        return np.average(points, axis=0, weights=mass)
-
-    forward = (center_of_mass(after) - center_of_mass(before))[0] / physics.dt
-    expected = 1.25 * forward + 5 - 0.1 * scale**2 * cost(action)
-    np.testing.assert_allclose(after.reward, expected, atol=2e-3)
-
-
-def center(model, state, link):
-    """Center of mass of a link."""
-    return link_point(state, link, model.body_ipos[1 + link])
-
-
-def link_point(state, link, point):
-    quat = np.asarray(state.xquat[link], np.float64)
-    w, axis = quat[0], quat[1:]
-    twice = 2 * np.cross(axis, point)
-    return np.asarray(state.xpos[link], np.float64) + point + w * twice + np.cross(axis, twice)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("preset", "scale"), [("brax", 0.4), ("paper", 1)])
-def test_humanoidstandup(preset, scale, program):
-    physics, _, after, action = step_once(program, "humanoidstandup", preset)
-    expected = float(after.xpos[0, 2]) / physics.dt + 1 - 0.01 * scale**2 * cost(action)
-    np.testing.assert_allclose(after.reward, expected, atol=1e-4)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("preset", "scale"), [("brax", 2), ("paper", 1)])
-def test_pusher(preset, scale, program):
-    # Brax measures the distances before the step, from the links' centers of mass.
-    physics, before, after, action = step_once(program, "pusher", preset)
-    model = physics._model
-    tip, thing, goal = (
-        center(model, before, physics.link_names.index(name))
-        for name in ("r_wrist_flex_link", "object", "goal")
-    )
-    expected = (
-        -np.linalg.norm(thing - goal)
-        - 0.1 * scale**2 * cost(action)
-        - 0.5 * np.linalg.norm(thing - tip)
-    )
-    np.testing.assert_allclose(after.reward, expected, atol=1e-4)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("task", ["ant", "reacher", "inverted_double_pendulum"])
-def test_tasks_that_the_paper_leaves_alone(task, program):
-    _, _, brax, _ = step_once(program, task, "brax")
-    _, _, paper, _ = step_once(program, task, "paper")
-    np.testing.assert_array_equal(brax.reward, paper.reward)
+    obs = paper.step(state, action).obs
+    np.testing.assert_allclose(obs, brax.step(state, action / 3).obs, atol=1e-5)
+    assert np.abs(obs - brax.step(state, action).obs).max() > 1e-2
 
 
 def test_every_paper_setting_belongs_to_a_task_that_differs():
@@ -213,28 +188,20 @@ def test_tip(backend, program, geom_pose):
 
 
 @backends
-def test_fallen_upper_pole_ends_the_episode_without_a_bonus(backend, program, geom_pose):
+@pytest.mark.parametrize(
+    ("q", "action", "alive"), [((0, 0, np.pi / 2), 0.0, 0), ((0, 0.01, 0.02), 0.1, 10)]
+)
+def test_a_fallen_upper_pole_ends_the_episode_without_a_bonus(
+    q, action, alive, backend, program, geom_pose
+):
     compiled = program(PENDULUM, backend)
-    fallen = compiled.from_qpos(np.array([0, 0, np.pi / 2], np.float32))
-    assert not fallen.terminated
-    state = compiled.step(fallen, np.zeros(1, np.float32))
-    assert state.terminated
+    first = compiled.from_qpos(np.array(q, np.float32))
+    assert not first.terminated
+    state = compiled.step(first, np.full(1, action, np.float32))
+    assert bool(state.terminated) == (alive == 0)
     assert not state.non_finite
-    assert state.reward < 0
-    np.testing.assert_allclose(
-        state.reward, pendulum_reward(compiled.physics, state, geom_pose, alive=0), atol=1e-4
-    )
-
-
-@backends
-def test_upright_pole_earns_the_bonus(backend, program, geom_pose):
-    compiled = program(PENDULUM, backend)
-    upright = compiled.from_qpos(np.array([0, 0.01, 0.02], np.float32))
-    state = compiled.step(upright, np.full(1, 0.1, np.float32))
-    assert not state.terminated
-    np.testing.assert_allclose(
-        state.reward, pendulum_reward(compiled.physics, state, geom_pose, alive=10), atol=1e-4
-    )
+    expected = pendulum_reward(compiled.physics, state, geom_pose, alive)
+    np.testing.assert_allclose(state.reward, expected, atol=1e-4)
 
 
 def pendulum_reward(physics, state, geom_pose, alive):

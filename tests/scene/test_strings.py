@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from pixelbrax_jax import GeomKind, Geoms, make_look, make_rig
-from pixelbrax_jax.scene.place import place
-from pixelbrax_jax.scene.strings import hang
+from pixelbrax_jax.scene.place import hang, place
 from pixelbrax_jax.types import Lamp, String
 
 LENGTH = 0.3

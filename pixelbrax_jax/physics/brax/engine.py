@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import copy
-from collections.abc import Callable, Collection, Hashable, Iterator, Mapping
+import copyreg
+from collections.abc import Collection, Hashable, Iterator, Mapping
 from importlib import import_module
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 from uuid import uuid4
 
 import jax
@@ -17,11 +18,14 @@ from flax import struct
 
 from pixelbrax_jax.flags import as_by_default, default_flags, under_default_flags
 from pixelbrax_jax.physics.base import Kinematics, RewardFn
-from pixelbrax_jax.physics.brax.compatibility import accept_old_clip
-from pixelbrax_jax.physics.divergence import GuardedPhysics, Recipe
+from pixelbrax_jax.physics.divergence import GuardedPhysics
 from pixelbrax_jax.physics.geometry import VISIBLE_GROUPS, as_geoms, geom_shapes, site_shapes
 from pixelbrax_jax.physics.model_scene import COM_LINK, tracked_body
-from pixelbrax_jax.physics.mujoco_compatibility import import_silenced, known_warnings_silenced
+from pixelbrax_jax.physics.mujoco_compatibility import (
+    accept_old_clip,
+    import_silenced,
+    known_warnings_silenced,
+)
 from pixelbrax_jax.physics.opengl import mujoco
 from pixelbrax_jax.physics.poses import check_pose, with_unit_rotations
 from pixelbrax_jax.physics.task import Color
@@ -32,6 +36,10 @@ from pixelbrax_jax.types import CameraRig, PhysicsState
 with import_silenced():
     from brax import envs, fluid
     from brax.envs.wrappers import training
+accept_old_clip(fluid)
+
+# An environment holds its backend's module, which a pickle names.
+copyreg.pickle(ModuleType, lambda module: (import_module, (module.__name__,)))
 
 # These handle batches, time limits and resets, which the caller handles here.
 _TRAINING_WRAPPERS = (
@@ -102,8 +110,7 @@ class BraxPhysics(GuardedPhysics):
                 lacks, or has geoms that the renderer does not support.
         """
         _check_env(env)
-        env = _changed(env, _shorten)
-        accept_old_clip(fluid)
+        env = _changed(env, sys=jax.tree.map(as_by_default, env.unwrapped.sys))
         model: mujoco.MjModel = env.unwrapped.sys.mj_model
         shapes = geom_shapes(
             model, colors=colors, drawn_radius=drawn_radius, geom_groups=geom_groups
@@ -116,43 +123,23 @@ class BraxPhysics(GuardedPhysics):
             model.body(i).name or f"link/{i - 1}" for i in range(1, model.nbody)
         )
         self._com_masses: np.ndarray | None = None
-        if rigs is not None:
-            self.rigs = rigs
-        else:
-            # Without material names, like the geoms.
-            shapes += [site._replace(material="") for site in site_shapes(model, geom_groups)]
+        if rigs is None:
+            shapes += site_shapes(model, geom_groups)
             self.followed_link = max(followed_body(model) - 1, 0)
-            self._read_cameras(model)
-        self.geoms = as_geoms(shapes)
+            com_link = len(self.link_names)
+            rigs, self.unfit_cameras = read_rigs(model, com_link), unfit_cameras(model)
+            if any(rig.link == com_link for rig in rigs.values()):
+                self.link_names += (COM_LINK,)
+                self._com_masses = _masses_below(model, tracked_body(model))
+        self.rigs = rigs
+        self.geoms = as_geoms([shape._replace(material="") for shape in shapes])
         self._model = model
         self._source = env
-        self._env = _replace_init(env, self._init)
+        self._env = _changed(env, pipeline_init=self._init)
         self._reward = reward
         self._control_range = _control_range(model) if unscale_actions else None
         self._identity = uuid4() if identity is None else identity
-        self._options = {
-            "colors": colors,
-            "drawn_radius": drawn_radius,
-            "geom_groups": geom_groups,
-            "rigs": rigs,
-            "unscale_actions": unscale_actions,
-            "reward": reward,
-            "identity": self._identity,
-        }
         self._check_shapes()
-
-    def __reduce_ex__(self, protocol: Any) -> Any:
-        if isinstance(self._identity, Recipe):
-            return super().__reduce_ex__(protocol)
-        env = _replace(self._source, ModuleType, lambda module: _Module(module.__name__))
-        return _restore, (type(self), env, self._options)
-
-    def _read_cameras(self, model: mujoco.MjModel) -> None:
-        com_link = len(self.link_names)
-        self.rigs, self.unfit_cameras = read_rigs(model, com_link), unfit_cameras(model)
-        if any(rig.link == com_link for rig in self.rigs.values()):
-            self.link_names += (COM_LINK,)
-            self._com_masses = _masses_below(model, tracked_body(model))
 
     def _reset(self, key: jax.Array) -> PhysicsState:
         """See ``Physics.reset``. ``key`` may be typed, or uint32 like Brax's."""
@@ -173,7 +160,7 @@ class BraxPhysics(GuardedPhysics):
             return self._init(q, qd, *args, **kwargs)
 
         key = jax.random.key(0) if key is None else key
-        return self._guard_first(self._first_state(_replace_init(self._source, init), key))
+        return self._guard_first(self._first_state(_changed(self._source, pipeline_init=init), key))
 
     def _step(self, state: PhysicsState, action: jax.Array) -> PhysicsState:
         action = jnp.asarray(action, jnp.float32)
@@ -201,6 +188,12 @@ class BraxPhysics(GuardedPhysics):
         reward = jnp.where(jnp.abs(done) < jnp.inf, jnp.asarray(reward, jnp.float32), jnp.nan)
         return self._state(after, reward, done > 0.5)
 
+    def _unscale(self, action: jax.Array) -> jax.Array:
+        if self._control_range is None:
+            return action
+        low, high = self._control_range
+        return (action - low) / (high - low) * 2 - 1
+
     def _watched(self, state: PhysicsState) -> Any:
         pipeline = state.engine.pipeline
         return pipeline.q, pipeline.qd, pipeline.x, pipeline.xd
@@ -214,7 +207,8 @@ class BraxPhysics(GuardedPhysics):
         self, brax_state: envs.State, reward: jax.Array, terminated: jax.Array
     ) -> PhysicsState:
         carry = _carry(brax_state)
-        if jax.tree.structure(carry) != self._tree:
+        tree: Any = jax.tree.structure(self._dtypes)
+        if jax.tree.structure(carry) != tree:
             raise ValueError("step changes the tree of the environment's state")
         # Brax writes Python numbers into some fields. With fixed dtypes a jitted step is not
         # traced again for its own output.
@@ -243,12 +237,6 @@ class BraxPhysics(GuardedPhysics):
         q = with_unit_rotations(self._model, q)
         return self._source.unwrapped.pipeline_init(q, qd, *args, **kwargs)
 
-    def _unscale(self, action: jax.Array) -> jax.Array:
-        if self._control_range is None:
-            return action
-        low, high = self._control_range
-        return (action - low) / (high - low) * 2 - 1
-
     def _check_shapes(self) -> None:
         key = jax.random.key(0)
         with _explained(self.backend), known_warnings_silenced():
@@ -264,7 +252,6 @@ class BraxPhysics(GuardedPhysics):
         self.state_size = int(first.obs.shape[0])
         self._obs_dtype = first.obs.dtype
         self._dtypes = jax.tree.map(lambda leaf: leaf.dtype, _carry(first))
-        self._tree: Any = jax.tree.structure(self._dtypes)
 
         state = jax.eval_shape(self.reset, key)
         with _explained(self.backend):
@@ -273,27 +260,6 @@ class BraxPhysics(GuardedPhysics):
             raise ValueError(f"the reward must be a scalar, got shape {after.reward.shape}")
         if after.terminated.shape != ():
             raise ValueError(f"done must be a scalar, got shape {after.terminated.shape}")
-
-
-class _Module(NamedTuple):
-    """Stands for a module in a pickle: an environment holds its backend's."""
-
-    name: str
-
-
-def _replace(env: envs.Env, kind: type, by: Callable[[Any], Any]) -> envs.Env:
-    """Copy an environment and its wrappers, and replace all values of a type."""
-    changed = copy.copy(env)
-    for name, value in vars(env).items():
-        if isinstance(value, kind):
-            setattr(changed, name, by(value))
-        elif isinstance(value, envs.Env):
-            setattr(changed, name, _replace(value, kind, by))
-    return changed
-
-
-def _restore(cls: type[BraxPhysics], env: envs.Env, options: dict[str, Any]) -> BraxPhysics:
-    return cls(_replace(env, _Module, lambda module: import_module(module.name)), **options)
 
 
 def kinematics(pipeline_state: Any) -> Kinematics:
@@ -333,22 +299,14 @@ def _explained(backend: str) -> Iterator[None]:
         ) from error
 
 
-def _changed(env: envs.Env, change: Callable[[envs.Env], None]) -> envs.Env:
-    """Copy ``env`` with all wrappers, and change the innermost copy."""
+def _changed(env: envs.Env, **attributes: Any) -> envs.Env:
+    """Copy ``env`` with all wrappers, and set attributes of the innermost copy."""
     clone = copy.copy(env)
     if isinstance(env, envs.Wrapper):
-        clone.env = _changed(env.env, change)
+        clone.env = _changed(env.env, **attributes)
     else:
-        change(clone)
+        vars(clone).update(attributes)
     return clone
-
-
-def _shorten(env: envs.Env) -> None:
-    env.sys = jax.tree.map(as_by_default, env.sys)
-
-
-def _replace_init(env: envs.Env, init: Callable[..., Any]) -> envs.Env:
-    return _changed(env, lambda clone: setattr(clone, "pipeline_init", init))
 
 
 def _as_dtype(leaf: Any, dtype: Any) -> jax.Array:
@@ -358,9 +316,7 @@ def _as_dtype(leaf: Any, dtype: Any) -> jax.Array:
 
 
 def _carry(brax_state: envs.State) -> BraxCarry:
-    return BraxCarry(
-        pipeline=brax_state.pipeline_state, metrics=brax_state.metrics, info=brax_state.info
-    )
+    return BraxCarry(brax_state.pipeline_state, brax_state.metrics, brax_state.info)
 
 
 def _masses_below(model: mujoco.MjModel, root: int) -> np.ndarray:

@@ -7,17 +7,17 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from pixelbrax_jax.physics.base import Kinematics
 from pixelbrax_jax.physics.brax.engine import BraxPhysics
-from pixelbrax_jax.physics.brax.tasks import REWARD_PRESETS, TASKS, BraxTask, Viewpoint
+from pixelbrax_jax.physics.brax.tasks import REWARD_PRESETS, TASKS, BraxTask
 from pixelbrax_jax.physics.divergence import Recipe
 from pixelbrax_jax.physics.mujoco_compatibility import (
     import_silenced,
     load_onto_own_device,
     loading_silenced,
 )
+from pixelbrax_jax.spatial import make_rig
 from pixelbrax_jax.types import CameraRig
 from pixelbrax_jax.validation import check_choice
 
@@ -70,22 +70,8 @@ def _load(task: str, backend: str, reward_preset: str) -> BraxPhysics:
 
 def rigs_of(task: BraxTask) -> dict[str, CameraRig]:
     """Return a task's viewpoints by name: ``default``, and ``original`` if the paper has one."""
-    views = {"default": task.camera, "original": task.original_camera}
-    return {name: _rig(view) for name, view in views.items() if view is not None}
-
-
-def _rig(view: Viewpoint) -> CameraRig:
-    def f32(numbers: Any) -> Any:
-        return np.asarray(numbers, np.float32)
-
-    return CameraRig(
-        link=view.link,
-        track=f32((1.0, 1.0, 0.0) if view.link >= 0 else (0.0, 0.0, 0.0)),
-        eye=f32(view.eye),
-        target=f32(view.target),
-        up=f32(view.up),
-        fovy=f32(view.fovy),
-    )
+    views = {"default": task.camera or task.original_camera, "original": task.original_camera}
+    return {name: make_rig(**vars(view)) for name, view in views.items() if view is not None}
 
 
 def load_brax_env(name: str, backend: str, **options: Any) -> envs.Env:

@@ -32,15 +32,7 @@ class BraxOptions:
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """Camera of a task.
-
-    Attributes:
-        eye: metres; relative to the followed link in x and y.
-        target: metres, likewise; the point the camera looks at.
-        fovy: vertical field of view, degrees.
-        link: index of the followed link, -1 for none.
-        up: the world direction that is up in the image.
-    """
+    """Camera of a task: arguments of ``make_rig``."""
 
     eye: _Point
     target: _Point
@@ -55,8 +47,8 @@ class BraxTask(Task):
 
     Attributes:
         default_backend: the default physics backend.
-        camera: the default viewpoint.
         original_camera: the paper's viewpoint, None if it has none.
+        camera: the default viewpoint, None for the paper's.
         backends: backends that simulate the task correctly, sorted.
         colors: colors by geom name that replace the model's.
         drawn_radius: metres, by name of a sphere that is rendered larger than it is.
@@ -67,8 +59,8 @@ class BraxTask(Task):
     """
 
     default_backend: str
-    camera: Viewpoint
     original_camera: Viewpoint | None
+    camera: Viewpoint | None = None
     backends: tuple[str, ...] = BACKENDS
     colors: Mapping[str, Color] = field(default_factory=dict)
     drawn_radius: Mapping[str, float] = field(default_factory=dict)
@@ -105,7 +97,6 @@ TASKS = by_name(
             "A four-legged body runs along x; ends when its torso is too low or too high.",
             "spring",
             _ANT,
-            _ANT,
             # Brax's reset noise puts feet below the ground, and the positional backend then throws
             # the ant into the air: a quarter of the episodes ends within four steps.
             backends=("generalized", "mjx", "spring"),
@@ -116,14 +107,12 @@ TASKS = by_name(
             "A planar two-legged body runs along x; never ends early.",
             "spring",
             _PLANAR,
-            _PLANAR,
         ),
         BraxTask(
             "hopper",
             "PixelBrax/Hopper-v0",
             "A planar one-legged body hops along x; ends when it falls.",
             "positional",
-            _PLANAR,
             _PLANAR,
         ),
         BraxTask(
@@ -132,7 +121,6 @@ TASKS = by_name(
             "A humanoid runs along x; ends when its torso is too low or too high.",
             "spring",
             _HUMANOID,
-            _HUMANOID,
             paper_unscaled=True,
         ),
         BraxTask(
@@ -140,8 +128,8 @@ TASKS = by_name(
             "PixelBrax/HumanoidStandup-v0",
             "A humanoid that lies on its back stands up; never ends early.",
             "spring",
-            _LYING,
             _HUMANOID,
+            camera=_LYING,
             paper_unscaled=True,
         ),
         BraxTask(
@@ -149,15 +137,14 @@ TASKS = by_name(
             "PixelBrax/InvertedDoublePendulum-v0",
             "A cart balances two poles in a row; ends when the tip sinks to 1 m.",
             "generalized",
-            Viewpoint((0.0, -3.0, 0.6), (0.0, 0.0, 0.6), 55.0),
             None,
+            camera=Viewpoint((0.0, -3.0, 0.6), (0.0, 0.0, 0.6), 55.0),
         ),
         BraxTask(
             "inverted_pendulum",
             "PixelBrax/InvertedPendulum-v0",
             "A cart balances a pole; ends when it tilts by more than 0.2 rad.",
             "generalized",
-            _CART,
             _CART,
             paper_unscaled=True,
         ),
@@ -167,7 +154,6 @@ TASKS = by_name(
             "PixelBrax/Pusher-v0",
             "A robot arm pushes a cylinder to a goal; never ends early.",
             "generalized",
-            _PUSHER,
             _PUSHER,
             # The goal disc has no name in Brax's model, so it is capsule/20.
             colors={"object_geom": _SKY_BLUE, "capsule/20": _VERMILLION},
@@ -179,7 +165,6 @@ TASKS = by_name(
             "A planar arm of two joints reaches for a target; never ends early.",
             "generalized",
             _REACHER,
-            _REACHER,
             colors={"fingertip": _YELLOW, "target": _RED},
             # At 84 pixels their 9 and 10 mm are two pixels.
             drawn_radius={"fingertip": 0.015, "target": 0.018},
@@ -190,7 +175,6 @@ TASKS = by_name(
             "A planar chain of three links swims along x; never ends early.",
             "generalized",
             _SWIMMER,
-            _SWIMMER,
             # Brax rejects the swimmer on other backends.
             backends=("generalized",),
             paper_reward="distance_swum",
@@ -200,7 +184,6 @@ TASKS = by_name(
             "PixelBrax/Walker2d-v0",
             "A planar two-legged body walks along x; ends when it falls.",
             "spring",
-            _PLANAR,
             _PLANAR,
             paper_options={"forward_reward_weight": 10.0},
         ),

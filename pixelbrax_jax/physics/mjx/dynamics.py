@@ -51,17 +51,7 @@ class Dynamics:
         out_of_reach: Iterable[str] = (),
         target_body: str = "",
     ):
-        """Put the model on the device; compile nothing.
-
-        Args:
-            model: a compiled model.
-            reads_forces: whether to compute sensors of forces and accelerations.
-            out_of_reach: names of geoms that never touch anything; their contacts are skipped.
-            target_body: name of a body, fixed to the world, that is at the target.
-
-        Raises:
-            NotImplementedError: the model has features that MuJoCo XLA lacks.
-        """
+        """Put a compiled model on the device; compile nothing. For the rest see ``Formulas``."""
         load_onto_own_device(mjx_io)
         self.model = model
         self.reads_forces = reads_forces

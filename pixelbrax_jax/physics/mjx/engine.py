@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable
+from functools import lru_cache
 from types import MappingProxyType
 from typing import Any
 
@@ -11,9 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from pixelbrax_jax.flags import default_flags, under_default_flags
-from pixelbrax_jax.physics.divergence import GuardedPhysics
+from pixelbrax_jax.physics.divergence import GuardedPhysics, Recipe
+from pixelbrax_jax.physics.mjx.domains import FORMULAS
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics, MjxState
 from pixelbrax_jax.physics.mjx.formulas import Formulas, Snapshot, Start
+from pixelbrax_jax.physics.mjx.models import load_model
+from pixelbrax_jax.physics.mjx.tasks import TASKS
 from pixelbrax_jax.physics.model_scene import COM_LINK, TARGET_LINK, read_scene, tracked_body
 from pixelbrax_jax.physics.opengl import mujoco
 from pixelbrax_jax.physics.poses import check_pose, with_unit_rotations
@@ -37,12 +41,7 @@ class MjxPhysics(GuardedPhysics):
 
     @default_flags()
     def __init__(self, formulas: Formulas, model: mujoco.MjModel, *, identity: Hashable):
-        """Put the model on the device, edited for the task, and read its scene; compile nothing.
-
-        Raises:
-            ValueError: the renderer does not support something visible.
-            NotImplementedError: the model has features that MuJoCo XLA lacks.
-        """
+        """Put the model on the device, edited for the task, and read its scene; compile nothing."""
         formulas.edit(model)
         scene = read_scene(model, formulas.camera, movable=formulas.movable)
         self.geoms, self.look = scene.geoms, scene.look
@@ -134,3 +133,12 @@ class MjxPhysics(GuardedPhysics):
         rows = [places[name][None] for name in self._extra_links]
         upright = jnp.tile(jnp.array(_UPRIGHT), (len(rows), 1))
         return jnp.concatenate([data.xpos[1:], *rows]), jnp.concatenate([data.xquat[1:], upright])
+
+
+# Loading a model takes a second. A model that is loaded again equals the first one.
+@lru_cache(maxsize=16)
+def make_physics(task: str) -> MjxPhysics:
+    """Make the physics of a task in ``TASKS``; equal and usually the same for one task."""
+    formulas = FORMULAS[task]
+    model = load_model(TASKS[task].domain, **formulas.options)
+    return MjxPhysics(formulas, model, identity=Recipe(make_physics, (task,)))

@@ -15,6 +15,9 @@ from flax import struct
 from pixelbrax_jax.physics.mjx.dynamics import Dynamics
 from pixelbrax_jax.physics.opengl import mujoco
 
+_MAX_ATTEMPTS = 1000
+"""Largest number of sampled poses."""
+
 
 class Start(struct.PyTreeNode):
     """An initial state with fields of ``MjxState``; None means at rest or without a target."""
@@ -31,40 +34,24 @@ class Snapshot:
     Positions, velocities and their sensors are current; sensors of forces and accelerations are
     from the beginning of the last physics step, as in DM Control. Positions are metres in the world
     frame; rotations are matrices with the axes as columns, or unit quaternions (w, x, y, z).
-    ``target`` is this episode's target, as in ``MjxState``.
+
+    Attributes:
+        data: MuJoCo's numbers by its names, such as ``qpos``, ``qvel`` and ``ctrl`` (0 after a
+            reset).
+        target: this episode's target, as in ``MjxState``.
     """
 
     model: mujoco.MjModel
     data: Any
     target: jax.Array
 
-    @property
-    def qpos(self) -> jax.Array:
-        """(Q,) float32, joint positions: metres, radians."""
-        return self.data.qpos
-
-    @property
-    def qvel(self) -> jax.Array:
-        """(V,) float32, joint velocities, per second."""
-        return self.data.qvel
-
-    @property
-    def act(self) -> jax.Array:
-        """Activations of actuators with a state."""
-        return self.data.act
-
-    @property
-    def ctrl(self) -> jax.Array:
-        """(A,) float32, the controls of the last step; 0 after a reset."""
-        return self.data.ctrl
-
     def joint_pos(self, *names: str) -> jax.Array:
         """Return the positions of hinges and slides."""
-        return self.qpos[np.array([self.model.joint(name).qposadr[0] for name in names])]
+        return self.data.qpos[np.array([self.model.joint(name).qposadr[0] for name in names])]
 
     def joint_vel(self, *names: str) -> jax.Array:
         """Return the velocities of hinges and slides."""
-        return self.qvel[np.array([self.model.joint(name).dofadr[0] for name in names])]
+        return self.data.qvel[np.array([self.model.joint(name).dofadr[0] for name in names])]
 
     def sensor(self, *names: str) -> jax.Array:
         """Return the readings of sensors, concatenated."""
@@ -96,10 +83,6 @@ class Snapshot:
         """Return (4,), the rotation of a body."""
         return self.data.xquat[self.model.body(body).id]
 
-    def xmats(self) -> jax.Array:
-        """Return (L, 3, 3), the rotations of all bodies but the world."""
-        return self.data.xmat[1:]
-
     def geom_pos(self, name: str) -> jax.Array:
         """Return (3,), the center of a geom."""
         return self.data.geom_xpos[self.model.geom(name).id]
@@ -118,6 +101,11 @@ def joined(*parts: jax.Array | float) -> jax.Array:
     return jnp.concatenate([jnp.ravel(jnp.asarray(part)) for part in parts])
 
 
+def observe_joints(seen: Snapshot) -> jax.Array:
+    """Return all joint positions and velocities."""
+    return joined(seen.data.qpos, seen.data.qvel)
+
+
 def tolerance(
     x: jax.Array,
     bounds: tuple[float, float] = (0.0, 0.0),
@@ -130,13 +118,8 @@ def tolerance(
     The formulas are those of section 4.3 of arXiv 1801.00690 and of
     ``dm_control.utils.rewards.tolerance``, with the sigmoids that the suite uses.
 
-    Args:
-        x: the quantity, of any shape.
-        bounds: lower and upper bound; may be infinite.
-        margin: distance from the bounds at which the result is ``value_at_margin``; with 0 the
-            result is 0 outside.
-        sigmoid: ``gaussian``, ``long_tail``, ``linear`` or ``quadratic``.
-        value_at_margin: in [0, 1), and not 0 for ``gaussian`` and ``long_tail``.
+    Bounds may be infinite. At ``margin`` from them the result is ``value_at_margin``: in [0, 1),
+    and not 0 for ``gaussian`` and ``long_tail``. With ``margin`` 0 it is 0 outside.
     """
     lower, upper = bounds
     inside = (x >= lower) & (x <= upper)
@@ -145,6 +128,11 @@ def tolerance(
     # The distance to an infinite bound would be infinite.
     distance = lower - x if upper == math.inf else jnp.where(x < lower, lower - x, x - upper)
     return jnp.where(inside, 1.0, _SIGMOIDS[sigmoid](distance / margin, value_at_margin))
+
+
+def small_control(control: jax.Array) -> jax.Array:
+    """Return 1 for controls of 0, and less the larger they are."""
+    return tolerance(control, margin=1.0, value_at_margin=0.0, sigmoid="quadratic")
 
 
 def rising(x: jax.Array, bound: float, margin: float, value_at_margin: float = 0.0) -> jax.Array:
@@ -215,3 +203,72 @@ class Formulas:
     starts_with_forces: bool = False
     out_of_reach: tuple[str, ...] = ()
     batch_last: bool = True
+
+
+def random_joints(model: mujoco.MjModel, key: jax.Array) -> jax.Array:
+    """Sample joint positions (Q,) as DM Control's ``randomize_limited_and_rotational_joints`` does.
+
+    Limited hinges and slides are uniform in their range, other hinges in [-pi, pi]. A free joint
+    keeps its position; its quaternion is sampled uniformly from [0, 1]^4 and normalised, which is
+    not uniform over rotations but is what DM Control does. There are no ball joints.
+    """
+    low, high = np.array(model.qpos0), np.array(model.qpos0)
+    rotations = []
+    for kind, limited, reach, at in zip(
+        model.jnt_type, model.jnt_limited, model.jnt_range, model.jnt_qposadr, strict=True
+    ):
+        if kind == mujoco.mjtJoint.mjJNT_FREE:
+            low[at + 3 : at + 7], high[at + 3 : at + 7] = 0.0, 1.0
+            rotations.append(int(at) + 3)
+        elif limited:
+            low[at], high[at] = reach
+        elif kind == mujoco.mjtJoint.mjJNT_HINGE:
+            low[at], high[at] = -np.pi, np.pi
+    qpos = low + (high - low) * jax.random.uniform(key, (model.nq,))
+    qpos = qpos.astype(jnp.float32)
+    for at in rotations:
+        quat = qpos[at : at + 4]
+        qpos = qpos.at[at : at + 4].set(quat / jnp.linalg.norm(quat))
+    return qpos
+
+
+def random_rotation(key: jax.Array) -> jax.Array:
+    """Sample a (4,) float32 unit quaternion, uniformly over rotations."""
+    quat = jax.random.normal(key, (4,))
+    return quat / jnp.linalg.norm(quat)
+
+
+def free_of_contact(
+    dynamics: Dynamics, key: jax.Array, sample: Callable[[jax.Array, Start], Start]
+) -> Start:
+    """Sample initial states until no geoms touch, at most ``_MAX_ATTEMPTS`` times.
+
+    ``sample`` maps a key and the previous sample, at first all zeros, to an initial state. The last
+    one is returned even if geoms touch.
+    """
+
+    def again(carry: tuple[jax.Array, Start, jax.Array]) -> jax.Array:
+        attempt, _, touches = carry
+        return touches & (attempt < _MAX_ATTEMPTS)
+
+    def attempt(
+        carry: tuple[jax.Array, Start, jax.Array],
+    ) -> tuple[jax.Array, Start, jax.Array]:
+        number, before, _ = carry
+        start = sample(jax.random.fold_in(key, number), before)
+        return number + 1, start, dynamics.touches(start.qpos)
+
+    zeros = Start(jnp.zeros(dynamics.model.nq), jnp.zeros(dynamics.model.nv))
+    shapes = jax.eval_shape(sample, key, zeros)
+    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    return jax.lax.while_loop(again, attempt, (jnp.int32(0), nothing, jnp.bool_(True)))[1]
+
+
+def start_anywhere(dynamics: Dynamics, key: jax.Array) -> Start:
+    """Sample joint positions as ``random_joints``, without a check for contacts."""
+    return Start(random_joints(dynamics.model, key))
+
+
+def start_free_of_contact(dynamics: Dynamics, key: jax.Array) -> Start:
+    """Sample joint positions as ``random_joints`` until no geoms touch."""
+    return free_of_contact(dynamics, key, lambda key, _: start_anywhere(dynamics, key))

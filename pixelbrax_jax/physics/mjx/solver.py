@@ -74,12 +74,10 @@ class _Problem(NamedTuple):
         slope = self.stiffness * residual
         return (slope >= self.high).astype(jnp.int32) - (slope <= self.low).astype(jnp.int32)
 
-    def curvature(self, piece: jax.Array) -> jax.Array:
-        return jnp.where(piece == 0, self.stiffness, 0.0)
-
     def curvature_times(self, residual: jax.Array, rows: jax.Array) -> jax.Array:
         """Return second derivatives times (R, V) rows."""
-        weighted = self.curvature(self.piece(residual))[:, None] * rows
+        curvature = jnp.where(self.piece(residual) == 0, self.stiffness, 0.0)
+        weighted = curvature[:, None] * rows
         if self.cones is None:
             return weighted
         own = self.cones.curvature_times(self._of_cones(residual), self._of_cones(rows))

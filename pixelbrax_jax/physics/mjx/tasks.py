@@ -12,8 +12,8 @@ class DmcTask(Task):
     """A task of the DM Control Suite.
 
     Attributes:
-        domain: the suite's name of the domain, and the name of its module in ``domains``.
-        task: the suite's name of the task, the key of its formulas in that module.
+        domain: the suite's name of the domain.
+        task: the suite's name of the task.
     """
 
     domain: str

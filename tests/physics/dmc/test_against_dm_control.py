@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from pixelbrax_jax.physics.mjx import models
-from pixelbrax_jax.physics.mjx.loading import formulas_of
+from pixelbrax_jax.physics.mjx.domains import FORMULAS
 from pixelbrax_jax.registry import make_physics
 from pixelbrax_jax.tasks import DMC_TASKS
 from tests.physics.dmc import measure, oracle
@@ -99,7 +99,7 @@ def test_initial_states_have_the_same_distribution(task):
 @pytest.mark.parametrize("task", DMC_TASKS)
 def test_models_are_equal(task):
     """Also those that are generated: swimmers, the quadruped and the manipulator."""
-    parts = formulas_of(task)
+    parts = FORMULAS[task]
     ours = models.load_model(DMC_TASKS[task].domain, **parts.options)
     parts.edit(ours)
     env = oracle.load(task)
@@ -136,7 +136,7 @@ def test_sizes_and_times(task):
 
 def drawn(task: str, count: int) -> np.ndarray:
     """(count, Q) joint positions of initial states."""
-    start, dynamics = formulas_of(task).start, make_physics(task).dynamics
+    start, dynamics = FORMULAS[task].start, make_physics(task).dynamics
     keys = jax.random.split(jax.random.key(0), count)
     return np.array(jax.jit(jax.vmap(lambda key: start(dynamics, key).qpos))(keys))
 
@@ -168,7 +168,7 @@ def test_rejection_leaves_no_contact(task):
 @pytest.mark.slow
 def test_the_ball_starts_in_the_hand_at_the_target_or_anywhere():
     task = "dmc_manipulator_bring_ball"
-    physics, draw = make_physics(task), formulas_of(task).start
+    physics, draw = make_physics(task), FORMULAS[task].start
     keys = jax.random.split(jax.random.key(0), 500)
     first = jax.jit(jax.vmap(lambda key: draw(physics.dynamics, key)))(keys)
     first = jax.tree.map(np.asarray, first)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import itertools
 import re
-from importlib import metadata
 
 import jax
 import jax.numpy as jnp
@@ -78,29 +77,10 @@ def test_without_dm_control_the_extra_is_named(monkeypatch):
     monkeypatch.setattr(models, "find_spec", lambda name: None)
     with pytest.raises(ImportError, match=r'try: pip install "pixelbrax\[dmc\]"'):
         models.load_model("cheetah")
-
-
-def test_pythons_without_wheels_are_told_another_way(monkeypatch):
-    monkeypatch.setattr(models, "find_spec", lambda name: None)
+    # Another way for Pythons without wheels.
     monkeypatch.setattr(models.sys, "version_info", (3, 13, 0))
     with pytest.raises(ImportError, match="pip install --no-deps dm_control"):
         models.load_model("cheetah")
-
-
-@needs_models
-def test_other_models_are_warned_of_once(monkeypatch):
-    monkeypatch.setattr(models, "_warned", [])
-    monkeypatch.setitem(models.KNOWN_MODELS, "pendulum", "another")
-    both = rf"dm_control {metadata.version('dm_control')} .* dm_control {models.KNOWN_VERSION}"
-    with pytest.warns(UserWarning, match=both):
-        models.load_model("pendulum")
-    models.load_model("pendulum")
-
-
-@needs_models
-def test_every_domains_models_are_known():
-    for domain in {row.domain for row in DMC_TASKS.values()}:
-        assert domain in models.KNOWN_MODELS
 
 
 @pytest.mark.parametrize("option", [{"reward_preset": "paper"}, {"backend": "mjx"}])

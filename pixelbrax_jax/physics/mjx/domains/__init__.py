@@ -1,1 +1,8 @@
-"""Domains of the DM Control Suite: initial states, observations and rewards of their tasks."""
+"""Initial states, observations and rewards of the DM Control Suite's tasks."""
+
+from __future__ import annotations
+
+from pixelbrax_jax.physics.mjx.domains import hands, poles, reachers, walkers
+
+FORMULAS = poles.TASKS | walkers.TASKS | reachers.TASKS | hands.TASKS
+"""Formulas by the name of the task."""

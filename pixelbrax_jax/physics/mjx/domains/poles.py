@@ -1,0 +1,96 @@
+"""Poles that swing up: acrobot, cartpole and pendulum."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+
+from pixelbrax_jax.physics.mjx.dynamics import Dynamics
+from pixelbrax_jax.physics.mjx.formulas import (
+    Formulas,
+    Snapshot,
+    Start,
+    joined,
+    small_control,
+    tolerance,
+)
+
+_COSINE_BOUND = math.cos(math.radians(8))
+
+
+def _start_anywhere(dynamics: Dynamics, key: jax.Array) -> Start:
+    return Start(jax.random.uniform(key, (dynamics.model.nq,), minval=-jnp.pi, maxval=jnp.pi))
+
+
+def _observe_acrobot(seen: Snapshot) -> jax.Array:
+    """Return x and z parts of both arms' axes, then velocities."""
+    axes = jnp.stack([seen.xmat("upper_arm")[:, 2], seen.xmat("lower_arm")[:, 2]])
+    return joined(axes[:, 0], axes[:, 2], seen.data.qvel)
+
+
+def _reward_acrobot(seen: Snapshot, *, margin: float) -> jax.Array:
+    distance = jnp.linalg.norm(seen.site_pos("target") - seen.site_pos("tip"))
+    radius = float(seen.model.site("target").size[0])
+    return tolerance(distance, (0.0, radius), margin=margin)
+
+
+def _start_hanging(dynamics: Dynamics, key: jax.Array) -> Start:
+    noise = 0.01 * jax.random.normal(key, (2, dynamics.model.nq))
+    return Start(jnp.array([0.0, jnp.pi]) + noise[0], noise[1])
+
+
+def _start_upright(dynamics: Dynamics, key: jax.Array) -> Start:
+    pose, speed = jax.random.split(key)
+    reach = jnp.array([0.1, 0.034])
+    qpos = jax.random.uniform(pose, (2,), minval=-reach, maxval=reach)
+    return Start(qpos, 0.01 * jax.random.normal(speed, (dynamics.model.nv,)))
+
+
+def _observe_cartpole(seen: Snapshot) -> jax.Array:
+    """Return the cart's position, cosine and sine of the pole's angle, and velocities."""
+    pole = seen.xmat("pole_1")
+    return joined(seen.joint_pos("slider"), pole[2, 2], pole[0, 2], seen.data.qvel)
+
+
+def _reward_cartpole(seen: Snapshot) -> jax.Array:
+    upright = (seen.xmat("pole_1")[2, 2] + 1) / 2
+    centered = (1 + tolerance(seen.joint_pos("slider")[0], margin=2.0)) / 2
+    small = small_control(seen.data.ctrl[0])
+    small_velocity = (1 + tolerance(seen.data.qvel[1], margin=5.0)) / 2
+    return upright * (4 + small) / 5 * small_velocity * centered
+
+
+def _reward_cartpole_sparse(seen: Snapshot) -> jax.Array:
+    centered = tolerance(seen.joint_pos("slider")[0], (-0.25, 0.25))
+    return centered * tolerance(seen.xmat("pole_1")[2, 2], (0.995, 1.0))
+
+
+def _observe_pendulum(seen: Snapshot) -> jax.Array:
+    pole = seen.xmat("pole")
+    return joined(pole[2, 2], pole[0, 2], seen.data.qvel)
+
+
+def _reward_pendulum(seen: Snapshot) -> jax.Array:
+    return tolerance(seen.xmat("pole")[2, 2], (_COSINE_BOUND, 1.0))
+
+
+def _acrobot(margin: float) -> Formulas:
+    return Formulas(_start_anywhere, _observe_acrobot, partial(_reward_acrobot, margin=margin))
+
+
+TASKS = {
+    "dmc_acrobot_swingup": _acrobot(1.0),
+    "dmc_acrobot_swingup_sparse": _acrobot(0.0),
+    "dmc_cartpole_balance": Formulas(_start_upright, _observe_cartpole, _reward_cartpole),
+    "dmc_cartpole_balance_sparse": Formulas(
+        _start_upright, _observe_cartpole, _reward_cartpole_sparse
+    ),
+    "dmc_cartpole_swingup": Formulas(_start_hanging, _observe_cartpole, _reward_cartpole),
+    "dmc_cartpole_swingup_sparse": Formulas(
+        _start_hanging, _observe_cartpole, _reward_cartpole_sparse
+    ),
+    "dmc_pendulum_swingup": Formulas(_start_anywhere, _observe_pendulum, _reward_pendulum),
+}

@@ -1,0 +1,187 @@
+"""Bodies that move to a target: fish, point mass, reacher and swimmer."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+
+from pixelbrax_jax.physics.mjx.dynamics import Dynamics
+from pixelbrax_jax.physics.mjx.formulas import (
+    Formulas,
+    Snapshot,
+    Start,
+    joined,
+    observe_joints,
+    random_joints,
+    random_rotation,
+    small_control,
+    start_anywhere,
+    tolerance,
+)
+from pixelbrax_jax.physics.opengl import mujoco
+
+_FISH_JOINTS = (
+    "tail1",
+    "tail_twist",
+    "tail2",
+    "finright_roll",
+    "finright_pitch",
+    "finleft_roll",
+    "finleft_pitch",
+)
+
+_SWIMMER_BODY_SENSORS = 12
+"""Index of the bodies' velocities, after readings of nose, target and head's axes."""
+
+
+def _start_fish_upright(dynamics: Dynamics, key: jax.Array) -> Start:
+    rotation, joints = jax.random.split(key)
+    model = dynamics.model
+    bend = jax.random.uniform(joints, (model.nq - 7,), minval=-0.2, maxval=0.2)
+    place = jnp.asarray(model.qpos0[:3], jnp.float32)
+    return Start(joined(place, random_rotation(rotation), bend))
+
+
+def _start_fish_swim(dynamics: Dynamics, key: jax.Array) -> Start:
+    fish, target = jax.random.split(key)
+    low, high = jnp.array([-0.4, -0.4, 0.1]), jnp.array([0.4, 0.4, 0.3])
+    place = jax.random.uniform(target, (3,), minval=low, maxval=high)
+    return _start_fish_upright(dynamics, fish).replace(target=place)
+
+
+def _fish_upright(seen: Snapshot) -> jax.Array:
+    return seen.xmat("torso")[2, 2]
+
+
+def _fish_to_target(seen: Snapshot) -> jax.Array:
+    """Return (3,) metres, the vector from the mouth to the target in the mouth's frame."""
+    return (seen.target - seen.geom_pos("mouth")) @ seen.geom_mat("mouth")
+
+
+def _observe_fish_upright(seen: Snapshot) -> jax.Array:
+    return joined(seen.joint_pos(*_FISH_JOINTS), _fish_upright(seen), seen.data.qvel)
+
+
+def _observe_fish_swim(seen: Snapshot) -> jax.Array:
+    joints = seen.joint_pos(*_FISH_JOINTS)
+    return joined(joints, _fish_upright(seen), _fish_to_target(seen), seen.data.qvel)
+
+
+def _reward_fish_upright(seen: Snapshot) -> jax.Array:
+    return tolerance(_fish_upright(seen), (1.0, 1.0), margin=1.0)
+
+
+def _reward_fish_swim(seen: Snapshot) -> jax.Array:
+    reach = sum(float(seen.model.geom(name).size[0]) for name in ("mouth", "target"))
+    near = tolerance(jnp.linalg.norm(_fish_to_target(seen)), (0.0, reach), margin=2 * reach)
+    return (7 * near + 0.5 * (_fish_upright(seen) + 1)) / 8
+
+
+def _hide_target(model: mujoco.MjModel) -> None:
+    model.geom("target").rgba[3] = 0.0
+
+
+def _reward_point_mass(seen: Snapshot) -> jax.Array:
+    distance = jnp.linalg.norm(seen.geom_pos("target") - seen.geom_pos("pointmass"))
+    radius = float(seen.model.geom("target").size[0])
+    near = tolerance(distance, (0.0, radius), margin=radius)
+    return near * (jnp.mean(small_control(seen.data.ctrl)) + 4) / 5
+
+
+def _start_reacher(dynamics: Dynamics, key: jax.Array) -> Start:
+    """Sample joint positions, and a target 5 to 20 cm away from the shoulder."""
+    joints, angle, radius = jax.random.split(key, 3)
+    model = dynamics.model
+    angle = jax.random.uniform(angle, (), minval=0.0, maxval=2 * jnp.pi)
+    radius = jax.random.uniform(radius, (), minval=0.05, maxval=0.20)
+    height = float(model.geom("target").pos[2])
+    target = jnp.stack([radius * jnp.sin(angle), radius * jnp.cos(angle), height])
+    return Start(random_joints(model, joints), target=target)
+
+
+def _reacher_to_target(seen: Snapshot) -> jax.Array:
+    """Return (2,) metres, the vector from the finger to the target in the plane."""
+    return (seen.target - seen.geom_pos("finger"))[:2]
+
+
+def _observe_reacher(seen: Snapshot) -> jax.Array:
+    return joined(seen.data.qpos, _reacher_to_target(seen), seen.data.qvel)
+
+
+def _reward_reacher(seen: Snapshot) -> jax.Array:
+    reach = sum(float(seen.model.geom(name).size[0]) for name in ("target", "finger"))
+    return tolerance(jnp.linalg.norm(_reacher_to_target(seen)), (0.0, reach))
+
+
+def _resize_target(model: mujoco.MjModel, *, radius: float) -> None:
+    model.geom("target").size[0] = radius
+
+
+def _start_swimmer(dynamics: Dynamics, key: jax.Array) -> Start:
+    joints, near, place = jax.random.split(key, 3)
+    model = dynamics.model
+    reach = jnp.where(jax.random.uniform(near) < 0.2, 0.3, 2.0)
+    xy = jax.random.uniform(place, (2,), minval=-1.0, maxval=1.0) * reach
+    target = joined(xy, float(model.geom("target").pos[2]))
+    return Start(random_joints(model, joints), target=target)
+
+
+def _swimmer_to_target(seen: Snapshot) -> jax.Array:
+    """Return (2,) metres, the vector from the nose to the target in the head's frame."""
+    return ((seen.target - seen.geom_pos("nose")) @ seen.xmat("head"))[:2]
+
+
+def _observe_swimmer(seen: Snapshot) -> jax.Array:
+    """Return joint positions, vector to the target, and each body's velocities in its frame."""
+    names = [seen.model.sensor(i).name for i in range(seen.model.nsensor)]
+    readings = seen.sensor(*names)[_SWIMMER_BODY_SENSORS:].reshape(-1, 6)
+    return joined(seen.data.qpos[3:], _swimmer_to_target(seen), readings[:, jnp.array([0, 1, 5])])
+
+
+def _reward_swimmer(seen: Snapshot) -> jax.Array:
+    radius = float(seen.model.geom("target").size[0])
+    distance = jnp.linalg.norm(_swimmer_to_target(seen))
+    return tolerance(distance, (0.0, radius), margin=5 * radius, sigmoid="long_tail")
+
+
+def _reacher(radius: float) -> Formulas:
+    edit = partial(_resize_target, radius=radius)
+    return Formulas(
+        _start_reacher, _observe_reacher, _reward_reacher, edit=edit, movable=("target",)
+    )
+
+
+def _swimmer(num_bodies: int) -> Formulas:
+    return Formulas(
+        _start_swimmer,
+        _observe_swimmer,
+        _reward_swimmer,
+        substeps=15,
+        options={"num_bodies": num_bodies},
+        movable=("target", "target_light"),
+    )
+
+
+TASKS = {
+    "dmc_fish_upright": Formulas(
+        _start_fish_upright,
+        _observe_fish_upright,
+        _reward_fish_upright,
+        substeps=10,
+        edit=_hide_target,
+    ),
+    "dmc_fish_swim": Formulas(
+        _start_fish_swim,
+        _observe_fish_swim,
+        _reward_fish_swim,
+        substeps=10,
+        movable=("target",),
+    ),
+    "dmc_point_mass_easy": Formulas(start_anywhere, observe_joints, _reward_point_mass),
+    "dmc_reacher_easy": _reacher(0.05),
+    "dmc_reacher_hard": _reacher(0.015),
+    "dmc_swimmer_swimmer6": _swimmer(6),
+    "dmc_swimmer_swimmer15": _swimmer(15),
+}

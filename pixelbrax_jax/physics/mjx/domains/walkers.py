@@ -1,0 +1,213 @@
+"""Bodies that stand, walk, run or hop: cheetah, hopper, humanoid, quadruped and walker."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pixelbrax_jax.physics.mjx.dynamics import Dynamics
+from pixelbrax_jax.physics.mjx.formulas import (
+    Formulas,
+    Snapshot,
+    Start,
+    joined,
+    random_joints,
+    random_rotation,
+    rising,
+    small_control,
+    start_anywhere,
+    start_free_of_contact,
+    tolerance,
+)
+from pixelbrax_jax.physics.opengl import mujoco
+
+_CHEETAH_SPEED = 10.0
+_CHEETAH_SETTLING_STEPS = 200
+
+_HOPPER_HEIGHT = 0.6
+_HOPPER_SPEED = 2.0
+
+_HUMANOID_HEIGHT = 1.4
+
+_QUADRUPED_LIFT = 0.01
+"""Metres between two tested heights."""
+_QUADRUPED_EPISODE = 20.0
+"""Seconds of an episode; sets the size of the floor."""
+
+_WALKER_HEIGHT = 1.2
+
+
+def _start_cheetah(dynamics: Dynamics, key: jax.Array) -> Start:
+    """Sample limited joints, then let the body fall for 200 physics steps.
+
+    As in DM Control, the first step uses the forces of the model's default pose.
+    """
+    model = dynamics.model
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data)
+    joints = random_joints(model, key)
+    # The root's hinge has no limit, so it is not sampled.
+    limited = np.zeros(model.nq, bool)
+    limited[model.jnt_qposadr[model.jnt_limited == 1]] = True
+    qpos = jnp.where(limited, joints, model.qpos0) + (data.qpos - model.qpos0)
+    state = dynamics.state(qpos, data.qvel)
+    state, _ = dynamics.step(state, _CHEETAH_SETTLING_STEPS - 1)
+    return Start(state.qpos, state.qvel)
+
+
+def _observe_cheetah(seen: Snapshot) -> jax.Array:
+    """Return joint positions without x, and velocities."""
+    return joined(seen.data.qpos[1:], seen.data.qvel)
+
+
+def _reward_cheetah(seen: Snapshot) -> jax.Array:
+    speed = seen.sensor("torso_subtreelinvel")[0]
+    return rising(speed, _CHEETAH_SPEED, margin=_CHEETAH_SPEED)
+
+
+def _observe_hopper(seen: Snapshot) -> jax.Array:
+    touch = jnp.log1p(seen.sensor("touch_toe", "touch_heel"))
+    return joined(seen.data.qpos[1:], seen.data.qvel, touch)
+
+
+def _standing_hopper(seen: Snapshot) -> jax.Array:
+    height = (seen.xipos("torso") - seen.xipos("foot"))[2]
+    return tolerance(height, (_HOPPER_HEIGHT, 2.0))
+
+
+def _reward_hopper_stand(seen: Snapshot) -> jax.Array:
+    small = small_control(seen.data.ctrl)
+    return _standing_hopper(seen) * (jnp.mean(small) + 4) / 5
+
+
+def _reward_hopper_hop(seen: Snapshot) -> jax.Array:
+    speed = seen.sensor("torso_subtreelinvel")[0]
+    standing = _standing_hopper(seen)
+    return standing * rising(speed, _HOPPER_SPEED, _HOPPER_SPEED / 2, value_at_margin=0.5)
+
+
+def _observe_humanoid(seen: Snapshot) -> jax.Array:
+    torso, frame = seen.xpos("torso"), seen.xmat("torso")
+    limbs = ("left_hand", "left_foot", "right_hand", "right_foot")
+    extremities = [(seen.xpos(limb) - torso) @ frame for limb in limbs]
+    return joined(
+        seen.data.qpos[7:],
+        seen.xpos("head")[2],
+        *extremities,
+        frame[2],
+        seen.sensor("torso_subtreelinvel"),
+        seen.data.qvel,
+    )
+
+
+def _reward_humanoid(seen: Snapshot, *, speed: float) -> jax.Array:
+    height = seen.xpos("head")[2]
+    standing = tolerance(height, (_HUMANOID_HEIGHT, jnp.inf), margin=_HUMANOID_HEIGHT / 4)
+    upright = rising(seen.xmat("torso")[2, 2], 0.9, margin=1.9)
+    stand = (4 + jnp.mean(small_control(seen.data.ctrl))) / 5 * standing * upright
+    velocity = seen.sensor("torso_subtreelinvel")[:2]
+    if speed == 0:
+        return stand * jnp.mean(tolerance(velocity, margin=2.0))
+    move = rising(jnp.linalg.norm(velocity), speed, margin=speed)
+    return stand * (5 * move + 1) / 6
+
+
+def _start_quadruped(dynamics: Dynamics, key: jax.Array) -> Start:
+    """Sample any rotation, at the lowest contact-free height in whole centimetres.
+
+    Distances from the floor grow with the height, so they need to be computed only at height 0.
+    """
+    model = dynamics.model
+    rotation = random_rotation(key)
+    joints = jnp.asarray(model.qpos0[7:], jnp.float32)
+    depth = -dynamics.clearance(joined(jnp.zeros(3), rotation, joints), "floor")
+    height = _QUADRUPED_LIFT * jnp.ceil(jnp.maximum(depth, 0.0) / _QUADRUPED_LIFT)
+    return Start(joined(jnp.zeros(2), height, rotation, joints))
+
+
+def _observe_quadruped(seen: Snapshot) -> jax.Array:
+    model, kinds = seen.model, mujoco.mjtSensor
+    hinges = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE)
+    names = [model.joint(int(hinge)).name for hinge in hinges]
+    return joined(
+        seen.joint_pos(*names),
+        seen.joint_vel(*names),
+        seen.data.act,
+        seen.sensor("velocimeter"),
+        seen.xmat("torso")[2, 2],
+        seen.sensors_of(kinds.mjSENS_GYRO, kinds.mjSENS_ACCELEROMETER),
+        jnp.arcsinh(seen.sensors_of(kinds.mjSENS_FORCE, kinds.mjSENS_TORQUE)),
+    )
+
+
+def _reward_quadruped(seen: Snapshot, *, speed: float) -> jax.Array:
+    upright = rising(seen.xmat("torso")[2, 2], 1.0, margin=2.0)
+    return upright * rising(seen.sensor("velocimeter")[0], speed, speed, value_at_margin=0.5)
+
+
+def _observe_walker(seen: Snapshot) -> jax.Array:
+    axes = seen.data.xmat[1:][:, 0][:, jnp.array([0, 2])]
+    return joined(axes, seen.xpos("torso")[2], seen.data.qvel)
+
+
+def _reward_walker(seen: Snapshot, *, speed: float) -> jax.Array:
+    height = seen.xpos("torso")[2]
+    standing = tolerance(height, (_WALKER_HEIGHT, jnp.inf), margin=_WALKER_HEIGHT / 2)
+    stand = (3 * standing + (1 + seen.xmat("torso")[2, 2]) / 2) / 4
+    if speed == 0:
+        return stand
+    x_speed = seen.sensor("torso_subtreelinvel")[0]
+    move = rising(x_speed, speed, speed / 2, value_at_margin=0.5)
+    return stand * (5 * move + 1) / 6
+
+
+_hopper = partial(
+    Formulas,
+    start_anywhere,
+    _observe_hopper,
+    substeps=4,
+    reads_forces=True,
+    starts_with_forces=True,
+)
+
+
+def _humanoid(speed: float) -> Formulas:
+    reward = partial(_reward_humanoid, speed=speed)
+    return Formulas(start_free_of_contact, _observe_humanoid, reward, batch_last=False, substeps=5)
+
+
+def _quadruped(speed: float) -> Formulas:
+    return Formulas(
+        _start_quadruped,
+        _observe_quadruped,
+        partial(_reward_quadruped, speed=speed),
+        batch_last=False,
+        substeps=4,
+        options={"floor_size": _QUADRUPED_EPISODE * speed},
+        camera=2,
+        reads_forces=True,
+        starts_with_forces=True,
+    )
+
+
+def _walker(speed: float) -> Formulas:
+    reward = partial(_reward_walker, speed=speed)
+    return Formulas(start_anywhere, _observe_walker, reward, substeps=10)
+
+
+TASKS = {
+    "dmc_cheetah_run": Formulas(_start_cheetah, _observe_cheetah, _reward_cheetah),
+    "dmc_hopper_stand": _hopper(_reward_hopper_stand),
+    "dmc_hopper_hop": _hopper(_reward_hopper_hop),
+    "dmc_humanoid_stand": _humanoid(0.0),
+    "dmc_humanoid_walk": _humanoid(1.0),
+    "dmc_humanoid_run": _humanoid(10.0),
+    "dmc_quadruped_walk": _quadruped(0.5),
+    "dmc_quadruped_run": _quadruped(5.0),
+    "dmc_walker_stand": _walker(0.0),
+    "dmc_walker_walk": _walker(1.0),
+    "dmc_walker_run": _walker(8.0),
+}
