@@ -171,11 +171,7 @@ class StatefulEnv:
         shape = (self.env.action_size,)
         action = as_actions(action, shape if self.single else (self.num_envs, *shape), self.device)
         packed, spare = self._latest.packed, self._spare(self._latest)
-        if mask is None:
-            stepped = self._programs.step(packed, action, self.params, spare)
-        else:
-            stepped = self._programs.step_where(packed, mask, action, self.params, spare)
-        return self._replace(stepped, keep)
+        return self._replace(self._programs.step(packed, action, self.params, spare, mask), keep)
 
     @property
     def extra(self) -> Any:
@@ -200,11 +196,11 @@ class StatefulEnv:
         self._check_usable()
         self._programs.check_state(state, self.params)
         if mask is None:
-            return self._replace(self._programs.start(state, self.params))
+            return self._replace(self._programs.start(state, self.params, None, None))
         if self._snapshot is None:
             raise error.ResetNeeded("the first reset must be of all environments.")
         packed = self._snapshot.packed
-        return self._replace(self._programs.start_where(packed, mask, state, self.params))
+        return self._replace(self._programs.start(state, self.params, packed, mask))
 
     def set_time_limit(self, control_steps: int) -> None:
         """Set the time limit of current and later episodes, at least 1."""

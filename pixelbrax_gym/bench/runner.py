@@ -1,4 +1,4 @@
-"""Run cases in separate processes and store their outcomes."""
+"""Run cases in separate processes."""
 
 from __future__ import annotations
 
@@ -6,19 +6,12 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
-from pixelbrax_gym.bench import report
-from pixelbrax_gym.bench.case import ABSENT, AbsentError, Case, Group
-from pixelbrax_gym.bench.machine import file_stem
-from pixelbrax_gym.bench.results import Results
-from pixelbrax_gym.bench.tables import number
-from pixelbrax_jax.stop_signals import stop_signals
+from pixelbrax_gym.bench.cases import ABSENT, AbsentError, Case
 
 OUT_OF_MEMORY = (
     "resource_exhausted",
@@ -28,50 +21,6 @@ OUT_OF_MEMORY = (
     "bad_alloc",
     "cannot allocate memory",
 )
-
-
-def measure_all(
-    cases: Sequence[Case],
-    groups: Mapping[str, Group],
-    output_dir: Path,
-    *,
-    again: bool = False,
-    timeout: float = 900.0,
-) -> tuple[Path, bool]:
-    """Measure the cases without a result on this machine and write results, page and plot.
-
-    Returns the JSON file, and whether a case failed other than by memory or an absent package.
-
-    Raises:
-        KeyboardInterrupt: a signal to stop arrived, with its number; the results are written.
-    """
-    # A process that outlives this one would disturb later measurements.
-    before = {number: signal.signal(number, _interrupt) for number in stop_signals()}
-    try:
-        machine = measure(Case("machine", "machine.describe"), 300.0)
-        if machine["status"] != "ok":
-            raise RuntimeError(machine["why"])
-        file = output_dir / f"{file_stem(machine['values'])}.json"
-        results = Results(file, machine["values"])
-        todo = [case for case in cases if again or not results.has(case)]
-        output_dir.mkdir(parents=True, exist_ok=True)
-        _say(f"{len(todo)} of {len(cases)} cases to measure; results in {file}\n")
-        failed = False
-        try:
-            for index, case in enumerate(todo, 1):
-                about = " ".join(f"{k}={v}" for k, v in case.arguments.items())
-                _say(f"{index}/{len(todo)}  {case.group} {about} ...")
-                outcome = measure(case, timeout)
-                failed |= outcome["status"] == "failed"
-                results.add(case, outcome)
-                _say(f" {_in_words(outcome)} ({outcome['seconds']:.0f} s)\n")
-        finally:
-            if file.exists():
-                report.write(file, groups)
-    finally:
-        for signal_number, handler in before.items():
-            signal.signal(signal_number, handler)
-    return file, failed
 
 
 def measure(case: Case, timeout: float) -> dict[str, Any]:
@@ -130,22 +79,3 @@ def _kill(child: subprocess.Popen[str]) -> None:
         return
     with suppress(ProcessLookupError):
         os.killpg(child.pid, signal.SIGKILL)
-
-
-def _interrupt(number: int, _frame: Any) -> None:
-    raise KeyboardInterrupt(number)
-
-
-def _in_words(outcome: dict[str, Any]) -> str:
-    if outcome["status"] != "ok":
-        return f"{outcome['status']}: {outcome['why'].strip().splitlines()[-1]}"
-    values = outcome["values"]
-    for name, unit in (("steps_per_second", "steps/s"), ("frames_per_second", "frames/s")):
-        if name in values:
-            return f"{number(values[name])} {unit}"
-    return "done"
-
-
-def _say(text: str) -> None:
-    sys.stdout.write(text)
-    sys.stdout.flush()

@@ -63,7 +63,7 @@ def main() -> None:
         return obs
 
     if what == "measure":
-        from pixelbrax_gym.bench.timing import rate
+        from pixelbrax_gym.bench.throughput import rate
 
         found["speed"] = rate(run)
     sys.stdout.write(json.dumps(found) + "\n")

@@ -102,9 +102,12 @@ BENCHMARKS = ("cpu-avx512", "cpu-avx2")
 
 
 def page_of(machine: str) -> str:
-    """The page of whole results."""
-    picture = f"{machine}.png" if (ROOT / f"docs/benchmarks/{machine}.png").exists() else None
-    return report.page(performance.read(f"benchmarks/{machine}.json"), GROUPS, picture)
+    """The page of whole results, with their plot above the first part."""
+    text = report.page(performance.read(f"benchmarks/{machine}.json"), GROUPS)
+    if not (ROOT / f"docs/benchmarks/{machine}.png").exists():
+        return text
+    plot = f"![Steps per second over the number of environments]({machine}.png)"
+    return text.replace("\n\n## ", f"\n\n{plot}\n\n## ", 1)
 
 
 def main() -> None:

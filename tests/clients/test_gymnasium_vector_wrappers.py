@@ -25,22 +25,11 @@ from gymnasium.wrappers import vector as wrappers
 from numpy.testing import assert_allclose, assert_array_equal
 
 from tests.clients.ball import ACTIONS, LIMIT, frames_of, make, make_vec, play
-from tests.clients.wrapper_cases import CHANGES, PICTURES, UNSEEN, darken, moments, same
+from tests.clients.wrapper_cases import CHANGES, PICTURES, UNSEEN, cases, darken, moments, same
 
-CASES = {}
+CASES, case = cases()
 # Three balls that go their own ways, beyond the end of the first episode.
 MANY = np.stack([ACTIONS, -ACTIONS, ACTIONS[::-1]], axis=1)
-
-
-def case(name):
-    """Files a test under the wrapper it is about."""
-
-    def file(test):
-        assert name not in CASES
-        CASES[name] = test
-        return test
-
-    return file
 
 
 @pytest.mark.parametrize("name", wrappers.__all__)

@@ -14,20 +14,9 @@ from gymnasium.utils.env_checker import check_env
 from numpy.testing import assert_allclose, assert_array_equal
 
 from tests.clients.ball import ACTIONS, LIMIT, frames_of, make, play
-from tests.clients.wrapper_cases import CHANGES, PICTURES, UNSEEN, darken, moments, same
+from tests.clients.wrapper_cases import CHANGES, PICTURES, UNSEEN, cases, darken, moments, same
 
-CASES = {}
-
-
-def case(name):
-    """Files a test under the wrapper it is about."""
-
-    def file(test):
-        assert name not in CASES
-        CASES[name] = test
-        return test
-
-    return file
+CASES, case = cases()
 
 
 @pytest.mark.parametrize("name", [name for name in wrappers.__all__ if name != "vector"])

@@ -86,6 +86,17 @@ CHANGES = {
 }
 
 
+def cases() -> tuple[dict[str, Callable], Callable]:
+    """Tests by the wrapper they are about, and a decorator that files one."""
+    filed: dict[str, Callable] = {}
+
+    def case(name: str) -> Callable[[Callable], Callable]:
+        assert name not in filed
+        return lambda test: filed.setdefault(name, test)
+
+    return filed, case
+
+
 def darken(pixels: np.ndarray) -> np.ndarray:
     """Half of the brightness, in place."""
     pixels //= 2

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import builtins
-import importlib
-import sys
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -100,25 +96,3 @@ def test_refilling_the_action_buffer_at_once_is_harmless(make_vector):
 def test_devices_must_agree():
     with pytest.raises(ValueError, match=r"on device meta, the environment on cpu:0"):
         dlpack.actions_to_jax(torch.zeros(1, device="meta"), jax.devices("cpu")[0])
-
-
-@pytest.mark.parametrize(
-    ("package", "module", "extra"),
-    [
-        ("torch", "pixelbrax_gym.interop.dlpack", "torch"),
-        ("torchrl", "pixelbrax_gym.torchrl.env", "torchrl"),
-        ("stable_baselines3", "pixelbrax_gym.sb3.vec_env", "sb3"),
-    ],
-)
-def test_a_missing_package_is_named_with_the_cure(monkeypatch, package, module, extra):
-    real = builtins.__import__
-
-    def without(name, *args, **kwargs):
-        if name.partition(".")[0] == package:
-            raise ImportError(name)
-        return real(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", without)
-    monkeypatch.delitem(sys.modules, module, raising=False)
-    with pytest.raises(ImportError, match=rf'pip install "pixelbrax\[{extra}\]"'):
-        importlib.import_module(module)
