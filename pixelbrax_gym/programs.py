@@ -64,14 +64,13 @@ class Programs:
 
     Programs take and return packed states and do not modify their arguments, so an exception
     leaves the state before or after a step. New frames reuse the memory of ``spare``, frames
-    that are not read again. Outputs are not read again and can be handed out.
+    that are not read again. With ``single``, actions and outputs lack the leading axis.
 
     ``programs_of`` makes one object per set of options, compared by identity, because JAX compares
-    it in every call. With ``single``, actions and outputs lack the leading axis.
+    it in every call.
     """
 
     def __init__(self, vector: VectorPixelEnv, single: bool) -> None:
-        """Store the arguments; the first call of each program compiles it."""
         self.vector, self.single = vector, single
         self._specs: dict[Any, EnvState] = {}
 

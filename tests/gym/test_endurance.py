@@ -1,8 +1,11 @@
-"""Long runs leak nothing."""
+"""Long runs: no leak, the same bits in two processes."""
 
 from __future__ import annotations
 
 import gc
+import hashlib
+import subprocess
+import sys
 from pathlib import Path
 
 import jax
@@ -41,3 +44,31 @@ def test_nothing_leaks(num_calls, name):
     assert abs(arrays_later - arrays) < 10
     # A single leaked observation a step would be 2.6 kB.
     assert memory_later - memory < 4 + num_calls * 0.2e-3
+
+
+DIGEST = """
+import hashlib, gymnasium, numpy as np, pixelbrax_gym
+env = gymnasium.make_vec(
+    "PixelBrax/InvertedPendulum-v0", num_envs=2, height=16, width=16, obs_mode="both",
+    max_episode_steps=20,
+)
+digest = hashlib.sha256()
+def add(*arrays):
+    for array in arrays:
+        digest.update(np.ascontiguousarray(array).tobytes())
+obs, _ = env.reset(seed=3)
+add(obs["pixels"], obs["state"])
+rng = np.random.default_rng(0)
+for _ in range(64):
+    obs, *rest, infos = env.step(rng.uniform(-1, 1, (2, 1)).astype(np.float32))
+    add(obs["pixels"], obs["state"], *rest, infos["episode_return"])
+print(digest.hexdigest())
+"""
+
+
+@pytest.mark.slow
+def test_two_processes_agree_bitwise():
+    command = [sys.executable, "-c", DIGEST]
+    runs = [subprocess.run(command, capture_output=True, check=True, text=True) for _ in "ab"]
+    assert len(runs[0].stdout.strip()) == len(hashlib.sha256().hexdigest())
+    assert runs[0].stdout == runs[1].stdout
