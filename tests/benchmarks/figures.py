@@ -118,8 +118,10 @@ def main() -> None:
     for machine in BENCHMARKS:
         (ROOT / f"docs/benchmarks/{machine}.md").write_text(page_of(machine), "utf-8")
     if "--plots" in sys.argv[1:]:
+        from tests.benchmarks import plots
+
         results.plot()
-        dmc_page.plot(dmc_page.FOLDER / "learning.png")
+        plots.learning_dmc(dmc_page.kept_runs(), dmc_page.FOLDER / "learning.png")
 
 
 if __name__ == "__main__":

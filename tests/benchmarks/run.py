@@ -20,8 +20,8 @@ from pixelbrax_gym.bench.cases import TASKS
 from pixelbrax_gym.cli import bench
 from pixelbrax_jax.tasks import DMC_TASKS
 from pixelbrax_jax.validation import check_choice
+from tests.benchmarks import plots
 from tests.benchmarks.cases import GROUPS
-from tests.benchmarks.speed_plot import plot
 
 ON_REQUEST = ("peers", "dmc", "gpu-program", "tpu-program")
 """They need what is not installed with the tests: OpenGL, other simulators, compilers."""
@@ -46,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     names = options.only or [name for name in GROUPS if name not in ON_REQUEST]
     status = bench.measure_groups(options, GROUPS, names)
     for file in options.output_dir.glob("*.json"):
-        plot(file)
+        plots.speed(file)
     return status
 
 

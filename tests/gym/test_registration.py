@@ -160,17 +160,3 @@ def test_spaces_cost_nothing_and_print_fast():
     copy = pickle.loads(pickle.dumps(env.observation_space))
     assert copy == env.observation_space
     assert copy.low.strides == (0, 0, 0, 0)
-
-
-def test_spaces_equal_ordinary_boxes(make_vector):
-    env = make_vector(obs_mode="both")
-    pixels = gymnasium.spaces.Box(0, 255, (3, 12, 12, 6), np.uint8)
-    assert env.observation_space["pixels"] == pixels
-    assert pixels == env.observation_space["pixels"]
-    assert env.single_action_space == gymnasium.spaces.Box(-1, 1, (1,), np.float32)
-    assert env.single_action_space != gymnasium.spaces.Box(-1, 2, (1,), np.float32)
-    assert env.action_space.sample().shape == (3, 1)
-    env.action_space.seed(4)
-    first = env.action_space.sample()
-    env.action_space.seed(4)
-    np.testing.assert_array_equal(first, env.action_space.sample())

@@ -123,14 +123,6 @@ def test_no_seed_means_a_fresh_one(make_single):
     assert len(set(first)) == 3
 
 
-def test_seeds_are_jax_keys(make_single):
-    env = make_single(obs_mode="state")
-    obs, _ = env.reset(seed=11)
-    pixel_env, params = env._stateful.env, env._stateful.params
-    _, timestep = pixel_env.reset(jax.random.key(11), params)
-    np.testing.assert_allclose(obs, timestep.obs, rtol=1e-6)
-
-
 def test_render(make_single):
     env = make_single(render_mode="rgb_array", render_height=20, render_width=30)
     env.reset(seed=0)
