@@ -137,7 +137,7 @@ def test_num_envs(num_envs):
 
 @pytest.mark.parametrize("mode", ["nextstep", None, "NEXT", ["next_step"]])
 def test_autoreset_mode(mode):
-    with pytest.raises(ValueError, match=r"unknown autoreset_mode.*allowed: disabled, next_step"):
+    with pytest.raises(ValueError, match=r"unknown autoreset_mode.*llowed: disabled, next_step"):
         GymnasiumVectorEnv(TASK, 2, autoreset_mode=mode)
 
 
