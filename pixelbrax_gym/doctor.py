@@ -217,11 +217,8 @@ def inspect() -> Machine:
     versions = {name: installed_version(name) for name in (*PACKAGES, *EXTRAS)}
     broken = broken_variables()
     # XLA would abort this process because of its flags.
-    first = broken.get("XLA_FLAGS") or _attempt(_first_device)
-    renderer: Any = None
-    torch_cuda: Any = None
-    to_torch: Any = None
-    to_jax: Any = None
+    first: Any = broken.get("XLA_FLAGS") or _attempt(_first_device)
+    renderer = torch_cuda = to_torch = to_jax = None
     has_jax = not isinstance(first, str)
     if has_jax and isinstance(renderer := _attempt(_renderer), str):
         renderer = "unknown", f"its check fails with {renderer}"

@@ -138,7 +138,7 @@ class Programs:
         """
         if self.single:
             state = jax.tree.map(lambda x: x[None], state)
-        if packed is not None:
+        if packed is not None and mask is not None:
             state = _where(mask, state, self._state(packed, params))
         rewards = jnp.zeros(self.vector.num_envs)
         see = jax.vmap(self.vector.env.timestep, in_axes=(0, 0, None))

@@ -6,6 +6,7 @@ import importlib
 import json
 import os
 import sys
+from contextlib import suppress
 
 # JAX and PyTorch take turns on the same cores.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -23,16 +24,13 @@ def peak_bytes() -> dict[str, int | None]:
     import jax
 
     device = jax.devices()[0].memory_stats() or {}
-    return {"host": _host_bytes(), "device": device.get("peak_bytes_in_use")}
-
-
-def _host_bytes() -> int | None:
-    try:
+    host = None
+    with suppress(ImportError):  # Windows
         import resource
-    except ImportError:  # Windows
-        return None
-    used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return used if sys.platform == "darwin" else 1024 * used
+
+        unit = 1 if sys.platform == "darwin" else 1024
+        host = unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return {"host": host, "device": device.get("peak_bytes_in_use")}
 
 
 if __name__ == "__main__":
