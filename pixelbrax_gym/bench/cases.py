@@ -47,7 +47,7 @@ class Case:
         """
         function = f"{self.package}.{self.measure}"
         arguments = json.dumps(dict(self.arguments))
-        return [sys.executable, "-m", "pixelbrax_gym.bench.worker", function, arguments]
+        return [sys.executable, "-m", "pixelbrax_gym.bench.runner", function, arguments]
 
     def environ(self) -> dict[str, str]:
         """Return additional environment variables for the process."""

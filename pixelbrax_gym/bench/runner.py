@@ -1,11 +1,13 @@
-"""Run cases in separate processes."""
+"""Run cases in processes of their own: ``python -m pixelbrax_gym.bench.runner FUNCTION JSON``."""
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -79,3 +81,30 @@ def _kill(child: subprocess.Popen[str]) -> None:
         return
     with suppress(ProcessLookupError):
         os.killpg(child.pid, signal.SIGKILL)
+
+
+def main() -> None:
+    """Call a function with arguments, given as JSON, and write its result as a JSON line."""
+    # JAX and PyTorch take turns on the same cores.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    module, _, function = sys.argv[1].rpartition(".")
+    result = getattr(importlib.import_module(module), function)(**json.loads(sys.argv[2]))
+    sys.stdout.write(json.dumps({"values": result, "peak_bytes": peak_bytes()}) + "\n")
+
+
+def peak_bytes() -> dict[str, int | None]:
+    """Return the peak memory of this process on host and device in bytes; None if unknown."""
+    import jax
+
+    device = jax.devices()[0].memory_stats() or {}
+    host = None
+    with suppress(ImportError):  # Windows
+        import resource
+
+        unit = 1 if sys.platform == "darwin" else 1024
+        host = unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return {"host": host, "device": device.get("peak_bytes_in_use")}
+
+
+if __name__ == "__main__":
+    main()
