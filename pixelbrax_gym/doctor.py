@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from pixelbrax_gym.bench.machine import PACKAGES, installed_version
 from pixelbrax_jax.cache import cache_folder
@@ -70,42 +70,31 @@ VARIABLES = {
 class Machine:
     """Facts about a machine, as ``inspect`` collects them."""
 
-    versions: dict[str, str | None]
-    """Package -> installed version, or None."""
-    jax_device: str | None
-    """JAX's default device, such as ``cuda:0``."""
-    jax_platform: str | None
-    """``cpu``, ``gpu``, ``tpu``, ..."""
-    jax_error: str | None
-    """Why JAX has no device."""
-    has_nvidia: bool
-    """Whether the system has an NVIDIA GPU."""
+    versions: dict[str, str | None]  # package -> installed version, or None
+    jax_device: str | None  # JAX's default device, such as cuda:0
+    jax_platform: str | None  # cpu, gpu, tpu, ...
+    jax_error: str | None  # why JAX has no device
+    has_nvidia: bool  # whether the system has an NVIDIA GPU
+    # Whether torch can use CUDA, a tensor shares the memory of its array, and an array that of its
+    # tensor; or the error; None without torch.
     torch_cuda: bool | str | None
-    """Whether torch can use CUDA, or the error of its import; None without torch."""
     to_torch: bool | str | None
-    """Whether a tensor shares the memory of its array, or the error; None without torch."""
     to_jax: bool | str | None
-    """Whether an array shares the memory of its tensor, or the error; None without torch."""
-    renderer: tuple[str, str] | None
-    """Renderer that ``renderer="auto"`` selects, and the reason; None if JAX has no device."""
-    gl_libraries: tuple[str, ...] | None
-    """OpenGL libraries loaded in this process; None if unknown."""
+    renderer: tuple[str, str] | None  # what renderer="auto" selects, and why; None without a device
     environ: dict[str, str]
-    """Environment variables."""
-    broken: dict[str, str]
-    """Name in ``VARIABLES`` -> the error that its value causes."""
-    cache: str
-    """Why the cache cannot be written; empty if it can."""
+    broken: dict[str, str]  # name in VARIABLES -> the error that its value causes
+    cache: str  # why the cache cannot be written; empty if it can
 
 
 class Finding(NamedTuple):
-    """An entry of the report."""
+    """An entry of the report: a ``note`` works, but can be improved; ``fix`` may be empty."""
 
     level: str
-    """``ok``, ``note`` (works, but can be improved) or ``problem``."""
     text: str
     fix: str = ""
-    """Suggested action; may be empty."""
+
+
+_ok, _note, _problem = (partial(Finding, level) for level in ("ok", "note", "problem"))
 
 
 def diagnose(machine: Machine) -> list[Finding]:
@@ -114,18 +103,17 @@ def diagnose(machine: Machine) -> list[Finding]:
 
 
 def _findings(m: Machine) -> Iterator[Finding]:
-    ok, note, problem = (partial(Finding, level) for level in ("ok", "note", "problem"))
     here = ", ".join(f"{name} {release}" for name, release in m.versions.items() if release)
-    yield ok(f"Python {platform.python_version()}, {here}")
+    yield _ok(f"Python {platform.python_version()}, {here}")
     for name, extra in EXTRAS.items():
         if m.versions[name] is None:
-            yield note(f"{name} is not installed", f"optional: {install_extra(extra)}")
+            yield _note(f"{name} is not installed", f"optional: {install_extra(extra)}")
 
     on_cpu, on_gpu = m.jax_platform == "cpu", m.jax_platform in _GPUS
     if m.jax_error is None:
-        yield ok(f"JAX computes on {m.jax_device}")
+        yield _ok(f"JAX computes on {m.jax_device}")
         if on_cpu and m.has_nvidia:
-            yield problem(
+            yield _problem(
                 "there is an NVIDIA GPU, but JAX does not use it",
                 f"{_JAX_ON_CUDA} (nvidia-smi shows the CUDA version), unset JAX_PLATFORMS, and "
                 "import jax before torch, because torch's CUDA libraries may hide JAX's",
@@ -133,7 +121,7 @@ def _findings(m: Machine) -> Iterator[Finding]:
         yield from _about_torch(m, on_cpu, on_gpu)
     elif "XLA_FLAGS" not in m.broken:
         platforms = m.environ.get("JAX_PLATFORMS")
-        yield problem(
+        yield _problem(
             f"JAX finds no device to compute on: {m.jax_error}"
             + (f" (JAX_PLATFORMS={platforms})" if platforms else ""),
             f"unset JAX_PLATFORMS, or install the jax that matches your driver: {_JAX_ON_CUDA}",
@@ -141,45 +129,40 @@ def _findings(m: Machine) -> Iterator[Finding]:
     if m.renderer is not None:
         name, why = m.renderer
         unexpected = on_gpu and m.has_nvidia and name != "pallas"
-        yield (note if unexpected else ok)(f"images are rendered by renderer={name!r}: {why}")
+        yield (_note if unexpected else _ok)(f"images are rendered by renderer={name!r}: {why}")
 
     for way, result in (("JAX to torch", m.to_torch), ("torch to JAX", m.to_jax)):
         if result is True:
-            yield ok(f"arrays pass from {way} without a copy")
+            yield _ok(f"arrays pass from {way} without a copy")
         elif result is False:
-            yield problem(
+            yield _problem(
                 f"arrays are copied from {way}",
                 "install current versions of torch and jax, such as those in constraints.txt",
             )
         elif result is not None:
-            yield problem(
+            yield _problem(
                 f"arrays cannot pass from {way}: {result}",
                 "fix the problems with devices above, or use output='numpy'",
             )
 
     new, old = _FRACTIONS
     if new in m.environ and old in m.environ:
-        yield problem(f"{new} and {old} are both set, which is an error in JAX", f"unset {old}")
+        yield _problem(f"{new} and {old} are both set, which is an error in JAX", f"unset {old}")
     share = _memory_share(m.environ)
     if on_gpu and share <= 0.5:
-        yield ok("JAX leaves GPU memory for other libraries")
+        yield _ok("JAX leaves GPU memory for other libraries")
     elif on_gpu and m.torch_cuda:
-        yield note(
+        yield _note(
             f"JAX reserves {share:.0%} of the GPU's memory when it starts; torch gets the rest",
             f"export {new}=0.4, or XLA_PYTHON_CLIENT_PREALLOCATE=false, before Python starts",
         )
 
-    if m.gl_libraries:
-        names = ", ".join(m.gl_libraries)
-        yield note(f"rendering needs no OpenGL, but another library has loaded {names}")
-    else:
-        yield ok("rendering needs no OpenGL and no display")
     for name, why in m.broken.items():
         level, effect = VARIABLES[name].level, VARIABLES[name].effect
         text = f"with {name}={m.environ.get(name, '')}, {effect}: {why}"
         yield Finding(level, text, f"unset {name}, or correct its value")
     if m.cache:
-        yield note(
+        yield _note(
             f"clips cannot be cached, so every run reads them again: {m.cache}",
             "export PIXELBRAX_CACHE=<a writable folder>",
         )
@@ -188,40 +171,28 @@ def _findings(m: Machine) -> Iterator[Finding]:
 def _about_torch(m: Machine, on_cpu: bool, on_gpu: bool) -> Iterator[Finding]:
     site = "https://pytorch.org/get-started/locally"
     if isinstance(m.torch_cuda, str):
-        yield Finding(
-            "problem",
-            f"torch is installed but cannot be imported: {m.torch_cuda}",
-            f"reinstall it, see {site}",
-        )
+        text = f"torch is installed but cannot be imported: {m.torch_cuda}"
+        yield _problem(text, f"reinstall it, see {site}")
     elif m.torch_cuda is None:
         return
     elif not on_cpu and not on_gpu:
-        yield Finding(
-            "note",
-            f"torch cannot share the memory of a {m.jax_platform}",
-            "use output='numpy' or output='jax'",
-        )
+        text = f"torch cannot share the memory of a {m.jax_platform}"
+        yield _note(text, "use output='numpy' or output='jax'")
     elif on_cpu and m.torch_cuda:
-        yield Finding(
-            "problem",
-            "torch uses CUDA but JAX uses the CPU: rendering is slow and frames must be copied",
-            _JAX_ON_CUDA,
-        )
+        text = "torch uses CUDA but JAX uses the CPU: rendering is slow and frames must be copied"
+        yield _problem(text, _JAX_ON_CUDA)
     elif on_gpu and not m.torch_cuda:
-        yield Finding(
-            "problem",
-            "JAX uses the GPU but torch cannot: output='torch' will not work",
-            f"install a torch built for CUDA, see {site}",
-        )
+        text = "JAX uses the GPU but torch cannot: output='torch' will not work"
+        yield _problem(text, f"install a torch built for CUDA, see {site}")
     else:
-        yield Finding("ok", "JAX and torch see the same device")
+        yield _ok("JAX and torch see the same device")
 
 
 def _memory_share(environ: Mapping[str, str]) -> float:
     """Return the fraction of GPU memory that JAX reserves when it starts."""
-    if environ.get("XLA_PYTHON_CLIENT_PREALLOCATE") in ("false", "False", "0"):
-        return 0.0
-    if environ.get("XLA_PYTHON_CLIENT_ALLOCATOR", "").lower() in ("platform", "cuda_async"):
+    allocator = environ.get("XLA_PYTHON_CLIENT_ALLOCATOR", "").lower()
+    as_needed = environ.get("XLA_PYTHON_CLIENT_PREALLOCATE") in ("false", "False", "0")
+    if as_needed or allocator in ("platform", "cuda_async"):
         return 0.0
     try:
         return float(environ.get(_FRACTIONS[0]) or environ.get(_FRACTIONS[1]) or 0.75)
@@ -244,43 +215,27 @@ def report(findings: list[Finding]) -> str:
 def inspect() -> Machine:
     """Inspect this machine; starts JAX and takes a second or two."""
     versions = {name: installed_version(name) for name in (*PACKAGES, *EXTRAS)}
-    device = jax_platform = jax_error = renderer = None
     broken = broken_variables()
-    try:
-        if "XLA_FLAGS" in broken:  # XLA would abort this process.
-            raise RuntimeError(broken["XLA_FLAGS"])
-        import jax
-
-        first = jax.devices()[0]
-        device, jax_platform = str(first), first.platform
-    except Exception as error:  # Any error is reported, not raised.
-        jax_error = f"{type(error).__name__}: {error}"
-    if jax_error is None:
-        try:
-            from pixelbrax_jax.renderer.choice import auto_renderer
-
-            renderer = auto_renderer()
-        except Exception as error:
-            renderer = "unknown", f"its check fails with {type(error).__name__}: {error}"
-    torch_cuda: bool | str | None = None
-    to_torch: bool | str | None = None
-    to_jax: bool | str | None = None
+    # XLA would abort this process because of its flags.
+    first: Any = broken.get("XLA_FLAGS") or _attempt(_first_device)
+    renderer = torch_cuda = to_torch = to_jax = None
+    has_jax = not isinstance(first, str)
+    if has_jax and isinstance(renderer := _attempt(_renderer), str):
+        renderer = "unknown", f"its check fails with {renderer}"
     if versions["torch"] is not None:
         torch_cuda = _attempt(_torch_has_cuda)
-        sharing = jax_platform == "cpu" or jax_platform in _GPUS
-        if jax_error is None and sharing and isinstance(torch_cuda, bool):
+        if has_jax and first.platform in ("cpu", *_GPUS) and not isinstance(torch_cuda, str):
             to_torch, to_jax = _attempt(_shares_to_torch), _attempt(_shares_to_jax)
     return Machine(
         versions=versions,
-        jax_device=device,
-        jax_platform=jax_platform,
-        jax_error=jax_error,
+        jax_device=str(first) if has_jax else None,
+        jax_platform=first.platform if has_jax else None,
+        jax_error=None if has_jax else first,
         has_nvidia=Path("/proc/driver/nvidia/version").exists(),
         torch_cuda=torch_cuda,
         to_torch=to_torch,
         to_jax=to_jax,
         renderer=renderer,
-        gl_libraries=_gl_libraries(),
         environ=dict(os.environ),
         broken=broken,
         cache=why_no_cache(),
@@ -325,11 +280,24 @@ def why_no_cache() -> str:
     return "" if os.access(folder, os.W_OK) else f"{folder} cannot be written"
 
 
-def _attempt(check: Callable[[], bool]) -> bool | str:
+def _attempt(check: Callable[[], Any]) -> Any:
+    """Return the result of a check, or its error as text."""
     try:
-        return bool(check())
+        return check()
     except Exception as error:  # Any error is reported, not raised.
         return f"{type(error).__name__}: {error}"
+
+
+def _first_device() -> Any:
+    import jax
+
+    return jax.devices()[0]
+
+
+def _renderer() -> tuple[str, str]:
+    from pixelbrax_jax.renderer.choice import auto_renderer
+
+    return auto_renderer()
 
 
 def _torch_has_cuda() -> bool:
@@ -358,13 +326,3 @@ def _shares_to_jax() -> bool:
     tensor = torch.zeros(1 << 16, device=default_torch_device())
     array = jax.block_until_ready(jax.dlpack.from_dlpack(tensor))
     return bool(array.unsafe_buffer_pointer() == tensor.data_ptr())
-
-
-def _gl_libraries() -> tuple[str, ...] | None:
-    """Return the OpenGL libraries in this process, after everything for rendering is imported."""
-    maps = Path("/proc/self/maps")
-    if not sys.platform.startswith("linux") or not maps.exists():
-        return None
-    names = {Path(line.split()[-1]).name for line in maps.read_text().splitlines() if "/" in line}
-    libraries = ("libGL.", "libEGL.", "libOSMesa.", "libGLX.")
-    return tuple(sorted(name for name in names if name.startswith(libraries)))

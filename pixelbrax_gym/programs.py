@@ -64,14 +64,13 @@ class Programs:
 
     Programs take and return packed states and do not modify their arguments, so an exception
     leaves the state before or after a step. New frames reuse the memory of ``spare``, frames
-    that are not read again. Outputs are not read again and can be handed out.
+    that are not read again. With ``single``, actions and outputs lack the leading axis.
 
     ``programs_of`` makes one object per set of options, compared by identity, because JAX compares
-    it in every call. With ``single``, actions and outputs lack the leading axis.
+    it in every call.
     """
 
     def __init__(self, vector: VectorPixelEnv, single: bool) -> None:
-        """Store the arguments; the first call of each program compiles it."""
         self.vector, self.single = vector, single
         self._specs: dict[Any, EnvState] = {}
 
@@ -104,19 +103,21 @@ class Programs:
         return self._stepped(_with_offsets(state, offsets), timestep, reported)
 
     @_into_spare
-    def step(self, packed: Packed, action: Array, params: EnvParams, spare: Array) -> Stepped:
-        """Step all environments."""
-        del spare
-        return self._stepped(*self._step(self._state(packed, params), action, params))
-
-    @_into_spare
-    def step_where(
-        self, packed: Packed, mask: Array, action: Array, params: EnvParams, spare: Array
+    def step(
+        self,
+        packed: Packed,
+        action: Array,
+        params: EnvParams,
+        spare: Array,
+        mask: Array | None = None,
     ) -> Stepped:
-        """Step environments where ``mask``; others repeat their observation with ``done`` False."""
+        """Step where ``mask``, or all; others repeat their observation with ``done`` False."""
         del spare
         state = self._state(packed, params)
-        stepped, timestep = self._step(state, action, params)
+        action = action[None] if self.single else action
+        stepped, timestep = self.vector.step(state, action, params)
+        if mask is None:
+            return self._stepped(stepped, timestep)
         state = _where(mask, stepped, state)
         packed, ended, outputs = self._stepped(state, timestep.replace(obs=self.vector.obs(state)))
         return Stepped(packed, ended & mask, outputs | {"done": outputs["done"] & mask})
@@ -128,25 +129,26 @@ class Programs:
         return jax.tree.map(lambda x: x[0], state) if self.single else state
 
     @compilation.jit(_env, static_argnums=0)
-    def start(self, state: EnvState, params: EnvParams) -> Stepped:
-        """Continue from states, without the leading axis for a single environment."""
+    def start(
+        self, state: EnvState, params: EnvParams, packed: Packed | None, mask: Array | None
+    ) -> Stepped:
+        """Continue from states where ``mask``, the others from ``packed``; or all from states.
+
+        For a single environment, ``state`` lacks the leading axis.
+        """
         if self.single:
             state = jax.tree.map(lambda x: x[None], state)
-        return self._started(state, params)
-
-    @compilation.jit(_env, static_argnums=0)
-    def start_where(
-        self, packed: Packed, mask: Array, state: EnvState, params: EnvParams
-    ) -> Stepped:
-        """Continue from states where ``mask``, (N,) bool; the others stay."""
-        return self._started(_where(mask, state, self._state(packed, params)), params)
+        if packed is not None and mask is not None:
+            state = _where(mask, state, self._state(packed, params))
+        rewards = jnp.zeros(self.vector.num_envs)
+        see = jax.vmap(self.vector.env.timestep, in_axes=(0, 0, None))
+        return self._stepped(state, see(state, rewards, params))
 
     @compilation.jit(_env, static_argnums=(0, 3, 4))
     def images(self, packed: Packed, params: EnvParams, height: int, width: int) -> jax.Array:
         """Render (N, height, width, 3) uint8 images of the states."""
         env, state = self.vector.env, self._state(packed, params)
-        images: jax.Array = jax.vmap(lambda row: env.image(row, params, height, width))(state)
-        return images
+        return jax.vmap(lambda row: env.image(row, params, height, width))(state)
 
     def check_state(self, state: Any, params: EnvParams) -> None:
         """Reject a state that does not fit; the message names the first difference."""
@@ -183,14 +185,6 @@ class Programs:
 
     def _state(self, packed: Packed, params: EnvParams) -> EnvState:
         return unpack(packed, self._spec(params))
-
-    def _step(self, state: EnvState, action: Array, params: EnvParams) -> tuple[EnvState, Timestep]:
-        return self.vector.step(state, action[None] if self.single else action, params)
-
-    def _started(self, state: EnvState, params: EnvParams) -> Stepped:
-        rewards = jnp.zeros(self.vector.num_envs)
-        see = jax.vmap(self.vector.env.timestep, in_axes=(0, 0, None))
-        return self._stepped(state, see(state, rewards, params))
 
     def _stepped(
         self, state: EnvState, timestep: Timestep, reported: Array | None = None

@@ -52,15 +52,10 @@ class StatefulEnv:
     An exception during a call, such as a ``KeyboardInterrupt``, leaves the states before or after
     the call. Copies and pickles continue as the original does.
 
-    ``reset`` and ``step`` return the ``outputs`` of ``programs.Stepped``: JAX arrays that are not
-    read again and may be handed out without a copy. An environment seeded with s uses only
-    ``jax.random.key(s)``, whatever its index and ``num_envs``.
-
-    Methods that compute raise ``ClosedEnvironmentError`` after ``close`` and ``RuntimeError`` in a
-    fork that cannot run JAX; all but ``reset`` raise ``ResetNeeded`` before the first reset.
-
-    With ``single``, outputs lack the leading axis. ``episode_length`` is the time limit in control
-    steps, and ``is_limited`` tells whether the caller gave it.
+    ``reset`` and ``step`` return the ``outputs`` of ``programs.Stepped``, without the leading axis
+    if ``single``. An environment seeded with s uses only ``jax.random.key(s)``, whatever its index
+    and ``num_envs``. ``episode_length`` is the time limit in control steps, and ``is_limited``
+    tells whether the caller gave it.
     """
 
     def __init__(
@@ -144,11 +139,9 @@ class StatefulEnv:
             stepped = self._programs.reset(numbers, self.params, time_limit_offsets)
             return self._replace(stepped, keep)
         before = self._latest
-        parts: list[tuple[np.ndarray, np.ndarray | None]] = [(where & ~given, None)]
-        if given.any():
-            # Two calls if some environments are seeded and others are not.
-            parts = [part for part in parts if part[0].any()] + [(given, numbers)]
-        for part, new_seeds in parts:
+        parts = [(where & ~given, None), (given, numbers)]
+        # Two calls if some environments are seeded and others are not.
+        for part, new_seeds in [part for part in parts if part[0].any()] or parts[:1]:
             spare = self._spare(before)
             stepped = self._programs.reset_where(
                 before.packed, part, where, self.params, new_seeds, time_limit_offsets, spare
@@ -159,11 +152,10 @@ class StatefulEnv:
     def step(
         self, action: Any, mask: np.ndarray | None = None, keep: Keep | None = None
     ) -> dict[str, Any]:
-        """Step environments where ``mask``, (N,) bool, or all; a single one takes no mask.
+        """Step environments where ``mask``, (N,) bool, or all, by (N, A) or (A,) actions.
 
-        ``action`` is (N, A), or (A,) for a single environment. ``keep`` computes ``extra`` from the
-        program's result. Environments that are not stepped repeat their observation with ``done``
-        False; their other outputs are undefined.
+        ``keep`` computes ``extra`` from the program's result. Environments that are not stepped
+        repeat their observation with ``done`` False; their other outputs are undefined.
         """
         self._check_ready("step")
         if self._must_reset:
@@ -171,11 +163,7 @@ class StatefulEnv:
         shape = (self.env.action_size,)
         action = as_actions(action, shape if self.single else (self.num_envs, *shape), self.device)
         packed, spare = self._latest.packed, self._spare(self._latest)
-        if mask is None:
-            stepped = self._programs.step(packed, action, self.params, spare)
-        else:
-            stepped = self._programs.step_where(packed, mask, action, self.params, spare)
-        return self._replace(stepped, keep)
+        return self._replace(self._programs.step(packed, action, self.params, spare, mask), keep)
 
     @property
     def extra(self) -> Any:
@@ -200,11 +188,11 @@ class StatefulEnv:
         self._check_usable()
         self._programs.check_state(state, self.params)
         if mask is None:
-            return self._replace(self._programs.start(state, self.params))
+            return self._replace(self._programs.start(state, self.params, None, None))
         if self._snapshot is None:
             raise error.ResetNeeded("the first reset must be of all environments.")
         packed = self._snapshot.packed
-        return self._replace(self._programs.start_where(packed, mask, state, self.params))
+        return self._replace(self._programs.start(state, self.params, packed, mask))
 
     def set_time_limit(self, control_steps: int) -> None:
         """Set the time limit of current and later episodes, at least 1."""
@@ -246,7 +234,7 @@ class StatefulEnv:
         return self._device
 
     def __deepcopy__(self, memo: dict[int, Any]) -> StatefulEnv:
-        """Return an independent environment that shares arrays which neither writes to."""
+        """Share arrays that neither the copy nor the original writes to."""
         copied = memo[id(self)] = object.__new__(type(self))
         if self._snapshot is not None:
             self._snapshot = replace(self._snapshot, shared=True, spare=None)

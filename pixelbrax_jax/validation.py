@@ -28,7 +28,8 @@ _ELSEWHERE = {
 
 _ADVICE = {
     "device": " Frames are where JAX computes: on an NVIDIA GPU with the extra cuda12 or cuda13.",
-    "num_envs": " Several environments in one program: gymnasium.make_vec.",
+    "num_envs": " Several environments in one program: gymnasium.make_vec, or in JAX "
+    "VectorPixelEnv(env, num_envs).",
     **dict.fromkeys(
         ("image_size", "img_size", "resolution", "size"), " Did you mean 'height' and 'width'?"
     ),
@@ -44,13 +45,15 @@ def check_choice(
     ``what`` names the option in the message; ``meant`` replaces the nearest name as suggestion.
 
     Raises:
-        ValueError: it is not; the message has the value, all allowed names and the nearest one.
+        ValueError: it is not; the message has the value, the nearest name and all allowed ones.
     """
     names = sorted(allowed)
     if isinstance(value, str) and value in names:
         return value
     question = f" Did you mean {meant!r}?" if meant in names else suggest(value, names)
-    raise ValueError(f"unknown {what}: {value!r}; allowed: {', '.join(names)}.{question}")
+    # The nearest name comes first, because there may be dozens of names.
+    listed = f".{question} Allowed:" if question else "; allowed:"
+    raise ValueError(f"unknown {what}: {value!r}{listed} {', '.join(names)}.")
 
 
 def check_options(given: Iterable[str], allowed: Iterable[str]) -> None:

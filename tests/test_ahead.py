@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from pixelbrax_gym.bench.case import AbsentError
+from pixelbrax_gym.bench.cases import AbsentError
 from tests.benchmarks.ahead import case, compiling, tables
 from tests.benchmarks.ahead.case import DUMP, PROGRAMS
 from tests.benchmarks.ahead.compiling import make_program

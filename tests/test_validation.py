@@ -66,5 +66,5 @@ def test_what_is_no_truth_value(value):
 
 @pytest.mark.parametrize("value", [None, 3, ["spring"], {"a": 1}])
 def test_what_is_no_name(value):
-    with pytest.raises(ValueError, match=r"unknown backend: .*; allowed: mjx, spring"):
+    with pytest.raises(ValueError, match=r"unknown backend: .*llowed: mjx, spring"):
         check_choice("backend", value, ["spring", "mjx"])

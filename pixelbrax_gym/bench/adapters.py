@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Mapping
 from importlib.util import find_spec
-from typing import Any
+from typing import Any, TypeVar
 
 import gymnasium
 import jax
@@ -13,11 +14,61 @@ import numpy as np
 
 import pixelbrax_gym
 import pixelbrax_jax as pb
-from pixelbrax_gym.bench.timing import SECONDS, speed_ratio, take_interleaved
+from pixelbrax_gym.bench.throughput import seconds_of
 from pixelbrax_jax.tasks import TASKS
 
+SECONDS = 90.0
+"""Approximate total duration of a comparison."""
+
+Name = TypeVar("Name")
 Run = Callable[[], Any]
 """Takes some steps and waits for their results."""
+
+
+def compare_speeds(
+    runs: Mapping[Name, Run], steps: int, standard: Callable[[Name], Name], seconds: float = SECONDS
+) -> dict[Name, dict[str, Any]]:
+    """Compare runs of ``steps`` steps in 5 to 300 rounds, about ``seconds`` in total.
+
+    Each round makes all in random order, so a slower machine affects all alike and ratios hold.
+
+    Returns:
+        For each name ``steps_per_second``; ``ratio``, the median over rounds of its speed to that
+        of the name's ``standard``; ``interval``, its 95 % bootstrap interval; and ``runs``, the
+        number of rounds.
+    """
+    for run in runs.values():
+        run()
+    order, random = list(runs), np.random.default_rng(0)
+    times: dict[Name, list[float]] = {name: [] for name in order}
+    started, rounds = time.perf_counter(), 0
+    while rounds < 5 or (rounds < 300 and time.perf_counter() - started < seconds):
+        rounds += 1
+        for place in random.permutation(len(order)):
+            times[order[place]].append(seconds_of(runs[order[place]]))
+    return {
+        name: {
+            "steps_per_second": steps / float(np.median(taken)),
+            **_speed_ratio(np.divide(times[standard(name)], taken)),
+        }
+        for name, taken in times.items()
+    }
+
+
+def _speed_ratio(ratios: np.ndarray) -> dict[str, Any]:
+    drawn = np.random.default_rng(0).choice(ratios, (2000, len(ratios)))
+    low, high = np.quantile(np.median(drawn, axis=1), [0.025, 0.975])
+    return {
+        "ratio": float(np.median(ratios)),
+        "interval": [float(low), float(high)],
+        "runs": len(ratios),
+    }
+
+
+def random_actions(num_steps: int, num_envs: int, action_size: int) -> np.ndarray:
+    """Draw (T, N, A) float32 actions in [-1, 1]."""
+    shape = (num_steps, num_envs, action_size)
+    return np.random.default_rng(0).uniform(-1, 1, shape).astype(np.float32)
 
 
 def compare(task: str, num_envs: int, seconds: float = SECONDS) -> list[dict[str, Any]]:
@@ -27,8 +78,7 @@ def compare(task: str, num_envs: int, seconds: float = SECONDS) -> list[dict[str
     Python loop over the compiled step that has the same autoreset mode and waits for each step.
     """
     env, params = pb.make(task)
-    shape = (max(8, min(100, 512 // num_envs)), num_envs, env.action_size)
-    actions = np.random.default_rng(0).uniform(-1, 1, shape).astype(np.float32)
+    actions = random_actions(max(8, min(100, 512 // num_envs)), num_envs, env.action_size)
     runs: dict[tuple[str, str], Run] = {
         ("JAX scan", "next_step"): scan(task, num_envs, actions),
         ("JAX loop", "next_step"): loop(env, params, num_envs, actions),
@@ -36,20 +86,15 @@ def compare(task: str, num_envs: int, seconds: float = SECONDS) -> list[dict[str
     for output in ("jax", "torch", "numpy") if find_spec("torch") else ("jax", "numpy"):
         runs[f"Gymnasium, {output}", "next_step"] = _gymnasium(task, num_envs, output, actions)
     others = {"torchrl": ("TorchRL", _torchrl), "stable_baselines3": ("Stable-Baselines3", _sb3)}
-    found = [row for package, row in others.items() if find_spec(package)]
-    if found:
+    installed = [row for package, row in others.items() if find_spec(package)]
+    if installed:
         runs["JAX loop", "same_step"] = loop(env, params, num_envs, actions, "same_step")
-    for name, make in found:
+    for name, make in installed:
         runs[name, "same_step"] = make(task, num_envs, actions)
-    times = take_interleaved(runs, seconds)
+    steps = num_envs * len(actions)
+    found = compare_speeds(runs, steps, lambda name: ("JAX loop", name[1]), seconds)
     return [
-        {
-            "adapter": name,
-            "autoreset_mode": mode,
-            "steps_per_second": num_envs * len(actions) / float(np.median(taken)),
-            **speed_ratio(taken, times["JAX loop", mode]),
-        }
-        for (name, mode), taken in times.items()
+        {"adapter": name, "autoreset_mode": mode, **speed} for (name, mode), speed in found.items()
     ]
 
 
@@ -82,7 +127,7 @@ def loop(env: Any, params: Any, num_envs: int, actions: np.ndarray, mode: str = 
     step = jax.jit(venv.step, donate_argnums=0, compiler_options=pb.compiler_options(venv))
     params = jax.device_put(params)
     carry = {"state": venv.reset(_keys(num_envs), params)[0]}
-    own = [jax.device_put(action) for action in actions]
+    own = list(map(jax.device_put, actions))
 
     def run() -> Any:
         for action in own:
@@ -102,7 +147,7 @@ def _gymnasium(task: str, num_envs: int, output: str, actions: np.ndarray) -> Ru
     first, _ = envs.reset(seed=0)
     own, wait = list(actions), lambda obs: obs
     if output == "jax":
-        own, wait = [jax.device_put(action) for action in actions], jax.block_until_ready
+        own, wait = list(map(jax.device_put, actions)), jax.block_until_ready
     elif output == "torch":
         own, wait = _tensors(actions, first.device), _wait_for_torch
 

@@ -1,15 +1,16 @@
-"""Write results as a page of tables and a plot of steps per second."""
+"""Store outcomes in a file, and write them as a page of tables."""
 
 from __future__ import annotations
 
+import hashlib
 import json
-import os
 from collections.abc import Mapping
-from importlib.util import find_spec
+from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
-from pixelbrax_gym.bench.case import Group, Row
-from pixelbrax_gym.bench.tables import succeeded, table, title
+from pixelbrax_gym.bench.cases import Case, Group
+from pixelbrax_gym.bench.tables import Row, table
 
 _HEADING = (
     "# Measurements",
@@ -19,28 +20,68 @@ _HEADING = (
 )
 
 
-def write(file: Path, groups: Mapping[str, Group]) -> None:
-    """Write the page of the results in ``file`` beside it, and the plot if matplotlib is there."""
-    kept = json.loads(file.read_text("utf-8"))
-    picture = file.with_suffix(".png")
-    plotted = find_spec("matplotlib") is not None and plot(_rows(kept, groups), picture)
-    if not plotted:
-        picture.unlink(missing_ok=True)
-    part = file.with_suffix(".md.part")
-    part.write_text(page(kept, groups, picture.name if plotted else None), "utf-8")
-    part.replace(file.with_suffix(".md"))
+class Results:
+    """Outcomes in a JSON file that is written after every case.
+
+    Raises:
+        ValueError: the file exists but has no results.
+    """
+
+    def __init__(self, file: Path, machine: dict[str, Any]) -> None:
+        self.file = file
+        self.machine = hashlib.sha256(json.dumps(machine).encode()).hexdigest()[:8]
+        self.kept: dict[str, Any] = {"machines": {}, "cases": {}}
+        if file.exists():
+            try:
+                kept = json.loads(file.read_text("utf-8"))
+            except ValueError:
+                kept = None
+            if not isinstance(kept, dict) or not {"machines", "cases"} <= kept.keys():
+                raise ValueError(f"{file} is not a result of this benchmark: move or delete it.")
+            self.kept = kept
+        self.kept["machines"][self.machine] = machine
+
+    def has(self, case: Case) -> bool:
+        """Return whether the case has a final result on this machine."""
+        known = self.kept["cases"].get(case.key, {})
+        learned = known.get("status") in ("ok", "out of memory")
+        return learned and known["machine"] == self.machine
+
+    def add(self, case: Case, outcome: dict[str, Any]) -> None:
+        """Store an outcome and replace the file atomically."""
+        cases = self.kept["cases"]
+        cases[case.key] = {
+            "group": case.group,
+            "measure": case.measure,
+            "arguments": dict(case.arguments),
+            "machine": self.machine,
+            "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M"),
+            **outcome,
+        }
+        used = {known["machine"] for known in cases.values()}
+        self.kept["machines"] = {k: v for k, v in self.kept["machines"].items() if k in used}
+        _replace(self.file, json.dumps(self.kept, indent=1) + "\n")
+
+    def write_page(self, groups: Mapping[str, Group]) -> None:
+        """Write the page beside the file."""
+        _replace(self.file.with_suffix(".md"), page(self.kept, groups))
 
 
-def page(kept: Mapping[str, Row], groups: Mapping[str, Group], picture: str | None) -> str:
-    """Return the results as a page in Markdown that includes the plot ``picture``."""
-    rows = _rows(kept, groups)
+def _replace(file: Path, text: str) -> None:
+    part = file.with_suffix(f"{file.suffix}.part")
+    part.write_text(text, "utf-8")
+    part.replace(file)
+
+
+def page(kept: Mapping[str, Row], groups: Mapping[str, Group]) -> str:
+    """Return the results as a page in Markdown."""
+    known = {case.key for group in groups.values() for case in group.cases}
+    rows = [row for key, row in kept["cases"].items() if key in known]
     used = {row["machine"] for row in rows}
     parts = [
         *_HEADING,
         *(_machine(machine) for name, machine in kept["machines"].items() if name in used),
     ]
-    if picture:
-        parts.append(f"![Steps per second over the number of environments]({picture})")
     for name, group in groups.items():
         of_group = [row for row in rows if row["group"] == name]
         if of_group:
@@ -48,53 +89,16 @@ def page(kept: Mapping[str, Row], groups: Mapping[str, Group], picture: str | No
             parts += [f"## {name.capitalize()}", f"{dates}. {group.note}", group.table(of_group)]
     missing = [row for row in rows if row["status"] != "ok"]
     if missing:
-        lines = [(_name(row), row["status"], _line(row["why"])) for row in missing]
+        lines = [
+            (
+                " ".join([row["measure"], *(f"{k}={v}" for k, v in row["arguments"].items())]),
+                row["status"],
+                " ".join(row["why"].split()).replace("|", "/")[-200:],
+            )
+            for row in missing
+        ]
         parts += ["## Not measured", table(("case", "", "why"), lines)]
     return "\n\n".join(part.strip() for part in parts) + "\n"
-
-
-def plot(rows: list[Row], path: Path) -> bool:
-    """Plot steps per second over the number of environments; return False if there are none."""
-    chosen = [row for row in succeeded(rows) if row["group"] == "environments"]
-    tasks = list(dict.fromkeys(row["arguments"]["task"] for row in chosen))
-    if not tasks:
-        return False
-    # A value left by another tool would make the import of matplotlib fail.
-    os.environ["MPLBACKEND"] = "Agg"
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, panels = plt.subplots(
-        1,
-        len(tasks),
-        figsize=(1 + 3 * len(tasks), 3.6),
-        sharey=True,
-        layout="constrained",
-        squeeze=False,
-    )
-    for panel, task in zip(panels[0], tasks, strict=True):
-        for obs_mode, label in (("state", "state only"), ("pixels", "84 x 84 pixels")):
-            points = sorted(
-                (row["arguments"]["num_envs"], row["values"]["steps_per_second"])
-                for row in chosen
-                if row["arguments"]["task"] == task and row["arguments"].get("obs_mode") == obs_mode
-            )
-            panel.loglog([x for x, _ in points], [y for _, y in points], "o-", label=label)
-        panel.set(title=title(task), xlabel="environments")
-        panel.grid(alpha=0.3, which="both")
-        panel.legend(fontsize=7)
-    panels[0, 0].set_ylabel("steps / s")
-    figure.savefig(path, dpi=130)
-    plt.close(figure)
-    return True
-
-
-def _rows(kept: Mapping[str, Row], groups: Mapping[str, Group]) -> list[Row]:
-    """Return the outcomes of the groups' cases."""
-    known = {case.key for group in groups.values() for case in group.cases()}
-    return [row for key, row in kept["cases"].items() if key in known]
 
 
 def _machine(machine: Row) -> str:
@@ -105,11 +109,3 @@ def _machine(machine: Row) -> str:
         f"{machine['system']}, Python {machine['python']}; {versions}. "
         f"XLA_FLAGS: `{machine['xla_flags'] or 'none'}`."
     )
-
-
-def _name(row: Row) -> str:
-    return " ".join([row["measure"], *(f"{k}={v}" for k, v in row["arguments"].items())])
-
-
-def _line(text: str) -> str:
-    return " ".join(text.split()).replace("|", "/")[-200:]

@@ -1,7 +1,8 @@
-"""Run cases in separate processes and store their outcomes."""
+"""Run cases in processes of their own: ``python -m pixelbrax_gym.bench.runner FUNCTION JSON``."""
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import signal
@@ -10,15 +11,9 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
-from pixelbrax_gym.bench import report
-from pixelbrax_gym.bench.case import ABSENT, AbsentError, Case, Group
-from pixelbrax_gym.bench.machine import file_stem
-from pixelbrax_gym.bench.results import Results
-from pixelbrax_gym.bench.tables import number
-from pixelbrax_jax.stop_signals import handling
+from pixelbrax_gym.bench.cases import ABSENT, AbsentError, Case
 
 OUT_OF_MEMORY = (
     "resource_exhausted",
@@ -28,46 +23,6 @@ OUT_OF_MEMORY = (
     "bad_alloc",
     "cannot allocate memory",
 )
-
-
-def measure_all(
-    cases: Sequence[Case],
-    groups: Mapping[str, Group],
-    output_dir: Path,
-    *,
-    again: bool = False,
-    timeout: float = 900.0,
-) -> tuple[Path, bool]:
-    """Measure the cases without a result on this machine and write results, page and plot.
-
-    Returns the JSON file, and whether a case failed other than by memory or an absent package.
-
-    Raises:
-        KeyboardInterrupt: a signal to stop arrived, with its number; the results are written.
-    """
-    # A process that outlives this one would disturb later measurements.
-    with handling(_interrupt):
-        machine = measure(Case("machine", "machine.describe"), 300.0)
-        if machine["status"] != "ok":
-            raise RuntimeError(machine["why"])
-        file = output_dir / f"{file_stem(machine['values'])}.json"
-        results = Results(file, machine["values"])
-        todo = [case for case in cases if again or not results.has(case)]
-        output_dir.mkdir(parents=True, exist_ok=True)
-        _say(f"{len(todo)} of {len(cases)} cases to measure; results in {file}\n")
-        failed = False
-        try:
-            for index, case in enumerate(todo, 1):
-                about = " ".join(f"{k}={v}" for k, v in case.arguments.items())
-                _say(f"{index}/{len(todo)}  {case.group} {about} ...")
-                outcome = measure(case, timeout)
-                failed |= outcome["status"] == "failed"
-                results.add(case, outcome)
-                _say(f" {_in_words(outcome)} ({outcome['seconds']:.0f} s)\n")
-        finally:
-            if file.exists():
-                report.write(file, groups)
-    return file, failed
 
 
 def measure(case: Case, timeout: float) -> dict[str, Any]:
@@ -128,20 +83,28 @@ def _kill(child: subprocess.Popen[str]) -> None:
         os.killpg(child.pid, signal.SIGKILL)
 
 
-def _interrupt(number: int, _frame: Any) -> None:
-    raise KeyboardInterrupt(number)
+def main() -> None:
+    """Call a function with arguments, given as JSON, and write its result as a JSON line."""
+    # JAX and PyTorch take turns on the same cores.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    module, _, function = sys.argv[1].rpartition(".")
+    result = getattr(importlib.import_module(module), function)(**json.loads(sys.argv[2]))
+    sys.stdout.write(json.dumps({"values": result, "peak_bytes": peak_bytes()}) + "\n")
 
 
-def _in_words(outcome: dict[str, Any]) -> str:
-    if outcome["status"] != "ok":
-        return f"{outcome['status']}: {outcome['why'].strip().splitlines()[-1]}"
-    values = outcome["values"]
-    for name, unit in (("steps_per_second", "steps/s"), ("frames_per_second", "frames/s")):
-        if name in values:
-            return f"{number(values[name])} {unit}"
-    return "done"
+def peak_bytes() -> dict[str, int | None]:
+    """Return the peak memory of this process on host and device in bytes; None if unknown."""
+    import jax
+
+    device = jax.devices()[0].memory_stats() or {}
+    host = None
+    with suppress(ImportError):  # Windows
+        import resource
+
+        unit = 1 if sys.platform == "darwin" else 1024
+        host = unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return {"host": host, "device": device.get("peak_bytes_in_use")}
 
 
-def _say(text: str) -> None:
-    sys.stdout.write(text)
-    sys.stdout.flush()
+if __name__ == "__main__":
+    main()

@@ -6,8 +6,10 @@ import math
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from pixelbrax_gym.bench.case import Row
 from pixelbrax_jax.tasks import TASKS
+
+Row = dict[str, Any]
+"""Stored outcome of a case: ``group``, ``measure``, ``arguments``, ``status``, ``values``, ..."""
 
 
 def table(heads: Iterable[str], lines: Iterable[Iterable[Any]]) -> str:
@@ -91,7 +93,8 @@ def environments(rows: list[Row]) -> str:
             pixels = find(of_task, "throughput.scan", **where, obs_mode="pixels")
             frames = find(of_task, "throughput.renderer", **where)
             both = (value(row, "steps_per_second") for row in (pixels, state))
-            held, peak = value(pixels, "bytes_per_env"), _peak_bytes(pixels)
+            held = value(pixels, "bytes_per_env")
+            peak = (pixels or {}).get("peak_bytes") or {"device": None, "host": None}
             lines.append(
                 [
                     title(task),
@@ -101,8 +104,8 @@ def environments(rows: list[Row]) -> str:
                     ratio(*both),
                     cell(frames, "frames_per_second") if frames else "-",
                     cell(pixels, "compile_seconds"),
-                    number(held and held / 1e3),
-                    number(peak and peak / 1e9),
+                    ratio(held, 1e3),
+                    ratio(peak["device"] or peak["host"], 1e9),
                 ]
             )
     heads = (
@@ -117,13 +120,6 @@ def environments(rows: list[Row]) -> str:
         "peak memory, GB",
     )
     return table(heads, lines)
-
-
-def _peak_bytes(row: Row | None) -> float | None:
-    if row is None or row["status"] != "ok":
-        return None
-    peak = row["peak_bytes"]
-    return peak["device"] or peak["host"]
 
 
 def interleaved(*columns: str) -> Callable[[list[Row]], str]:

@@ -2,13 +2,52 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 import pixelbrax_jax as pb
-from pixelbrax_gym.bench.timing import compiled, rate
+
+REPETITIONS = 5
+REPETITION_SECONDS = 0.5
+"""Minimum duration of a repetition."""
+
+
+def compiled(
+    env: Any, function: Callable, *arguments: Any, **jit_options: Any
+) -> tuple[Any, float]:
+    """Return the compiled function and the seconds to trace and compile it."""
+    started = time.perf_counter()
+    jitted = jax.jit(function, compiler_options=pb.compiler_options(env), **jit_options)
+    program = jitted.lower(*arguments).compile()
+    return program, time.perf_counter() - started
+
+
+def rate(run: Callable[[int], Any], least_calls: int = 1) -> dict[str, float]:
+    """Measure calls per second; ``run(n)`` makes n calls and returns arrays to wait for."""
+    calls = least_calls
+    seconds_of(run, calls)
+    while (seconds := seconds_of(run, calls)) < REPETITION_SECONDS:
+        wanted = 1.1 * REPETITION_SECONDS / max(seconds, 1e-6)
+        calls = max(calls + 1, int(calls * min(10.0, wanted)))
+    rates = [calls / seconds_of(run, calls) for _ in range(REPETITIONS)]
+    return {
+        "median": float(np.median(rates)),
+        "slowest": min(rates),
+        "fastest": max(rates),
+        "calls": calls,
+    }
+
+
+def seconds_of(run: Callable[..., Any], *arguments: Any) -> float:
+    """Return the seconds of a call, until its arrays are complete."""
+    started = time.perf_counter()
+    jax.block_until_ready(run(*arguments))
+    return time.perf_counter() - started
 
 
 def renderer(
@@ -46,17 +85,12 @@ def first_states(env: pb.PixelEnv, params: Any, num_envs: int) -> Any:
     return reset(keys)
 
 
-def scan(
-    task: str,
-    num_envs: int,
-    obs_mode: str = "pixels",
-    size: int = 84,
-) -> dict[str, Any]:
+def scan(task: str, num_envs: int, obs_mode: str = "pixels") -> dict[str, Any]:
     """Measure environment steps in one compiled loop, with random actions and autoreset.
 
     Every frame enters the frame stack in the loop's state, so no rendering is optimised away.
     """
-    env, params = pb.make(task, obs_mode=obs_mode, height=size, width=size)
+    env, params = pb.make(task, obs_mode=obs_mode)
     venv = pb.VectorPixelEnv(env, num_envs)
     state, timestep = venv.reset(jax.random.key(0), params)
 

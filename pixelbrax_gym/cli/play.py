@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from importlib.util import find_spec
 from itertools import islice
@@ -85,7 +86,13 @@ def run(arguments: Sequence[str]) -> int:
     shown = images(env, act, options.seed, options.size if options.observation else None)
     fps = env.metadata["render_fps"]
     if written is None:
-        _show(shown, fps, f"PixelBrax {options.task}")
+        from pixelbrax_gym.gymnasium.window import Window
+
+        with closing(Window(f"PixelBrax {options.task}", fps)) as window:
+            for image in shown:
+                window.show(image)
+                if window.closed:
+                    break
     else:
         path = write_frames(written, islice(shown, options.num_frames), fps)
         sys.stdout.write(f"{path.resolve()}\n")
@@ -140,19 +147,6 @@ def _make(options: Options) -> tuple[GymnasiumEnv, Act]:
         return env, lambda _: np.zeros(env.action_space.shape or (), np.float32)
     env.action_space.seed(options.seed)
     return env, lambda _: env.action_space.sample()
-
-
-def _show(shown: Iterator[np.ndarray], fps: int, title: str) -> None:
-    from pixelbrax_gym.gymnasium.window import Window
-
-    window = Window(title, fps)
-    try:
-        for image in shown:
-            window.show(image)
-            if window.closed:
-                return
-    finally:
-        window.close()
 
 
 def _why_no_window() -> str:

@@ -154,27 +154,23 @@ def _names_for_objects() -> ConstructorRegistry:
     types, registry = get_type_hints(EnvConfig), ConstructorRegistry()
 
     @registry.primitive_rule
-    def one_name(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
-        if info.type not in [types[name] for name in ("camera", "look", "clips")]:
+    def names(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+        if info.type not in [types[name] for name in ("camera", "look", "clips", "distractors")]:
             return None
+        if info.type == types["distractors"]:
+            return PrimitiveConstructorSpec(
+                nargs="*",
+                metavar="[NAME ...]",
+                instance_from_str=tuple,
+                is_instance=lambda value: isinstance(value, tuple),
+                str_from_instance=list,
+            )
         return PrimitiveConstructorSpec(
             nargs=1,
             metavar="FOLDER" if info.type == types["clips"] else "NAME",
             instance_from_str=lambda args: args[0],
             is_instance=lambda value: value is None or isinstance(value, str),
             str_from_instance=lambda value: [str(value)],
-        )
-
-    @registry.primitive_rule
-    def several_names(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
-        if info.type != types["distractors"]:
-            return None
-        return PrimitiveConstructorSpec(
-            nargs="*",
-            metavar="[NAME ...]",
-            instance_from_str=tuple,
-            is_instance=lambda value: isinstance(value, tuple),
-            str_from_instance=list,
         )
 
     return registry

@@ -80,7 +80,7 @@ class _Check:
             for name, space in ((f"single_{kind}_space", single), (f"{kind}_space", batched)):
                 _require(isinstance(space, spaces.Space), f"{name} must be a Space")
             _require(
-                _is_batch(single, batched, self.num_envs),
+                batch_space(single, self.num_envs) == batched,
                 f"{kind}_space must be single_{kind}_space, batched {self.num_envs} times: "
                 f"{batched} is not that of {single}",
             )
@@ -90,11 +90,9 @@ class _Check:
             f"metadata['autoreset_mode'] must be an AutoresetMode, is {mode!r}",
         )
         self.mode: AutoresetMode = mode
-        attribute = getattr(env, "autoreset_mode", mode)
-        _require(
-            attribute == mode,
-            f"the attribute autoreset_mode ({attribute}) must agree with the metadata ({mode})",
-        )
+        own = getattr(env, "autoreset_mode", mode)
+        rule = f"the attribute autoreset_mode ({own}) must agree with the metadata ({mode})"
+        _require(own == mode, rule)
 
     def determinism(self) -> None:
         first, again = self.replay(self.seed), self.replay(self.seed)
@@ -108,7 +106,7 @@ class _Check:
         undisturbed, disturbed = self.replay(self.seed), self.replay(self.seed, mask)
         for one, other in zip(undisturbed, disturbed, strict=False):
             _require(
-                _equal(*(jax.tree.map(lambda x: x[1:], tree) for tree in (one, other))),
+                _equal(_rows(one, slice(1, None)), _rows(other, slice(1, None))),
                 "reset(options={'reset_mask': mask}) must leave the other environments alone",
             )
 
@@ -169,8 +167,8 @@ class _Check:
             f"rewards must be floats of shape ({self.num_envs},), are {_describe(rewards)}",
         )
         _require(bool(np.isfinite(rewards).all()), "rewards must be finite")
-        for name, flag in zip(("terminated", "truncated"), flags, strict=True):
-            self.check_bools(name, flag)
+        self.check_bools("terminated", flags[0])
+        self.check_bools("truncated", flags[1])
         self.check_infos(returned[4], "step")
         return flags[0] | flags[1]
 
@@ -204,9 +202,12 @@ class _Check:
             )
         rule = "in mode SAME_STEP, the observation at the end of an episode must be the next one's"
         for i in np.flatnonzero(done):
-            final, first = (jax.tree.map(lambda x, i=i: x[i], x) for x in (infos["final_obs"], obs))
+            final, first = _rows(infos["final_obs"], i), _rows(obs, i)
             _check_in_space(self.env.single_observation_space, final, f"infos['final_obs'][{i}]")
-            self.changed[rule] = self.changed.get(rule, False) or not _equal(final, first)
+            self.note_change(rule, final, first)
+
+    def note_change(self, rule: str, before: Any, after: Any) -> None:
+        self.changed[rule] = self.changed.get(rule, False) or not _equal(before, after)
 
     def reset_some(self, mask: np.ndarray, before: Any) -> None:
         """Reset where ``mask`` is True and compare with ``before``, the last observations."""
@@ -218,14 +219,13 @@ class _Check:
             _warn("reset() changed the caller's options; wrappers then see no reset_mask")
         _require(np.array_equal(given, mask), f"{rule} not write to the mask")
         obs = _copy(self.check_reset(returned))
-        old, new = (jax.tree.map(lambda x: x[~mask], tree) for tree in (kept, obs))
         _require(
-            _equal(old, new),
+            _equal(_rows(kept, ~mask), _rows(obs, ~mask)),
             f"{rule} return the observations of the other environments as they were",
         )
-        old, new = (jax.tree.map(lambda x: x[mask], tree) for tree in (kept, obs))
-        reset = f"{rule} reset the masked environments"
-        self.changed[reset] = self.changed.get(reset, False) or not _equal(old, new)
+        self.note_change(
+            f"{rule} reset the masked environments", _rows(kept, mask), _rows(obs, mask)
+        )
 
     def render(self) -> None:
         if self.env.render_mode is None:
@@ -238,11 +238,9 @@ class _Check:
         if self.env.render_mode != "rgb_array":
             return
         for image in images:
+            is_image = isinstance(image, np.ndarray) and image.dtype == np.uint8
             _require(
-                isinstance(image, np.ndarray)
-                and image.dtype == np.uint8
-                and image.ndim == 3
-                and image.shape[2] == 3,
+                is_image and image.ndim == 3 and image.shape[2] == 3,
                 "render() must return uint8 NumPy arrays (height, width, 3)",
             )
         fps: Any = self.env.metadata.get("render_fps")
@@ -271,6 +269,10 @@ def _copy(tree: Any) -> Any:
     return jax.tree.map(lambda x: np.array(np.asarray(x)), tree)
 
 
+def _rows(tree: Any, which: Any) -> Any:
+    return jax.tree.map(lambda x: x[which], tree)
+
+
 def _equal(one: Any, other: Any) -> bool:
     left, right = jax.tree.leaves(one), jax.tree.leaves(other)
     return len(left) == len(right) and all(map(np.array_equal, left, right))
@@ -280,43 +282,13 @@ def _describe(array: np.ndarray) -> str:
     return f"{array.dtype} of shape {array.shape}"
 
 
-def _is_batch(single: spaces.Space, batched: spaces.Space, num_envs: int) -> bool:
-    if isinstance(single, spaces.Dict):
-        return (
-            isinstance(batched, spaces.Dict)
-            and set(single.spaces) == set(batched.spaces)
-            and all(_is_batch(single[name], batched[name], num_envs) for name in single.spaces)
-        )
-    if not isinstance(single, spaces.Box):
-        return batch_space(single, num_envs) == batched
-    # Compare parts, because an ordinary batched Box of many pixel environments takes gigabytes.
-    return (
-        isinstance(batched, spaces.Box)
-        and batched.shape == (num_envs, *single.shape)
-        and batched.dtype == single.dtype
-        and all(
-            np.array_equal(batched.low[i], single.low)
-            and np.array_equal(batched.high[i], single.high)
-            for i in (0, -1)
-        )
-    )
-
-
 def _check_in_space(space: spaces.Space, value: Any, what: str) -> None:
     if isinstance(space, spaces.Dict):
         _require(
             isinstance(value, dict) and set(value) == set(space.spaces),
             f"{what} must be a dict of {', '.join(space.spaces)}",
         )
-        parts: dict[Any, spaces.Space] = space.spaces
-    elif isinstance(space, spaces.Tuple):
-        size = len(space.spaces)
-        _require(
-            isinstance(value, tuple) and len(value) == size, f"{what} must be a tuple of {size}"
-        )
-        parts = dict(enumerate(space.spaces))
-    if isinstance(space, (spaces.Dict, spaces.Tuple)):
-        for name, part in parts.items():
+        for name, part in space.spaces.items():
             _check_in_space(part, value[name], f"{what}, entry {name!r},")
         return
     if isinstance(space, spaces.Box):

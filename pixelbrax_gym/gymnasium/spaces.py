@@ -5,11 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import gymnasium
-import jax
 import numpy as np
 from gymnasium.vector.utils import batch_differing_spaces, iterate
-
-_BOUNDS = ("low", "high", "bounded_below", "bounded_above")
 
 
 class BroadcastBox(gymnasium.spaces.Box):
@@ -23,22 +20,14 @@ class BroadcastBox(gymnasium.spaces.Box):
         super().__init__(low, high, (1,), dtype)
         self._shape = tuple(shape)
         self.low_repr, self.high_repr = str(self.low[0]), str(self.high[0])
-        self._spread({name: getattr(self, name)[0] for name in _BOUNDS})
+        for name in ("low", "high", "bounded_below", "bounded_above"):
+            setattr(self, name, np.broadcast_to(getattr(self, name)[0], self._shape))
 
-    def _spread(self, bounds: dict[str, Any]) -> None:
-        for name, value in bounds.items():
-            setattr(self, name, np.broadcast_to(value, self._shape))
-
-    def __getstate__(self) -> dict[str, Any]:
-        state = dict(self.__dict__)
-        state["bounds"] = {name: state.pop(name).flat[0] for name in _BOUNDS}
-        return state
-
-    def __setstate__(self, state: Any) -> None:
-        state = dict(state)
-        bounds = state.pop("bounds")
-        self.__dict__.update(state)
-        self._spread(bounds)
+    def __reduce__(self) -> Any:
+        """Pickle or copy two numbers, and the generator of samples."""
+        bounds = self.low.flat[0], self.high.flat[0]
+        generator = {"_np_random": self._np_random}
+        return BroadcastBox, (*bounds, self._shape, self.dtype), generator
 
     def __eq__(self, other: object) -> bool:
         if isinstance(other, BroadcastBox):
@@ -66,12 +55,7 @@ def observation_space(spec: Any, num_envs: int | None = None) -> gymnasium.Space
         return gymnasium.spaces.Dict(
             {name: observation_space(part, num_envs) for name, part in spec.items()}
         )
-    return _box(spec, num_envs)
-
-
-def _box(spec: jax.ShapeDtypeStruct, num_envs: int | None) -> gymnasium.spaces.Box:
-    pixels = spec.dtype == np.uint8
-    low, high = (0, 255) if pixels else (-np.inf, np.inf)
+    low, high = (0, 255) if spec.dtype == np.uint8 else (-np.inf, np.inf)
     return _batched(low, high, spec.shape, spec.dtype, num_envs)
 
 

@@ -257,10 +257,8 @@ def _with_masks(infos: dict[str, Any], mask: Any) -> dict[str, Any]:
 
 def as_autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:
     """Convert the name of an autoreset mode, or the value of a member, to Gymnasium's member."""
-    if isinstance(mode, AutoresetMode):
-        return mode
-    by_value = {known.value: known for known in AutoresetMode}
-    if isinstance(mode, str) and mode in by_value:
-        return by_value[mode]
+    for known in AutoresetMode:
+        if mode in (known, known.value):
+            return known
     modes = [known.name.lower() for known in AutoresetMode]
     return AutoresetMode[check_choice("autoreset_mode", mode, modes).upper()]

@@ -94,7 +94,6 @@ class TorchRLEnv(EnvBase):
         self._task, self._stateful, self._num_envs = task, stateful, stateful.num_envs
         # Seeds of environments whose next reset starts episode 0 of a seed; None for the others.
         self._seeds: list[int | None] | None = None
-        self._is_seeded = False
 
         env, size = stateful.env, (self._num_envs, self.device)
         self.observation_spec = observation_spec(env.obs_spec, *size)
@@ -112,7 +111,7 @@ class TorchRLEnv(EnvBase):
         given = None if tensordict is None else tensordict.get("_reset", None)
         if given is not None:
             mask = self._mask("'_reset'", given)
-        if not self._is_seeded:
+        if self._seeds is None and self._stateful.extra is None:  # the first reset
             self._set_seed(None)
         seeds = None
         first_obs, was_reset = self._begun
@@ -202,7 +201,6 @@ class TorchRLEnv(EnvBase):
         if seed is None:
             seed = int(torch.randint(SEEDS, ()))
         self._seeds = list(spread_seeds(seed, self._num_envs))
-        self._is_seeded = True
 
     def render(self) -> torch.Tensor:
         """Render (N, render_height, render_width, 3) uint8 images, row 0 at the top.

@@ -6,7 +6,7 @@ from typing import Any
 
 from pixelbrax_jax.agents.config import TrainConfig
 from pixelbrax_jax.agents.registry import ALGORITHMS
-from pixelbrax_jax.validation import check_choice
+from pixelbrax_jax.validation import check_choice, suggest
 
 _DEACREP = {
     "backend": "spring",
@@ -151,6 +151,10 @@ def preset(
         settings = settings | {"task": task}
     if of_tasks := TASK_SETTINGS.get(name, {}).get(algorithm):
         task = settings.get("task", kind().env.task)
-        check_choice(f"task of the preset {name!r}", task, of_tasks)
+        if task not in of_tasks:
+            raise ValueError(
+                f"the preset {name!r} has no settings for task {task!r}; use preset 'default', or "
+                f"one of its tasks: {', '.join(sorted(of_tasks))}.{suggest(task, of_tasks)}"
+            )
         settings = settings | of_tasks[task]
     return kind().replace(**settings | changes)

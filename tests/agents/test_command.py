@@ -55,7 +55,8 @@ def test_a_preset_may_have_settings_of_a_task(algorithm, task):
 def test_a_preset_without_settings_of_the_task_is_told(capsys):
     assert main(["train", "ppo", "--preset", "cpu", "--task", "pusher"]) == 1
     told = capsys.readouterr().err
-    assert "unknown task of the preset 'cpu': 'pusher'; allowed: ant, dmc_cartpole" in told
+    assert "the preset 'cpu' has no settings for task 'pusher'; use preset 'default'" in told
+    assert "one of its tasks: ant, dmc_cartpole" in told
     assert main(["train", "ppo", "--preset", "gpu"]) == 2
     assert "Did you mean 'cpu'" in capsys.readouterr().err
 

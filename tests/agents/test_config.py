@@ -51,7 +51,7 @@ BAD = [
     (SHARES, r"lie in \[0, 1\]", (-0.1, 1.5, NAN, "1")),
     (POSITIVE, "a positive number", (0, -1.0, NAN, INF, "1")),
     (POSITIVE_OR_0, "at least 0", (-1.0, NAN, INF, "1")),
-    (CHOICES, "unknown .*; allowed: .*, ", ("Nonesuch", None, 3)),
+    (CHOICES, "unknown .*llowed: .*, ", ("Nonesuch", None, 3)),
 ]
 
 

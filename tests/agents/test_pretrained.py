@@ -46,7 +46,10 @@ def test_a_pretrained_policy_earns_what_its_table_says(name, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--pretrained", "cheetah"], "unknown pretrained policy: 'cheetah'; allowed: "),
+        (
+            ["--pretrained", "cheetah"],
+            "unknown pretrained policy: 'cheetah'. Did you mean 'halfcheetah'? Allowed: ",
+        ),
         ([], "give either the folder of a run or --pretrained"),
         (["runs/ppo", "--pretrained", "halfcheetah"], "give either the folder of a run or"),
         (["--pretrained", "halfcheetah", "--best"], "--steps, --best and --run need the folder"),

@@ -6,11 +6,8 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-
 import pixelbrax_jax as pb
-from pixelbrax_gym.bench.adapters import scan
-from pixelbrax_gym.bench.timing import SECONDS, speed_ratio, take_interleaved
+from pixelbrax_gym.bench.adapters import SECONDS, compare_speeds, random_actions, scan
 
 
 def compare(task: str, sizes: Sequence[int], seconds: float = SECONDS) -> list[dict[str, Any]]:
@@ -18,18 +15,9 @@ def compare(task: str, sizes: Sequence[int], seconds: float = SECONDS) -> list[d
     action_size = pb.make(task)[0].action_size
     # 16 steps of the largest number: a call takes fresh memory, a tenth of the time of four steps.
     steps = 16 * math.lcm(*sizes)
-    runners = {}
-    for num_envs in sizes:
-        shape = (steps // num_envs, num_envs, action_size)
-        actions = np.random.default_rng(0).uniform(-1, 1, shape).astype(np.float32)
-        runners[num_envs] = scan(task, num_envs, actions)
-    times = take_interleaved(runners, seconds)
-    return [
-        {
-            "num_envs": num_envs,
-            "steps_per_second": steps / float(np.median(runs)),
-            **speed_ratio(runs, times[sizes[0]]),
-            "runs": len(runs),
-        }
-        for num_envs, runs in times.items()
-    ]
+    runs = {
+        num_envs: scan(task, num_envs, random_actions(steps // num_envs, num_envs, action_size))
+        for num_envs in sizes
+    }
+    found = compare_speeds(runs, steps, lambda _: sizes[0], seconds)
+    return [{"num_envs": num_envs, **speed} for num_envs, speed in found.items()]

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pixelbrax_gym.bench import runner
-from pixelbrax_gym.bench.case import Case, Group
-from pixelbrax_gym.bench.cases import FULL, TASKS
+from pixelbrax_gym.bench.cases import FULL, TASKS, Case, Group
 from pixelbrax_gym.bench.machine import num_cores
 from pixelbrax_gym.bench.tables import interleaved
 from pixelbrax_jax.tasks import DMC_TASKS
@@ -56,39 +55,6 @@ class DevicesCase(Case):
         return {"XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {flag}".strip()}
 
 
-def batches() -> Iterator[Case]:
-    """Pixels over the number of environments, interleaved."""
-    for task in TASKS:
-        yield Case("batches", "batches.compare", {"task": task, "sizes": (100, 10, 1000)}, HERE)
-
-
-def distractors() -> Iterator[Case]:
-    """Pixels with each distractor."""
-    for task, num_envs in (("ant", 256), ("ant", 1024), *((task, 1000) for task in TASKS)):
-        where = {"task": task, "num_envs": num_envs}
-        yield Case("distractors", "distractors.compare", where, HERE)
-
-
-def original() -> Iterator[Case]:
-    """The settings in which the original's speed is known."""
-    for task, num_envs, _ in ORIGINAL:
-        yield Case("original", "throughput.scan", {"task": task, "num_envs": num_envs})
-
-
-def startup() -> Iterator[Case]:
-    """From the import to the first frames."""
-    for cache in ("none", "cold", "warm"):
-        yield Case("startup", "startup.first_frame", {"task": "ant", "cache": cache}, HERE)
-
-
-def devices() -> Iterator[Case]:
-    """Training on emulated devices, with as many cores of this machine."""
-    for num_devices, cores, num_envs in ((1, 1, 64), (2, 2, 128), (1, 2, 128), (4, 2, 128)):
-        where = {"num_devices": num_devices, "cores": cores, "num_envs": num_envs}
-        where["task"] = "inverted_pendulum"
-        yield DevicesCase("devices", "scaling.training", where, HERE)
-
-
 def peers() -> Iterator[Case]:
     """Others and ourselves, one after the other; all hand NumPy arrays to Python."""
     for task in TASKS:
@@ -115,48 +81,39 @@ def dmc() -> Iterator[Case]:
         yield PeerCase("dmc", "peers.dm_control_envs", where)
 
 
-def gpu_programs() -> Iterator[Case]:
-    """Programs for NVIDIA GPUs, of which none need be here."""
-    for card in CARDS:
-        for num_envs in (1024, 8192):
-            for task in TASKS:
-                for program in PROGRAMS:
-                    where = {"task": task, "program": program, "num_envs": num_envs, "card": card}
-                    yield AheadCase("gpu-program", "compiling.gpu", where)
-
-
-def tpu_programs() -> Iterator[Case]:
-    """Programs for a TPU, likewise."""
-    for task in ("inverted_pendulum", *TASKS):
-        for program in ("renderer", "step"):
-            where = {"task": task, "program": program, "num_envs": 1024}
-            yield AheadCase("tpu-program", "compiling.tpu", where, platform="tpu")
-
-
 GROUPS = {
     "renderer": FULL["renderer"],
     "startup": Group(
-        startup,
+        [
+            Case("startup", "startup.first_frame", {"task": "ant", "cache": cache}, HERE)
+            for cache in ("none", "cold", "warm")
+        ],
         tables.startup,
         "16 environments behind Gymnasium; one sample each. `gymnasium` and PixelBrax are imported "
         "first, JAX and Brax when the environment is made.",
     ),
     "adapters": FULL["adapters"],
     "distractors": Group(
-        distractors,
+        [
+            Case("distractors", "distractors.compare", {"task": task, "num_envs": num_envs}, HERE)
+            for task, num_envs in (("ant", 256), ("ant", 1024), *((task, 1000) for task in TASKS))
+        ],
         interleaved("num_envs", "distractors"),
         "With a bank of 60 clips of 70 frames. Ratios are to the speed without: medians over "
         "rounds, in which all take a turn of 1 to 100 steps in one process, with bootstrap "
         "intervals of 95 %.",
     ),
     "original": Group(
-        original,
+        [
+            Case("original", "throughput.scan", {"task": task, "num_envs": num_envs})
+            for task, num_envs, _ in ORIGINAL
+        ],
         tables.original,
         "A compiled loop of ours in the settings in which the speed of the original is known; "
         "that was measured apart, on two cores of an AMD EPYC whose vectors were not noted.",
     ),
     "peers": Group(
-        peers,
+        list(peers()),
         tables.peers,
         "All hand NumPy arrays to Python. Tasks are of the same class, not the same: bodies, "
         "control steps and simulators differ. OpenGL peers draw textures and shadows, which we do "
@@ -165,7 +122,7 @@ GROUPS = {
         "shadows.",
     ),
     "dmc": Group(
-        dmc,
+        list(dmc()),
         tables.dmc,
         "128 environments through `gymnasium.make_vec`, 84 x 84, three frames, NumPy arrays; "
         "dm_control has one environment and one frame in one process, and draws through a software "
@@ -174,13 +131,29 @@ GROUPS = {
         "compilation cache and with one that such a process has filled.",
     ),
     "devices": Group(
-        devices,
+        [
+            DevicesCase(
+                "devices",
+                "scaling.training",
+                {
+                    "num_devices": num_devices,
+                    "cores": cores,
+                    "num_envs": num_envs,
+                    "task": "inverted_pendulum",
+                },
+                HERE,
+            )
+            for num_devices, cores, num_envs in ((1, 1, 64), (2, 2, 128), (1, 2, 128), (4, 2, 128))
+        ],
         tables.devices,
         "Training, PPO's preset `ci`. Emulated devices share the cores of the machine. Ideal is "
         "the speed of one device on one core times the number of cores.",
     ),
     "batches": Group(
-        batches,
+        [
+            Case("batches", "batches.compare", {"task": task, "sizes": (100, 10, 1000)}, HERE)
+            for task in TASKS
+        ],
         interleaved("num_envs"),
         "A compiled loop over steps. Ratios are to the first line of a task: medians over rounds, "
         "in which all take a turn of 16,000 environment steps in one process, with bootstrap "
@@ -188,7 +161,17 @@ GROUPS = {
     ),
     "environments": FULL["environments"],
     "gpu-program": Group(
-        gpu_programs,
+        [
+            AheadCase(
+                "gpu-program",
+                "compiling.gpu",
+                {"task": task, "program": program, "num_envs": num_envs, "card": card},
+            )
+            for card in CARDS
+            for num_envs in (1024, 8192)
+            for task in TASKS
+            for program in PROGRAMS
+        ],
         compiled.gpu,
         "Compiled, not run. Parts for the host are launched one after the other, a loop outside a "
         "graph among them as one; 1 is one CUDA graph. A loop of unknown length counts as one "
@@ -197,7 +180,16 @@ GROUPS = {
         "and 1.5 us at least: it compares forms of a program, and is no measurement.",
     ),
     "tpu-program": Group(
-        tpu_programs,
+        [
+            AheadCase(
+                "tpu-program",
+                "compiling.tpu",
+                {"task": task, "program": program, "num_envs": 1024},
+                platform="tpu",
+            )
+            for task in ("inverted_pendulum", *TASKS)
+            for program in ("renderer", "step")
+        ],
         compiled.tpu,
         "Compiled for a chip of a TPU v5e, not run. Bytes and times are the estimates of XLA.",
     ),

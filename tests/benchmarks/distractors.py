@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 import pixelbrax_jax as pb
-from pixelbrax_gym.bench.adapters import loop
-from pixelbrax_gym.bench.timing import SECONDS, speed_ratio, take_interleaved
+from pixelbrax_gym.bench.adapters import SECONDS, compare_speeds, loop, random_actions
 
 
 def chains() -> dict[str, tuple[Any, ...]]:
@@ -44,15 +43,7 @@ def compare(task: str, num_envs: int, seconds: float = SECONDS) -> list[dict[str
     for name, links in chains().items():
         plays = any(isinstance(link, pb.distractors.Video) for link in links)
         env, params = pb.make(task, distractors=links, clips=clips if plays else None)
-        shape = (max(1, min(100, 512 // num_envs)), num_envs, env.action_size)
-        actions = np.random.default_rng(0).uniform(-1, 1, shape).astype(np.float32)
+        actions = random_actions(max(1, min(100, 512 // num_envs)), num_envs, env.action_size)
         runs[name] = loop(env, params, num_envs, actions)
-    times = take_interleaved(runs, seconds)
-    return [
-        {
-            "distractors": name,
-            "steps_per_second": num_envs * len(actions) / float(np.median(taken)),
-            **speed_ratio(taken, times["none"]),
-        }
-        for name, taken in times.items()
-    ]
+    found = compare_speeds(runs, num_envs * len(actions), lambda _: "none", seconds)
+    return [{"distractors": name, **speed} for name, speed in found.items()]

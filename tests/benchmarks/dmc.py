@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import json
-import os
 import sys
 import tempfile
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pixelbrax_jax.tasks import TASKS
-from tests.benchmarks.startup import last_line
+from tests.benchmarks.startup import last_line, with_cache
 
 
 def pixels(task: str, num_envs: int) -> dict[str, Any]:
@@ -23,10 +21,7 @@ def pixels(task: str, num_envs: int) -> dict[str, Any]:
     step. The first one finds an empty compilation cache, the second one that of the first.
     """
     with tempfile.TemporaryDirectory() as folder:
-        ours = ("JAX_COMPILATION", "JAX_ENABLE_COMPILATION")
-        environ = {k: v for k, v in os.environ.items() if not k.startswith(ours)}
-        environ["JAX_COMPILATION_CACHE_DIR"] = str(Path(folder) / "programs")
-        environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.3"
+        environ = with_cache(folder)
         first = _process(task, num_envs, "measure", environ)
         again = _process(task, num_envs, "start", environ)
     return {
@@ -63,7 +58,7 @@ def main() -> None:
         return obs
 
     if what == "measure":
-        from pixelbrax_gym.bench.timing import rate
+        from pixelbrax_gym.bench.throughput import rate
 
         found["speed"] = rate(run)
     sys.stdout.write(json.dumps(found) + "\n")

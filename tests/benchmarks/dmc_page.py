@@ -8,12 +8,10 @@ from functools import cache
 from operator import itemgetter
 from pathlib import Path
 
-import numpy as np
-
 from pixelbrax_gym.bench.tables import find, number, table
 from pixelbrax_jax.tasks import DMC_TASKS
 from tests.benchmarks import tables
-from tests.benchmarks.results import final, groups, return_at
+from tests.benchmarks.results import final, groups
 
 FOLDER = Path(__file__).parents[2] / "docs" / "dmc"
 
@@ -100,34 +98,6 @@ def physics() -> str:
         "lowest p",
     )
     return table(heads, lines)
-
-
-def plot(path: Path) -> None:
-    """Return of training episodes over control steps, a line for each seed."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    runs = kept_runs()
-    figure, panels = plt.subplots(
-        1, len(runs), figsize=(4 * len(runs), 3.4), layout="constrained", squeeze=False
-    )
-    for (name, seeds), axes in zip(runs.items(), panels[0], strict=True):
-        for run in seeds:
-            end = run["steps"][-1]
-            grid = np.linspace(0.04 * end, end, 60)
-            line = [return_at(run, when, "steps", 0.04 * end) for when in grid]
-            axes.plot(grid / 1e6, line, color="C0", label="training episodes")
-            evaluated = [(e["steps"] / 1e6, e["clean/return"]) for e in run["evaluations"]]
-            axes.plot(*zip(*evaluated, strict=True), "o", color="C1", label="mean action")
-        axes.set(xlabel="million control steps", title=name.split("-")[1], ylim=(0, 1000))
-        axes.grid(alpha=0.3)
-    panels[0][0].set_ylabel("return")
-    handles, labels = panels[0][0].get_legend_handles_labels()
-    named = dict(zip(labels, handles, strict=True))
-    panels[0][0].legend(named.values(), named.keys(), fontsize=8)
-    figure.savefig(path, dpi=130)
 
 
 def speeds(task: str) -> tuple[float, float]:

@@ -102,9 +102,12 @@ BENCHMARKS = ("cpu-avx512", "cpu-avx2")
 
 
 def page_of(machine: str) -> str:
-    """The page of whole results."""
-    picture = f"{machine}.png" if (ROOT / f"docs/benchmarks/{machine}.png").exists() else None
-    return report.page(performance.read(f"benchmarks/{machine}.json"), GROUPS, picture)
+    """The page of whole results, with their plot above the first part."""
+    text = report.page(performance.read(f"benchmarks/{machine}.json"), GROUPS)
+    if not (ROOT / f"docs/benchmarks/{machine}.png").exists():
+        return text
+    plot = f"![Steps per second over the number of environments]({machine}.png)"
+    return text.replace("\n\n## ", f"\n\n{plot}\n\n## ", 1)
 
 
 def main() -> None:
@@ -115,8 +118,10 @@ def main() -> None:
     for machine in BENCHMARKS:
         (ROOT / f"docs/benchmarks/{machine}.md").write_text(page_of(machine), "utf-8")
     if "--plots" in sys.argv[1:]:
+        from tests.benchmarks import plots
+
         results.plot()
-        dmc_page.plot(dmc_page.FOLDER / "learning.png")
+        plots.learning_dmc(dmc_page.kept_runs(), dmc_page.FOLDER / "learning.png")
 
 
 if __name__ == "__main__":

@@ -306,8 +306,8 @@ FIGURES: Figures = {
 def plot() -> None:
     """Draw the learning curves; what is earned without learning is played once and kept."""
     # Drawing and playing need more than tables do.
+    from tests.benchmarks import plots
     from tests.benchmarks.baselines import play_baselines
-    from tests.benchmarks.results_plot import draw
 
     tasks = by_task(seeds_of())
     play_baselines({key: next(iter(g.values()))[0]["config"] for key, g in tasks.items()})
@@ -317,4 +317,4 @@ def plot() -> None:
         shown = [seeds for name, seeds in of_task.items() if name.count("-") == 1]
         if shown:
             panels[title(key, list(tasks))] = (shown, read("untrained.json")[key])
-    draw(panels, FOLDER / "clean.png")
+    plots.learning(panels, FOLDER / "clean.png")

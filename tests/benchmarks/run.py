@@ -20,6 +20,7 @@ from pixelbrax_gym.bench.cases import TASKS
 from pixelbrax_gym.cli import bench
 from pixelbrax_jax.tasks import DMC_TASKS
 from pixelbrax_jax.validation import check_choice
+from tests.benchmarks import plots
 from tests.benchmarks.cases import GROUPS
 
 ON_REQUEST = ("peers", "dmc", "gpu-program", "tpu-program")
@@ -30,7 +31,6 @@ ON_REQUEST = ("peers", "dmc", "gpu-program", "tpu-program")
 class Options(bench.Options):
     """Measures all that ``pixelbrax bench --full`` does, and more."""
 
-    full: bool = True
     output_dir: Path = Path("runs/benchmarks")
     only: tuple[str, ...] = ()  # type: ignore[assignment]
     task: tuple[str, ...] = ()  # type: ignore[assignment]
@@ -44,7 +44,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name in options.task:
         check_choice("task", name, ("inverted_pendulum", *TASKS, *DMC_TASKS))
     names = options.only or [name for name in GROUPS if name not in ON_REQUEST]
-    return bench.measure_groups(options, GROUPS, names)
+    status = bench.measure_groups(options, GROUPS, names)
+    for file in options.output_dir.glob("*.json"):
+        plots.speed(file)
+    return status
 
 
 if __name__ == "__main__":

@@ -8,8 +8,8 @@ from typing import Any
 
 import jax
 
-from pixelbrax_gym.bench.case import ABSENT
-from pixelbrax_gym.bench.timing import compiled, rate
+from pixelbrax_gym.bench.cases import ABSENT
+from pixelbrax_gym.bench.throughput import compiled, rate
 from pixelbrax_jax.agents.config import make_env
 from pixelbrax_jax.agents.on_policy.ppo import PPO
 from pixelbrax_jax.agents.presets import preset

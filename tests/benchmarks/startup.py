@@ -51,15 +51,21 @@ def first_frame(task: str, cache: str) -> dict[str, Any]:
             or ``"warm"`` (filled by an earlier process).
     """
     with tempfile.TemporaryDirectory() as folder:
-        ours = ("JAX_COMPILATION", "JAX_ENABLE_COMPILATION")
-        environ = {k: v for k, v in os.environ.items() if not k.startswith(ours)}
-        if cache != "none":
-            environ["JAX_COMPILATION_CACHE_DIR"] = str(Path(folder) / "programs")
-            environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.3"
+        environ = with_cache(None if cache == "none" else folder)
         for _ in range(2 if cache == "warm" else 1):
             script = SCRIPT.replace("TASK", TASKS[task].gymnasium_id)
             marks = last_line(["-c", script], environ)
     return {"peak_bytes": marks.pop("peak_bytes"), "seconds": marks}
+
+
+def with_cache(folder: str | None) -> dict[str, str]:
+    """The variables of a process with a compilation cache in a folder, or without one."""
+    ours = ("JAX_COMPILATION", "JAX_ENABLE_COMPILATION")
+    environ = {k: v for k, v in os.environ.items() if not k.startswith(ours)}
+    if folder is not None:
+        environ["JAX_COMPILATION_CACHE_DIR"] = str(Path(folder) / "programs")
+        environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.3"
+    return environ
 
 
 def last_line(arguments: list[str], environ: dict[str, str]) -> dict[str, Any]:

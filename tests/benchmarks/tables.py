@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
-from pixelbrax_gym.bench.case import Row
 from pixelbrax_gym.bench.cases import TASKS
-from pixelbrax_gym.bench.tables import cell, find, number, ratio, succeeded, table, title, value
+from pixelbrax_gym.bench.tables import (
+    Row,
+    cell,
+    find,
+    number,
+    ratio,
+    succeeded,
+    table,
+    title,
+    value,
+)
 from tests.benchmarks.original import ORIGINAL
 
 

@@ -9,7 +9,7 @@ from gymnasium import make_vec
 
 import pixelbrax_gym  # noqa: F401  # registers the ids
 import pixelbrax_jax as pb
-from pixelbrax_gym.bench.timing import rate
+from pixelbrax_gym.bench.throughput import rate
 from pixelbrax_jax.tasks import TASKS
 
 

@@ -43,6 +43,12 @@ def takes_percent(wrappers: ModuleType, env: Any) -> Any:
     return wrappers.TransformAction(percent, lambda action: 50 * action + 50, None)
 
 
+def darken(pixels: np.ndarray) -> np.ndarray:
+    """Half of the brightness, in place."""
+    pixels //= 2
+    return pixels
+
+
 CHANGES = {
     "ClipAction": Change(takes_actions_of_any_size, action=lambda action: 7 * action),
     "ClipReward": Change(
@@ -67,6 +73,12 @@ CHANGES = {
         obs=lambda pixels: np.uint8((pixels * [0.2125, 0.7154, 0.0721]).sum(axis=-1)),
     ),
     "RescaleAction": Change(takes_percent),
+    "RescaleObservation": Change(
+        lambda wrappers, env: wrappers.RescaleObservation(
+            wrappers.DtypeObservation(env, np.float32), np.float32(-1), np.float32(1)
+        ),
+        obs=lambda pixels: np.float32(pixels / 127.5 - 1),
+    ),
     "ReshapeObservation": Change(
         lambda wrappers, env: wrappers.ReshapeObservation(env, (12, 36)),
         obs=lambda pixels: pixels.reshape(12, 36),
@@ -79,6 +91,11 @@ CHANGES = {
         lambda wrappers, env: wrappers.TransformAction(env, lambda action: -action, None),
         action=lambda action: -action,
     ),
+    # It may write to what it gets.
+    "TransformObservation": Change(
+        lambda wrappers, env: wrappers.TransformObservation(env, darken, None),
+        obs=lambda pixels: pixels // 2,
+    ),
     "TransformReward": Change(
         lambda wrappers, env: wrappers.TransformReward(env, lambda reward: 2 * reward + 1),
         reward=lambda reward: 2 * reward + 1,
@@ -86,10 +103,15 @@ CHANGES = {
 }
 
 
-def darken(pixels: np.ndarray) -> np.ndarray:
-    """Half of the brightness, in place."""
-    pixels //= 2
-    return pixels
+def cases() -> tuple[dict[str, Callable], Callable]:
+    """Tests by the wrapper they are about, and a decorator that files one."""
+    filed: dict[str, Callable] = {}
+
+    def case(name: str) -> Callable[[Callable], Callable]:
+        assert name not in filed
+        return lambda test: filed.setdefault(name, test)
+
+    return filed, case
 
 
 def moments(seen: np.ndarray) -> tuple[Any, Any]:

@@ -224,11 +224,14 @@ class TestMake:
     @pytest.mark.parametrize(
         ("options", "message"),
         [
-            ({"task": "antt"}, "unknown task: 'antt'; allowed: ant, .* Did you mean 'ant'"),
+            ({"task": "antt"}, r"unknown task: 'antt'\. Did you mean 'ant'\? Allowed: ant, "),
             ({"task": "PixelBrax/Ant-v0"}, "unknown task: .* Did you mean 'ant'"),
             ({"backend": "sprng"}, "Did you mean 'spring'"),
             ({"camera": "sid"}, "unknown camera of task 'ant': 'sid'.*Did you mean 'side'"),
-            ({"look": "orginal"}, "unknown look: 'orginal'; allowed: default, dmc, original"),
+            (
+                {"look": "orginal"},
+                r"'orginal'\. .*'original'\? Allowed: default, dmc, original",
+            ),
             ({"reward_preset": "papers"}, "Did you mean 'paper'"),
             ({"obs_mode": "image"}, "unknown obs_mode: 'image'; allowed: both, pixels, state"),
         ],

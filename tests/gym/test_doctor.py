@@ -19,7 +19,6 @@ HEALTHY = doctor.Machine(
     to_torch=True,
     to_jax=True,
     renderer=("pallas", "by one kernel, on NVIDIA H100"),
-    gl_libraries=(),
     environ={"XLA_CLIENT_MEM_FRACTION": "0.4"},
     broken={},
     cache="",
@@ -93,7 +92,6 @@ def test_a_healthy_machine():
             "are both set",
             "unset XLA_PYTHON_CLIENT_MEM_FRACTION",
         ),
-        ({"gl_libraries": ("libGL.so.1",)}, "note", "loaded libGL.so.1", ""),
         (
             {
                 "jax_error": "AssertionError: ",

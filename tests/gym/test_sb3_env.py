@@ -124,10 +124,13 @@ def test_sub_envs(make_sb3):
     assert not env.has_attr("difficulty")
     with pytest.raises(AttributeError):
         env.get_attr("difficulty")
-    images = env.env_method("render", indices=[0, 2])
-    assert [image.shape for image in images] == [(8, 8, 3)] * 2
-    np.testing.assert_array_equal(images[1], env.get_images()[2])
+    images = env.env_method("render", indices=[2, 0])
+    assert images[0].shape == (8, 8, 3)
+    np.testing.assert_array_equal(images, [env.get_images()[i] for i in (2, 0)])
     assert env.env_method("get_wrapper_attr", "index", indices=1) == [1]
+    assert env.env_method("set_wrapper_attr", "level", 7, indices=[1]) == [True]
+    assert env.env_method("has_wrapper_attr", "level") == [False, True, False]
+    assert env.env_method("set_wrapper_attr", "other", 7, force=False) == [False] * 3
     assert env.env_is_wrapped(Monitor) == [False] * 3
     assert env.get_attr("unwrapped")[0].action_space == env.action_space
 
@@ -210,14 +213,6 @@ def test_ppo_takes_channels_first(make_sb3):
     model.learn(12)
 
 
-def test_float64_actions_are_rounded(make_sb3):
-    one, other = make_sb3(obs_mode="state"), make_sb3(obs_mode="state")
-    one.reset(), other.reset()
-    np.testing.assert_array_equal(
-        one.step(RIGHT)[0], other.step(np.asfortranarray(RIGHT.astype(np.float64)))[0]
-    )
-
-
 def test_use_out_of_order(make_sb3):
     env = make_sb3()
     with pytest.raises(error.ResetNeeded, match="reset"):
@@ -230,18 +225,6 @@ def test_use_out_of_order(make_sb3):
     env.close()
     with pytest.raises(error.ClosedEnvironmentError, match="closed"):
         env.step(STAY)
-
-
-def test_sub_envs_have_the_attributes_of_gymnasium(make_sb3):
-    env = make_sb3(render_mode="rgb_array", render_height=8, render_width=8)
-    env.reset()
-    assert env.env_method("has_wrapper_attr", "level") == [False] * 3
-    assert env.env_method("set_wrapper_attr", "level", 7, indices=[1]) == [True]
-    assert env.env_method("has_wrapper_attr", "level") == [False, True, False]
-    assert env.env_method("get_wrapper_attr", "level", indices=1) == [7]
-    assert env.env_method("set_wrapper_attr", "other", 7, force=False) == [False] * 3
-    images = env.env_method("render", indices=[2, 0])
-    np.testing.assert_array_equal(images, [env.get_images()[i] for i in (2, 0)])
 
 
 def test_channels_first_space_is_an_image_to_gymnasium(make_sb3):

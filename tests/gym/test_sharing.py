@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import builtins
-import importlib
-import sys
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -61,16 +57,6 @@ def test_nothing_exported_is_part_of_the_state(make_vector, mode):
         assert not pointers(outputs) & pointers(stateful._snapshot.packed)
 
 
-def test_a_kept_tensor_outlives_later_steps(make_vector):
-    env = make_vector(output="torch")
-    kept, _ = env.reset(seed=0)
-    copy = kept.clone()
-    for _ in range(20):
-        env.step(ACTIONS)
-    env.close()
-    assert torch.equal(kept, copy)
-
-
 def test_actions_are_copied():
     device = jax.devices("cpu")[0]
     actions = torch.full((2, 3), 0.5)
@@ -81,8 +67,11 @@ def test_actions_are_copied():
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float16, torch.bfloat16])
 def test_actions_are_rounded_to_float32(dtype):
-    actions = torch.full((2,), 0.5, dtype=dtype, requires_grad=True)
-    assert dlpack.actions_to_jax(actions, jax.devices("cpu")[0]).dtype == np.float32
+    # Every second number of a tensor with a gradient.
+    actions = torch.full((4,), 0.5, dtype=dtype, requires_grad=True)[::2]
+    converted = dlpack.actions_to_jax(actions, jax.devices("cpu")[0])
+    assert converted.dtype == np.float32
+    np.testing.assert_array_equal(converted, [0.5, 0.5])
 
 
 def test_refilling_the_action_buffer_at_once_is_harmless(make_vector):
@@ -100,25 +89,3 @@ def test_refilling_the_action_buffer_at_once_is_harmless(make_vector):
 def test_devices_must_agree():
     with pytest.raises(ValueError, match=r"on device meta, the environment on cpu:0"):
         dlpack.actions_to_jax(torch.zeros(1, device="meta"), jax.devices("cpu")[0])
-
-
-@pytest.mark.parametrize(
-    ("package", "module", "extra"),
-    [
-        ("torch", "pixelbrax_gym.interop.dlpack", "torch"),
-        ("torchrl", "pixelbrax_gym.torchrl.env", "torchrl"),
-        ("stable_baselines3", "pixelbrax_gym.sb3.vec_env", "sb3"),
-    ],
-)
-def test_a_missing_package_is_named_with_the_cure(monkeypatch, package, module, extra):
-    real = builtins.__import__
-
-    def without(name, *args, **kwargs):
-        if name.partition(".")[0] == package:
-            raise ImportError(name)
-        return real(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", without)
-    monkeypatch.delitem(sys.modules, module, raising=False)
-    with pytest.raises(ImportError, match=rf'pip install "pixelbrax\[{extra}\]"'):
-        importlib.import_module(module)

@@ -101,7 +101,7 @@ def test_what_is_refused(make_single, make_vector):
         )
     with pytest.raises(ValueError, match="does not have the structure"):
         make_single(distractors="color").set_state(state)
-    with pytest.raises(ValueError, match="allowed: reset_mask, state"):
+    with pytest.raises(ValueError, match="Allowed: reset_mask, state"):
         make_vector().reset(options={"mask": 1})
     # The first one stays usable after each.
     env.step(ACTION)

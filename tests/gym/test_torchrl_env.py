@@ -12,7 +12,7 @@ import torch
 from gymnasium import error
 from tensordict import TensorDict
 from torchrl.collectors import Collector
-from torchrl.data import LazyTensorStorage, ReplayBuffer, Unbounded
+from torchrl.data import Unbounded
 from torchrl.envs import (
     CatFrames,
     Compose,
@@ -310,23 +310,6 @@ def test_transforms(make_torchrl):
     torch.testing.assert_close(data["next", "episode_reward"][ended.cumsum(1) == 0], returns)
 
 
-def test_replay_buffer(make_torchrl):
-    data = make_torchrl().rollout(12, policy, break_when_any_done=False)
-    buffer = ReplayBuffer(storage=LazyTensorStorage(100), batch_size=8)
-    buffer.extend(data.reshape(-1))
-    sample = buffer.sample()
-    assert sample["next", "pixels"].dtype == torch.uint8
-    assert len(buffer) == 36
-
-
-def test_render(make_torchrl):
-    env = make_torchrl(render_height=10, render_width=14)
-    env.reset()
-    images = env.render()
-    assert images.shape == (3, 10, 14, 3)
-    assert images.dtype == torch.uint8
-
-
 def test_recording(make_torchrl, tmp_path):
     """Images of `render` end up in a video of TorchRL's recorder."""
     logger = CSVLogger("run", str(tmp_path), video_format="pt")
@@ -388,31 +371,6 @@ def test_infos(make_torchrl):
         assert env.infos["episode_length"].tolist() == [steps] * 3
     torch.testing.assert_close(env.infos["episode_return"], rewards)
     assert not env.infos["non_finite"].any()
-
-
-def test_actions_are_converted(make_torchrl):
-    wanted = torch.tensor([[0.25], [-0.5], [1.0]])
-    strided = torch.zeros(3, 2)
-    strided[:, :1] = wanted
-    results = []
-    for action in (
-        wanted,
-        wanted.double(),
-        wanted.clone().requires_grad_(),
-        strided[:, :1],
-    ):
-        env = make_torchrl(obs_mode="state")
-        td = env.reset().set("action", action)
-        results.append(env.step(td)["next", "observation"])
-    for result in results[1:]:
-        assert torch.equal(result, results[0])
-
-
-def test_wrong_batch_size(make_torchrl):
-    env = make_torchrl()
-    env.reset()
-    with pytest.raises(RuntimeError, match="shape"):
-        env.step(TensorDict({"action": torch.zeros(2, 1)}, batch_size=[2]))
 
 
 def test_use_out_of_order(make_torchrl):

@@ -224,15 +224,6 @@ def test_number_of_environments_does_not_matter(make_vector):
         np.testing.assert_allclose(left[0], right[0][:2], rtol=1e-6)
 
 
-def test_render_is_a_tuple(make_vector):
-    env = make_vector(render_mode="rgb_array", render_height=10, render_width=11)
-    env.reset(seed=0)
-    images = env.render()
-    assert isinstance(images, tuple)
-    assert [image.shape for image in images] == [(10, 11, 3)] * 3
-    assert make_vector().render() is None
-
-
 def test_non_finite_actions_on_the_device_end_the_episode(make_vector):
     env = make_vector(output="jax")
     env.reset(seed=0)

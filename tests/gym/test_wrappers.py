@@ -3,24 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from gymnasium import wrappers
 from gymnasium.wrappers import vector as vector_wrappers
 
 ACTIONS = np.full((3, 1), -0.1, np.float32)
-
-
-@pytest.mark.parametrize("mode", ["next_step", "same_step", "disabled"])
-def test_record_episode_statistics_of_many(make_vector, mode):
-    env = vector_wrappers.RecordEpisodeStatistics(
-        make_vector(obs_mode="state", autoreset_mode=mode)
-    )
-    env.reset(seed=0)
-    for _ in range(6):
-        infos = env.step(ACTIONS)[4]
-    ours = infos["final_info"] if mode == "same_step" else infos
-    np.testing.assert_array_equal(infos["episode"]["l"], [6, 6, 6])
-    np.testing.assert_allclose(infos["episode"]["r"], ours["episode_return"], rtol=1e-5)
 
 
 def test_statistics_survive_a_partial_reset(make_vector):

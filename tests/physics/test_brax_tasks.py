@@ -86,14 +86,14 @@ def test_equal_calls_give_equal_physics():
     [
         (
             {"task": "antt"},
-            r"unknown task: 'antt'; allowed: ant, dmc_.*, halfcheetah, .*\. Did you mean 'ant'\?",
+            r"unknown task: 'antt'\. Did you mean 'ant'\? Allowed: ant, dmc_.*, halfcheetah, .*\.$",
         ),
         ({"task": "Walker2d"}, "Did you mean 'walker2d'?"),
         ({"task": None}, "unknown task: None; allowed: ant"),
         (
             {"task": "ant", "backend": "sprng"},
-            r"unknown backend of task 'ant': 'sprng'; allowed: generalized, mjx, spring\. "
-            r"Did you mean 'spring'\?",
+            r"unknown backend of task 'ant': 'sprng'\. Did you mean 'spring'\? "
+            r"Allowed: generalized, mjx, spring\.",
         ),
         (
             {"task": "swimmer", "backend": "mjx"},
@@ -101,7 +101,7 @@ def test_equal_calls_give_equal_physics():
         ),
         (
             {"task": "ant", "reward_preset": "papr"},
-            r"unknown reward_preset: 'papr'; allowed: brax, paper\. Did you mean 'paper'\?",
+            r"unknown reward_preset: 'papr'\. Did you mean 'paper'\? Allowed: brax, paper\.",
         ),
     ],
 )

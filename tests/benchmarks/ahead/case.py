@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
-from pixelbrax_gym.bench.case import AbsentError, Case
+from pixelbrax_gym.bench.cases import AbsentError, Case
 from pixelbrax_jax.cache import cache_folder
 from tests.benchmarks.ahead.targets import TPU_ENVIRON
 from tests.benchmarks.packages import install_packages

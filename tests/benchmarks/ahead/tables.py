@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Container, Iterator
 from itertools import compress
 
-from pixelbrax_gym.bench.case import Row
-from pixelbrax_gym.bench.tables import number, succeeded, table, title
+from pixelbrax_gym.bench.tables import Row, number, succeeded, table, title
 
 
 def gpu(rows: list[Row], left_out: Container[str] = ()) -> str:

@@ -10,13 +10,12 @@ works.
 from __future__ import annotations
 
 import json
-import os
 import sys
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from shared import speed_of
+from shared import opengl, speed_of
 
 TASKS = {"cheetah": "run", "walker": "walk", "quadruped": "walk", "humanoid": "walk"}
 SECONDS, SIZE = 3.0, 84
@@ -28,31 +27,15 @@ def load(domain: str, goal: str, seed: int) -> Any:
     return suite.load(domain, goal, task_kwargs={"random": seed})
 
 
-def opengl() -> str:
-    """Chooses an OpenGL that works; the name of its renderer."""
-    import subprocess
-
-    probe = (
-        "from dm_control import suite\n"
-        "from OpenGL import GL\n"
-        "physics = suite.load('cheetah', 'run').physics\n"
-        "physics.render(8, 8)\n"
-        "with physics.contexts.gl.make_current() as context:\n"
-        "    print(context.call(GL.glGetString, GL.GL_RENDERER).decode())\n"
-    )
-    why = ""
-    for name in [os.environ["MUJOCO_GL"]] if "MUJOCO_GL" in os.environ else ["egl", "osmesa"]:
-        environ = os.environ | {"MUJOCO_GL": name}
-        done = subprocess.run(
-            [sys.executable, "-c", probe], env=environ, capture_output=True, text=True, check=False
-        )
-        if done.returncode == 0:
-            os.environ["MUJOCO_GL"] = name
-            return f"{name}: {done.stdout.strip().splitlines()[-1]}"
-        why += f"\n{name}: {done.stderr.strip()}"
-    print(why[-3000:], file=sys.stderr)
-    print("no OpenGL works", file=sys.stderr)
-    sys.exit(3)
+PROBE = """
+from dm_control import suite
+from OpenGL import GL
+physics = suite.load('cheetah', 'run').physics
+physics.render(8, 8)
+with physics.contexts.gl.make_current() as context:
+    print(context.call(GL.glGetString, GL.GL_RENDERER).decode())
+"""
+"""Prints the name of OpenGL's renderer."""
 
 
 def alone(domain: str, goal: str, camera: int) -> Callable[[], int]:
@@ -110,7 +93,7 @@ def main() -> None:
     arguments = json.loads(sys.argv[1])
     import dm_control  # noqa: F401  # a missing one is no matter of OpenGL
 
-    renderer = opengl()
+    renderer = opengl(PROBE)
     domain, processes = arguments["domain"], arguments["processes"]
     processes = arguments["cores"] if processes == "cores" else processes
     goal, camera = arguments.get("goal", TASKS.get(domain)), arguments.get("camera", 0)

@@ -19,7 +19,7 @@ import sys
 from typing import Any
 
 import numpy as np
-from shared import GYMNASIUM_IDS, speed_of
+from shared import GYMNASIUM_IDS, no_opengl, speed_of
 
 SECONDS, SIZE = 2.0, 84
 
@@ -39,9 +39,7 @@ def with_opengl() -> None:
         if "OpenGL" not in why:
             print(why[-3000:], file=sys.stderr)
             sys.exit(done.returncode)
-    print(why[-3000:], file=sys.stderr)
-    print("no OpenGL works", file=sys.stderr)
-    sys.exit(3)
+    no_opengl(why)
 
 
 def measure(name: str, num_envs: int, batch_size: int, cores: int) -> dict[str, Any]:

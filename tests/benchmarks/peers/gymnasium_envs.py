@@ -6,14 +6,12 @@ python gymnasium_envs.py '{"task": "ant", "cores": 2}'
 from __future__ import annotations
 
 import json
-import os
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from shared import GYMNASIUM_IDS, speed_of
+from shared import GYMNASIUM_IDS, opengl, speed_of
 
 SECONDS, SIZE = 3.0, 84
 
@@ -26,28 +24,15 @@ def make(name: str) -> Any:
     return gymnasium.wrappers.AddRenderObservation(env)
 
 
-def opengl(name: str) -> str:
-    """Chooses an OpenGL that works; the name of its renderer."""
-    probe = (
-        "import sys; sys.path.insert(0, sys.argv[1])\n"
-        "from gymnasium_envs import make\n"
-        "env = make(sys.argv[2])\n"
-        "env.reset()\n"
-        "from OpenGL import GL\n"
-        "print(GL.glGetString(GL.GL_RENDERER).decode())\n"
-    )
-    why = ""
-    for library in [os.environ["MUJOCO_GL"]] if "MUJOCO_GL" in os.environ else ["egl", "osmesa"]:
-        environ = os.environ | {"MUJOCO_GL": library, "PYOPENGL_PLATFORM": library}
-        command = [sys.executable, "-c", probe, str(Path(__file__).parent), name]
-        done = subprocess.run(command, env=environ, capture_output=True, text=True, check=False)
-        if done.returncode == 0:
-            os.environ |= {"MUJOCO_GL": library, "PYOPENGL_PLATFORM": library}
-            return f"{library}: {done.stdout.strip().splitlines()[-1]}"
-        why += f"\n{library}: {done.stderr.strip()}"
-    print(why[-3000:], file=sys.stderr)
-    print("no OpenGL works", file=sys.stderr)
-    sys.exit(3)
+PROBE = """
+import sys; sys.path.insert(0, sys.argv[1])
+from gymnasium_envs import make
+env = make(sys.argv[2])
+env.reset()
+from OpenGL import GL
+print(GL.glGetString(GL.GL_RENDERER).decode())
+"""
+"""Prints the name of OpenGL's renderer."""
 
 
 def main() -> None:
@@ -57,7 +42,8 @@ def main() -> None:
 
     arguments = json.loads(sys.argv[1])
     name, processes = GYMNASIUM_IDS[arguments["task"]], arguments["cores"]
-    renderer = opengl(name)
+    variables = ("MUJOCO_GL", "PYOPENGL_PLATFORM")
+    renderer = opengl(PROBE, str(Path(__file__).parent), name, variables=variables)
     envs = gymnasium.vector.AsyncVectorEnv([lambda: make(name)] * processes, context="spawn")
     if np.ptp(envs.reset(seed=0)[0]) == 0:
         raise RuntimeError("it draws nothing")

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import time
 from collections.abc import Callable
+from typing import NoReturn
 
 import numpy as np
 
@@ -28,3 +32,29 @@ def speed_of(step: Callable[[], int], seconds: float) -> dict[str, float]:
         if repetition:
             rates.append(steps / (time.perf_counter() - started))
     return {"median": float(np.median(rates)), "slowest": min(rates), "fastest": max(rates)}
+
+
+def opengl(probe: str, *arguments: str, variables: tuple[str, ...] = ("MUJOCO_GL",)) -> str:
+    """Choose an OpenGL with which a program works, whose last line is the renderer's name.
+
+    It is named in the environment's variables. Where there is none, this process ends with 3.
+    """
+    why = ""
+    for name in [os.environ["MUJOCO_GL"]] if "MUJOCO_GL" in os.environ else ["egl", "osmesa"]:
+        chosen = dict.fromkeys(variables, name)
+        command = [sys.executable, "-c", probe, *arguments]
+        done = subprocess.run(
+            command, env=os.environ | chosen, capture_output=True, text=True, check=False
+        )
+        if done.returncode == 0:
+            os.environ |= chosen
+            return f"{name}: {done.stdout.strip().splitlines()[-1]}"
+        why += f"\n{name}: {done.stderr.strip()}"
+    return no_opengl(why)
+
+
+def no_opengl(why: str) -> NoReturn:
+    """End this process with the status of what is absent."""
+    print(why[-3000:], file=sys.stderr)
+    print("no OpenGL works", file=sys.stderr)
+    sys.exit(3)

@@ -1,0 +1,109 @@
+"""The plots of the documentation: learning curves, and steps per second."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+
+from pixelbrax_gym.bench.tables import title
+from tests.benchmarks.results import return_at
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+COLORS = {"ppo": "C0", "ppg": "C1", "dcpg": "C2"}
+BASELINES = {"random": ("random policy", ":"), "none": ("no action", "--")}
+"""Label and line."""
+
+
+def row_of_panels(count: int, size: tuple[float, float], **options: Any) -> tuple[Any, Any]:
+    """A figure, and its panels side by side."""
+    figure, panels = plt.subplots(
+        1, count, figsize=size, layout="constrained", squeeze=False, **options
+    )
+    for panel in panels[0]:
+        panel.grid(alpha=0.3, which="both")
+    return figure, panels[0]
+
+
+def learning(panels: dict[str, tuple[list[list[dict]], dict]], path: Path) -> None:
+    """Return over steps: thin lines for seeds, a thick one for their mean, a band between them.
+
+    Steps and not minutes, which depend on the machine.
+    """
+    figure, row = row_of_panels(len(panels), (4 * len(panels), 3.4))
+    for axes, (name, (groups, untrained)) in zip(row, panels.items(), strict=True):
+        for seeds in groups:
+            _curve(axes, seeds)
+        for kind, (label, style) in BASELINES.items():
+            level = untrained[kind]["return"]
+            axes.axhline(level, color="gray", linestyle=style, label=label)
+        axes.set(xlabel="million control steps", title=name)
+        axes.legend(fontsize=7)
+    row[0].set_ylabel("return of training episodes")
+    figure.savefig(path, dpi=130)
+
+
+def _curve(axes: plt.Axes, seeds: list[dict]) -> None:
+    """Draw the runs of one algorithm."""
+    algorithm, end = seeds[0]["algorithm"], min(run["steps"][-1] for run in seeds)
+    color, grid, window = COLORS[algorithm], np.linspace(0.05 * end, end, 40), 0.1 * end
+    lines = np.array([[return_at(run, t, "steps", window) for t in grid] for run in seeds])
+    for line in lines:
+        axes.plot(grid / 1e6, line, color=color, alpha=0.3, linewidth=0.7)
+    if len(seeds) > 1:
+        low, high = lines.min(0), lines.max(0)
+        axes.fill_between(grid / 1e6, low, high, color=color, alpha=0.2, linewidth=0)
+    axes.plot(grid / 1e6, lines.mean(0), color=color, linewidth=1.8, label=algorithm.upper())
+
+
+def learning_dmc(runs: dict[str, list[dict]], path: Path) -> None:
+    """Return of training episodes over control steps, a line for each seed."""
+    figure, row = row_of_panels(len(runs), (4 * len(runs), 3.4))
+    for (name, seeds), axes in zip(runs.items(), row, strict=True):
+        for run in seeds:
+            end = run["steps"][-1]
+            grid = np.linspace(0.04 * end, end, 60)
+            line = [return_at(run, when, "steps", 0.04 * end) for when in grid]
+            axes.plot(grid / 1e6, line, color="C0", label="training episodes")
+            evaluated = [(e["steps"] / 1e6, e["clean/return"]) for e in run["evaluations"]]
+            axes.plot(*zip(*evaluated, strict=True), "o", color="C1", label="mean action")
+        axes.set(xlabel="million control steps", title=name.split("-")[1], ylim=(0, 1000))
+    row[0].set_ylabel("return")
+    handles, labels = row[0].get_legend_handles_labels()
+    named = dict(zip(labels, handles, strict=True))
+    row[0].legend(named.values(), named.keys(), fontsize=8)
+    figure.savefig(path, dpi=130)
+
+
+def speed(file: Path) -> None:
+    """Steps per second over the number of environments, if the results in ``file`` have any.
+
+    The picture is named as the file.
+    """
+    rows = [
+        row
+        for row in json.loads(file.read_text("utf-8"))["cases"].values()
+        if row["group"] == "environments" and row["status"] == "ok"
+    ]
+    tasks = list(dict.fromkeys(row["arguments"]["task"] for row in rows))
+    if not tasks:
+        return
+    figure, panels = row_of_panels(len(tasks), (1 + 3 * len(tasks), 3.6), sharey=True)
+    for panel, task in zip(panels, tasks, strict=True):
+        for obs_mode, label in (("state", "state only"), ("pixels", "84 x 84 pixels")):
+            points = sorted(
+                (row["arguments"]["num_envs"], row["values"]["steps_per_second"])
+                for row in rows
+                if row["arguments"]["task"] == task and row["arguments"].get("obs_mode") == obs_mode
+            )
+            panel.loglog([x for x, _ in points], [y for _, y in points], "o-", label=label)
+        panel.set(title=title(task), xlabel="environments")
+        panel.legend(fontsize=7)
+    panels[0].set_ylabel("steps / s")
+    figure.savefig(file.with_suffix(".png"), dpi=130)
+    plt.close(figure)
