@@ -208,6 +208,9 @@ _BY_KIND = {
 _FAR_FORMS = {GeomKind.SPHERE: _distant_sphere, GeomKind.CAPSULE: _distant_capsule}
 """For distant cameras."""
 
+assert set(_BY_KIND) == set(GeomKind), f"no formulas: {set(GeomKind) - set(_BY_KIND)}"
+assert set(_FAR_FORMS) == {kind for kind in GeomKind if kind.has_far_form}
+
 
 def intersect(
     kind: int,

@@ -222,6 +222,7 @@ _LOCAL = {
     GeomKind.CYLINDER: _cylinder,
     GeomKind.BOX: _box,
 }
+assert set(_LOCAL) == set(GeomKind), f"no formulas: {set(GeomKind) - set(_LOCAL)}"
 
 
 def _ground_color(scene: Scene, g: int, rays: jax.Array, height: int) -> jax.Array:
