@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import sys
+import warnings
 from collections.abc import Callable
+from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
 from xml.etree import ElementTree
@@ -12,8 +15,36 @@ from pixelbrax_jax.extras import install_extra
 from pixelbrax_jax.physics.mujoco_compatibility import loading_silenced
 from pixelbrax_jax.physics.opengl import mujoco
 
+KNOWN_VERSION = "1.0.50"
+"""Release of dm_control whose models the tests compare with."""
+
+KNOWN_MODELS = {
+    "acrobot": "318565bb75f5587f",
+    "ball_in_cup": "aed8880a33227847",
+    "cartpole": "049fc7484ab1a118",
+    "cheetah": "e200f6f051961105",
+    "finger": "b849081be69e1470",
+    "fish": "82214f68b3ec4770",
+    "hopper": "c14ce94c4bc108d7",
+    "humanoid": "f18638be4e464429",
+    "manipulator": "608a06bb47623612",
+    "pendulum": "c5c4b0342074bbdb",
+    "point_mass": "a9b36a3581197253",
+    "quadruped": "0fb169bde60fc592",
+    "reacher": "5eb539927a2e8933",
+    "swimmer": "aab420a1503b7e2c",
+    "walker": "e5efd523aa043683",
+}
+"""Domain -> start of the SHA-256 of its XML file and included files in that release."""
+
 _NO_WHEELS = (3, 13)
 """First Python without wheels for dm_control's requirements; its models can still be read."""
+
+_TO_MAKE = 8
+"""Stack level from the warning here to the caller of ``pixelbrax_jax.make``."""
+
+_warned: list[str] = []
+"""Domain of the only warning given in this process."""
 
 _INCLUDED = ("common/materials.xml", "common/skybox.xml", "common/visual.xml")
 
@@ -25,12 +56,14 @@ def load_model(domain: str, **options: float) -> mujoco.MjModel:
     and ``floor_size`` in metres (quadruped). Without dm_control it raises an ImportError.
     """
     folder = _suite_folder()
-    xml = (folder / f"{domain}.xml").read_text("utf-8")
+    files = {name: (folder / name).read_bytes() for name in (f"{domain}.xml", *_INCLUDED)}
+    _warn_if_unknown(domain, files)
+    xml = files.pop(f"{domain}.xml").decode()
     if domain in _GENERATORS:
         root = ElementTree.fromstring(xml)
         _GENERATORS[domain](root, **options)
         xml = ElementTree.tostring(root, encoding="unicode")
-    assets = {f"./{name}": (folder / name).read_bytes() for name in _INCLUDED}
+    assets = {f"./{name}": content for name, content in files.items()}
     with loading_silenced():
         return mujoco.MjModel.from_xml_string(xml, assets)
 
@@ -44,6 +77,26 @@ def _suite_folder() -> Path:
     raise ImportError(
         "dm_control is not installed, from which tasks of the DM Control Suite read their models; "
         f"try: {install_extra('dmc')}{newer if sys.version_info >= _NO_WHEELS else ''}"
+    )
+
+
+def _warn_if_unknown(domain: str, files: dict[str, bytes]) -> None:
+    # Independent of line ends.
+    content = b"".join(files[name].replace(b"\r\n", b"\n") for name in sorted(files))
+    if _warned or hashlib.sha256(content).hexdigest()[:16] == KNOWN_MODELS[domain]:
+        return
+    _warned.append(domain)
+    try:
+        installed = metadata.version("dm_control")
+    except metadata.PackageNotFoundError:
+        installed = "of an unknown version"
+    warnings.warn(
+        f"dm_control {installed} has another model of {domain!r} than "
+        f"dm_control {KNOWN_VERSION}, with which the tasks of PixelBrax are compared: results may "
+        f'differ from those of others. pip install "dm_control=={KNOWN_VERSION}" has the model '
+        "that is known.",
+        UserWarning,
+        stacklevel=_TO_MAKE,
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import itertools
 import re
+from importlib import metadata
 
 import jax
 import jax.numpy as jnp
@@ -81,6 +82,16 @@ def test_without_dm_control_the_extra_is_named(monkeypatch):
     monkeypatch.setattr(models.sys, "version_info", (3, 13, 0))
     with pytest.raises(ImportError, match="pip install --no-deps dm_control"):
         models.load_model("cheetah")
+
+
+@needs_models
+def test_other_models_are_warned_of_once(monkeypatch):
+    monkeypatch.setattr(models, "_warned", [])
+    monkeypatch.setitem(models.KNOWN_MODELS, "pendulum", "another")
+    both = rf"dm_control {metadata.version('dm_control')} .* dm_control {models.KNOWN_VERSION}"
+    with pytest.warns(UserWarning, match=both):
+        models.load_model("pendulum")
+    models.load_model("pendulum")
 
 
 @pytest.mark.parametrize("option", [{"reward_preset": "paper"}, {"backend": "mjx"}])
