@@ -31,6 +31,9 @@ if hasattr(signal, "SIGHUP"):
 import jax
 import pytest
 
+# Tracing makes millions of objects that live on, and Python looks at all of them again and again.
+gc.set_threshold(200_000, 20, 50)
+
 MAX_MAPS = 45_000
 """Memory maps of this process beyond which compiled programs are forgotten."""
 MAX_BYTES = 5 * 10**9

@@ -83,7 +83,7 @@ def without(*parts: str) -> dict[str, str]:
     ("flags", "part"),
     [
         (X64 | RULES, f"env:{TASK}"),
-        (TRACED, "program:dmc_cartpole_swingup,color"),
+        (TRACED, "program:dmc_pendulum_swingup,color"),
         (CHECKS, "gymnasium"),
     ],
     ids=["rules", "program", "checks"],
