@@ -159,7 +159,7 @@ def test_derivatives_are_those_without_flags():
 def test_brax_environments_of_64_bits_are_the_same_physics():
     from brax import envs
 
-    from pixelbrax_jax.physics.mujoco_compatibility import known_warnings_silenced
+    from pixelbrax_jax.physics.mujoco.compatibility import known_warnings_silenced
 
     def play_brax():
         with known_warnings_silenced():

@@ -10,7 +10,7 @@ import numpy as np
 
 from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.envs.vector import VectorPixelEnv
-from pixelbrax_jax.physics.mujoco_compatibility import accept_device_put_replicated, import_silenced
+from pixelbrax_jax.physics.mujoco.compatibility import accept_device_put_replicated, import_silenced
 from pixelbrax_jax.types import EnvParams, Timestep
 
 with import_silenced():

@@ -13,7 +13,7 @@ import pytest
 from pixelbrax_jax import EnvParams, PixelEnv, VectorPixelEnv
 from pixelbrax_jax.envs.brax_env import PIXELS, BraxEnv, wrap_fresh_episodes
 from pixelbrax_jax.physics.brax.engine import training
-from pixelbrax_jax.physics.mujoco_compatibility import accept_device_put_replicated
+from pixelbrax_jax.physics.mujoco.compatibility import accept_device_put_replicated
 from tests.envs.toy import PARAMS, Ball, limited
 
 RIGHT = jnp.ones(1)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import pixelbrax_jax as pb
-from pixelbrax_jax.physics.geometry import site_shapes
-from pixelbrax_jax.physics.viewpoints import followed_body
+from pixelbrax_jax.physics.mujoco.geometry import site_shapes
+from pixelbrax_jax.physics.mujoco.viewpoints import followed_body
 from tests.envs.toy import Ball
 
 REACHER = """

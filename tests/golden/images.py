@@ -15,7 +15,7 @@ import numpy as np
 from PIL import Image
 
 import pixelbrax_jax as pb
-from pixelbrax_jax.physics.model_scene import COM_LINK
+from pixelbrax_jax.physics.mujoco.scene import COM_LINK
 from pixelbrax_jax.renderer.base import render
 from pixelbrax_jax.scene.place import place
 from pixelbrax_jax.tasks import BRAX_TASKS, DMC_TASKS

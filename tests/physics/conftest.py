@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from pixelbrax_jax.physics.mujoco_compatibility import loading_silenced
+from pixelbrax_jax.physics.mujoco.compatibility import loading_silenced
 from pixelbrax_jax.registry import make_physics
 from pixelbrax_jax.types import Geoms
 

@@ -11,7 +11,7 @@ from brax.io import mjcf
 
 from pixelbrax_jax.physics.brax.engine import BraxPhysics, envs, training
 from pixelbrax_jax.physics.brax.loading import load_brax_env
-from pixelbrax_jax.physics.mujoco_compatibility import loading_silenced
+from pixelbrax_jax.physics.mujoco.compatibility import loading_silenced
 
 SLIDER = """
 <mujoco>

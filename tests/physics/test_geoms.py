@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from pixelbrax_jax.physics.geometry import as_geoms, geom_shapes
+from pixelbrax_jax.physics.mujoco.geometry import as_geoms, geom_shapes
 from pixelbrax_jax.renderer import intersect, reference
 from pixelbrax_jax.tasks import BRAX_TASKS
 from pixelbrax_jax.types import GeomKind

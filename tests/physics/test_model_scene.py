@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from pixelbrax_jax.physics.model_scene import read_scene, tracked_body
+from pixelbrax_jax.physics.mujoco.scene import read_scene, tracked_body
 from pixelbrax_jax.types import GeomKind
 
 MODEL = """

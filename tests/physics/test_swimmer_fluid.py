@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pixelbrax_jax.physics.brax.engine import fluid
-from pixelbrax_jax.physics.mujoco_compatibility import accept_old_clip
+from pixelbrax_jax.physics.mujoco.compatibility import accept_old_clip
 
 
 def test_fluid_force_is_mujocos(program, unfused_model):

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from pixelbrax_jax.physics.model_scene import ModelScene, read_scene, tracked_body
+from pixelbrax_jax.physics.mujoco.scene import ModelScene, read_scene, tracked_body
 from pixelbrax_jax.scene.cameras import seen_from
 
 MODELS = {

@@ -19,17 +19,17 @@ from flax import struct
 from pixelbrax_jax.flags import as_by_default, default_flags, under_default_flags
 from pixelbrax_jax.physics.base import Kinematics, RewardFn
 from pixelbrax_jax.physics.divergence import GuardedPhysics
-from pixelbrax_jax.physics.geometry import VISIBLE_GROUPS, as_geoms, geom_shapes, site_shapes
-from pixelbrax_jax.physics.model_scene import COM_LINK, tracked_body
-from pixelbrax_jax.physics.mujoco_compatibility import (
+from pixelbrax_jax.physics.mujoco.geometry import VISIBLE_GROUPS, as_geoms, geom_shapes, site_shapes
+from pixelbrax_jax.physics.mujoco.scene import COM_LINK, tracked_body
+from pixelbrax_jax.physics.mujoco.compatibility import (
     accept_old_clip,
     import_silenced,
     known_warnings_silenced,
 )
-from pixelbrax_jax.physics.opengl import mujoco
-from pixelbrax_jax.physics.poses import check_pose, with_unit_rotations
+from pixelbrax_jax.physics.mujoco.opengl import mujoco
+from pixelbrax_jax.physics.mujoco.poses import check_pose, with_unit_rotations
 from pixelbrax_jax.physics.task import Color
-from pixelbrax_jax.physics.viewpoints import followed_body, read_rigs, unfit_cameras
+from pixelbrax_jax.physics.mujoco.viewpoints import followed_body, read_rigs, unfit_cameras
 from pixelbrax_jax.spatial import quat_normalize, rotate
 from pixelbrax_jax.types import CameraRig, PhysicsState
 

@@ -12,7 +12,7 @@ from pixelbrax_jax.physics.base import Kinematics
 from pixelbrax_jax.physics.brax.engine import BraxPhysics
 from pixelbrax_jax.physics.brax.tasks import REWARD_PRESETS, TASKS, BraxTask
 from pixelbrax_jax.physics.divergence import Recipe
-from pixelbrax_jax.physics.mujoco_compatibility import (
+from pixelbrax_jax.physics.mujoco.compatibility import (
     import_silenced,
     load_onto_own_device,
     loading_silenced,

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from pixelbrax_jax.physics.mujoco_compatibility import import_silenced
-from pixelbrax_jax.physics.opengl import mujoco
+from pixelbrax_jax.physics.mujoco.compatibility import import_silenced
+from pixelbrax_jax.physics.mujoco.opengl import mujoco
 
 with import_silenced():
     from mujoco.mjx._src.collision_driver import geom_pairs

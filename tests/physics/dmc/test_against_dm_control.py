@@ -10,8 +10,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from pixelbrax_jax.physics.mjx import models
-from pixelbrax_jax.physics.mjx.domains import FORMULAS
+from pixelbrax_jax.physics.dmc import models
+from pixelbrax_jax.physics.dmc.domains import FORMULAS
 from pixelbrax_jax.registry import make_physics
 from pixelbrax_jax.tasks import DMC_TASKS
 from tests.physics.dmc import measure, oracle

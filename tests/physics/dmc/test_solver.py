@@ -11,9 +11,9 @@ from mujoco.mjx._src import collision_driver
 from mujoco.mjx._src import solver as theirs
 
 from pixelbrax_jax._platform.interpreter import batch_last
-from pixelbrax_jax.physics.mjx import elimination
-from pixelbrax_jax.physics.mjx.dynamics import Dynamics
-from pixelbrax_jax.physics.mjx.solver import is_supported
+from pixelbrax_jax.physics.dmc import elimination
+from pixelbrax_jax.physics.mujoco.dynamics import Dynamics
+from pixelbrax_jax.physics.mujoco.solver import is_supported
 
 # Two arms with dry friction, limits and a joint that follows another; a ball that slides and rolls.
 MODEL = """

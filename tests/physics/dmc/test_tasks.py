@@ -16,9 +16,9 @@ from jax.extend import core
 from mujoco.mjx._src import collision_driver
 
 import pixelbrax_jax as pb
-from pixelbrax_jax.physics.mjx import models
-from pixelbrax_jax.physics.mjx.elimination import LARGEST
-from pixelbrax_jax.physics.mjx.solver import is_supported
+from pixelbrax_jax.physics.dmc import models
+from pixelbrax_jax.physics.mujoco.elimination import LARGEST
+from pixelbrax_jax.physics.mujoco.solver import is_supported
 from pixelbrax_jax.registry import make_physics
 from pixelbrax_jax.tasks import BRAX_TASKS, DMC_TASKS
 from tests.physics.dmc import oracle

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pixelbrax_jax.physics.mjx.dynamics import Dynamics
-from pixelbrax_jax.physics.mjx.formulas import (
+from pixelbrax_jax.physics.mujoco.dynamics import Dynamics
+from pixelbrax_jax.physics.dmc.formulas import (
     Formulas,
     Snapshot,
     Start,
@@ -19,7 +19,7 @@ from pixelbrax_jax.physics.mjx.formulas import (
     start_free_of_contact,
     tolerance,
 )
-from pixelbrax_jax.physics.opengl import mujoco
+from pixelbrax_jax.physics.mujoco.opengl import mujoco
 
 _FINGER_SPEED = 15.0
 
@@ -98,12 +98,12 @@ def _observe_spin(seen: Snapshot) -> jax.Array:
 
 def _distance(seen: Snapshot) -> jax.Array:
     """Return metres from the tip to the target's surface, negative inside."""
-    offset = _from_hinge(seen, seen.target) - _from_hinge(seen, seen.sensor("tip"))
+    offset = _from_hinge(seen, seen.state.target) - _from_hinge(seen, seen.sensor("tip"))
     return jnp.linalg.norm(offset) - float(seen.model.site("target").size[0])
 
 
 def _observe_turn(seen: Snapshot) -> jax.Array:
-    return joined(_observe_spin(seen), _from_hinge(seen, seen.target), _distance(seen))
+    return joined(_observe_spin(seen), _from_hinge(seen, seen.state.target), _distance(seen))
 
 
 def _reward_spin(seen: Snapshot) -> jax.Array:

@@ -12,15 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from pixelbrax_jax.physics.mjx.dynamics import Dynamics
-from pixelbrax_jax.physics.opengl import mujoco
+from pixelbrax_jax.physics.mujoco.dynamics import Dynamics, Readings, State
+from pixelbrax_jax.physics.mujoco.opengl import mujoco
 
 _MAX_ATTEMPTS = 1000
 """Largest number of sampled poses."""
 
 
 class Start(struct.PyTreeNode):
-    """An initial state with fields of ``MjxState``; None means at rest or without a target."""
+    """An initial state with fields of ``State``; None means at rest or without a target."""
 
     qpos: jax.Array
     qvel: jax.Array | None = None
@@ -36,22 +36,22 @@ class Snapshot:
     frame; rotations are matrices with the axes as columns, or unit quaternions (w, x, y, z).
 
     Attributes:
-        data: MuJoCo's numbers by its names, such as ``qpos``, ``qvel`` and ``ctrl`` (0 after a
-            reset).
-        target: this episode's target, as in ``MjxState``.
+        state: positions, velocities, activations, the last controls (0 after a reset) and this
+            episode's target.
+        data: what MuJoCo computes from them, by its names of ``MjData``.
     """
 
     model: mujoco.MjModel
-    data: Any
-    target: jax.Array
+    state: State
+    data: Readings
 
     def joint_pos(self, *names: str) -> jax.Array:
         """Return the positions of hinges and slides."""
-        return self.data.qpos[np.array([self.model.joint(name).qposadr[0] for name in names])]
+        return self.state.qpos[np.array([self.model.joint(name).qposadr[0] for name in names])]
 
     def joint_vel(self, *names: str) -> jax.Array:
         """Return the velocities of hinges and slides."""
-        return self.data.qvel[np.array([self.model.joint(name).dofadr[0] for name in names])]
+        return self.state.qvel[np.array([self.model.joint(name).dofadr[0] for name in names])]
 
     def sensor(self, *names: str) -> jax.Array:
         """Return the readings of sensors, concatenated."""
@@ -103,7 +103,7 @@ def joined(*parts: jax.Array | float) -> jax.Array:
 
 def observe_joints(seen: Snapshot) -> jax.Array:
     """Return all joint positions and velocities."""
-    return joined(seen.data.qpos, seen.data.qvel)
+    return joined(seen.state.qpos, seen.state.qvel)
 
 
 def tolerance(

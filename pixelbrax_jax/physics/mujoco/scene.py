@@ -9,7 +9,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from pixelbrax_jax.physics.geometry import (
+from pixelbrax_jax.physics.mujoco.geometry import (
     VISIBLE_GROUPS,
     Shape,
     as_geoms,
@@ -18,10 +18,10 @@ from pixelbrax_jax.physics.geometry import (
     resolve_rgba,
     site_shapes,
 )
-from pixelbrax_jax.physics.lighting import checker, mean_color, read_lamps, read_look
-from pixelbrax_jax.physics.opengl import mujoco
-from pixelbrax_jax.physics.viewpoints import camera_name, read_rigs
-from pixelbrax_jax.physics.viewpoints import tracked_body as tracked_body
+from pixelbrax_jax.physics.mujoco.lighting import checker, mean_color, read_lamps, read_look
+from pixelbrax_jax.physics.mujoco.opengl import mujoco
+from pixelbrax_jax.physics.mujoco.viewpoints import camera_name, read_rigs
+from pixelbrax_jax.physics.mujoco.viewpoints import tracked_body as tracked_body
 from pixelbrax_jax.spatial import f32
 from pixelbrax_jax.types import CameraRig, GeomKind, Geoms, Look, String
 

@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pixelbrax_jax.physics.mjx import elimination
-from pixelbrax_jax.physics.mjx.cones import Cones
-from pixelbrax_jax.physics.mujoco_compatibility import import_silenced
-from pixelbrax_jax.physics.opengl import mujoco
+from pixelbrax_jax.physics.dmc import elimination
+from pixelbrax_jax.physics.mujoco.cones import Cones
+from pixelbrax_jax.physics.mujoco.compatibility import import_silenced
+from pixelbrax_jax.physics.mujoco.opengl import mujoco
 
 with import_silenced():
     from mujoco.mjx._src import support

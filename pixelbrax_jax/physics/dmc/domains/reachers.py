@@ -7,8 +7,8 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from pixelbrax_jax.physics.mjx.dynamics import Dynamics
-from pixelbrax_jax.physics.mjx.formulas import (
+from pixelbrax_jax.physics.mujoco.dynamics import Dynamics
+from pixelbrax_jax.physics.dmc.formulas import (
     Formulas,
     Snapshot,
     Start,
@@ -20,7 +20,7 @@ from pixelbrax_jax.physics.mjx.formulas import (
     start_anywhere,
     tolerance,
 )
-from pixelbrax_jax.physics.opengl import mujoco
+from pixelbrax_jax.physics.mujoco.opengl import mujoco
 
 _FISH_JOINTS = (
     "tail1",
@@ -57,16 +57,16 @@ def _fish_upright(seen: Snapshot) -> jax.Array:
 
 def _fish_to_target(seen: Snapshot) -> jax.Array:
     """Return (3,) metres, the vector from the mouth to the target in the mouth's frame."""
-    return (seen.target - seen.geom_pos("mouth")) @ seen.geom_mat("mouth")
+    return (seen.state.target - seen.geom_pos("mouth")) @ seen.geom_mat("mouth")
 
 
 def _observe_fish_upright(seen: Snapshot) -> jax.Array:
-    return joined(seen.joint_pos(*_FISH_JOINTS), _fish_upright(seen), seen.data.qvel)
+    return joined(seen.joint_pos(*_FISH_JOINTS), _fish_upright(seen), seen.state.qvel)
 
 
 def _observe_fish_swim(seen: Snapshot) -> jax.Array:
     joints = seen.joint_pos(*_FISH_JOINTS)
-    return joined(joints, _fish_upright(seen), _fish_to_target(seen), seen.data.qvel)
+    return joined(joints, _fish_upright(seen), _fish_to_target(seen), seen.state.qvel)
 
 
 def _reward_fish_upright(seen: Snapshot) -> jax.Array:
@@ -87,7 +87,7 @@ def _reward_point_mass(seen: Snapshot) -> jax.Array:
     distance = jnp.linalg.norm(seen.geom_pos("target") - seen.geom_pos("pointmass"))
     radius = float(seen.model.geom("target").size[0])
     near = tolerance(distance, (0.0, radius), margin=radius)
-    return near * (jnp.mean(small_control(seen.data.ctrl)) + 4) / 5
+    return near * (jnp.mean(small_control(seen.state.ctrl)) + 4) / 5
 
 
 def _start_reacher(dynamics: Dynamics, key: jax.Array) -> Start:
@@ -103,11 +103,11 @@ def _start_reacher(dynamics: Dynamics, key: jax.Array) -> Start:
 
 def _reacher_to_target(seen: Snapshot) -> jax.Array:
     """Return (2,) metres, the vector from the finger to the target in the plane."""
-    return (seen.target - seen.geom_pos("finger"))[:2]
+    return (seen.state.target - seen.geom_pos("finger"))[:2]
 
 
 def _observe_reacher(seen: Snapshot) -> jax.Array:
-    return joined(seen.data.qpos, _reacher_to_target(seen), seen.data.qvel)
+    return joined(seen.state.qpos, _reacher_to_target(seen), seen.state.qvel)
 
 
 def _reward_reacher(seen: Snapshot) -> jax.Array:
@@ -130,14 +130,14 @@ def _start_swimmer(dynamics: Dynamics, key: jax.Array) -> Start:
 
 def _swimmer_to_target(seen: Snapshot) -> jax.Array:
     """Return (2,) metres, the vector from the nose to the target in the head's frame."""
-    return ((seen.target - seen.geom_pos("nose")) @ seen.xmat("head"))[:2]
+    return ((seen.state.target - seen.geom_pos("nose")) @ seen.xmat("head"))[:2]
 
 
 def _observe_swimmer(seen: Snapshot) -> jax.Array:
     """Return joint positions, vector to the target, and each body's velocities in its frame."""
     names = [seen.model.sensor(i).name for i in range(seen.model.nsensor)]
     readings = seen.sensor(*names)[_SWIMMER_BODY_SENSORS:].reshape(-1, 6)
-    return joined(seen.data.qpos[3:], _swimmer_to_target(seen), readings[:, jnp.array([0, 1, 5])])
+    return joined(seen.state.qpos[3:], _swimmer_to_target(seen), readings[:, jnp.array([0, 1, 5])])
 
 
 def _reward_swimmer(seen: Snapshot) -> jax.Array:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from pixelbrax_jax.physics.opengl import mujoco
+from pixelbrax_jax.physics.mujoco.opengl import mujoco
 from pixelbrax_jax.physics.task import Color
 from pixelbrax_jax.types import GeomKind, Geoms
 from pixelbrax_jax.validation import check_choice

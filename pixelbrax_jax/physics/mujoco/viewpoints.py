@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pixelbrax_jax.physics.opengl import mujoco
+from pixelbrax_jax.physics.mujoco.opengl import mujoco
 from pixelbrax_jax.spatial import make_rig
 from pixelbrax_jax.types import CameraRig
 

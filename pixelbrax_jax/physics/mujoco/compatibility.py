@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from pixelbrax_jax.physics.opengl import mujoco
+from pixelbrax_jax.physics.mujoco.opengl import mujoco
 
 _KNOWN_WARNINGS: tuple[tuple[str, type[Warning]], ...] = (
     # Brax, at every load of a model.

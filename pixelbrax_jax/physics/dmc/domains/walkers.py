@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pixelbrax_jax.physics.mjx.dynamics import Dynamics
-from pixelbrax_jax.physics.mjx.formulas import (
+from pixelbrax_jax.physics.mujoco.dynamics import Dynamics
+from pixelbrax_jax.physics.dmc.formulas import (
     Formulas,
     Snapshot,
     Start,
@@ -22,7 +22,7 @@ from pixelbrax_jax.physics.mjx.formulas import (
     start_free_of_contact,
     tolerance,
 )
-from pixelbrax_jax.physics.opengl import mujoco
+from pixelbrax_jax.physics.mujoco.opengl import mujoco
 
 _CHEETAH_SPEED = 10.0
 _CHEETAH_SETTLING_STEPS = 200
@@ -60,7 +60,7 @@ def _start_cheetah(dynamics: Dynamics, key: jax.Array) -> Start:
 
 def _observe_cheetah(seen: Snapshot) -> jax.Array:
     """Return joint positions without x, and velocities."""
-    return joined(seen.data.qpos[1:], seen.data.qvel)
+    return joined(seen.state.qpos[1:], seen.state.qvel)
 
 
 def _reward_cheetah(seen: Snapshot) -> jax.Array:
@@ -70,7 +70,7 @@ def _reward_cheetah(seen: Snapshot) -> jax.Array:
 
 def _observe_hopper(seen: Snapshot) -> jax.Array:
     touch = jnp.log1p(seen.sensor("touch_toe", "touch_heel"))
-    return joined(seen.data.qpos[1:], seen.data.qvel, touch)
+    return joined(seen.state.qpos[1:], seen.state.qvel, touch)
 
 
 def _standing_hopper(seen: Snapshot) -> jax.Array:
@@ -79,7 +79,7 @@ def _standing_hopper(seen: Snapshot) -> jax.Array:
 
 
 def _reward_hopper_stand(seen: Snapshot) -> jax.Array:
-    small = small_control(seen.data.ctrl)
+    small = small_control(seen.state.ctrl)
     return _standing_hopper(seen) * (jnp.mean(small) + 4) / 5
 
 
@@ -94,12 +94,12 @@ def _observe_humanoid(seen: Snapshot) -> jax.Array:
     limbs = ("left_hand", "left_foot", "right_hand", "right_foot")
     extremities = [(seen.xpos(limb) - torso) @ frame for limb in limbs]
     return joined(
-        seen.data.qpos[7:],
+        seen.state.qpos[7:],
         seen.xpos("head")[2],
         *extremities,
         frame[2],
         seen.sensor("torso_subtreelinvel"),
-        seen.data.qvel,
+        seen.state.qvel,
     )
 
 
@@ -107,7 +107,7 @@ def _reward_humanoid(seen: Snapshot, *, speed: float) -> jax.Array:
     height = seen.xpos("head")[2]
     standing = tolerance(height, (_HUMANOID_HEIGHT, jnp.inf), margin=_HUMANOID_HEIGHT / 4)
     upright = rising(seen.xmat("torso")[2, 2], 0.9, margin=1.9)
-    stand = (4 + jnp.mean(small_control(seen.data.ctrl))) / 5 * standing * upright
+    stand = (4 + jnp.mean(small_control(seen.state.ctrl))) / 5 * standing * upright
     velocity = seen.sensor("torso_subtreelinvel")[:2]
     if speed == 0:
         return stand * jnp.mean(tolerance(velocity, margin=2.0))
@@ -123,7 +123,7 @@ def _start_quadruped(dynamics: Dynamics, key: jax.Array) -> Start:
     model = dynamics.model
     rotation = random_rotation(key)
     joints = jnp.asarray(model.qpos0[7:], jnp.float32)
-    depth = -dynamics.clearance(joined(jnp.zeros(3), rotation, joints), "floor")
+    depth = -dynamics.clearances(joined(jnp.zeros(3), rotation, joints))[model.geom("floor").id]
     height = _QUADRUPED_LIFT * jnp.ceil(jnp.maximum(depth, 0.0) / _QUADRUPED_LIFT)
     return Start(joined(jnp.zeros(2), height, rotation, joints))
 
@@ -135,7 +135,7 @@ def _observe_quadruped(seen: Snapshot) -> jax.Array:
     return joined(
         seen.joint_pos(*names),
         seen.joint_vel(*names),
-        seen.data.act,
+        seen.state.act,
         seen.sensor("velocimeter"),
         seen.xmat("torso")[2, 2],
         seen.sensors_of(kinds.mjSENS_GYRO, kinds.mjSENS_ACCELEROMETER),
@@ -150,7 +150,7 @@ def _reward_quadruped(seen: Snapshot, *, speed: float) -> jax.Array:
 
 def _observe_walker(seen: Snapshot) -> jax.Array:
     axes = seen.data.xmat[1:][:, 0][:, jnp.array([0, 2])]
-    return joined(axes, seen.xpos("torso")[2], seen.data.qvel)
+    return joined(axes, seen.xpos("torso")[2], seen.state.qvel)
 
 
 def _reward_walker(seen: Snapshot, *, speed: float) -> jax.Array:

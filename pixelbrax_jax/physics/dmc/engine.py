@@ -13,15 +13,15 @@ import numpy as np
 
 from pixelbrax_jax.flags import default_flags, under_default_flags
 from pixelbrax_jax.physics.divergence import GuardedPhysics, Recipe
-from pixelbrax_jax.physics.mjx.domains import FORMULAS
-from pixelbrax_jax.physics.mjx.dynamics import Dynamics, MjxState
-from pixelbrax_jax.physics.mjx.formulas import Formulas, Snapshot, Start
-from pixelbrax_jax.physics.mjx.models import load_model
-from pixelbrax_jax.physics.mjx.tasks import TASKS
-from pixelbrax_jax.physics.model_scene import COM_LINK, TARGET_LINK, read_scene, tracked_body
-from pixelbrax_jax.physics.opengl import mujoco
-from pixelbrax_jax.physics.poses import check_pose, with_unit_rotations
-from pixelbrax_jax.physics.viewpoints import unfit_cameras
+from pixelbrax_jax.physics.dmc.domains import FORMULAS
+from pixelbrax_jax.physics.mujoco.dynamics import Dynamics, Readings, State
+from pixelbrax_jax.physics.dmc.formulas import Formulas, Snapshot, Start
+from pixelbrax_jax.physics.dmc.models import load_model
+from pixelbrax_jax.physics.dmc.tasks import TASKS
+from pixelbrax_jax.physics.mujoco.scene import COM_LINK, TARGET_LINK, read_scene, tracked_body
+from pixelbrax_jax.physics.mujoco.opengl import mujoco
+from pixelbrax_jax.physics.mujoco.poses import check_pose, with_unit_rotations
+from pixelbrax_jax.physics.mujoco.viewpoints import unfit_cameras
 from pixelbrax_jax.types import PhysicsState
 
 _UPRIGHT = (1.0, 0.0, 0.0, 0.0)
@@ -52,6 +52,7 @@ class MjxPhysics(GuardedPhysics):
         self.dynamics = Dynamics(
             model,
             reads_forces=formulas.reads_forces,
+            starts_with_forces=formulas.starts_with_forces,
             out_of_reach=formulas.out_of_reach,
             target_body=formulas.target_body,
         )
@@ -78,11 +79,10 @@ class MjxPhysics(GuardedPhysics):
         low, high = self._control_range
         return low + 0.5 * (action + 1) * (high - low)
 
-    def observe(self, state: MjxState, sensors: jax.Array) -> PhysicsState:
-        """Return poses, observation and reward; force sensors are read from ``sensors``."""
-        data = self.dynamics.refresh(state, sensors)
-        seen = Snapshot(self._model, data, state.target)
-        xpos, xquat = self._links(data, state.target)
+    def observe(self, state: State, readings: Readings) -> PhysicsState:
+        """Return poses, observation and reward."""
+        seen = Snapshot(self._model, state, readings)
+        xpos, xquat = self._links(readings, state.target)
         return PhysicsState(
             engine=state,
             xpos=xpos,
@@ -93,8 +93,8 @@ class MjxPhysics(GuardedPhysics):
             non_finite=jnp.zeros((), bool),
         )
 
-    def first(self, key: jax.Array) -> tuple[MjxState, jax.Array]:
-        """Sample an initial state; return it and the sensors for ``observe``."""
+    def first(self, key: jax.Array) -> tuple[State, Readings]:
+        """Sample an initial state; return it and its readings."""
         return self._settle(self._formulas.start(self.dynamics, key))
 
     @under_default_flags
@@ -107,15 +107,11 @@ class MjxPhysics(GuardedPhysics):
         start = start.replace(qpos=with_unit_rotations(self._model, q), qvel=qd)
         return self._guard_first(self.observe(*self._settle(start)))
 
-    def _settle(self, start: Start) -> tuple[MjxState, jax.Array]:
-        state = self.dynamics.state(start.qpos, start.qvel, start.target)
-        sensors = jnp.zeros(self._model.nsensordata)
-        if self._formulas.starts_with_forces:
-            state, sensors = self.dynamics.at_rest(state)
-        return state, sensors
+    def _settle(self, start: Start) -> tuple[State, Readings]:
+        return self.dynamics.first(self.dynamics.state(start.qpos, start.qvel, start.target))
 
-    def move(self, state: MjxState, action: jax.Array) -> tuple[MjxState, jax.Array]:
-        """Advance by one control step; return the state and the sensors for ``observe``."""
+    def move(self, state: State, action: jax.Array) -> tuple[State, Readings]:
+        """Advance by one control step; return the state and its readings."""
         action = jnp.asarray(action, jnp.float32)
         return self.dynamics.step(state.replace(ctrl=self.control(action)), self._formulas.substeps)
 
@@ -128,11 +124,11 @@ class MjxPhysics(GuardedPhysics):
     def _watched(self, state: PhysicsState) -> Any:
         return state.engine, state.xpos
 
-    def _links(self, data: Any, target: jax.Array) -> tuple[jax.Array, jax.Array]:
-        places = {TARGET_LINK: target, COM_LINK: data.subtree_com[self._tracked_body]}
+    def _links(self, readings: Readings, target: jax.Array) -> tuple[jax.Array, jax.Array]:
+        places = {TARGET_LINK: target, COM_LINK: readings.subtree_com[self._tracked_body]}
         rows = [places[name][None] for name in self._extra_links]
         upright = jnp.tile(jnp.array(_UPRIGHT), (len(rows), 1))
-        return jnp.concatenate([data.xpos[1:], *rows]), jnp.concatenate([data.xquat[1:], upright])
+        return jnp.concatenate([readings.xpos[1:], *rows]), jnp.concatenate([readings.xquat[1:], upright])
 
 
 # Loading a model takes a second. A model that is loaded again equals the first one.

@@ -12,8 +12,8 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from pixelbrax_jax.extras import install_extra
-from pixelbrax_jax.physics.mujoco_compatibility import loading_silenced
-from pixelbrax_jax.physics.opengl import mujoco
+from pixelbrax_jax.physics.mujoco.compatibility import loading_silenced
+from pixelbrax_jax.physics.mujoco.opengl import mujoco
 
 KNOWN_VERSION = "1.0.50"
 """Release of dm_control whose models the tests compare with."""

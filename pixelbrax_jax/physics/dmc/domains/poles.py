@@ -8,8 +8,8 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from pixelbrax_jax.physics.mjx.dynamics import Dynamics
-from pixelbrax_jax.physics.mjx.formulas import (
+from pixelbrax_jax.physics.mujoco.dynamics import Dynamics
+from pixelbrax_jax.physics.dmc.formulas import (
     Formulas,
     Snapshot,
     Start,
@@ -28,7 +28,7 @@ def _start_anywhere(dynamics: Dynamics, key: jax.Array) -> Start:
 def _observe_acrobot(seen: Snapshot) -> jax.Array:
     """Return x and z parts of both arms' axes, then velocities."""
     axes = jnp.stack([seen.xmat("upper_arm")[:, 2], seen.xmat("lower_arm")[:, 2]])
-    return joined(axes[:, 0], axes[:, 2], seen.data.qvel)
+    return joined(axes[:, 0], axes[:, 2], seen.state.qvel)
 
 
 def _reward_acrobot(seen: Snapshot, *, margin: float) -> jax.Array:
@@ -52,14 +52,14 @@ def _start_upright(dynamics: Dynamics, key: jax.Array) -> Start:
 def _observe_cartpole(seen: Snapshot) -> jax.Array:
     """Return the cart's position, cosine and sine of the pole's angle, and velocities."""
     pole = seen.xmat("pole_1")
-    return joined(seen.joint_pos("slider"), pole[2, 2], pole[0, 2], seen.data.qvel)
+    return joined(seen.joint_pos("slider"), pole[2, 2], pole[0, 2], seen.state.qvel)
 
 
 def _reward_cartpole(seen: Snapshot) -> jax.Array:
     upright = (seen.xmat("pole_1")[2, 2] + 1) / 2
     centered = (1 + tolerance(seen.joint_pos("slider")[0], margin=2.0)) / 2
-    small = small_control(seen.data.ctrl[0])
-    small_velocity = (1 + tolerance(seen.data.qvel[1], margin=5.0)) / 2
+    small = small_control(seen.state.ctrl[0])
+    small_velocity = (1 + tolerance(seen.state.qvel[1], margin=5.0)) / 2
     return upright * (4 + small) / 5 * small_velocity * centered
 
 
@@ -70,7 +70,7 @@ def _reward_cartpole_sparse(seen: Snapshot) -> jax.Array:
 
 def _observe_pendulum(seen: Snapshot) -> jax.Array:
     pole = seen.xmat("pole")
-    return joined(pole[2, 2], pole[0, 2], seen.data.qvel)
+    return joined(pole[2, 2], pole[0, 2], seen.state.qvel)
 
 
 def _reward_pendulum(seen: Snapshot) -> jax.Array:

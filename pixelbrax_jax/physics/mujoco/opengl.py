@@ -1,4 +1,4 @@
-"""Import of MuJoCo without OpenGL: ``from pixelbrax_jax.physics.opengl import mujoco``."""
+"""Import of MuJoCo without OpenGL: ``from pixelbrax_jax.physics.mujoco.opengl import mujoco``."""
 
 from __future__ import annotations
 

@@ -1,0 +1,212 @@
+"""Calls of Python functions by programs compiled for a CPU.
+
+``jax.pure_callback`` starts other work of JAX's in every call, which may wait for the very thread
+that makes the call, and JAX does not cache programs with it. A call here reads and writes the
+program's memory, takes some 20 microseconds, and is cached, because the program contains only a
+name. It implements the C interface of XLA's foreign functions (``xla/ffi/api/c_api.h``, which
+jaxlib contains) with ctypes.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import re
+import traceback
+from collections.abc import Callable, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+_TARGET = "pixelbrax_host_call"
+
+_functions: dict[str, Callable[..., None]] = {}
+"""Functions by the names that programs contain; kept as long as a program may run."""
+
+
+def register(name: str, function: Callable[..., None]) -> None:
+    """Let programs call ``function`` by ``name``, which must mean the same in every process.
+
+    It is called with the operands as read-only arrays, then with the results as arrays to fill, in
+    any thread. It must not use JAX, and may be called by several threads at once.
+    """
+    _functions[name] = function
+
+
+def host_call(
+    name: str, operands: Sequence[jax.Array], results: Sequence[jax.ShapeDtypeStruct]
+) -> list[jax.Array]:
+    """Return what the function registered as ``name`` makes of float32 or bool arrays.
+
+    Only a CPU's programs may contain it. An exception of the function ends the program with an
+    error of JAX that contains the traceback.
+    """
+    _register_target()
+    return list(jax.ffi.ffi_call(_TARGET, list(results))(*operands, function=name))
+
+
+class _Extension(ctypes.Structure):
+    pass
+
+
+_Extension._fields_ = [
+    ("size", ctypes.c_size_t),
+    ("type", ctypes.c_int),
+    ("next", ctypes.POINTER(_Extension)),
+]
+
+
+class _Version(ctypes.Structure):
+    _fields_ = [
+        ("size", ctypes.c_size_t),
+        ("extension", ctypes.c_void_p),
+        ("major", ctypes.c_int),
+        ("minor", ctypes.c_int),
+    ]
+
+
+class _Metadata(ctypes.Structure):
+    _fields_ = [
+        ("size", ctypes.c_size_t),
+        ("version", _Version),
+        ("traits", ctypes.c_uint32),
+        ("state_type", ctypes.c_int64),
+    ]
+
+
+class _MetadataExtension(ctypes.Structure):
+    _fields_ = [("base", _Extension), ("metadata", ctypes.POINTER(_Metadata))]
+
+
+class _Buffer(ctypes.Structure):
+    _fields_ = [
+        ("size", ctypes.c_size_t),
+        ("extension", ctypes.c_void_p),
+        ("dtype", ctypes.c_int),
+        ("data", ctypes.c_void_p),
+        ("rank", ctypes.c_int64),
+        ("dims", ctypes.POINTER(ctypes.c_int64)),
+    ]
+
+
+class _Buffers(ctypes.Structure):
+    _fields_ = [
+        ("size", ctypes.c_size_t),
+        ("extension", ctypes.c_void_p),
+        ("count", ctypes.c_int64),
+        ("types", ctypes.c_void_p),
+        ("items", ctypes.POINTER(ctypes.POINTER(_Buffer))),
+    ]
+
+
+class _Text(ctypes.Structure):
+    _fields_ = [("data", ctypes.c_void_p), ("length", ctypes.c_size_t)]
+
+
+class _Attributes(ctypes.Structure):
+    _fields_ = [
+        ("size", ctypes.c_size_t),
+        ("extension", ctypes.c_void_p),
+        ("count", ctypes.c_int64),
+        ("types", ctypes.c_void_p),
+        ("names", ctypes.c_void_p),
+        ("items", ctypes.POINTER(ctypes.POINTER(_Text))),
+    ]
+
+
+class _ErrorArguments(ctypes.Structure):
+    _fields_ = [
+        ("size", ctypes.c_size_t),
+        ("extension", ctypes.c_void_p),
+        ("message", ctypes.c_char_p),
+        ("code", ctypes.c_int),
+    ]
+
+
+_CREATE_ERROR = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_ErrorArguments))
+_INTERNAL = 13
+"""XLA's code of an internal error."""
+
+
+class _Api(ctypes.Structure):
+    _fields_ = [
+        ("size", ctypes.c_size_t),
+        ("extension", ctypes.c_void_p),
+        ("version", _Version),
+        ("internal", ctypes.c_void_p),
+        ("create_error", _CREATE_ERROR),
+    ]
+
+
+class _Call(ctypes.Structure):
+    _fields_ = [
+        ("size", ctypes.c_size_t),
+        ("extension", ctypes.POINTER(_Extension)),
+        ("api", ctypes.POINTER(_Api)),
+        ("context", ctypes.c_void_p),
+        ("stage", ctypes.c_int),
+        ("operands", _Buffers),
+        ("results", _Buffers),
+        ("attributes", _Attributes),
+    ]
+
+
+_HANDLER = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_Call))
+_DTYPES = {1: np.dtype(bool), 11: np.dtype(np.float32)}
+"""dtypes by XLA's numbers."""
+
+
+@cache
+def _version() -> tuple[int, int]:
+    """Return the version of the interface, from jaxlib's own header."""
+    header = Path(jax.ffi.include_dir(), "xla", "ffi", "api", "c_api.h").read_text("utf-8")
+    numbers = re.findall(r"#define XLA_FFI_API_(?:MAJOR|MINOR) (\d+)", header)
+    major, minor = map(int, numbers)
+    return major, minor
+
+
+def _arrays(buffers: _Buffers, *, writable: bool) -> list[np.ndarray]:
+    arrays = []
+    for i in range(buffers.count):
+        buffer = buffers.items[i].contents
+        shape, dtype = buffer.dims[: buffer.rank], _DTYPES[buffer.dtype]
+        size = math.prod(shape) * dtype.itemsize
+        # The address of an empty array may be null.
+        memory = (ctypes.c_char * size).from_address(buffer.data) if size else bytearray()
+        array = np.frombuffer(memory, dtype).reshape(shape)
+        array.flags.writeable = writable
+        arrays.append(array)
+    return arrays
+
+
+@_HANDLER
+def _handle(pointer: Any) -> Any:
+    call = pointer.contents
+    if call.extension:  # XLA asks for the version, when the function is registered
+        extension = ctypes.cast(call.extension, ctypes.POINTER(_MetadataExtension))
+        metadata = extension.contents.metadata.contents
+        metadata.version.major, metadata.version.minor = _version()
+        metadata.traits = metadata.state_type = 0
+        return None
+    try:
+        text = call.attributes.items[0].contents
+        function = _functions[ctypes.string_at(text.data, text.length).decode()]
+        function(
+            *_arrays(call.operands, writable=False),
+            *_arrays(call.results, writable=True),
+        )
+    except BaseException:  # nothing may pass through the C code above
+        message = traceback.format_exc().encode()
+        size = ctypes.sizeof(_ErrorArguments)
+        arguments = _ErrorArguments(size, None, message, _INTERNAL)
+        return call.api.contents.create_error(ctypes.byref(arguments))
+    return None
+
+
+@cache
+def _register_target() -> None:
+    address = ctypes.cast(_handle, ctypes.c_void_p).value
+    jax.ffi.register_ffi_target(_TARGET, jax.ffi.pycapsule(address), platform="cpu")

@@ -1,0 +1,1 @@
+"""MuJoCo XLA: the engine that simulates the DM Control Suite."""

@@ -1,0 +1,194 @@
+"""Dynamics of any MuJoCo model: MuJoCo itself on a CPU, MuJoCo XLA on an accelerator."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from pixelbrax_jax._platform.host_call import host_call, register
+from pixelbrax_jax._platform.row_function import call
+from pixelbrax_jax.physics.mujoco.native import Native, shapes_of_readings
+from pixelbrax_jax.physics.mujoco.opengl import mujoco
+
+if TYPE_CHECKING:
+    from pixelbrax_jax.physics.mujoco.xla import Xla
+
+Engine = Literal["auto", "mujoco", "xla"]
+
+
+class State(struct.PyTreeNode):
+    """The integration state: all that the next step depends on.
+
+    Attributes:
+        qpos: (Q,) float32, joint positions: metres, radians, unit quaternions.
+        qvel: (V,) float32, joint velocities, per second.
+        act: activations of actuators with a state.
+        qacc_warmstart: (V,) float32, accelerations from which the solver starts.
+        ctrl: (A,) float32, the last controls, for rewards.
+        target: metres, this episode's target: (3,) float32; (7,) with a unit quaternion if it is a
+            body; (0,) for tasks without one.
+    """
+
+    qpos: jax.Array
+    qvel: jax.Array
+    act: jax.Array
+    qacc_warmstart: jax.Array
+    ctrl: jax.Array
+    target: jax.Array
+
+
+class Readings(struct.PyTreeNode):
+    """What MuJoCo computes from a state, by its names of ``MjData``; all float32.
+
+    Positions, velocities and their sensors are current; sensors of forces and accelerations are
+    from the beginning of the last physics step.
+    """
+
+    xpos: jax.Array
+    xquat: jax.Array
+    xmat: jax.Array
+    xipos: jax.Array
+    geom_xpos: jax.Array
+    geom_xmat: jax.Array
+    site_xpos: jax.Array
+    site_xmat: jax.Array
+    subtree_com: jax.Array
+    sensordata: jax.Array
+
+
+class Dynamics:
+    """A model's dynamics, for one environment.
+
+    The same program is MuJoCo's own engine when it is lowered for a CPU and MuJoCo XLA when it is
+    lowered for an accelerator. Both compute the same; MuJoCo in float64.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        *,
+        engine: Engine = "auto",
+        reads_forces: bool = False,
+        starts_with_forces: bool = False,
+        out_of_reach: Iterable[str] = (),
+        target_body: str = "",
+    ):
+        """Take a compiled model; compile nothing. For the rest see ``Formulas``."""
+        self.model = model
+        self.engine = engine
+        self._target_body = model.body(target_body).id if target_body else None
+        self._xla_options: dict[str, Any] = {
+            "reads_forces": reads_forces,
+            "starts_with_forces": starts_with_forces,
+            "out_of_reach": tuple(out_of_reach),
+        }
+        self.native = Native(model, self._target_body)
+        # Equal in every process, so that JAX's cache finds the programs that contain it.
+        self.name = f"{_digest(model)}/{self._target_body}"
+        self._shapes = shapes_of_readings(model)
+
+    @cached_property
+    def xla(self) -> Xla:
+        """The engine for accelerators, loaded at the first use."""
+        from pixelbrax_jax.physics.mujoco.xla import Xla
+
+        return Xla(self.model, self._target_body, **self._xla_options)
+
+    def state(
+        self,
+        qpos: jax.Array,
+        qvel: jax.Array | None = None,
+        target: jax.typing.ArrayLike | None = None,
+    ) -> State:
+        """Return a state without control or activation; without velocities it is at rest."""
+        model = self.model
+        return State(
+            qpos=jnp.asarray(qpos, jnp.float32),
+            qvel=jnp.zeros(model.nv) if qvel is None else jnp.asarray(qvel, jnp.float32),
+            act=jnp.zeros(model.na),
+            qacc_warmstart=jnp.zeros(model.nv),
+            ctrl=jnp.zeros(model.nu),
+            target=jnp.zeros(0) if target is None else jnp.asarray(target, jnp.float32),
+        )
+
+    def step(self, state: State, num_steps: int) -> tuple[State, Readings]:
+        """Advance by physics steps with the state's controls."""
+        names = ("qpos", "qvel", "act", "qacc_warmstart")
+        arrays = [getattr(state, name) for name in (*names, "ctrl", "target")]
+        shapes = [x.shape for x in arrays[:4]] + self._shapes
+        results = self._call("step", arrays, shapes, num_steps)
+        return state.replace(**dict(zip(names, results, strict=False))), Readings(*results[4:])
+
+    def first(self, state: State) -> tuple[State, Readings]:
+        """Return a first state with accelerations for the solver's start, and its readings.
+
+        Actuators are off, as in DM Control's resets.
+        """
+        arrays = [state.qpos, state.qvel, state.target]
+        shapes = [state.qvel.shape, *self._shapes]
+        warmstart, *readings = self._call("first", arrays, shapes)
+        return state.replace(qacc_warmstart=warmstart), Readings(*readings)
+
+    def clearances(self, qpos: jax.Array) -> jax.Array:
+        """Return (G,) metres at joint positions (Q,): negative for a geom that overlaps another."""
+        return self._call("clearances", [qpos], [(self.model.ngeom,)])[0]
+
+    def site(self, qpos: jax.Array, name: str) -> tuple[jax.Array, jax.Array]:
+        """Return (3,) metres and (3, 3), position and axes of a site at joint positions (Q,)."""
+        target = jnp.zeros(0)
+        if (at := self._target_body) is not None:
+            target = np.concatenate([self.model.body_pos[at], self.model.body_quat[at]])
+        _, readings = self.first(self.state(qpos, target=target))
+        row = self.model.site(name).id
+        return readings.site_xpos[row], readings.site_xmat[row]
+
+    def touches(self, qpos: jax.Array) -> jax.Array:
+        """Return () bool, whether any geoms touch at joint positions (Q,)."""
+        return jnp.any(self.clearances(qpos) < 0)
+
+    def _call(
+        self, method: str, arrays: list[jax.Array], shapes: list[tuple[int, ...]], *options: int
+    ) -> list[jax.Array]:
+        arrays = [jnp.asarray(x, jnp.float32) for x in arrays]
+        function = _Function(self, method, options, tuple(shapes))
+        return list(function.elsewhere(*arrays)) if self.engine == "xla" else call(function, *arrays)
+
+
+@dataclass(frozen=True)
+class _Function:
+    """A method of ``Native`` and ``Xla``."""
+
+    dynamics: Dynamics
+    method: str
+    options: tuple[int, ...]
+    shapes: tuple[tuple[int, ...], ...]
+
+    def on_cpu(self, *rows: jax.Array) -> list[jax.Array]:
+        """See ``RowFunction``."""
+        function = partial(getattr(self.dynamics.native, self.method), *self.options)
+        name = "/".join([self.dynamics.name, self.method, *map(str, self.options)])
+        register(name, function)
+        sizes = [(rows[0].shape[0], *shape) for shape in self.shapes]
+        return host_call(name, rows, [jax.ShapeDtypeStruct(size, np.float32) for size in sizes])
+
+    def elsewhere(self, *row: jax.Array) -> Sequence[jax.Array]:
+        """See ``RowFunction``."""
+        results: Sequence[jax.Array] = getattr(self.dynamics.xla, self.method)(*self.options, *row)
+        return results
+
+    def __str__(self) -> str:
+        return 'the physics of MuJoCo itself, for which engine="xla" is a substitute,'
+
+
+def _digest(model: mujoco.MjModel) -> str:
+    content = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, content)
+    return hashlib.sha256(content.tobytes()).hexdigest()[:32]

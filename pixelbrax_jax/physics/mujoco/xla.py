@@ -1,0 +1,136 @@
+"""MuJoCo XLA: steps of a model for one environment, for accelerators and gradients."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from pixelbrax_jax.physics.mujoco.compatibility import import_silenced, load_onto_own_device
+from pixelbrax_jax.physics.mujoco.native import READINGS
+from pixelbrax_jax.physics.mujoco.opengl import mujoco
+from pixelbrax_jax.physics.mujoco.substitutes import substituted
+
+with import_silenced():
+    from mujoco import mjx
+    from mujoco.mjx._src import io as mjx_io
+
+Arrays = tuple[jax.Array, ...]
+
+
+class Xla:
+    """Steps of a model, as ``Native`` makes them, for one environment and as pure functions."""
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        target_body: int | None,
+        *,
+        reads_forces: bool,
+        starts_with_forces: bool,
+        out_of_reach: Iterable[str],
+    ):
+        """Put a compiled model on the device; compile nothing. For the rest see ``Formulas``."""
+        load_onto_own_device(mjx_io)
+        self._model = model
+        self._target_body = target_body
+        self._starts_with_forces = starts_with_forces
+        self._simulated = _simulated(model, out_of_reach)
+        self._mx = mjx.put_model(self._simulated, impl="jax")
+        self._moving = (
+            self._mx if reads_forces else self._without(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+        )
+        self._passive = self._without(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
+
+    def _without(self, feature: mujoco.mjtDisableBit) -> Any:
+        flags = type(self._mx.opt.disableflags)(int(self._mx.opt.disableflags) | int(feature))
+        return self._mx.replace(opt=self._mx.opt.replace(disableflags=flags))
+
+    def step(
+        self,
+        num_steps: int,
+        qpos: jax.Array,
+        qvel: jax.Array,
+        act: jax.Array,
+        qacc_warmstart: jax.Array,
+        ctrl: jax.Array,
+        target: jax.Array,
+    ) -> Arrays:
+        """See ``Native.step``."""
+
+        def one(carry: Arrays) -> Arrays:
+            qpos, qvel, act, warmstart, _ = carry
+            data = self._data(qpos, qvel, act=act, qacc_warmstart=warmstart, ctrl=ctrl)
+            with substituted(self._model):
+                data = mjx.step(self._moving, data)
+            return data.qpos, data.qvel, data.act, data.qacc_warmstart, data.sensordata
+
+        carry = (qpos, qvel, act, qacc_warmstart, jnp.zeros(self._model.nsensordata))
+        if num_steps == 1:
+            carry = one(carry)
+        else:
+            # A loop, so that the program has one copy of the step.
+            carry = jax.lax.fori_loop(0, num_steps, lambda _, carry: one(carry), carry)
+        qpos, qvel, act, warmstart, sensors = carry
+        data = self._data(qpos, qvel, act=act, ctrl=ctrl, sensordata=sensors)
+        return qpos, qvel, act, warmstart, *self._readings(data, target)
+
+    def first(self, qpos: jax.Array, qvel: jax.Array, target: jax.Array) -> Arrays:
+        """See ``Native.first``; without forces where no observation of a first state has any."""
+        data = self._data(qpos, qvel)
+        if self._starts_with_forces:
+            with substituted(self._model):
+                forward = mjx.forward(self._passive, data)
+            warmstart = forward.qacc
+            data = data.replace(sensordata=forward.sensordata)
+        else:
+            warmstart = jnp.zeros(self._model.nv)
+        return warmstart, *self._readings(data, target)
+
+    def clearances(self, qpos: jax.Array) -> Arrays:
+        """See ``Native.clearances``; of geoms that do not overlap it may be a distance."""
+        with substituted(self._model):
+            data = mjx.kinematics(self._mx, self._data(qpos, jnp.zeros(self._model.nv)))
+            contact = mjx.collision(self._mx, data)._impl.contact
+        distances = contact.dist - contact.includemargin
+        found = jnp.full(self._model.ngeom, jnp.inf)
+        for geoms in contact.geom.T:
+            found = found.at[geoms].min(distances)
+        return (found,)
+
+    def _readings(self, data: Any, target: jax.Array) -> Arrays:
+        """Return ``READINGS`` with positions, velocities and their sensors made anew."""
+        mx = self._mx
+        if self._target_body is not None:
+            at = self._target_body
+            mx = mx.replace(
+                body_pos=mx.body_pos.at[at].set(target[:3]),
+                body_quat=mx.body_quat.at[at].set(target[3:]),
+            )
+        with substituted(self._model):
+            data = mjx.kinematics(mx, data)
+            data = mjx.com_pos(mx, data)
+            data = mjx.com_vel(mx, data)
+            if self._model.nsensor:
+                data = mjx.sensor_pos(mx, data)
+                data = mjx.sensor_vel(mx, data)
+        return tuple(getattr(data, name) for name in READINGS)
+
+    def _data(self, qpos: jax.Array, qvel: jax.Array, **fields: jax.Array) -> Any:
+        data = mjx.make_data(self._simulated, impl="jax")
+        return data.replace(qpos=qpos, qvel=qvel, **fields)
+
+
+def _simulated(model: mujoco.MjModel, out_of_reach: Iterable[str]) -> mujoco.MjModel:
+    """Return the model without energy (unsupported), disabled contacts and geoms out of reach."""
+    model = copy.copy(model)
+    model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_ENERGY)
+    off = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    if model.opt.disableflags & off:
+        model.geom_contype[:] = model.geom_conaffinity[:] = 0
+    for name in out_of_reach:
+        model.geom(name).contype[:] = model.geom(name).conaffinity[:] = 0
+    return model
