@@ -13,6 +13,7 @@ from pixelbrax_jax.distractors.base import Distractor
 from pixelbrax_jax.distractors.clips import ClipBank
 from pixelbrax_jax.distractors.presets import as_tuple
 from pixelbrax_jax.physics.brax.tasks import BraxOptions
+from pixelbrax_jax.physics.mujoco.options import MujocoOptions
 from pixelbrax_jax.plain import from_plain
 from pixelbrax_jax.renderer.base import check_renderer
 from pixelbrax_jax.scene.look import make_look
@@ -78,11 +79,11 @@ class ProgramConfig:
         object.__setattr__(self, name, value)
 
 
-_SUITE_OPTIONS = fields(BraxOptions)
+_SUITE_OPTIONS = (*fields(BraxOptions), *fields(MujocoOptions))
 
 
 @dataclass(frozen=True)
-class EnvConfig(BraxOptions, ProgramConfig):
+class EnvConfig(BraxOptions, MujocoOptions, ProgramConfig):
     """All options of an environment; ``pixelbrax_jax.make(task, **options)`` takes them.
 
     Raises the errors of ``ProgramConfig``.
@@ -111,6 +112,7 @@ class EnvConfig(BraxOptions, ProgramConfig):
         for name in ("task", "split", *(option.name for option in _SUITE_OPTIONS)):
             self._static(name)
         BraxOptions.__post_init__(self)
+        MujocoOptions.__post_init__(self)
         episode_length = check_positive_int("episode_length", self._static("episode_length"))
         self._store("episode_length", episode_length)
         if self.shadows is not None:

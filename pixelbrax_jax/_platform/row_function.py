@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, Protocol
+from functools import partial
+from typing import Any, ClassVar, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +23,9 @@ class RowFunction(Protocol):
     def shapes(self) -> Sequence[tuple[int, ...]]:
         """The shapes of the float32 results of one row."""
 
+    no_derivative: ClassVar[str]
+    """Why it has no derivative; the message of the error."""
+
     def on_cpu(self, *rows: jax.Array) -> Sequence[jax.Array]:
         """Compute (N, ...) results of (N, ...) rows."""
 
@@ -36,7 +40,11 @@ def call(function: RowFunction, *arrays: jax.Array) -> list[jax.Array]:
 
 _primitive = Primitive("row_function")
 _primitive.multiple_results = True
-_primitive.def_impl(lambda *arrays, **params: jax.jit(lambda *x: _primitive.bind(*x, **params))(*arrays))
+
+
+@_primitive.def_impl
+def _compute(*arrays: Any, **params: Any) -> Any:
+    return jax.jit(partial(_primitive.bind, **params))(*arrays)
 
 
 @_primitive.def_abstract_eval
@@ -57,7 +65,7 @@ def _batch(arrays: Any, axes: Any, *, function: RowFunction, batch: tuple[int, .
 
 def _derivative(*args: Any, function: RowFunction, **params: Any) -> Any:
     del args, params
-    raise NotImplementedError(f"{function} has no derivative.")
+    raise NotImplementedError(function.no_derivative)
 
 
 def _flat(method: Any, batch: tuple[int, ...]) -> Any:

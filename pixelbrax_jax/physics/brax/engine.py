@@ -19,17 +19,17 @@ from flax import struct
 from pixelbrax_jax.flags import as_by_default, default_flags, under_default_flags
 from pixelbrax_jax.physics.base import Kinematics, RewardFn
 from pixelbrax_jax.physics.divergence import GuardedPhysics
-from pixelbrax_jax.physics.mujoco.geometry import VISIBLE_GROUPS, as_geoms, geom_shapes, site_shapes
-from pixelbrax_jax.physics.mujoco.scene import COM_LINK, tracked_body
 from pixelbrax_jax.physics.mujoco.compatibility import (
     accept_old_clip,
     import_silenced,
     known_warnings_silenced,
 )
+from pixelbrax_jax.physics.mujoco.geometry import VISIBLE_GROUPS, as_geoms, geom_shapes, site_shapes
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
-from pixelbrax_jax.physics.mujoco.poses import check_pose, with_unit_rotations
-from pixelbrax_jax.physics.task import Color
+from pixelbrax_jax.physics.mujoco.poses import check_pose, masses_below, with_unit_rotations
+from pixelbrax_jax.physics.mujoco.scene import COM_LINK, tracked_body
 from pixelbrax_jax.physics.mujoco.viewpoints import followed_body, read_rigs, unfit_cameras
+from pixelbrax_jax.physics.task import Color
 from pixelbrax_jax.spatial import quat_normalize, rotate
 from pixelbrax_jax.types import CameraRig, PhysicsState
 
@@ -130,7 +130,7 @@ class BraxPhysics(GuardedPhysics):
             rigs, self.unfit_cameras = read_rigs(model, com_link), unfit_cameras(model)
             if any(rig.link == com_link for rig in rigs.values()):
                 self.link_names += (COM_LINK,)
-                self._com_masses = _masses_below(model, tracked_body(model))
+                self._com_masses = masses_below(model, tracked_body(model))
         self.rigs = rigs
         self.geoms = as_geoms([shape._replace(material="") for shape in shapes])
         self._model = model
@@ -317,16 +317,6 @@ def _as_dtype(leaf: Any, dtype: Any) -> jax.Array:
 
 def _carry(brax_state: envs.State) -> BraxCarry:
     return BraxCarry(brax_state.pipeline_state, brax_state.metrics, brax_state.info)
-
-
-def _masses_below(model: mujoco.MjModel, root: int) -> np.ndarray:
-    """Return (bodies - 1,) float32, each body's fraction of the mass of ``root``'s subtree."""
-    below = np.zeros(model.nbody, bool)
-    below[root] = True
-    for body in range(1, model.nbody):
-        below[body] |= below[model.body_parentid[body]]
-    masses = np.where(below, model.body_mass, 0.0)[1:]
-    return (masses / masses.sum()).astype(np.float32)
 
 
 def _control_range(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:

@@ -16,8 +16,8 @@ from pixelbrax_jax.physics.base import Kinematics, ResetFn, RewardFn
 from pixelbrax_jax.physics.brax.engine import BraxPhysics, kinematics
 from pixelbrax_jax.physics.brax.omissions import check_simulated
 from pixelbrax_jax.physics.brax.tasks import BACKENDS
-from pixelbrax_jax.physics.mujoco.geometry import VISIBLE_GROUPS, geom_shapes
 from pixelbrax_jax.physics.mujoco.compatibility import import_silenced, loading_silenced
+from pixelbrax_jax.physics.mujoco.geometry import VISIBLE_GROUPS, geom_shapes
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
 from pixelbrax_jax.physics.task import Color
 

@@ -14,6 +14,7 @@ from flax import struct
 
 from pixelbrax_jax.physics.mujoco.dynamics import Dynamics, Readings, State
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
+from pixelbrax_jax.spatial import f32, quat_multiply, quat_to_mat, rotate
 
 _MAX_ATTEMPTS = 1000
 """Largest number of sampled poses."""
@@ -71,29 +72,43 @@ class Snapshot:
         """Return (3,), the origin of a body."""
         return self.data.xpos[self.model.body(body).id]
 
-    def xipos(self, body: str) -> jax.Array:
-        """Return (3,), the center of mass of a body."""
-        return self.data.xipos[self.model.body(body).id]
-
-    def xmat(self, body: str) -> jax.Array:
-        """Return (3, 3), the rotation of a body."""
-        return self.data.xmat[self.model.body(body).id]
-
     def xquat(self, body: str) -> jax.Array:
         """Return (4,), the rotation of a body."""
         return self.data.xquat[self.model.body(body).id]
 
+    def xmat(self, body: str) -> jax.Array:
+        """Return (3, 3), the rotation of a body."""
+        return quat_to_mat(self.xquat(body))
+
+    def xipos(self, body: str) -> jax.Array:
+        """Return (3,), the center of mass of a body."""
+        return self._place(self.model.body(body).id, self.model.body(body).ipos)
+
     def geom_pos(self, name: str) -> jax.Array:
         """Return (3,), the center of a geom."""
-        return self.data.geom_xpos[self.model.geom(name).id]
+        geom = self.model.geom(name)
+        return self._place(geom.bodyid[0], geom.pos)
 
     def geom_mat(self, name: str) -> jax.Array:
         """Return (3, 3), the rotation of a geom."""
-        return self.data.geom_xmat[self.model.geom(name).id]
+        geom = self.model.geom(name)
+        return self._rotation(geom.bodyid[0], geom.quat)
 
     def site_pos(self, name: str) -> jax.Array:
         """Return (3,), the center of a site."""
-        return self.data.site_xpos[self.model.site(name).id]
+        site = self.model.site(name)
+        return self._place(site.bodyid[0], site.pos)
+
+    def site_mat(self, name: str) -> jax.Array:
+        """Return (3, 3), the rotation of a site."""
+        site = self.model.site(name)
+        return self._rotation(site.bodyid[0], site.quat)
+
+    def _place(self, body: int, pos: np.ndarray) -> jax.Array:
+        return self.data.xpos[body] + rotate(self.data.xquat[body], f32(pos))
+
+    def _rotation(self, body: int, quat: np.ndarray) -> jax.Array:
+        return quat_to_mat(quat_multiply(self.data.xquat[body], f32(quat)))
 
 
 def joined(*parts: jax.Array | float) -> jax.Array:
@@ -186,8 +201,7 @@ class Formulas:
         target_body: name of the body, fixed to the world, that it moves; empty for none.
         reads_forces: whether observations use sensors of forces or accelerations.
         starts_with_forces: whether these sensors are not 0 in an initial state.
-        out_of_reach: names of the geoms that never touch anything.
-        batch_last: whether a CPU is faster with the environments as last axis of a batch.
+        out_of_reach: names of the geoms that never touch anything, which MuJoCo XLA then skips.
     """
 
     start: Callable[[Dynamics, jax.Array], Start]
@@ -202,7 +216,6 @@ class Formulas:
     reads_forces: bool = False
     starts_with_forces: bool = False
     out_of_reach: tuple[str, ...] = ()
-    batch_last: bool = True
 
 
 def random_joints(model: mujoco.MjModel, key: jax.Array) -> jax.Array:

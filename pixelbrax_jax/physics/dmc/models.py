@@ -12,7 +12,6 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from pixelbrax_jax.extras import install_extra
-from pixelbrax_jax.physics.mujoco.compatibility import loading_silenced
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
 
 KNOWN_VERSION = "1.0.50"
@@ -49,8 +48,8 @@ _warned: list[str] = []
 _INCLUDED = ("common/materials.xml", "common/skybox.xml", "common/visual.xml")
 
 
-def load_model(domain: str, **options: float) -> mujoco.MjModel:
-    """Compile the model of a domain.
+def load_spec(domain: str, **options: float) -> mujoco.MjSpec:
+    """Read the model of a domain.
 
     Options of the domain's generator are ``max_contacts`` (manipulator), ``num_bodies`` (swimmer)
     and ``floor_size`` in metres (quadruped). Without dm_control it raises an ImportError.
@@ -63,9 +62,7 @@ def load_model(domain: str, **options: float) -> mujoco.MjModel:
         root = ElementTree.fromstring(xml)
         _GENERATORS[domain](root, **options)
         xml = ElementTree.tostring(root, encoding="unicode")
-    assets = {f"./{name}": content for name, content in files.items()}
-    with loading_silenced():
-        return mujoco.MjModel.from_xml_string(xml, assets)
+    return mujoco.MjSpec.from_string(xml, include=files)
 
 
 def _suite_folder() -> Path:

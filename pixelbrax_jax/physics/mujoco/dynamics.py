@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -15,13 +15,12 @@ from flax import struct
 
 from pixelbrax_jax._platform.host_call import host_call, register
 from pixelbrax_jax._platform.row_function import call
-from pixelbrax_jax.physics.mujoco.native import Native, shapes_of_readings
+from pixelbrax_jax.physics.mujoco.native import Native
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
+from pixelbrax_jax.spatial import quat_normalize
 
 if TYPE_CHECKING:
     from pixelbrax_jax.physics.mujoco.xla import Xla
-
-Engine = Literal["auto", "mujoco", "xla"]
 
 
 class State(struct.PyTreeNode):
@@ -46,42 +45,41 @@ class State(struct.PyTreeNode):
 
 
 class Readings(struct.PyTreeNode):
-    """What MuJoCo computes from a state, by its names of ``MjData``; all float32.
+    """What MuJoCo computes from a state, by its names of ``MjData``.
 
     Positions, velocities and their sensors are current; sensors of forces and accelerations are
     from the beginning of the last physics step.
+
+    Attributes:
+        xpos: (B, 3) float32, metres, origins of all bodies, of the world first.
+        xquat: (B, 4) float32, unit quaternions, their orientations.
+        sensordata: float32, all sensors, in MuJoCo's units.
     """
 
     xpos: jax.Array
     xquat: jax.Array
-    xmat: jax.Array
-    xipos: jax.Array
-    geom_xpos: jax.Array
-    geom_xmat: jax.Array
-    site_xpos: jax.Array
-    site_xmat: jax.Array
-    subtree_com: jax.Array
     sensordata: jax.Array
 
 
 class Dynamics:
     """A model's dynamics, for one environment.
 
-    The same program is MuJoCo's own engine when it is lowered for a CPU and MuJoCo XLA when it is
-    lowered for an accelerator. Both compute the same; MuJoCo in float64.
+    With ``engine="auto"`` MuJoCo's own engine computes programs lowered for a CPU, in float64, and
+    MuJoCo XLA all others, in float32. A name in ``options.ENGINES`` chooses one.
     """
 
     def __init__(
         self,
         model: mujoco.MjModel,
+        posed: mujoco.MjModel,
         *,
-        engine: Engine = "auto",
+        engine: str = "auto",
         reads_forces: bool = False,
         starts_with_forces: bool = False,
         out_of_reach: Iterable[str] = (),
         target_body: str = "",
     ):
-        """Take a compiled model; compile nothing. For the rest see ``Formulas``."""
+        """Take a model and the same ``with_poses``. For the rest see ``Formulas``."""
         self.model = model
         self.engine = engine
         self._target_body = model.body(target_body).id if target_body else None
@@ -90,17 +88,18 @@ class Dynamics:
             "starts_with_forces": starts_with_forces,
             "out_of_reach": tuple(out_of_reach),
         }
-        self.native = Native(model, self._target_body)
+        self.native = Native(model, posed, reads_forces=reads_forces)
         # Equal in every process, so that JAX's cache finds the programs that contain it.
-        self.name = f"{_digest(model)}/{self._target_body}"
-        self._shapes = shapes_of_readings(model)
+        self.name = f"{_digest(model)}/{reads_forces}"
+        sizes = (model.nbody, 3), (model.nbody, 4), (model.nsensordata,)
+        self._shapes: list[tuple[int, ...]] = list(sizes)
 
     @cached_property
     def xla(self) -> Xla:
         """The engine for accelerators, loaded at the first use."""
         from pixelbrax_jax.physics.mujoco.xla import Xla
 
-        return Xla(self.model, self._target_body, **self._xla_options)
+        return Xla(self.model, **self._xla_options)
 
     def state(
         self,
@@ -120,35 +119,29 @@ class Dynamics:
         )
 
     def step(self, state: State, num_steps: int) -> tuple[State, Readings]:
-        """Advance by physics steps with the state's controls."""
+        """Advance by at least one physics step with the state's controls."""
         names = ("qpos", "qvel", "act", "qacc_warmstart")
-        arrays = [getattr(state, name) for name in (*names, "ctrl", "target")]
+        arrays = [getattr(state, name) for name in (*names, "ctrl")]
         shapes = [x.shape for x in arrays[:4]] + self._shapes
         results = self._call("step", arrays, shapes, num_steps)
-        return state.replace(**dict(zip(names, results, strict=False))), Readings(*results[4:])
+        state = state.replace(**dict(zip(names, results, strict=False)))
+        return state, self._readings(state, results[4:])
 
-    def first(self, state: State) -> tuple[State, Readings]:
-        """Return a first state with accelerations for the solver's start, and its readings.
+    def first(self, state: State) -> Readings:
+        """Return the readings of a first state; actuators are off, as in DM Control's resets."""
+        results = self._call("first", [state.qpos, state.qvel], self._shapes)
+        return self._readings(state, results)
 
-        Actuators are off, as in DM Control's resets.
-        """
-        arrays = [state.qpos, state.qvel, state.target]
-        shapes = [state.qvel.shape, *self._shapes]
-        warmstart, *readings = self._call("first", arrays, shapes)
-        return state.replace(qacc_warmstart=warmstart), Readings(*readings)
+    def _readings(self, state: State, results: list[jax.Array]) -> Readings:
+        xpos, xquat, sensordata = results
+        if (at := self._target_body) is not None:
+            xpos = xpos.at[at].set(state.target[:3])
+            xquat = xquat.at[at].set(quat_normalize(state.target[3:]))
+        return Readings(xpos, xquat, sensordata)
 
     def clearances(self, qpos: jax.Array) -> jax.Array:
         """Return (G,) metres at joint positions (Q,): negative for a geom that overlaps another."""
         return self._call("clearances", [qpos], [(self.model.ngeom,)])[0]
-
-    def site(self, qpos: jax.Array, name: str) -> tuple[jax.Array, jax.Array]:
-        """Return (3,) metres and (3, 3), position and axes of a site at joint positions (Q,)."""
-        target = jnp.zeros(0)
-        if (at := self._target_body) is not None:
-            target = np.concatenate([self.model.body_pos[at], self.model.body_quat[at]])
-        _, readings = self.first(self.state(qpos, target=target))
-        row = self.model.site(name).id
-        return readings.site_xpos[row], readings.site_xmat[row]
 
     def touches(self, qpos: jax.Array) -> jax.Array:
         """Return () bool, whether any geoms touch at joint positions (Q,)."""
@@ -159,7 +152,9 @@ class Dynamics:
     ) -> list[jax.Array]:
         arrays = [jnp.asarray(x, jnp.float32) for x in arrays]
         function = _Function(self, method, options, tuple(shapes))
-        return list(function.elsewhere(*arrays)) if self.engine == "xla" else call(function, *arrays)
+        if self.engine == "xla":
+            return list(function.elsewhere(*arrays))
+        return call(function, *arrays)
 
 
 @dataclass(frozen=True)
@@ -170,6 +165,9 @@ class _Function:
     method: str
     options: tuple[int, ...]
     shapes: tuple[tuple[int, ...], ...]
+    no_derivative: ClassVar[str] = (
+        "MuJoCo itself has no derivatives: choose engine='xla', MuJoCo XLA, which has them."
+    )
 
     def on_cpu(self, *rows: jax.Array) -> list[jax.Array]:
         """See ``RowFunction``."""
@@ -181,11 +179,13 @@ class _Function:
 
     def elsewhere(self, *row: jax.Array) -> Sequence[jax.Array]:
         """See ``RowFunction``."""
+        if self.dynamics.engine == "mujoco":
+            raise NotImplementedError(
+                "engine='mujoco' computes on a CPU alone; for programs of other devices choose "
+                "engine='xla', or engine='auto'."
+            )
         results: Sequence[jax.Array] = getattr(self.dynamics.xla, self.method)(*self.options, *row)
         return results
-
-    def __str__(self) -> str:
-        return 'the physics of MuJoCo itself, for which engine="xla" is a substitute,'
 
 
 def _digest(model: mujoco.MjModel) -> str:

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
-from pixelbrax_jax.physics.task import Color
 from pixelbrax_jax.physics.mujoco.viewpoints import follows_tracked
+from pixelbrax_jax.physics.task import Color
 from pixelbrax_jax.spatial import f32
 from pixelbrax_jax.types import Lamp, Look
 

@@ -5,177 +5,172 @@ from __future__ import annotations
 import copy
 import os
 import queue
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cache
-from typing import Any, NamedTuple
+from typing import TypeVar
 
 import numpy as np
 
+from pixelbrax_jax.physics.mujoco.compatibility import loading_silenced
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
 
-READINGS = (
-    *("xpos", "xquat", "xmat", "xipos", "geom_xpos", "geom_xmat", "site_xpos", "site_xmat"),
-    *("subtree_com", "sensordata"),
-)
-"""What is read of ``MjData`` after a step."""
+from mujoco.rollout import Rollout  # isort: skip  # MuJoCo is imported without OpenGL above
 
-_FEWEST = 8
-"""Environments that are worth a thread."""
+_FEWEST = 16
+"""Environments for which other threads are worth waking."""
 
-_STATE = int(
-    mujoco.mjtState.mjSTATE_QPOS
-    | mujoco.mjtState.mjSTATE_QVEL
-    | mujoco.mjtState.mjSTATE_ACT
-    | mujoco.mjtState.mjSTATE_WARMSTART
-    | mujoco.mjtState.mjSTATE_CTRL
-)
-"""What a step depends on, in MuJoCo's order of a state."""
+_STATE = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
+_OFF = mujoco.mjtDisableBit
 
-
-class _Worker(NamedTuple):
-    """A model and data for one thread, and views of what is read."""
-
-    model: mujoco.MjModel
-    data: mujoco.MjData
-    readings: tuple[np.ndarray, ...]
+_Thing = TypeVar("_Thing")
 
 
 class Native:
     """Steps of a model, for rows of environments.
 
-    A method takes (N, ...) arrays and fills its last ones. It may run in several threads at once.
-    The result of a row depends on nothing but the row.
+    A method takes (N, ...) float32 arrays and fills its last ones. It may run in several threads at
+    once. The result of a row depends on nothing but the row. A row that diverges becomes NaN.
     """
 
-    def __init__(self, model: mujoco.MjModel, target_body: int | None):
-        """Take a model; ``target_body`` is a body that targets of (7,) move."""
-        self._model = model
-        self._target_body = target_body
-        self._idle: queue.SimpleQueue[_Worker] = queue.SimpleQueue()
+    def __init__(self, model: mujoco.MjModel, posed: mujoco.MjModel, *, reads_forces: bool):
+        """Take a model and the same ``with_poses``; compile nothing."""
+        # A state that diverges stays as it is.
+        disabled = _OFF.mjDSBL_AUTORESET
+        self._moving = _without(model, disabled if reads_forces else disabled | _OFF.mjDSBL_SENSOR)
+        self._resting = _without(posed, disabled | _OFF.mjDSBL_ACTUATION)
+        self._still = _without(
+            posed,
+            disabled | _OFF.mjDSBL_ACTUATION | _OFF.mjDSBL_CONSTRAINT | _OFF.mjDSBL_CONTACT,
+        )
+        self._still.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
+        if mujoco.mj_stateSize(model, _STATE) != 1 + model.nq + model.nv + model.na:
+            raise ValueError("MuJoCo's plugins and delays are not simulated: remove them.")
+        stages = np.repeat(model.sensor_needstage, model.sensor_dim)
+        self._is_force = stages == int(mujoco.mjtStage.mjSTAGE_ACC)
+        self._idle: dict[int, queue.SimpleQueue[list[mujoco.MjData]]] = {}
 
     def step(self, num_steps: int, *arrays: np.ndarray) -> None:
-        """Advance ``qpos, qvel, act, qacc_warmstart, ctrl, target`` by physics steps.
+        """Advance ``qpos, qvel, act, qacc_warmstart, ctrl`` by at least one physics step.
 
-        Fills the first four, and ``READINGS``. Positions, velocities and their sensors are those
-        after the last step; sensors of forces and accelerations those of its beginning.
+        Fills the first four, and ``xpos``, ``xquat`` and ``sensordata``. Positions, velocities and
+        their sensors are those after the last step; sensors of forces and accelerations those of
+        its beginning. The accelerations are those of the last step, from its velocities.
         """
-        state, (_, target, *results) = _join(arrays[:5]), arrays[4:]
-        moved, readings = results[:4], results[4:]
+        model = self._moving
+        qpos, qvel, act, warmstart, ctrl, *results = arrays
+        first = np.concatenate([np.zeros((len(qpos), 1)), qpos, qvel, act], 1, dtype=np.float64)
+        states, sensors = self._roll(
+            model, first, num_steps, ctrl.astype(np.float64), warmstart.astype(np.float64)
+        )
+        last = states[:, -1]
+        # MuJoCo ends a row's steps where it warns.
+        lost = np.abs(last[:, 0] - num_steps * model.opt.timestep) > model.opt.timestep / 2
+        last[lost, 1:] = np.nan
+        edges = np.cumsum([1, model.nq, model.nv, model.na])
+        for result, start, stop in zip(results, edges, edges[1:], strict=False):
+            result[:] = last[:, start:stop]
+        before = states[:, -2] if num_steps > 1 else first
+        velocities = slice(edges[1], edges[2])
+        results[3][:] = (last[:, velocities] - before[:, velocities]) / model.opt.timestep
+        _, found = self._roll(self._still, last, 1)
+        self._read(found[:, 0], *results[4:])
+        results[6][:, self._is_force] = sensors[:, -1, self._is_force]
 
-        def row(worker: _Worker, i: int) -> None:
-            model, data = worker.model, worker.data
-            mujoco.mj_setState(model, data, state[i], _STATE)
-            self._place_target(model, target, i)
-            mujoco.mj_step(model, data, num_steps)
-            mujoco.mj_step1(model, data)
-            mujoco.mj_getState(model, data, state[i], _STATE)
-            _read(worker, readings, i)
+    def first(
+        self,
+        qpos: np.ndarray,
+        qvel: np.ndarray,
+        xpos: np.ndarray,
+        xquat: np.ndarray,
+        sensordata: np.ndarray,
+    ) -> None:
+        """Compute what ``qpos`` and ``qvel`` say, with actuators off, as DM Control's resets do.
 
-        self._for_rows(len(state), row)
-        _split(state, moved)
-
-    def first(self, *arrays: np.ndarray) -> None:
-        """Compute what ``qpos, qvel, target`` say, with actuators off, as DM Control's resets do.
-
-        Fills ``qacc_warmstart``, the accelerations, and ``READINGS``.
+        Fills ``xpos``, ``xquat`` and ``sensordata``.
         """
-        (qpos, qvel, target, warmstart), readings = arrays[:4], arrays[4:]
-        others = self._model.na + self._model.nv + self._model.nu
-        state = _join([qpos, qvel, np.zeros((len(qpos), others))])
-        off = int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
-
-        def row(worker: _Worker, i: int) -> None:
-            model, data = worker.model, worker.data
-            mujoco.mj_setState(model, data, state[i], _STATE)
-            self._place_target(model, target, i)
-            before = model.opt.disableflags
-            model.opt.disableflags |= off
-            try:
-                mujoco.mj_forward(model, data)
-            finally:
-                model.opt.disableflags = before
-            warmstart[i] = data.qacc
-            _read(worker, readings, i)
-
-        self._for_rows(len(qpos), row)
+        parts = [np.zeros((len(qpos), 1)), qpos, qvel, np.zeros((len(qpos), self._moving.na))]
+        _, found = self._roll(self._resting, np.concatenate(parts, 1, dtype=np.float64), 1)
+        self._read(found[:, 0], xpos, xquat, sensordata)
 
     def clearances(self, qpos: np.ndarray, found: np.ndarray) -> None:
         """Fill (N, G) metres, by which each geom overlaps another, negative; infinity for none."""
         found[:] = np.inf
+        with self._data(self._moving, 1) as (data,):
+            for row, distances in zip(qpos, found, strict=True):
+                data.qpos = row
+                mujoco.mj_fwdPosition(self._moving, data)
+                contact = data.contact
+                for geoms in contact.geom.T:
+                    np.minimum.at(distances, geoms, contact.dist - contact.includemargin)
 
-        def row(worker: _Worker, i: int) -> None:
-            worker.data.qpos = qpos[i]
-            mujoco.mj_fwdPosition(worker.model, worker.data)
-            contact = worker.data.contact
-            distances = contact.dist - contact.includemargin
-            for geoms in contact.geom.T:
-                np.minimum.at(found[i], geoms, distances)
+    def _roll(
+        self,
+        model: mujoco.MjModel,
+        first: np.ndarray,
+        num_steps: int,
+        ctrl: np.ndarray | None = None,
+        warmstart: np.ndarray | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return (N, num_steps, ...) states after each step, and sensors before it."""
+        num_rows = len(first)
+        controls = None
+        if ctrl is not None:
+            controls = np.repeat(ctrl[:, None], num_steps, axis=1)
+        states = np.empty((num_rows, num_steps, first.shape[1]))
+        sensors = np.empty((num_rows, num_steps, model.nsensordata))
+        num_threads = _num_threads() if num_rows >= _FEWEST else 1
+        with self._data(model, num_threads) as data, _rollout(num_threads) as rollout:
+            rollout.rollout(
+                [model] * num_rows,
+                data,
+                np.ascontiguousarray(first),
+                controls,
+                nstep=num_steps,
+                initial_warmstart=warmstart,
+                state=states,
+                sensordata=sensors,
+                skip_checks=True,
+            )
+        return states, sensors
 
-        self._for_rows(len(qpos), row)
-
-    def _place_target(self, model: mujoco.MjModel, target: np.ndarray, i: int) -> None:
-        if self._target_body is not None:
-            model.body_pos[self._target_body] = target[i, :3]
-            model.body_quat[self._target_body] = target[i, 3:]
-
-    def _for_rows(self, num_rows: int, row: Callable[[_Worker, int], None]) -> None:
-        def block(start: int, stop: int) -> None:
-            with self._worker() as worker:
-                for i in range(start, stop):
-                    row(worker, i)
-
-        num_blocks = max(1, min(_num_threads(), num_rows // _FEWEST))
-        edges = [num_rows * k // num_blocks for k in range(num_blocks + 1)]
-        others = [_pool().submit(block, *edge) for edge in zip(edges[1:], edges[2:], strict=False)]
-        block(*edges[:2])
-        for other in others:
-            other.result()
+    def _read(
+        self, found: np.ndarray, xpos: np.ndarray, xquat: np.ndarray, own: np.ndarray
+    ) -> None:
+        own[:] = found[:, : own.shape[1]]
+        poses = found[:, own.shape[1] :].reshape(len(found), -1, 7)
+        xpos[:, 0], xquat[:, 0] = 0, (1, 0, 0, 0)
+        xpos[:, 1:], xquat[:, 1:] = poses[..., :3], poses[..., 3:]
 
     @contextmanager
-    def _worker(self) -> Iterator[_Worker]:
-        try:
-            worker = self._idle.get_nowait()
-        except queue.Empty:
-            model = copy.copy(self._model)
-            # A state that diverges stays as it is, for `GuardedPhysics` to find.
-            model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
-            data = mujoco.MjData(model)
-            # MuJoCo prints, and writes to a file, the first warning of a kind.
-            data.warning.number[:] = 1
-            worker = _Worker(model, data, _views(data))
-        try:
-            yield worker
-        finally:
-            self._idle.put(worker)
+    def _data(self, model: mujoco.MjModel, count: int) -> Iterator[list[mujoco.MjData]]:
+        idle = self._idle.setdefault(id(model), queue.SimpleQueue())
+        with _borrowed(idle, list) as data:
+            while len(data) < count:
+                data.append(mujoco.MjData(model))
+            yield data[:count]
 
 
-def shapes_of_readings(model: mujoco.MjModel) -> list[tuple[int, ...]]:
-    """Return the shapes of ``READINGS``."""
-    return [view.shape for view in _views(mujoco.MjData(model))]
+def compile_model(spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """Compile a model without MuJoCo's known warnings."""
+    with loading_silenced():
+        return spec.compile()
 
 
-def _views(data: mujoco.MjData) -> tuple[np.ndarray, ...]:
-    """Return views of ``READINGS``, with matrices of (3, 3)."""
-    views = [getattr(data, name) for name in READINGS]
-    return tuple(view.reshape(-1, 3, 3) if view.shape[1:] == (9,) else view for view in views)
+def with_poses(spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """Compile a model that also senses the poses of all bodies but the world."""
+    spec = spec.copy()
+    for i, body in enumerate(spec.bodies):
+        body.name = body.name or f"body/{i}"
+    for body in spec.bodies[1:]:
+        for kind in (mujoco.mjtSensor.mjSENS_FRAMEPOS, mujoco.mjtSensor.mjSENS_FRAMEQUAT):
+            spec.add_sensor(type=kind, objtype=mujoco.mjtObj.mjOBJ_XBODY, objname=body.name)
+    return compile_model(spec)
 
 
-def _join(arrays: Sequence[np.ndarray]) -> np.ndarray:
-    return np.concatenate(arrays, axis=1, dtype=np.float64)
-
-
-def _split(state: np.ndarray, parts: Sequence[np.ndarray]) -> None:
-    start = 0
-    for part in parts:
-        part[:] = state[:, start : start + part.shape[1]]
-        start += part.shape[1]
-
-
-def _read(worker: _Worker, readings: Sequence[np.ndarray], i: int) -> None:
-    for reading, value in zip(readings, worker.readings, strict=True):
-        reading[i] = value
+def _without(model: mujoco.MjModel, features: int) -> mujoco.MjModel:
+    model = copy.copy(model)
+    model.opt.disableflags |= int(features)
+    return model
 
 
 def _num_threads() -> int:
@@ -183,11 +178,39 @@ def _num_threads() -> int:
     return len(available(0)) if available else os.cpu_count() or 1
 
 
-@cache
-def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(_num_threads(), thread_name_prefix="pixelbrax-mujoco")
+_pools: queue.SimpleQueue[Rollout] = queue.SimpleQueue()
+"""Thread pools that nobody uses."""
+_abandoned: list[object] = []
+_in_this_thread = Rollout(nthread=0)
 
 
-# A forked process has the pool, but none of its threads.
+def _forget_pools() -> None:
+    """In a forked process: pools without threads must not be used, nor be deleted."""
+    global _pools
+    _abandoned.append(_pools)
+    _pools = queue.SimpleQueue()
+
+
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_pool.cache_clear)
+    os.register_at_fork(after_in_child=_forget_pools)
+
+
+@contextmanager
+def _rollout(num_threads: int) -> Iterator[Rollout]:
+    if num_threads == 1:
+        yield _in_this_thread
+    else:
+        with _borrowed(_pools, lambda: Rollout(nthread=num_threads)) as pool:
+            yield pool
+
+
+@contextmanager
+def _borrowed(idle: queue.SimpleQueue[_Thing], make: Callable[[], _Thing]) -> Iterator[_Thing]:
+    try:
+        thing = idle.get_nowait()
+    except queue.Empty:
+        thing = make()
+    try:
+        yield thing
+    finally:
+        idle.put(thing)

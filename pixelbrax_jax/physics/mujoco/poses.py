@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
 from pixelbrax_jax.spatial import quat_normalize
@@ -34,3 +35,13 @@ def with_unit_rotations(model: mujoco.MjModel, q: jax.Array) -> jax.Array:
             continue
         q = q.at[rotation].set(quat_normalize(q[rotation]))
     return q
+
+
+def masses_below(model: mujoco.MjModel, root: int) -> np.ndarray:
+    """Return (bodies - 1,) float32, each body's fraction of the mass of ``root``'s subtree."""
+    below = np.zeros(model.nbody, bool)
+    below[root] = True
+    for body in range(1, model.nbody):
+        below[body] |= below[model.body_parentid[body]]
+    masses = np.where(below, model.body_mass, 0.0)[1:]
+    return (masses / masses.sum()).astype(np.float32)

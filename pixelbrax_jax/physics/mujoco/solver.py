@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pixelbrax_jax.physics.dmc import elimination
-from pixelbrax_jax.physics.mujoco.cones import Cones
+from pixelbrax_jax.physics.mujoco import elimination
 from pixelbrax_jax.physics.mujoco.compatibility import import_silenced
+from pixelbrax_jax.physics.mujoco.cones import Cones
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
 
 with import_silenced():

@@ -10,10 +10,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from pixelbrax_jax.physics.dmc import elimination
-from pixelbrax_jax.physics.mujoco.solver import is_supported, solve
+from pixelbrax_jax.physics.mujoco import elimination
 from pixelbrax_jax.physics.mujoco.compatibility import import_silenced
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
+from pixelbrax_jax.physics.mujoco.solver import is_supported, solve
 
 with import_silenced():
     from mujoco.mjx._src import collision_driver, scan, smooth, support

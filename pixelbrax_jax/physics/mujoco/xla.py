@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax.physics.mujoco.compatibility import import_silenced, load_onto_own_device
-from pixelbrax_jax.physics.mujoco.native import READINGS
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
 from pixelbrax_jax.physics.mujoco.substitutes import substituted
 
@@ -27,7 +26,6 @@ class Xla:
     def __init__(
         self,
         model: mujoco.MjModel,
-        target_body: int | None,
         *,
         reads_forces: bool,
         starts_with_forces: bool,
@@ -36,7 +34,6 @@ class Xla:
         """Put a compiled model on the device; compile nothing. For the rest see ``Formulas``."""
         load_onto_own_device(mjx_io)
         self._model = model
-        self._target_body = target_body
         self._starts_with_forces = starts_with_forces
         self._simulated = _simulated(model, out_of_reach)
         self._mx = mjx.put_model(self._simulated, impl="jax")
@@ -57,7 +54,6 @@ class Xla:
         act: jax.Array,
         qacc_warmstart: jax.Array,
         ctrl: jax.Array,
-        target: jax.Array,
     ) -> Arrays:
         """See ``Native.step``."""
 
@@ -68,7 +64,7 @@ class Xla:
                 data = mjx.step(self._moving, data)
             return data.qpos, data.qvel, data.act, data.qacc_warmstart, data.sensordata
 
-        carry = (qpos, qvel, act, qacc_warmstart, jnp.zeros(self._model.nsensordata))
+        carry: Arrays = (qpos, qvel, act, qacc_warmstart, jnp.zeros(self._model.nsensordata))
         if num_steps == 1:
             carry = one(carry)
         else:
@@ -76,19 +72,16 @@ class Xla:
             carry = jax.lax.fori_loop(0, num_steps, lambda _, carry: one(carry), carry)
         qpos, qvel, act, warmstart, sensors = carry
         data = self._data(qpos, qvel, act=act, ctrl=ctrl, sensordata=sensors)
-        return qpos, qvel, act, warmstart, *self._readings(data, target)
+        return qpos, qvel, act, warmstart, *self._readings(data)
 
-    def first(self, qpos: jax.Array, qvel: jax.Array, target: jax.Array) -> Arrays:
+    def first(self, qpos: jax.Array, qvel: jax.Array) -> Arrays:
         """See ``Native.first``; without forces where no observation of a first state has any."""
         data = self._data(qpos, qvel)
         if self._starts_with_forces:
             with substituted(self._model):
                 forward = mjx.forward(self._passive, data)
-            warmstart = forward.qacc
             data = data.replace(sensordata=forward.sensordata)
-        else:
-            warmstart = jnp.zeros(self._model.nv)
-        return warmstart, *self._readings(data, target)
+        return self._readings(data)
 
     def clearances(self, qpos: jax.Array) -> Arrays:
         """See ``Native.clearances``; of geoms that do not overlap it may be a distance."""
@@ -101,23 +94,16 @@ class Xla:
             found = found.at[geoms].min(distances)
         return (found,)
 
-    def _readings(self, data: Any, target: jax.Array) -> Arrays:
-        """Return ``READINGS`` with positions, velocities and their sensors made anew."""
-        mx = self._mx
-        if self._target_body is not None:
-            at = self._target_body
-            mx = mx.replace(
-                body_pos=mx.body_pos.at[at].set(target[:3]),
-                body_quat=mx.body_quat.at[at].set(target[3:]),
-            )
+    def _readings(self, data: Any) -> Arrays:
+        """Return ``xpos, xquat, sensordata``; sensors of forces are those of ``data``."""
         with substituted(self._model):
-            data = mjx.kinematics(mx, data)
-            data = mjx.com_pos(mx, data)
-            data = mjx.com_vel(mx, data)
+            data = mjx.kinematics(self._mx, data)
+            data = mjx.com_pos(self._mx, data)
+            data = mjx.com_vel(self._mx, data)
             if self._model.nsensor:
-                data = mjx.sensor_pos(mx, data)
-                data = mjx.sensor_vel(mx, data)
-        return tuple(getattr(data, name) for name in READINGS)
+                data = mjx.sensor_pos(self._mx, data)
+                data = mjx.sensor_vel(self._mx, data)
+        return data.xpos, data.xquat, data.sensordata
 
     def _data(self, qpos: jax.Array, qvel: jax.Array, **fields: jax.Array) -> Any:
         data = mjx.make_data(self._simulated, impl="jax")

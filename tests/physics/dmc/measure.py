@@ -46,7 +46,7 @@ def same_state(task: str, count: int) -> dict[str, float]:
     """
     states = oracle.transitions(task, count).before
     physics, state = make_physics(task), _ours(task, states)
-    _, readings = jax.jit(jax.vmap(lambda state: physics.dynamics.step(state, 0)))(state)
+    readings = jax.jit(jax.vmap(physics.dynamics.first))(state)
     # Forces are those of the last step, which only DM Control has made.
     is_force = physics._model.sensor_needstage == int(mujoco.mjtStage.mjSTAGE_ACC)
     is_force = np.repeat(is_force, physics._model.sensor_dim)

@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pixelbrax_jax.physics.mujoco.dynamics import Dynamics
 from pixelbrax_jax.physics.dmc.formulas import (
     Formulas,
     Snapshot,
@@ -19,6 +18,7 @@ from pixelbrax_jax.physics.dmc.formulas import (
     start_free_of_contact,
     tolerance,
 )
+from pixelbrax_jax.physics.mujoco.dynamics import Dynamics
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
 
 _FINGER_SPEED = 15.0
@@ -144,7 +144,9 @@ def _sample(dynamics: Dynamics, key: jax.Array, before: Start) -> Start:
     target = jax.random.uniform(keys[1], (3,), minval=low, maxval=high)
     low, high = jnp.array([-0.5, 0.0, 0.0]), jnp.array([0.5, 0.7, 2 * jnp.pi])
     anywhere = jax.random.uniform(keys[2], (3,), minval=low, maxval=high)
-    place, axes = dynamics.site(qpos, "grasp")
+    state = dynamics.state(qpos, target=_pose(model, target))
+    seen = Snapshot(model, state, dynamics.first(state))
+    place, axes = seen.site_pos("grasp"), seen.site_mat("grasp")
     in_hand = jnp.stack([place[0], place[2], jnp.pi - jnp.arctan2(axes[2, 0], axes[0, 0])])
 
     where = jax.random.uniform(keys[3])

@@ -8,7 +8,6 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from pixelbrax_jax.physics.mujoco.dynamics import Dynamics
 from pixelbrax_jax.physics.dmc.formulas import (
     Formulas,
     Snapshot,
@@ -17,6 +16,7 @@ from pixelbrax_jax.physics.dmc.formulas import (
     small_control,
     tolerance,
 )
+from pixelbrax_jax.physics.mujoco.dynamics import Dynamics
 
 _COSINE_BOUND = math.cos(math.radians(8))
 

@@ -7,7 +7,6 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from pixelbrax_jax.physics.mujoco.dynamics import Dynamics
 from pixelbrax_jax.physics.dmc.formulas import (
     Formulas,
     Snapshot,
@@ -20,6 +19,7 @@ from pixelbrax_jax.physics.dmc.formulas import (
     start_anywhere,
     tolerance,
 )
+from pixelbrax_jax.physics.mujoco.dynamics import Dynamics
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
 
 _FISH_JOINTS = (

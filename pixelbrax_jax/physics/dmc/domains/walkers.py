@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pixelbrax_jax.physics.mujoco.dynamics import Dynamics
 from pixelbrax_jax.physics.dmc.formulas import (
     Formulas,
     Snapshot,
@@ -22,7 +21,9 @@ from pixelbrax_jax.physics.dmc.formulas import (
     start_free_of_contact,
     tolerance,
 )
+from pixelbrax_jax.physics.mujoco.dynamics import Dynamics
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
+from pixelbrax_jax.spatial import quat_to_mat
 
 _CHEETAH_SPEED = 10.0
 _CHEETAH_SETTLING_STEPS = 200
@@ -149,7 +150,7 @@ def _reward_quadruped(seen: Snapshot, *, speed: float) -> jax.Array:
 
 
 def _observe_walker(seen: Snapshot) -> jax.Array:
-    axes = seen.data.xmat[1:][:, 0][:, jnp.array([0, 2])]
+    axes = quat_to_mat(seen.data.xquat[1:])[:, 0][:, jnp.array([0, 2])]
     return joined(axes, seen.xpos("torso")[2], seen.state.qvel)
 
 
@@ -176,7 +177,7 @@ _hopper = partial(
 
 def _humanoid(speed: float) -> Formulas:
     reward = partial(_reward_humanoid, speed=speed)
-    return Formulas(start_free_of_contact, _observe_humanoid, reward, batch_last=False, substeps=5)
+    return Formulas(start_free_of_contact, _observe_humanoid, reward, substeps=5)
 
 
 def _quadruped(speed: float) -> Formulas:
@@ -184,7 +185,6 @@ def _quadruped(speed: float) -> Formulas:
         _start_quadruped,
         _observe_quadruped,
         partial(_reward_quadruped, speed=speed),
-        batch_last=False,
         substeps=4,
         options={"floor_size": _QUADRUPED_EPISODE * speed},
         camera=2,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Hashable
 from functools import lru_cache
-from types import MappingProxyType
 from typing import Any
 
 import jax
@@ -14,35 +13,39 @@ import numpy as np
 from pixelbrax_jax.flags import default_flags, under_default_flags
 from pixelbrax_jax.physics.divergence import GuardedPhysics, Recipe
 from pixelbrax_jax.physics.dmc.domains import FORMULAS
-from pixelbrax_jax.physics.mujoco.dynamics import Dynamics, Readings, State
 from pixelbrax_jax.physics.dmc.formulas import Formulas, Snapshot, Start
-from pixelbrax_jax.physics.dmc.models import load_model
+from pixelbrax_jax.physics.dmc.models import load_spec
 from pixelbrax_jax.physics.dmc.tasks import TASKS
-from pixelbrax_jax.physics.mujoco.scene import COM_LINK, TARGET_LINK, read_scene, tracked_body
+from pixelbrax_jax.physics.mujoco.dynamics import Dynamics, Readings, State
+from pixelbrax_jax.physics.mujoco.native import compile_model, with_poses
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
-from pixelbrax_jax.physics.mujoco.poses import check_pose, with_unit_rotations
+from pixelbrax_jax.physics.mujoco.options import ENGINES
+from pixelbrax_jax.physics.mujoco.poses import check_pose, masses_below, with_unit_rotations
+from pixelbrax_jax.physics.mujoco.scene import COM_LINK, TARGET_LINK, read_scene, tracked_body
 from pixelbrax_jax.physics.mujoco.viewpoints import unfit_cameras
+from pixelbrax_jax.spatial import f32, rotate
 from pixelbrax_jax.types import PhysicsState
+from pixelbrax_jax.validation import check_choice
 
 _UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 
 
-class MjxPhysics(GuardedPhysics):
-    """A task of the DM Control Suite, simulated by MuJoCo XLA.
+class DmcPhysics(GuardedPhysics):
+    """A task of the DM Control Suite, simulated by MuJoCo.
 
     Links are the model's bodies without the world, then, if the task has them, ``camera/com``, the
     center of mass that cameras and lights follow, and ``target``, this episode's target.
     """
 
-    backend = "mjx"
-    # XLA's CPU library YNNPACK is slower than XLA's own loops for the small sums and products of
-    # these models.
-    compiler_options = MappingProxyType({"xla_cpu_experimental_ynn_fusion_type": ""})
+    backend = "mujoco"
+    batch_last = False
 
     @default_flags()
-    def __init__(self, formulas: Formulas, model: mujoco.MjModel, *, identity: Hashable):
-        """Put the model on the device, edited for the task, and read its scene; compile nothing."""
-        formulas.edit(model)
+    def __init__(self, formulas: Formulas, spec: mujoco.MjSpec, *, engine: str, identity: Hashable):
+        """Compile the model, edited for the task, and read its scene; compile no program."""
+        model, posed = compile_model(spec), with_poses(spec)
+        for edited in (model, posed):
+            formulas.edit(edited)
         scene = read_scene(model, formulas.camera, movable=formulas.movable)
         self.geoms, self.look = scene.geoms, scene.look
         self.rigs = scene.rigs | {"default": scene.rig}
@@ -51,6 +54,8 @@ class MjxPhysics(GuardedPhysics):
         self.link_names = (*bodies, *scene.links)
         self.dynamics = Dynamics(
             model,
+            posed,
+            engine=engine,
             reads_forces=formulas.reads_forces,
             starts_with_forces=formulas.starts_with_forces,
             out_of_reach=formulas.out_of_reach,
@@ -59,10 +64,9 @@ class MjxPhysics(GuardedPhysics):
         # Rounded, so that 0.0025 * 10 is 0.025.
         self.dt = float(f"{model.opt.timestep * formulas.substeps:.6g}")
         self.action_size = int(model.nu)
-        self.batch_last = formulas.batch_last
         self._formulas = formulas
         self._model = model
-        self._tracked_body = tracked_body(model)
+        self._masses = masses_below(model, tracked_body(model))
         self._extra_links = scene.links
         self._identity = identity
         low, high = model.actuator_ctrlrange.T.astype(np.float32)
@@ -82,7 +86,7 @@ class MjxPhysics(GuardedPhysics):
     def observe(self, state: State, readings: Readings) -> PhysicsState:
         """Return poses, observation and reward."""
         seen = Snapshot(self._model, state, readings)
-        xpos, xquat = self._links(readings, state.target)
+        xpos, xquat = self._links(seen)
         return PhysicsState(
             engine=state,
             xpos=xpos,
@@ -108,7 +112,8 @@ class MjxPhysics(GuardedPhysics):
         return self._guard_first(self.observe(*self._settle(start)))
 
     def _settle(self, start: Start) -> tuple[State, Readings]:
-        return self.dynamics.first(self.dynamics.state(start.qpos, start.qvel, start.target))
+        state = self.dynamics.state(start.qpos, start.qvel, start.target)
+        return state, self.dynamics.first(state)
 
     def move(self, state: State, action: jax.Array) -> tuple[State, Readings]:
         """Advance by one control step; return the state and its readings."""
@@ -124,17 +129,28 @@ class MjxPhysics(GuardedPhysics):
     def _watched(self, state: PhysicsState) -> Any:
         return state.engine, state.xpos
 
-    def _links(self, readings: Readings, target: jax.Array) -> tuple[jax.Array, jax.Array]:
-        places = {TARGET_LINK: target, COM_LINK: readings.subtree_com[self._tracked_body]}
-        rows = [places[name][None] for name in self._extra_links]
+    def _links(self, seen: Snapshot) -> tuple[jax.Array, jax.Array]:
+        xpos, xquat = seen.data.xpos[1:], seen.data.xquat[1:]
+        rows = []
+        for name in self._extra_links:
+            if name == COM_LINK:
+                centers = xpos + rotate(xquat, f32(self._model.body_ipos[1:]))
+                rows.append(self._masses @ centers)
+            else:
+                assert name == TARGET_LINK
+                rows.append(seen.state.target[:3])
         upright = jnp.tile(jnp.array(_UPRIGHT), (len(rows), 1))
-        return jnp.concatenate([readings.xpos[1:], *rows]), jnp.concatenate([readings.xquat[1:], upright])
+        return jnp.stack([*xpos, *rows]), jnp.concatenate([xquat, upright])
+
+
+def make_physics(task: str, *, engine: str = "auto") -> DmcPhysics:
+    """Make the physics of a task in ``TASKS``. Equal arguments give equal objects."""
+    return _load(task, check_choice("engine", engine, ENGINES))
 
 
 # Loading a model takes a second. A model that is loaded again equals the first one.
 @lru_cache(maxsize=16)
-def make_physics(task: str) -> MjxPhysics:
-    """Make the physics of a task in ``TASKS``; equal and usually the same for one task."""
+def _load(task: str, engine: str) -> DmcPhysics:
     formulas = FORMULAS[task]
-    model = load_model(TASKS[task].domain, **formulas.options)
-    return MjxPhysics(formulas, model, identity=Recipe(make_physics, (task,)))
+    spec = load_spec(TASKS[task].domain, **formulas.options)
+    return DmcPhysics(formulas, spec, engine=engine, identity=Recipe(_load, (task, engine)))

@@ -1,0 +1,23 @@
+"""Options of all tasks that MuJoCo simulates. Importing it loads no physics."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pixelbrax_jax.validation import check_choice
+
+ENGINES = ("auto", "mujoco", "xla")
+"""Names of the engines."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MujocoOptions:
+    """Options of tasks that MuJoCo simulates; raises ValueError for one that is out of range."""
+
+    engine: str = "auto"
+    """Engine of the DM Control Suite's tasks: ``mujoco`` (MuJoCo itself, on a CPU), ``xla`` (MuJoCo
+    XLA, on any device and with gradients), or ``auto``: ``mujoco`` in programs for a CPU, ``xla``
+    in others."""
+
+    def __post_init__(self) -> None:
+        check_choice("engine", self.engine, ENGINES)
