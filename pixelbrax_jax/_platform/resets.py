@@ -42,6 +42,9 @@ def replace_rows(
     blocks have in common, such as physics at the initial pose, out of the loop and into every step.
     """
     num_rows = mask.shape[0]
+    if num_rows == 1:
+        # In a loop, everything would be common to all blocks.
+        return jax.lax.cond(mask[0], lambda: jax.vmap(fn)(*arguments), lambda: rows)
     block = min(_BLOCK, num_rows)
 
     def put(carry: tuple[jax.Array, Any]) -> tuple[jax.Array, Any]:

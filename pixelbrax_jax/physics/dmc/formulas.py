@@ -201,6 +201,7 @@ class Formulas:
         target_body: name of the body, fixed to the world, that it moves; empty for none.
         reads_forces: whether observations use sensors of forces or accelerations.
         starts_with_forces: whether these sensors are not 0 in an initial state.
+        is_small: whether a CPU steps the model faster by MuJoCo XLA.
         out_of_reach: names of the geoms that never touch anything, which MuJoCo XLA then skips.
     """
 
@@ -215,6 +216,7 @@ class Formulas:
     target_body: str = ""
     reads_forces: bool = False
     starts_with_forces: bool = False
+    is_small: bool = False
     out_of_reach: tuple[str, ...] = ()
 
 

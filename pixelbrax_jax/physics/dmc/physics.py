@@ -38,7 +38,6 @@ class DmcPhysics(GuardedPhysics):
     """
 
     backend = "mujoco"
-    batch_last = False
 
     @default_flags()
     def __init__(self, formulas: Formulas, spec: mujoco.MjSpec, *, engine: str, identity: Hashable):
@@ -57,6 +56,7 @@ class DmcPhysics(GuardedPhysics):
             posed,
             engine=engine,
             reads_forces=formulas.reads_forces,
+            is_small=formulas.is_small,
             starts_with_forces=formulas.starts_with_forces,
             out_of_reach=formulas.out_of_reach,
             target_body=formulas.target_body,
@@ -131,16 +131,11 @@ class DmcPhysics(GuardedPhysics):
 
     def _links(self, seen: Snapshot) -> tuple[jax.Array, jax.Array]:
         xpos, xquat = seen.data.xpos[1:], seen.data.xquat[1:]
-        rows = []
-        for name in self._extra_links:
-            if name == COM_LINK:
-                centers = xpos + rotate(xquat, f32(self._model.body_ipos[1:]))
-                rows.append(self._masses @ centers)
-            else:
-                assert name == TARGET_LINK
-                rows.append(seen.state.target[:3])
+        centers = xpos + rotate(xquat, f32(self._model.body_ipos[1:]))
+        places = {TARGET_LINK: seen.state.target[:3], COM_LINK: self._masses @ centers}
+        rows = [places[name][None] for name in self._extra_links]
         upright = jnp.tile(jnp.array(_UPRIGHT), (len(rows), 1))
-        return jnp.stack([*xpos, *rows]), jnp.concatenate([xquat, upright])
+        return jnp.concatenate([xpos, *rows]), jnp.concatenate([xquat, upright])
 
 
 def make_physics(task: str, *, engine: str = "auto") -> DmcPhysics:

@@ -65,7 +65,8 @@ class Dynamics:
     """A model's dynamics, for one environment.
 
     With ``engine="auto"`` MuJoCo's own engine computes programs lowered for a CPU, in float64, and
-    MuJoCo XLA all others, in float32. A name in ``options.ENGINES`` chooses one.
+    MuJoCo XLA all others, in float32; it also steps small models on a CPU. Another name in
+    ``options.ENGINES`` chooses one for all.
     """
 
     def __init__(
@@ -74,6 +75,7 @@ class Dynamics:
         posed: mujoco.MjModel,
         *,
         engine: str = "auto",
+        is_small: bool = False,
         reads_forces: bool = False,
         starts_with_forces: bool = False,
         out_of_reach: Iterable[str] = (),
@@ -82,6 +84,7 @@ class Dynamics:
         """Take a model and the same ``with_poses``. For the rest see ``Formulas``."""
         self.model = model
         self.engine = engine
+        self._steps_by_xla = engine == "xla" or (engine == "auto" and is_small)
         self._target_body = model.body(target_body).id if target_body else None
         self._xla_options: dict[str, Any] = {
             "reads_forces": reads_forces,
@@ -152,7 +155,7 @@ class Dynamics:
     ) -> list[jax.Array]:
         arrays = [jnp.asarray(x, jnp.float32) for x in arrays]
         function = _Function(self, method, options, tuple(shapes))
-        if self.engine == "xla":
+        if self.engine == "xla" or (method == "step" and self._steps_by_xla):
             return list(function.elsewhere(*arrays))
         return call(function, *arrays)
 

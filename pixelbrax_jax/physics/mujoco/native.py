@@ -47,6 +47,7 @@ class Native:
             raise ValueError("MuJoCo's plugins and delays are not simulated: remove them.")
         stages = np.repeat(model.sensor_needstage, model.sensor_dim)
         self._is_force = stages == int(mujoco.mjtStage.mjSTAGE_ACC)
+        self._rest = np.concatenate([[0], model.qpos0, np.zeros(model.nv + model.na)])
         self._idle: dict[int, queue.SimpleQueue[list[mujoco.MjData]]] = {}
 
     def step(self, num_steps: int, *arrays: np.ndarray) -> None:
@@ -58,20 +59,24 @@ class Native:
         """
         model = self._moving
         qpos, qvel, act, warmstart, ctrl, *results = arrays
+        is_bad = ~(np.abs(ctrl) < mujoco.mjMAXVAL).all(axis=1)
+        ctrl = np.where(is_bad[:, None], 0, ctrl)  # MuJoCo would do so without an error
         first = np.concatenate([np.zeros((len(qpos), 1)), qpos, qvel, act], 1, dtype=np.float64)
         states, sensors = self._roll(
             model, first, num_steps, ctrl.astype(np.float64), warmstart.astype(np.float64)
         )
         last = states[:, -1]
         # MuJoCo ends a row's steps where it warns.
-        lost = np.abs(last[:, 0] - num_steps * model.opt.timestep) > model.opt.timestep / 2
-        last[lost, 1:] = np.nan
+        is_bad |= np.abs(last[:, 0] - num_steps * model.opt.timestep) > model.opt.timestep / 2
+        last[is_bad] = self._rest
         edges = np.cumsum([1, model.nq, model.nv, model.na])
         for result, start, stop in zip(results, edges, edges[1:], strict=False):
             result[:] = last[:, start:stop]
         before = states[:, -2] if num_steps > 1 else first
         velocities = slice(edges[1], edges[2])
         results[3][:] = (last[:, velocities] - before[:, velocities]) / model.opt.timestep
+        for result in results[:4]:
+            result[is_bad] = np.nan
         _, found = self._roll(self._still, last, 1)
         self._read(found[:, 0], *results[4:])
         results[6][:, self._is_force] = sensors[:, -1, self._is_force]

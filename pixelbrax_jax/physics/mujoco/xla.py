@@ -27,16 +27,16 @@ class Xla:
         self,
         model: mujoco.MjModel,
         *,
-        reads_forces: bool,
-        starts_with_forces: bool,
-        out_of_reach: Iterable[str],
+        reads_forces: bool = False,
+        starts_with_forces: bool = False,
+        out_of_reach: Iterable[str] = (),
     ):
         """Put a compiled model on the device; compile nothing. For the rest see ``Formulas``."""
         load_onto_own_device(mjx_io)
         self._model = model
         self._starts_with_forces = starts_with_forces
-        self._simulated = _simulated(model, out_of_reach)
-        self._mx = mjx.put_model(self._simulated, impl="jax")
+        self.simulated = _simulated(model, out_of_reach)
+        self._mx = mjx.put_model(self.simulated, impl="jax")
         self._moving = (
             self._mx if reads_forces else self._without(mujoco.mjtDisableBit.mjDSBL_SENSOR)
         )
@@ -106,7 +106,7 @@ class Xla:
         return data.xpos, data.xquat, data.sensordata
 
     def _data(self, qpos: jax.Array, qvel: jax.Array, **fields: jax.Array) -> Any:
-        data = mjx.make_data(self._simulated, impl="jax")
+        data = mjx.make_data(self.simulated, impl="jax")
         return data.replace(qpos=qpos, qvel=qvel, **fields)
 
 

@@ -12,6 +12,7 @@ import pytest
 
 from pixelbrax_jax.physics.dmc import models
 from pixelbrax_jax.physics.dmc.domains import FORMULAS
+from pixelbrax_jax.physics.mujoco.native import compile_model
 from pixelbrax_jax.registry import make_physics
 from pixelbrax_jax.tasks import DMC_TASKS
 from tests.physics.dmc import measure, oracle
@@ -100,7 +101,7 @@ def test_initial_states_have_the_same_distribution(task):
 def test_models_are_equal(task):
     """Also those that are generated: swimmers, the quadruped and the manipulator."""
     parts = FORMULAS[task]
-    ours = models.load_model(DMC_TASKS[task].domain, **parts.options)
+    ours = compile_model(models.load_spec(DMC_TASKS[task].domain, **parts.options))
     parts.edit(ours)
     env = oracle.load(task)
     theirs = env.physics.model

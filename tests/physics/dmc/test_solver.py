@@ -11,9 +11,9 @@ from mujoco.mjx._src import collision_driver
 from mujoco.mjx._src import solver as theirs
 
 from pixelbrax_jax._platform.interpreter import batch_last
-from pixelbrax_jax.physics.dmc import elimination
-from pixelbrax_jax.physics.mujoco.dynamics import Dynamics
+from pixelbrax_jax.physics.mujoco import elimination
 from pixelbrax_jax.physics.mujoco.solver import is_supported
+from pixelbrax_jax.physics.mujoco.xla import Xla
 
 # Two arms with dry friction, limits and a joint that follows another; a ball that slides and rolls.
 MODEL = """
@@ -58,10 +58,14 @@ def last(function):
 
 
 def after_a_step(model, qpos, qvel, batch=jax.vmap):
-    """Our states after a step of MuJoCo XLA, whose own functions are in their places again."""
+    """Our ``qpos, qvel, act, qacc`` after a step.
+
+    MuJoCo XLA's own functions are in their places again.
+    """
     before = theirs.solve, dict(collision_driver._COLLISION_FUNC)
-    dynamics = Dynamics(model)
-    move = batch(lambda q, v: dynamics.step(dynamics.state(q, v), 1)[0])
+    engine = Xla(model)
+    act, ctrl, accelerations = jnp.zeros(model.na), jnp.zeros(model.nu), jnp.zeros(model.nv)
+    move = batch(lambda q, v: engine.step(1, q, v, act, accelerations, ctrl)[:4])
     found = jax.jit(move)(jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32))
     assert before == (theirs.solve, collision_driver._COLLISION_FUNC)
     return found
@@ -95,7 +99,7 @@ def test_forces_are_those_of_mujoco(cone, condim, batch):
     model = model_of(cone, condim, arms=max(condim, 3))
     assert is_supported(model)
     qpos, qvel = states(model)
-    ours = after_a_step(model, qpos, qvel, batch).qacc_warmstart
+    ours = after_a_step(model, qpos, qvel, batch)[3]
     numbers, zones = set(), set()
     for found, data in zip(ours, mujocos(model, qpos, qvel, mujoco.mj_forward), strict=True):
         numbers.add((data.ne, data.nf, data.nl, data.ncon))
@@ -133,7 +137,7 @@ def test_steep_capsules_slide_as_in_mujoco():
     height = 0.3 * np.cos(tilt) + 0.1 - 0.005
     qpos = np.concatenate([np.zeros((40, 2)), height[:, None], np.stack(quat, axis=1)], axis=1)
     qvel = random.normal(size=(40, 6))
-    ours = after_a_step(model, qpos, qvel).qvel
+    ours = after_a_step(model, qpos, qvel)[1]
     for found, data in zip(ours, mujocos(model, qpos, qvel, mujoco.mj_step), strict=True):
         assert data.ncon == 1
         np.testing.assert_allclose(found, data.qvel, atol=1e-3)

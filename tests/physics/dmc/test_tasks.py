@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import itertools
 import re
+from functools import partial
 from importlib import metadata
 
 import jax
@@ -77,11 +78,11 @@ def test_the_models_cameras_have_names():
 def test_without_dm_control_the_extra_is_named(monkeypatch):
     monkeypatch.setattr(models, "find_spec", lambda name: None)
     with pytest.raises(ImportError, match=r'try: pip install "pixelbrax\[dmc\]"'):
-        models.load_model("cheetah")
+        models.load_spec("cheetah")
     # Another way for Pythons without wheels.
     monkeypatch.setattr(models.sys, "version_info", (3, 13, 0))
     with pytest.raises(ImportError, match="pip install --no-deps dm_control"):
-        models.load_model("cheetah")
+        models.load_spec("cheetah")
 
 
 @needs_models
@@ -90,8 +91,8 @@ def test_other_models_are_warned_of_once(monkeypatch):
     monkeypatch.setitem(models.KNOWN_MODELS, "pendulum", "another")
     both = rf"dm_control {metadata.version('dm_control')} .* dm_control {models.KNOWN_VERSION}"
     with pytest.warns(UserWarning, match=both):
-        models.load_model("pendulum")
-    models.load_model("pendulum")
+        models.load_spec("pendulum")
+    models.load_spec("pendulum")
 
 
 @pytest.mark.parametrize("option", [{"reward_preset": "paper"}, {"backend": "mjx"}])
@@ -130,7 +131,7 @@ def test_episodes_are_truncated_after_1000_control_steps(task):
 @pytest.mark.parametrize("task", [task for task in DMC_TASKS if "finger" in task])
 def test_what_the_finger_cannot_reach_is_not_tried(task):
     theirs = oracle.load(task).physics.model
-    ours = make_physics(task).dynamics._simulated
+    ours = make_physics(task).dynamics.xla.simulated
     pairs = set(geom_pairs(theirs.ptr)) - set(geom_pairs(ours))
     assert len(geom_pairs(ours)) == 2
     data = mujoco.MjData(theirs.ptr)
@@ -159,8 +160,9 @@ def geom_pairs(model):
 def test_a_step_factorises_one_matrix_after_the_other(task):
     """Threads of jaxlib 0.10 wait for each other otherwise: 128 humanoids never moved."""
     dynamics = make_physics(task).dynamics
-    state = jax.eval_shape(dynamics.state, jax.ShapeDtypeStruct((dynamics.model.nq,), jnp.float32))
-    step = jax.jit(lambda state: dynamics.step(state, 1)).trace(state)
+    sizes = [getattr(dynamics.model, name) for name in ("nq", "nv", "na", "nv", "nu")]
+    state = [jax.ShapeDtypeStruct((size,), jnp.float32) for size in sizes]
+    step = jax.jit(partial(dynamics.xla.step, 1)).trace(*state)
     if dynamics.model.nv > LARGEST:
         assert count_factorised(step.jaxpr.jaxpr) > 1
         assert_in_turn(step.jaxpr.jaxpr)
@@ -176,16 +178,15 @@ def test_a_long_chain_is_computed_once():
     dynamics = make_physics("dmc_swimmer_swimmer6").dynamics
     model = dynamics.model
     qpos = jax.random.normal(jax.random.key(0), (4, model.nq))
-    sensors = jnp.zeros((4, model.nsensordata))
 
-    def places(qpos, sensors):
-        return dynamics.refresh(dynamics.state(qpos), sensors).xpos
+    def places(qpos):
+        return dynamics.xla.first(qpos, jnp.zeros(model.nv))[0]
 
-    lowered = jax.jit(jax.vmap(places)).lower(qpos, sensors)
+    lowered = jax.jit(jax.vmap(places)).lower(qpos)
     compiled = lowered.compile(compiler_options=optimized())
     assert compiled.cost_analysis()["flops"] < 2 * lowered.cost_analysis()["flops"]
     data = mujoco.MjData(model)
-    for row, found in zip(qpos, compiled(qpos, sensors), strict=True):
+    for row, found in zip(qpos, compiled(qpos), strict=True):
         data.qpos = row
         mujoco.mj_kinematics(model, data)
         np.testing.assert_allclose(found, data.xpos, atol=1e-5)

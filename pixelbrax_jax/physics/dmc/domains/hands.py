@@ -202,7 +202,9 @@ def _reward_manipulator(seen: Snapshot) -> jax.Array:
     return tolerance(apart, (0.0, _NEAR), margin=2 * _NEAR)
 
 
-_finger = partial(Formulas, substeps=2, out_of_reach=_OUT_OF_REACH, reads_forces=True)
+_finger = partial(
+    Formulas, substeps=2, out_of_reach=_OUT_OF_REACH, reads_forces=True, is_small=True
+)
 
 
 def _turn(radius: float) -> Formulas:
@@ -211,7 +213,9 @@ def _turn(radius: float) -> Formulas:
 
 
 TASKS = {
-    "dmc_ball_in_cup_catch": Formulas(_start_cup, observe_joints, _reward_cup, substeps=10),
+    "dmc_ball_in_cup_catch": Formulas(
+        _start_cup, observe_joints, _reward_cup, substeps=10, is_small=True
+    ),
     "dmc_finger_spin": _finger(start_free_of_contact, _observe_spin, _reward_spin, edit=_edit_spin),
     "dmc_finger_turn_easy": _turn(0.07),
     "dmc_finger_turn_hard": _turn(0.03),

@@ -78,19 +78,27 @@ def _reward_pendulum(seen: Snapshot) -> jax.Array:
 
 
 def _acrobot(margin: float) -> Formulas:
-    return Formulas(_start_anywhere, _observe_acrobot, partial(_reward_acrobot, margin=margin))
+    return Formulas(
+        _start_anywhere, _observe_acrobot, partial(_reward_acrobot, margin=margin), is_small=True
+    )
 
 
 TASKS = {
     "dmc_acrobot_swingup": _acrobot(1.0),
     "dmc_acrobot_swingup_sparse": _acrobot(0.0),
-    "dmc_cartpole_balance": Formulas(_start_upright, _observe_cartpole, _reward_cartpole),
+    "dmc_cartpole_balance": Formulas(
+        _start_upright, _observe_cartpole, _reward_cartpole, is_small=True
+    ),
     "dmc_cartpole_balance_sparse": Formulas(
-        _start_upright, _observe_cartpole, _reward_cartpole_sparse
+        _start_upright, _observe_cartpole, _reward_cartpole_sparse, is_small=True
     ),
-    "dmc_cartpole_swingup": Formulas(_start_hanging, _observe_cartpole, _reward_cartpole),
+    "dmc_cartpole_swingup": Formulas(
+        _start_hanging, _observe_cartpole, _reward_cartpole, is_small=True
+    ),
     "dmc_cartpole_swingup_sparse": Formulas(
-        _start_hanging, _observe_cartpole, _reward_cartpole_sparse
+        _start_hanging, _observe_cartpole, _reward_cartpole_sparse, is_small=True
     ),
-    "dmc_pendulum_swingup": Formulas(_start_anywhere, _observe_pendulum, _reward_pendulum),
+    "dmc_pendulum_swingup": Formulas(
+        _start_anywhere, _observe_pendulum, _reward_pendulum, is_small=True
+    ),
 }

@@ -149,7 +149,12 @@ def _reward_swimmer(seen: Snapshot) -> jax.Array:
 def _reacher(radius: float) -> Formulas:
     edit = partial(_resize_target, radius=radius)
     return Formulas(
-        _start_reacher, _observe_reacher, _reward_reacher, edit=edit, movable=("target",)
+        _start_reacher,
+        _observe_reacher,
+        _reward_reacher,
+        edit=edit,
+        movable=("target",),
+        is_small=True,
     )
 
 
@@ -161,6 +166,7 @@ def _swimmer(num_bodies: int) -> Formulas:
         substeps=15,
         options={"num_bodies": num_bodies},
         movable=("target", "target_light"),
+        is_small=num_bodies < 10,
     )
 
 
@@ -171,6 +177,7 @@ TASKS = {
         _reward_fish_upright,
         substeps=10,
         edit=_hide_target,
+        is_small=True,
     ),
     "dmc_fish_swim": Formulas(
         _start_fish_swim,
@@ -178,8 +185,11 @@ TASKS = {
         _reward_fish_swim,
         substeps=10,
         movable=("target",),
+        is_small=True,
     ),
-    "dmc_point_mass_easy": Formulas(start_anywhere, observe_joints, _reward_point_mass),
+    "dmc_point_mass_easy": Formulas(
+        start_anywhere, observe_joints, _reward_point_mass, is_small=True
+    ),
     "dmc_reacher_easy": _reacher(0.05),
     "dmc_reacher_hard": _reacher(0.015),
     "dmc_swimmer_swimmer6": _swimmer(6),
