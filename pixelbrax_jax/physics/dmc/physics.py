@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable
 from functools import lru_cache
+from types import MappingProxyType
 from typing import Any
 
 import jax
@@ -38,6 +39,9 @@ class DmcPhysics(GuardedPhysics):
     """
 
     backend = "mujoco"
+    # XLA's CPU library YNNPACK is slower than XLA's own loops for the small sums and products of
+    # these models.
+    compiler_options = MappingProxyType({"xla_cpu_experimental_ynn_fusion_type": ""})
 
     @default_flags()
     def __init__(self, formulas: Formulas, spec: mujoco.MjSpec, *, engine: str, identity: Hashable):
@@ -132,7 +136,10 @@ class DmcPhysics(GuardedPhysics):
     def _links(self, seen: Snapshot) -> tuple[jax.Array, jax.Array]:
         xpos, xquat = seen.data.xpos[1:], seen.data.xquat[1:]
         centers = xpos + rotate(xquat, f32(self._model.body_ipos[1:]))
-        places = {TARGET_LINK: seen.state.target[:3], COM_LINK: self._masses @ centers}
+        places: dict[str, jax.Array] = {
+            TARGET_LINK: seen.state.target[:3],
+            COM_LINK: self._masses @ centers,
+        }
         rows = [places[name][None] for name in self._extra_links]
         upright = jnp.tile(jnp.array(_UPRIGHT), (len(rows), 1))
         return jnp.concatenate([xpos, *rows]), jnp.concatenate([xquat, upright])

@@ -102,7 +102,9 @@ class Dynamics:
         """The engine for accelerators, loaded at the first use."""
         from pixelbrax_jax.physics.mujoco.xla import Xla
 
-        return Xla(self.model, **self._xla_options)
+        # The first use may be within a program that is being traced.
+        with jax.ensure_compile_time_eval():
+            return Xla(self.model, **self._xla_options)
 
     def state(
         self,
