@@ -38,8 +38,8 @@ POSITIVE_OR_0 = (
 CHOICES = ("encoder", "policy", "normalize_advantage", "layout")
 UNCHECKED = {
     # Options of the environment, checked with those of every other one.
-    "task", "backend", "reward_preset", "distractors", "clips", "camera", "look", "shadows",
-    "split", "obs_mode", "renderer",
+    "task", "backend", "engine", "reward_preset", "distractors", "clips", "camera", "look",
+    "shadows", "split", "obs_mode", "renderer",
     # Truth values.
     "state_critic", "anneal", "normalize_reward", "clip_value", "decoupled",
 }  # fmt: skip

@@ -15,7 +15,7 @@ import numpy as np
 from PIL import Image
 
 import pixelbrax_jax as pb
-from pixelbrax_jax.physics.mujoco.scene import COM_LINK
+from pixelbrax_jax.physics.mujoco.scene import COM_LINK, tracked_body
 from pixelbrax_jax.renderer.base import render
 from pixelbrax_jax.scene.place import place
 from pixelbrax_jax.tasks import BRAX_TASKS, DMC_TASKS
@@ -66,7 +66,7 @@ def pose(physics: pb.Physics) -> tuple[np.ndarray, np.ndarray]:
     mujoco.mj_comPos(model, data)
     xpos, xquat = [*data.xpos[1:]], [*data.xquat[1:]]
     for link in physics.link_names[model.nbody - 1 :]:
-        com = data.subtree_com[physics._tracked_body] if link == COM_LINK else TARGET
+        com = data.subtree_com[tracked_body(physics._model)] if link == COM_LINK else TARGET
         xpos.append(np.asarray(com))
         xquat.append(np.asarray([1.0, 0, 0, 0]))
     return np.asarray(xpos, np.float32), np.asarray(xquat, np.float32)

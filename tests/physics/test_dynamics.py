@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import queue
 from functools import partial
 
 import jax
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 import pixelbrax_jax as pb
+from pixelbrax_jax.physics.mujoco import native
 from pixelbrax_jax.registry import make_physics
 from pixelbrax_jax.tasks import DMC_TASKS
 
@@ -45,14 +47,13 @@ def play(physics, num_envs, num_steps=5):
     "task", [pytest.param(t, marks=() if t == TASK else pytest.mark.slow) for t in OF_EACH_DOMAIN]
 )
 def test_both_engines_take_the_same_step(task):
-    native, xla = (make_physics(task, engine=engine) for engine in ("mujoco", "xla"))
-    assert native != xla
-    states = play(native, 16).engine
-    states = jax.tree.map(lambda x: x[:, -1], states)
-    actions = jax.random.uniform(jax.random.key(1), (16, native.action_size), minval=-1)
+    ours, theirs = (make_physics(task, engine=engine) for engine in ("mujoco", "xla"))
+    assert ours != theirs
+    states = jax.tree.map(lambda x: x[:, -1], play(ours, 16).engine)
+    actions = jax.random.uniform(jax.random.key(1), (16, ours.action_size), minval=-1)
     ours, theirs = (
         jax.jit(jax.vmap(lambda s, a, p=p: p.observe(*p.move(s, a))))(states, actions)
-        for p in (native, xla)
+        for p in (ours, theirs)
     )
     far = np.abs(ours.engine.qvel - theirs.engine.qvel) / np.maximum(1, np.abs(ours.engine.qvel))
     assert np.quantile(far.max(axis=1), 0.9) < 1e-2
@@ -64,7 +65,8 @@ def test_bits_do_not_depend_on_the_number_of_environments_nor_of_threads(physics
     many = play(physics, 33)
     few = play(physics, 3)
     jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[:3], b), many, few)
-    monkeypatch.setattr("pixelbrax_jax.physics.mujoco.native._num_threads", lambda: 3)
+    monkeypatch.setattr(native, "_num_threads", lambda: 3)
+    monkeypatch.setattr(native, "_pools", queue.SimpleQueue())
     jax.tree.map(np.testing.assert_array_equal, many, play(physics, 33))
 
 
@@ -150,7 +152,7 @@ def test_engines_are_options_of_the_suite():
 @pytest.mark.filterwarnings("ignore:.*fork.*")
 def test_a_forked_process_has_threads_of_its_own(physics):
     """Without JAX, which cannot be used after a fork."""
-    native, model = physics.dynamics.native, physics.dynamics.model
+    engine, model = physics.dynamics.native, physics.dynamics.model
     rows = 64
     state = [np.zeros((rows, n), np.float32) for n in (model.nq, model.nv, 0, model.nv, model.nu)]
     state[0][:] = model.qpos0
@@ -158,7 +160,7 @@ def test_a_forked_process_has_threads_of_its_own(physics):
 
     def step():
         results = [np.zeros((rows, *s), np.float32) for s in (*shapes, (model.nsensordata,))]
-        native.step(4, *state, *results)
+        engine.step(4, *state, *results)
         return results[0]
 
     expected = step()

@@ -13,7 +13,7 @@ BEFORE = """
 import os
 before = dict(os.environ)
 """
-FILE = Path(__file__).parents[2] / "pixelbrax_jax" / "physics" / "opengl.py"
+FILE = Path(__file__).parents[2] / "pixelbrax_jax" / "physics" / "mujoco" / "opengl.py"
 # The file by itself, as its package imports JAX.
 MUJOCO = f"import runpy\nrunpy.run_path({str(FILE)!r})['import_mujoco']()\n"
 PHYSICS = "import pixelbrax_jax.physics\n"

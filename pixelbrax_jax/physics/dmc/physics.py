@@ -22,7 +22,7 @@ from pixelbrax_jax.physics.mujoco.native import compile_model, with_poses
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
 from pixelbrax_jax.physics.mujoco.options import ENGINES
 from pixelbrax_jax.physics.mujoco.poses import check_pose, masses_below, with_unit_rotations
-from pixelbrax_jax.physics.mujoco.scene import COM_LINK, TARGET_LINK, read_scene, tracked_body
+from pixelbrax_jax.physics.mujoco.scene import COM_LINK, read_scene, tracked_body
 from pixelbrax_jax.physics.mujoco.viewpoints import unfit_cameras
 from pixelbrax_jax.spatial import f32, rotate
 from pixelbrax_jax.types import PhysicsState
@@ -136,11 +136,9 @@ class DmcPhysics(GuardedPhysics):
     def _links(self, seen: Snapshot) -> tuple[jax.Array, jax.Array]:
         xpos, xquat = seen.data.xpos[1:], seen.data.xquat[1:]
         centers = xpos + rotate(xquat, f32(self._model.body_ipos[1:]))
-        places: dict[str, jax.Array] = {
-            TARGET_LINK: seen.state.target[:3],
-            COM_LINK: self._masses @ centers,
-        }
-        rows = [places[name][None] for name in self._extra_links]
+        com = jnp.dot(self._masses, centers)
+        target = seen.state.target[:3]
+        rows = [(com if name == COM_LINK else target)[None] for name in self._extra_links]
         upright = jnp.tile(jnp.array(_UPRIGHT), (len(rows), 1))
         return jnp.concatenate([xpos, *rows]), jnp.concatenate([xquat, upright])
 

@@ -21,7 +21,10 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
 
+# Both suites' cheetahs use settotalmass, which MuJoCo still applies.
+_KNOWN_MUJOCO_WARNING = "compiler attribute 'settotalmass' is deprecated"
 _KNOWN_WARNINGS: tuple[tuple[str, type[Warning]], ...] = (
+    (_KNOWN_MUJOCO_WARNING, UserWarning),
     # Brax, at every load of a model.
     ("Brax System, piplines and environments are not actively", UserWarning),
     # Imported by Brax's generalized backend.
@@ -29,8 +32,6 @@ _KNOWN_WARNINGS: tuple[tuple[str, type[Warning]], ...] = (
     # Brax reads MJX fields that moved; MJX still serves them.
     (r"Accessing `\w+` directly from `(Data|Model)` is deprecated", DeprecationWarning),
 )
-# Both suites' cheetahs use settotalmass, which MuJoCo still applies.
-_KNOWN_MUJOCO_WARNING = "compiler attribute 'settotalmass' is deprecated"
 # MJX prints a line when an optional dependency, Warp, is not installed.
 _KNOWN_PRINT = "Failed to import "
 

@@ -124,7 +124,10 @@ class Native:
         states = np.empty((num_rows, num_steps, first.shape[1]))
         sensors = np.empty((num_rows, num_steps, model.nsensordata))
         num_threads = _num_threads() if num_rows >= _FEWEST else 1
-        with self._data(model, num_threads) as data, _rollout(num_threads) as rollout:
+        with (
+            _rollout(num_threads) as rollout,
+            self._data(model, max(1, rollout.nthread)) as data,
+        ):
             rollout.rollout(
                 [model] * num_rows,
                 data,

@@ -66,11 +66,8 @@ def test_one_control_step(task):
 
 def check_control_step(task, count, **episodes):
     errors = measure.control_step(task, count, **episodes)
-    if task in measure.CAUSES:
-        assert errors["rewards_off"] <= errors["velocities_off"] <= 2, errors
-    else:
-        assert errors["reward"] < 1e-4, errors
-        assert errors["velocity"] < 1e-2, errors
+    assert errors["reward"] < 1e-5, errors
+    assert errors["velocity"] < 1e-3, errors
 
 
 def test_a_step_is_a_move_and_a_look():
