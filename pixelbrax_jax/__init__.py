@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from importlib import import_module, metadata
 from typing import TYPE_CHECKING, Any
+
+from pixelbrax_jax.cache import KEEP_PROGRAMS, keep_programs
 
 if TYPE_CHECKING:
     from pixelbrax_jax import distractors as distractors
@@ -36,6 +39,9 @@ if TYPE_CHECKING:
     from pixelbrax_jax.types import Look as Look
     from pixelbrax_jax.types import PhysicsState as PhysicsState
     from pixelbrax_jax.types import Timestep as Timestep
+
+if os.environ.get(KEEP_PROGRAMS) == "1":
+    keep_programs()
 
 # Loaded at first use, so that the list of tasks does not wait for JAX.
 _PUBLIC = {

@@ -1,8 +1,11 @@
-"""The cache folder, and paths in the home folder."""
+"""The cache folder, programs kept in it, and paths in the home folder."""
 
 from __future__ import annotations
 
+import hashlib
 import os
+import platform
+import sys
 from pathlib import Path
 
 
@@ -36,3 +39,43 @@ def in_home(path: Path) -> Path:
         raise FileNotFoundError(
             f"{path} is in a home folder that is unknown; set HOME, or give the whole path."
         ) from error
+
+
+KEEP_PROGRAMS = "PIXELBRAX_KEEP_PROGRAMS"
+"""Environment variable: with ``1`` importing PixelBrax keeps compiled programs, with ``0`` nothing
+does."""
+
+_FOLDER, _SHORTEST = "JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"
+
+
+def keep_programs() -> Path | None:
+    """Keep compiled programs in the cache folder, for later processes; imports no JAX.
+
+    There is a folder for each kind of CPU, because a program may use instructions that another CPU
+    lacks. Nothing is deleted by itself.
+
+    Returns:
+        The folder; None if JAX was told of another, or the environment has
+        ``PIXELBRAX_KEEP_PROGRAMS=0``.
+    """
+    jax = sys.modules.get("jax")
+    told = jax.config.jax_compilation_cache_dir if jax else os.environ.get(_FOLDER)
+    if told or os.environ.get(KEEP_PROGRAMS) == "0":
+        return None
+    folder = cache_folder() / "programs" / _kind_of_cpu()
+    # For processes that this one starts, too.
+    os.environ[_FOLDER] = str(folder)
+    os.environ.setdefault(_SHORTEST, "0.3")
+    if jax:
+        jax.config.update(_FOLDER.lower(), str(folder))
+        jax.config.update(_SHORTEST.lower(), float(os.environ[_SHORTEST]))
+    return folder
+
+
+def _kind_of_cpu() -> str:
+    features = platform.processor()
+    info = Path("/proc/cpuinfo")
+    if info.exists():
+        lines = info.read_text("utf-8", "replace").splitlines()
+        features = next((line for line in lines if line.startswith(("flags", "Features"))), "")
+    return hashlib.sha256(f"{platform.machine()} {features}".encode()).hexdigest()[:8]

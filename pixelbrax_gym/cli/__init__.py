@@ -7,7 +7,7 @@ import signal
 import sys
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from difflib import get_close_matches
 from importlib import import_module
 from pathlib import Path
@@ -15,9 +15,13 @@ from pkgutil import iter_modules
 from typing import Any, TypeVar
 
 from pixelbrax_gym.bench.machine import installed_version
+from pixelbrax_jax.cache import keep_programs
 from pixelbrax_jax.extras import install_extra
 
 Options = TypeVar("Options")
+
+
+_KEEP_NONE = "--keep-no-programs"
 
 
 class CommandError(Exception):
@@ -34,7 +38,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     The exit status is 0 for success, 1 for an error, 2 for a wrong command line and 128 plus the
     signal's number after a signal to stop, as in shells: 130 for Ctrl-C.
     """
-    first, *rest = (sys.argv[1:] if arguments is None else arguments) or [""]
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    keeps_programs = given[:1] != [_KEEP_NONE]
+    first, *rest = given[not keeps_programs :] or [""]
     if first in ("-h", "--help"):
         sys.stdout.write(_help())
         return 0
@@ -49,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     _find_modules_here()
     try:
-        with _warnings_of(first):
+        with _warnings_of(first), _programs_kept() if keeps_programs else nullcontext():
             status: int = import_module(f"{__name__}.{first}").run(rest)
             return status
     except KeyboardInterrupt:
@@ -64,6 +70,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     finally:
         for stream in filter(None, (sys.stdout, sys.stderr)):
             _flush(stream)
+
+
+@contextmanager
+def _programs_kept() -> Iterator[None]:
+    """Keep compiled programs; say so after the first ones."""
+    try:
+        folder = keep_programs()
+    except FileNotFoundError:  # without a home folder none are kept
+        folder = None
+    is_first = folder is not None and not folder.exists()
+    yield
+    if is_first and folder is not None and folder.exists():
+        with suppress(OSError, ValueError):
+            sys.stderr.write(
+                f"pixelbrax: the compiled programs are kept in {folder}, so that the next start is "
+                f"faster; 'pixelbrax {_KEEP_NONE} COMMAND' keeps none.\n"
+            )
 
 
 def say(command: str, message: object) -> None:
@@ -103,10 +126,11 @@ def _help() -> str:
         about = (import_module(f"{__name__}.{name}").__doc__ or "").partition("\n")[0]
         lines.append(f"  {name:10}{about}\n")
     return (
-        "usage: pixelbrax COMMAND [options]\n\nContinuous control from pixels, on JAX.\n\n"
+        f"usage: pixelbrax [{_KEEP_NONE}] COMMAND [options]\n\n"
+        "Continuous control from pixels, on JAX.\n\n"
         f"commands:\n{''.join(lines)}\n"
         "'pixelbrax COMMAND --help' lists the options of one; 'pixelbrax --version' tells the "
-        "release.\n"
+        f"release. Compiled programs are kept for the next start, but not with {_KEEP_NONE}.\n"
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import warnings
@@ -84,3 +85,41 @@ def test_a_reader_that_has_gone_is_no_error():
     done = subprocess.run(["bash", "-c", line], capture_output=True, text=True, check=True)
     assert done.stdout.strip() in ("0", "1")
     assert "Traceback" not in done.stderr
+
+
+def test_programs_are_kept_by_default_and_it_is_said_once(tmp_path):
+    """In a home folder of its own: the folder, the line, and both ways to keep none."""
+    code = "import sys; from pixelbrax_gym.cli import main; sys.exit(main(sys.argv[1:]))"
+    play = ["play", "inverted_pendulum", "--gif", str(tmp_path / "a.gif")]
+    play += ["--num-frames", "2", "--size", "16"]
+    environ = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")}
+    environ |= {"PIXELBRAX_CACHE": str(tmp_path / "cache")}
+    programs = tmp_path / "cache" / "programs"
+
+    def said(*arguments, **settings):
+        command = [sys.executable, "-W", "ignore", "-c", code, *arguments]
+        done = subprocess.run(command, env=environ | settings, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        return "kept in" in done.stderr
+
+    assert not said("--keep-no-programs", *play)
+    assert not said(*play, PIXELBRAX_KEEP_PROGRAMS="0")
+    assert not programs.exists()
+    assert said(*play)
+    kept = list(programs.rglob("*-cache"))
+    assert kept
+    assert not said(*play)
+    assert sorted(programs.rglob("*-cache")) == sorted(kept)
+
+
+def test_programs_of_a_library_are_kept_on_demand(tmp_path):
+    code = "import pixelbrax_jax, jax; print(jax.config.jax_compilation_cache_dir)"
+    environ = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")}
+    environ |= {"PIXELBRAX_CACHE": str(tmp_path)}
+    for value, first in (("1", code), ("1", f"import jax; {code}"), ("0", code)):
+        settings = environ | {"PIXELBRAX_KEEP_PROGRAMS": value}
+        done = subprocess.run(
+            [sys.executable, "-c", first], env=settings, capture_output=True, text=True, check=True
+        )
+        found = done.stdout.strip()
+        assert found == "None" if value == "0" else found.startswith(str(tmp_path / "programs"))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pixelbrax_jax.physics.dmc.domains import hands, poles, reachers, walkers
+from pixelbrax_jax.physics.dmc.domains import hands, poles, targets, walkers
 
-FORMULAS = poles.TASKS | walkers.TASKS | reachers.TASKS | hands.TASKS
+FORMULAS = poles.TASKS | walkers.TASKS | targets.TASKS | hands.TASKS
 """Formulas by the name of the task."""
