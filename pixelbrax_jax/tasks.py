@@ -9,6 +9,7 @@ from types import MappingProxyType
 from pixelbrax_jax.physics.brax.tasks import TASKS as BRAX_TASKS
 from pixelbrax_jax.physics.brax.tasks import BraxOptions
 from pixelbrax_jax.physics.dmc.tasks import TASKS as DMC_TASKS
+from pixelbrax_jax.physics.gym.tasks import TASKS as GYM_TASKS
 from pixelbrax_jax.physics.mujoco.options import MujocoOptions
 from pixelbrax_jax.physics.task import Task
 
@@ -42,6 +43,12 @@ SUITES: Mapping[str, Suite] = MappingProxyType(
             "tasks of the DM Control Suite",
             DMC_TASKS,
             "pixelbrax_jax.physics.dmc.physics",
+            tuple(option.name for option in fields(MujocoOptions)),
+        ),
+        "gym": Suite(
+            "Gymnasium's MuJoCo tasks",
+            GYM_TASKS,
+            "pixelbrax_jax.physics.gym.physics",
             tuple(option.name for option in fields(MujocoOptions)),
         ),
     }

@@ -34,6 +34,7 @@ class State(struct.PyTreeNode):
         ctrl: (A,) float32, the last controls, for rewards.
         target: metres, this episode's target: (3,) float32; (7,) with a unit quaternion if it is a
             body; (0,) for tasks without one.
+        remembered: float32, what the next reward compares with; (0,) for most tasks.
     """
 
     qpos: jax.Array
@@ -42,23 +43,28 @@ class State(struct.PyTreeNode):
     qacc_warmstart: jax.Array
     ctrl: jax.Array
     target: jax.Array
+    remembered: jax.Array
 
 
 class Readings(struct.PyTreeNode):
-    """What MuJoCo computes from a state, by its names of ``MjData``.
+    """What MuJoCo computes from a state, by its names of ``MjData``; all float32.
 
     Positions, velocities and their sensors are current; sensors of forces and accelerations are
     from the beginning of the last physics step.
 
     Attributes:
-        xpos: (B, 3) float32, metres, origins of all bodies, of the world first.
-        xquat: (B, 4) float32, unit quaternions, their orientations.
-        sensordata: float32, all sensors, in MuJoCo's units.
+        xpos: (B, 3) metres, origins of all bodies, of the world first.
+        xquat: (B, 4) unit quaternions, their orientations.
+        sensordata: all sensors, in MuJoCo's units.
+        moved: (Q,) change of the joint positions in the control step; 0 in a first state.
+        fields: ``Formulas.reads`` by name.
     """
 
     xpos: jax.Array
     xquat: jax.Array
     sensordata: jax.Array
+    moved: jax.Array
+    fields: dict[str, jax.Array]
 
 
 class Dynamics:
@@ -80,6 +86,7 @@ class Dynamics:
         starts_with_forces: bool = False,
         out_of_reach: Iterable[str] = (),
         target_body: str = "",
+        reads: Sequence[str] = (),
     ):
         """Take a model and the same ``with_poses``. For the rest see ``Formulas``."""
         self.model = model
@@ -90,12 +97,15 @@ class Dynamics:
             "reads_forces": reads_forces,
             "starts_with_forces": starts_with_forces,
             "out_of_reach": tuple(out_of_reach),
+            "reads": tuple(reads),
         }
-        self.native = Native(model, posed, reads_forces=reads_forces)
+        self.native = Native(model, posed, reads_forces=reads_forces, reads=reads)
         # Equal in every process, so that JAX's cache finds the programs that contain it.
-        self.name = f"{_digest(model)}/{reads_forces}"
-        sizes = (model.nbody, 3), (model.nbody, 4), (model.nsensordata,)
-        self._shapes: list[tuple[int, ...]] = list(sizes)
+        self.name = "/".join([_digest(model), str(reads_forces), *reads])
+        data = mujoco.MjData(model)
+        fields = [getattr(data, name).shape for name in reads]
+        self._shapes = [(model.nbody, 3), (model.nbody, 4), (model.nsensordata,), *fields]
+        self._reads = tuple(reads)
 
     @cached_property
     def xla(self) -> Xla:
@@ -121,28 +131,30 @@ class Dynamics:
             qacc_warmstart=jnp.zeros(model.nv),
             ctrl=jnp.zeros(model.nu),
             target=jnp.zeros(0) if target is None else jnp.asarray(target, jnp.float32),
+            remembered=jnp.zeros(0),
         )
 
     def step(self, state: State, num_steps: int) -> tuple[State, Readings]:
         """Advance by at least one physics step with the state's controls."""
         names = ("qpos", "qvel", "act", "qacc_warmstart")
         arrays = [getattr(state, name) for name in (*names, "ctrl")]
-        shapes = [x.shape for x in arrays[:4]] + self._shapes
+        shapes = [x.shape for x in (*arrays[:4], state.qpos)] + self._shapes
         results = self._call("step", arrays, shapes, num_steps)
         state = state.replace(**dict(zip(names, results, strict=False)))
-        return state, self._readings(state, results[4:])
+        return state, self._readings(state, results[4], results[5:])
 
     def first(self, state: State) -> Readings:
         """Return the readings of a first state; actuators are off, as in DM Control's resets."""
         results = self._call("first", [state.qpos, state.qvel], self._shapes)
-        return self._readings(state, results)
+        return self._readings(state, jnp.zeros_like(state.qpos), results)
 
-    def _readings(self, state: State, results: list[jax.Array]) -> Readings:
-        xpos, xquat, sensordata = results
+    def _readings(self, state: State, moved: jax.Array, results: list[jax.Array]) -> Readings:
+        xpos, xquat, sensordata, *fields = results
         if (at := self._target_body) is not None:
             xpos = xpos.at[at].set(state.target[:3])
             xquat = xquat.at[at].set(quat_normalize(state.target[3:]))
-        return Readings(xpos, xquat, sensordata)
+        by_name = dict(zip(self._reads, fields, strict=True))
+        return Readings(xpos, xquat, sensordata, moved, by_name)
 
     def clearances(self, qpos: jax.Array) -> jax.Array:
         """Return (G,) metres at joint positions (Q,): negative for a geom that overlaps another."""

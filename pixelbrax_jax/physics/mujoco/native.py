@@ -5,8 +5,10 @@ from __future__ import annotations
 import copy
 import os
 import queue
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import cache
 from typing import TypeVar
 
 import numpy as np
@@ -32,8 +34,16 @@ class Native:
     once. The result of a row depends on nothing but the row. A row that diverges becomes NaN.
     """
 
-    def __init__(self, model: mujoco.MjModel, posed: mujoco.MjModel, *, reads_forces: bool):
-        """Take a model and the same ``with_poses``; compile nothing."""
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        posed: mujoco.MjModel,
+        *,
+        reads_forces: bool = False,
+        reads: Sequence[str] = (),
+    ):
+        """Take a model and the same ``with_poses``. For the rest see ``Formulas``."""
+        self._fields = tuple(reads)
         # A state that diverges stays as it is.
         disabled = _OFF.mjDSBL_AUTORESET
         self._moving = _without(model, disabled if reads_forces else disabled | _OFF.mjDSBL_SENSOR)
@@ -53,49 +63,105 @@ class Native:
     def step(self, num_steps: int, *arrays: np.ndarray) -> None:
         """Advance ``qpos, qvel, act, qacc_warmstart, ctrl`` by at least one physics step.
 
-        Fills the first four, and ``xpos``, ``xquat`` and ``sensordata``. Positions, velocities and
-        their sensors are those after the last step; sensors of forces and accelerations those of
-        its beginning. The accelerations are those of the last step, from its velocities.
+        Fills the first four, the change of ``qpos``, and ``xpos``, ``xquat`` and ``sensordata``.
+        Positions, velocities and their sensors are those after the last step; sensors of forces and
+        accelerations those of its beginning. The accelerations are those of the last step, from its
+        velocities. Then it fills the fields, as the last step and ``mj_rnePostConstraint`` leave
+        them.
         """
         model = self._moving
         qpos, qvel, act, warmstart, ctrl, *results = arrays
         is_bad = ~(np.abs(ctrl) < mujoco.mjMAXVAL).all(axis=1)
         ctrl = np.where(is_bad[:, None], 0, ctrl)  # MuJoCo would do so without an error
         first = np.concatenate([np.zeros((len(qpos), 1)), qpos, qvel, act], 1, dtype=np.float64)
-        states, sensors = self._roll(
-            model, first, num_steps, ctrl.astype(np.float64), warmstart.astype(np.float64)
-        )
-        last = states[:, -1]
-        # MuJoCo ends a row's steps where it warns.
+        moved, xpos, xquat, sensordata, *fields = results[4:]
+        begin = first, ctrl.astype(np.float64), warmstart.astype(np.float64)
+        if fields:
+            last, qacc, sensors = self._step_each(num_steps, *begin, fields)
+        else:
+            last, qacc, sensors = self._step_all(num_steps, *begin)
+        # MuJoCo may end a row's steps where it warns.
         is_bad |= np.abs(last[:, 0] - num_steps * model.opt.timestep) > model.opt.timestep / 2
+        is_bad |= ~(np.abs(qacc) < mujoco.mjMAXVAL).all(axis=1)
         last[is_bad] = self._rest
         edges = np.cumsum([1, model.nq, model.nv, model.na])
         for result, start, stop in zip(results, edges, edges[1:], strict=False):
             result[:] = last[:, start:stop]
-        before = states[:, -2] if num_steps > 1 else first
-        velocities = slice(edges[1], edges[2])
-        results[3][:] = (last[:, velocities] - before[:, velocities]) / model.opt.timestep
+        results[3][:] = qacc
         for result in results[:4]:
             result[is_bad] = np.nan
+        moved[:] = (last - first)[:, edges[0] : edges[1]]
         _, found = self._roll(self._still, last, 1)
-        self._read(found[:, 0], *results[4:])
-        results[6][:, self._is_force] = sensors[:, -1, self._is_force]
+        _read(found[:, 0], xpos, xquat, sensordata)
+        sensordata[:, self._is_force] = sensors[:, self._is_force]
 
-    def first(
+    def _step_all(
+        self, num_steps: int, first: np.ndarray, ctrl: np.ndarray, warmstart: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the last states, accelerations from their velocities, and sensors."""
+        model = self._moving
+        states, sensors = self._roll(model, first, num_steps, ctrl, warmstart)
+        last, before = states[:, -1], states[:, -2] if num_steps > 1 else first
+        velocities = slice(1 + model.nq, 1 + model.nq + model.nv)
+        qacc = (last - before)[:, velocities] / model.opt.timestep
+        return last, qacc, sensors[:, -1]
+
+    def _step_each(
         self,
-        qpos: np.ndarray,
-        qvel: np.ndarray,
-        xpos: np.ndarray,
-        xquat: np.ndarray,
-        sensordata: np.ndarray,
-    ) -> None:
+        num_steps: int,
+        first: np.ndarray,
+        ctrl: np.ndarray,
+        warmstart: np.ndarray,
+        fields: Sequence[np.ndarray],
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the same, with MuJoCo's own accelerations, and fill the fields."""
+        model = self._moving
+        last, qacc = first.copy(), warmstart
+        sensors = np.empty((len(first), model.nsensordata))
+
+        def step(start: int, stop: int) -> None:
+            with self._data(model, 1) as (data,):
+                views = [getattr(data, name) for name in self._fields]
+                for i in range(start, stop):
+                    mujoco.mj_setState(model, data, first[i], _STATE)
+                    data.ctrl, data.qacc_warmstart = ctrl[i], warmstart[i]
+                    mujoco.mj_step(model, data, num_steps)
+                    mujoco.mj_rnePostConstraint(model, data)
+                    mujoco.mj_getState(model, data, last[i], _STATE)
+                    qacc[i], sensors[i] = data.qacc_warmstart, data.sensordata
+                    for field, view in zip(fields, views, strict=True):
+                        field[i] = view
+
+        half = len(first) // 2 if len(first) >= _FEWEST and _num_threads() > 1 else 0
+        other = _second_thread().submit(step, 0, half)
+        step(half, len(first))
+        other.result()
+        return last, qacc, sensors
+
+    def first(self, qpos: np.ndarray, qvel: np.ndarray, *results: np.ndarray) -> None:
         """Compute what ``qpos`` and ``qvel`` say, with actuators off, as DM Control's resets do.
 
-        Fills ``xpos``, ``xquat`` and ``sensordata``.
+        Fills ``xpos``, ``xquat``, ``sensordata`` and the fields, with ``cfrc_ext`` 0.
         """
+        xpos, xquat, sensordata, *fields = results
         parts = [np.zeros((len(qpos), 1)), qpos, qvel, np.zeros((len(qpos), self._moving.na))]
-        _, found = self._roll(self._resting, np.concatenate(parts, 1, dtype=np.float64), 1)
-        self._read(found[:, 0], xpos, xquat, sensordata)
+        first = np.concatenate(parts, 1, dtype=np.float64)
+        _, found = self._roll(self._resting, first, 1)
+        _read(found[:, 0], xpos, xquat, sensordata)
+        if fields:
+            self._read_fields(first, fields)
+
+    def _read_fields(self, states: np.ndarray, fields: Sequence[np.ndarray]) -> None:
+        """Fill fields of ``MjData`` in states without controls."""
+        model = self._moving
+        with self._data(model, 1) as (data,):
+            views = [getattr(data, name) for name in self._fields]
+            for i, state in enumerate(states):
+                mujoco.mj_setState(model, data, state, _STATE)
+                data.ctrl, data.cfrc_ext = 0, 0
+                mujoco.mj_forward(model, data)
+                for field, view in zip(fields, views, strict=True):
+                    field[i] = view
 
     def clearances(self, qpos: np.ndarray, found: np.ndarray) -> None:
         """Fill (N, G) metres, by which each geom overlaps another, negative; infinity for none."""
@@ -141,14 +207,6 @@ class Native:
             )
         return states, sensors
 
-    def _read(
-        self, found: np.ndarray, xpos: np.ndarray, xquat: np.ndarray, own: np.ndarray
-    ) -> None:
-        own[:] = found[:, : own.shape[1]]
-        poses = found[:, own.shape[1] :].reshape(len(found), -1, 7)
-        xpos[:, 0], xquat[:, 0] = 0, (1, 0, 0, 0)
-        xpos[:, 1:], xquat[:, 1:] = poses[..., :3], poses[..., 3:]
-
     @contextmanager
     def _data(self, model: mujoco.MjModel, count: int) -> Iterator[list[mujoco.MjData]]:
         idle = self._idle.setdefault(id(model), queue.SimpleQueue())
@@ -156,6 +214,14 @@ class Native:
             while len(data) < count:
                 data.append(mujoco.MjData(model))
             yield data[:count]
+
+
+def _read(found: np.ndarray, xpos: np.ndarray, xquat: np.ndarray, own: np.ndarray) -> None:
+    """Fill poses and sensors from the sensors of a model ``with_poses``."""
+    own[:] = found[:, : own.shape[1]]
+    poses = found[:, own.shape[1] :].reshape(len(found), -1, 7)
+    xpos[:, 0], xquat[:, 0] = 0, (1, 0, 0, 0)
+    xpos[:, 1:], xquat[:, 1:] = poses[..., :3], poses[..., 3:]
 
 
 def compile_model(spec: mujoco.MjSpec) -> mujoco.MjModel:
@@ -197,6 +263,12 @@ def _forget_pools() -> None:
     global _pools
     _abandoned.append(_pools)
     _pools = queue.SimpleQueue()
+    _second_thread.cache_clear()
+
+
+@cache
+def _second_thread() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(_num_threads(), thread_name_prefix="pixelbrax-mujoco")
 
 
 if hasattr(os, "register_at_fork"):

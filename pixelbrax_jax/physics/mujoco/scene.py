@@ -41,7 +41,7 @@ class ModelScene(NamedTuple):
     Attributes:
         geoms: geoms, visible sites (``site/<name>``) and the pieces of visible tendons
             (``tendon/<name>/<piece>``).
-        rig: the chosen camera.
+        rig: the chosen camera; None if the model has none.
         rigs: all cameras that can be rigs, by name.
         look: the model's lights, sky and ground.
         links: names of the links after those of the bodies, if the model needs them: ``camera/com``
@@ -50,7 +50,7 @@ class ModelScene(NamedTuple):
     """
 
     geoms: Geoms
-    rig: CameraRig
+    rig: CameraRig | None
     rigs: dict[str, CameraRig]
     look: Look
     links: tuple[str, ...]
@@ -81,7 +81,8 @@ def read_scene(
     geoms = as_geoms([*shapes, *pieces]).replace(strings=tuple(strings))
     rigs = read_rigs(model, com_link)
     look = read_look(model).replace(lamps=tuple(lamps.values()))
-    return ModelScene(geoms, rigs[camera_name(model, camera)], rigs, look, tuple(links))
+    rig = rigs[camera_name(model, camera)] if model.ncam else None
+    return ModelScene(geoms, rig, rigs, look, tuple(links))
 
 
 def _textured_geoms(model: mujoco.MjModel) -> Iterator[Shape]:

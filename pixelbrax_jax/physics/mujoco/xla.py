@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import jax
@@ -16,6 +16,7 @@ from pixelbrax_jax.physics.mujoco.substitutes import substituted
 with import_silenced():
     from mujoco import mjx
     from mujoco.mjx._src import io as mjx_io
+    from mujoco.mjx._src import smooth
 
 Arrays = tuple[jax.Array, ...]
 
@@ -30,11 +31,13 @@ class Xla:
         reads_forces: bool = False,
         starts_with_forces: bool = False,
         out_of_reach: Iterable[str] = (),
+        reads: Sequence[str] = (),
     ):
         """Put a compiled model on the device; compile nothing. For the rest see ``Formulas``."""
         load_onto_own_device(mjx_io)
         self._model = model
-        self._starts_with_forces = starts_with_forces
+        self._starts_with_forces = starts_with_forces or bool(reads)
+        self._fields = tuple(reads)
         self.simulated = _simulated(model, out_of_reach)
         self._mx = mjx.put_model(self.simulated, impl="jax")
         self._moving = (
@@ -56,32 +59,46 @@ class Xla:
         ctrl: jax.Array,
     ) -> Arrays:
         """See ``Native.step``."""
+        first = qpos
 
         def one(carry: Arrays) -> Arrays:
-            qpos, qvel, act, warmstart, _ = carry
+            qpos, qvel, act, warmstart, *_ = carry
             data = self._data(qpos, qvel, act=act, qacc_warmstart=warmstart, ctrl=ctrl)
             with substituted(self._model):
                 data = mjx.step(self._moving, data)
-            return data.qpos, data.qvel, data.act, data.qacc_warmstart, data.sensordata
+            return (
+                *(data.qpos, data.qvel, data.act, data.qacc_warmstart),
+                *(data.sensordata, *self._left(data, is_after_step=True)),
+            )
 
         carry: Arrays = (qpos, qvel, act, qacc_warmstart, jnp.zeros(self._model.nsensordata))
+        carry += tuple(jnp.zeros(x.shape, x.dtype) for x in jax.eval_shape(one, carry)[5:])
         if num_steps == 1:
             carry = one(carry)
         else:
             # A loop, so that the program has one copy of the step.
             carry = jax.lax.fori_loop(0, num_steps, lambda _, carry: one(carry), carry)
-        qpos, qvel, act, warmstart, sensors = carry
+        qpos, qvel, act, warmstart, sensors, *left = carry
         data = self._data(qpos, qvel, act=act, ctrl=ctrl, sensordata=sensors)
-        return qpos, qvel, act, warmstart, *self._readings(data)
+        moved = qpos - first
+        return qpos, qvel, act, warmstart, moved, *self._readings(data), *left
 
     def first(self, qpos: jax.Array, qvel: jax.Array) -> Arrays:
         """See ``Native.first``; without forces where no observation of a first state has any."""
         data = self._data(qpos, qvel)
+        left: Arrays = ()
         if self._starts_with_forces:
             with substituted(self._model):
                 forward = mjx.forward(self._passive, data)
             data = data.replace(sensordata=forward.sensordata)
-        return self._readings(data)
+            left = self._left(forward, is_after_step=False)
+        return *self._readings(data), *left
+
+    def _left(self, data: Any, *, is_after_step: bool) -> Arrays:
+        """Return the fields of ``MjData`` that a step leaves."""
+        if is_after_step and "cfrc_ext" in self._fields:
+            data = smooth.rne_postconstraint(self._mx, data)
+        return tuple(getattr(data, name) for name in self._fields)
 
     def clearances(self, qpos: jax.Array) -> Arrays:
         """See ``Native.clearances``; of geoms that do not overlap it may be a distance."""

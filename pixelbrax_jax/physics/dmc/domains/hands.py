@@ -8,17 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pixelbrax_jax.physics.dmc.formulas import (
-    Formulas,
-    Snapshot,
-    Start,
-    free_of_contact,
-    joined,
-    observe_joints,
-    start_free_of_contact,
-    tolerance,
-)
+from pixelbrax_jax.physics.dmc.formulas import free_of_contact, start_free_of_contact, tolerance
 from pixelbrax_jax.physics.mujoco.dynamics import Dynamics
+from pixelbrax_jax.physics.mujoco.formulas import Formulas, Snapshot, Start, joined, observe_joints
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
 
 _FINGER_SPEED = 15.0

@@ -8,15 +8,9 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from pixelbrax_jax.physics.dmc.formulas import (
-    Formulas,
-    Snapshot,
-    Start,
-    joined,
-    small_control,
-    tolerance,
-)
+from pixelbrax_jax.physics.dmc.formulas import small_control, tolerance
 from pixelbrax_jax.physics.mujoco.dynamics import Dynamics
+from pixelbrax_jax.physics.mujoco.formulas import Formulas, Snapshot, Start, joined
 
 _COSINE_BOUND = math.cos(math.radians(8))
 

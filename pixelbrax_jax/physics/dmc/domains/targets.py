@@ -8,11 +8,6 @@ import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax.physics.dmc.formulas import (
-    Formulas,
-    Snapshot,
-    Start,
-    joined,
-    observe_joints,
     random_joints,
     random_rotation,
     small_control,
@@ -20,6 +15,7 @@ from pixelbrax_jax.physics.dmc.formulas import (
     tolerance,
 )
 from pixelbrax_jax.physics.mujoco.dynamics import Dynamics
+from pixelbrax_jax.physics.mujoco.formulas import Formulas, Snapshot, Start, joined, observe_joints
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
 
 _FISH_JOINTS = (

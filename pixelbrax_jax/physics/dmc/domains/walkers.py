@@ -9,10 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from pixelbrax_jax.physics.dmc.formulas import (
-    Formulas,
-    Snapshot,
-    Start,
-    joined,
     random_joints,
     random_rotation,
     rising,
@@ -22,6 +18,7 @@ from pixelbrax_jax.physics.dmc.formulas import (
     tolerance,
 )
 from pixelbrax_jax.physics.mujoco.dynamics import Dynamics
+from pixelbrax_jax.physics.mujoco.formulas import Formulas, Snapshot, Start, joined
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
 from pixelbrax_jax.spatial import quat_to_mat
 

@@ -1,0 +1,321 @@
+"""Initial states, observations, rewards and ends of Gymnasium's MuJoCo tasks, version 5.
+
+The formulas are those of ``gymnasium.envs.mujoco``. Velocities of bodies come from the change of
+the joint positions, which the engine computes before it rounds to float32.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+
+from pixelbrax_jax.physics.mujoco.dynamics import Dynamics
+from pixelbrax_jax.physics.mujoco.formulas import (
+    Formulas,
+    Snapshot,
+    Start,
+    joined,
+    observe_joints,
+)
+from pixelbrax_jax.spatial import f32
+
+_REACHER_RADIUS = 0.2
+_PUSHER_CLEARANCE = 0.17
+_BODY_FIELDS = ("cinert", "cvel", "qfrc_actuator", "cfrc_ext")
+
+
+def _near_default(
+    dynamics: Dynamics, key: jax.Array, *, noise: float, normal: bool = False
+) -> Start:
+    """Add uniform noise to the model's pose; velocities are uniform too, or normal."""
+    model = dynamics.model
+    positions, velocities = jax.random.split(key)
+    qpos = model.qpos0 + jax.random.uniform(positions, (model.nq,), minval=-noise, maxval=noise)
+    if normal:
+        qvel = noise * jax.random.normal(velocities, (model.nv,))
+    else:
+        qvel = jax.random.uniform(velocities, (model.nv,), minval=-noise, maxval=noise)
+    return Start(qpos, qvel)
+
+
+def _start_reacher(dynamics: Dynamics, key: jax.Array) -> Start:
+    """Sample the arm near its default pose, and the target in a disk."""
+    arm, radius, angle, velocities = jax.random.split(key, 4)
+    qpos = dynamics.model.qpos0[:2] + jax.random.uniform(arm, (2,), minval=-0.1, maxval=0.1)
+    # Gymnasium rejects points of a square, which has the same distribution.
+    distance = _REACHER_RADIUS * jnp.sqrt(jax.random.uniform(radius))
+    turn = jax.random.uniform(angle, minval=-jnp.pi, maxval=jnp.pi)
+    goal = distance * jnp.stack([jnp.cos(turn), jnp.sin(turn)])
+    qvel = jax.random.uniform(velocities, (2,), minval=-0.005, maxval=0.005)
+    return Start(joined(qpos, goal), joined(qvel, jnp.zeros(2)))
+
+
+def _start_pusher(dynamics: Dynamics, key: jax.Array) -> Start:
+    """Sample the cylinder, not too near to the goal, and small velocities of the arm."""
+    model = dynamics.model
+    places, velocities = jax.random.split(key)
+
+    def place(number: jax.Array) -> jax.Array:
+        low, high = jnp.array([-0.3, -0.2]), jnp.array([0.0, 0.2])
+        return jax.random.uniform(jax.random.fold_in(places, number), (2,), minval=low, maxval=high)
+
+    def is_near(number: jax.Array) -> jax.Array:
+        return jnp.linalg.norm(place(number)) <= _PUSHER_CLEARANCE
+
+    number = jax.lax.while_loop(is_near, lambda number: number + 1, jnp.int32(0))
+    arm = jnp.asarray(model.qpos0[:-4], jnp.float32)
+    speed = jax.random.uniform(velocities, (model.nv - 4,), minval=-0.005, maxval=0.005)
+    return Start(joined(arm, place(number), jnp.zeros(2)), joined(speed, jnp.zeros(4)))
+
+
+def _left(seen: Snapshot, body: str) -> jax.Array:
+    """Return (3,) metres, where MuJoCo's last step left a body."""
+    return seen.data.fields["xpos"][seen.model.body(body).id]
+
+
+def _without_place(seen: Snapshot, *, skipped: int) -> jax.Array:
+    """Return joint positions without the first ones, and velocities."""
+    return joined(seen.state.qpos[skipped:], seen.state.qvel)
+
+
+def _with_clipped_speed(seen: Snapshot) -> jax.Array:
+    return joined(seen.state.qpos[1:], jnp.clip(seen.state.qvel, -10, 10))
+
+
+def _observe_ant(seen: Snapshot) -> jax.Array:
+    forces = jnp.clip(seen.data.fields["cfrc_ext"], -1, 1)
+    return joined(_without_place(seen, skipped=2), forces[1:])
+
+
+def _observe_humanoid(seen: Snapshot) -> jax.Array:
+    fields = seen.data.fields
+    bodies = fields["cinert"][1:], fields["cvel"][1:]
+    return joined(
+        _without_place(seen, skipped=2),
+        *bodies,
+        fields["qfrc_actuator"][6:],
+        fields["cfrc_ext"][1:],
+    )
+
+
+def _observe_double_pendulum(seen: Snapshot) -> jax.Array:
+    state, force = seen.state, seen.data.fields["qfrc_constraint"][:1]
+    angles = state.qpos[1:]
+    return joined(
+        state.qpos[:1],
+        jnp.sin(angles),
+        jnp.cos(angles),
+        jnp.clip(state.qvel, -10, 10),
+        jnp.clip(force, -10, 10),
+    )
+
+
+def _observe_reacher(seen: Snapshot) -> jax.Array:
+    state = seen.state
+    angles = state.qpos[:2]
+    away = (_left(seen, "fingertip") - _left(seen, "target"))[:2]
+    return joined(jnp.cos(angles), jnp.sin(angles), state.qpos[2:], state.qvel[:2], away)
+
+
+def _observe_pusher(seen: Snapshot) -> jax.Array:
+    places = (_left(seen, name) for name in ("tips_arm", "object", "goal"))
+    return joined(seen.state.qpos[:7], seen.state.qvel[:7], *places)
+
+
+def _effort(seen: Snapshot, weight: float) -> jax.Array:
+    return weight * jnp.sum(seen.state.ctrl**2)
+
+
+def _within(x: jax.Array, low: float, high: float) -> jax.Array:
+    return (low < x) & (x < high)
+
+
+def _speed(seen: Snapshot, substeps: int) -> jax.Array:
+    """Return the velocity of the first joint over the control step."""
+    return seen.data.moved[0] / (seen.model.opt.timestep * substeps)
+
+
+def _lagging_speed(
+    seen: Snapshot, place: Callable[[Snapshot], jax.Array], substeps: int
+) -> jax.Array:
+    """Return the velocity along x of what lags behind the root's joint by one physics step."""
+    lag = place(seen) - seen.state.remembered
+    return (seen.data.moved[0] + lag[0]) / (seen.model.opt.timestep * substeps)
+
+
+def _torso(seen: Snapshot) -> jax.Array:
+    """Return (2,) metres, the first body, from the root's joint."""
+    return seen.data.fields["xpos"][1, :2] - seen.state.qpos[:2]
+
+
+def _center_of_mass(seen: Snapshot) -> jax.Array:
+    """Return (2,) metres, the center of mass, from the root's joint."""
+    masses = f32(seen.model.body_mass / seen.model.body_mass.sum())
+    # The world has no mass. Differences from the root keep their digits far away.
+    root = joined(seen.state.qpos[:2], 0.0)
+    return jnp.dot(masses[1:], seen.data.fields["xipos"][1:] - root)[:2]
+
+
+def _reward_runner(seen: Snapshot, *, substeps: int, effort: float) -> jax.Array:
+    return _speed(seen, substeps) - _effort(seen, effort)
+
+
+def _reward_stander(
+    seen: Snapshot, *, fallen: Callable[[Snapshot], jax.Array], substeps: int, effort: float
+) -> jax.Array:
+    return _reward_runner(seen, substeps=substeps, effort=effort) + jnp.where(
+        fallen(seen), 0.0, 1.0
+    )
+
+
+def _ant_fell(seen: Snapshot) -> jax.Array:
+    z = seen.state.qpos[2]
+    return ~((z >= 0.2) & (z <= 1.0))
+
+
+def _reward_ant(seen: Snapshot) -> jax.Array:
+    forces = jnp.clip(seen.data.fields["cfrc_ext"], -1, 1)
+    forward = _lagging_speed(seen, _torso, 5)
+    healthy = jnp.where(_ant_fell(seen), 0.0, 1.0)
+    return forward + healthy - _effort(seen, 0.5) - 5e-4 * jnp.sum(forces**2)
+
+
+def _hopper_fell(seen: Snapshot) -> jax.Array:
+    _, z, angle = seen.state.qpos[:3]
+    rest = joined(seen.state.qpos, seen.state.qvel)[2:]
+    return ~(jnp.all(_within(rest, -100, 100)) & (z > 0.7) & _within(angle, -0.2, 0.2))
+
+
+def _walker_fell(seen: Snapshot) -> jax.Array:
+    _, z, angle = seen.state.qpos[:3]
+    return ~(_within(z, 0.8, 2.0) & _within(angle, -1.0, 1.0))
+
+
+def _humanoid_fell(seen: Snapshot) -> jax.Array:
+    return ~_within(seen.state.qpos[2], 1.0, 2.0)
+
+
+def _impact(seen: Snapshot, weight: float) -> jax.Array:
+    return jnp.minimum(weight * jnp.sum(seen.data.fields["cfrc_ext"] ** 2), 10.0)
+
+
+def _reward_humanoid(seen: Snapshot) -> jax.Array:
+    forward = 1.25 * _lagging_speed(seen, _center_of_mass, 5)
+    healthy = jnp.where(_humanoid_fell(seen), 0.0, 5.0)
+    return forward + healthy - _effort(seen, 0.1) - _impact(seen, 5e-7)
+
+
+def _reward_standup(seen: Snapshot) -> jax.Array:
+    height = seen.state.qpos[2] / seen.model.opt.timestep
+    return height - _effort(seen, 0.1) - _impact(seen, 5e-7) + 1
+
+
+def _pole_fell(seen: Snapshot) -> jax.Array:
+    return jnp.abs(seen.state.qpos[1]) > 0.2
+
+
+def _tip(seen: Snapshot) -> tuple[jax.Array, jax.Array]:
+    x, _, z = seen.data.fields["site_xpos"][0]
+    return x, z
+
+
+def _poles_fell(seen: Snapshot) -> jax.Array:
+    return _tip(seen)[1] <= 1
+
+
+def _reward_double_pendulum(seen: Snapshot) -> jax.Array:
+    x, z = _tip(seen)
+    first, second = seen.state.qvel[1:3]
+    alive = jnp.where(_poles_fell(seen), 0.0, 10.0)
+    return alive - 0.01 * x**2 - (z - 2) ** 2 - 1e-3 * first**2 - 5e-3 * second**2
+
+
+def _reward_reacher(seen: Snapshot) -> jax.Array:
+    away = _left(seen, "fingertip") - _left(seen, "target")
+    return -jnp.linalg.norm(away) - _effort(seen, 1.0)
+
+
+def _reward_pusher(seen: Snapshot) -> jax.Array:
+    near = jnp.linalg.norm(_left(seen, "object") - _left(seen, "tips_arm"))
+    away = jnp.linalg.norm(_left(seen, "object") - _left(seen, "goal"))
+    return -0.5 * near - away - _effort(seen, 0.1)
+
+
+FORMULAS = {
+    "gym_ant": Formulas(
+        partial(_near_default, noise=0.1, normal=True),
+        _observe_ant,
+        _reward_ant,
+        _ant_fell,
+        _torso,
+        substeps=5,
+        reads=("xpos", "cfrc_ext"),
+    ),
+    "gym_halfcheetah": Formulas(
+        partial(_near_default, noise=0.1, normal=True),
+        partial(_without_place, skipped=1),
+        partial(_reward_runner, substeps=5, effort=0.1),
+        substeps=5,
+    ),
+    "gym_hopper": Formulas(
+        partial(_near_default, noise=5e-3),
+        _with_clipped_speed,
+        partial(_reward_stander, fallen=_hopper_fell, substeps=4, effort=1e-3),
+        _hopper_fell,
+        substeps=4,
+    ),
+    "gym_humanoid": Formulas(
+        partial(_near_default, noise=1e-2),
+        _observe_humanoid,
+        _reward_humanoid,
+        _humanoid_fell,
+        _center_of_mass,
+        substeps=5,
+        reads=("xipos", *_BODY_FIELDS),
+    ),
+    "gym_humanoidstandup": Formulas(
+        partial(_near_default, noise=1e-2),
+        _observe_humanoid,
+        _reward_standup,
+        substeps=5,
+        reads=_BODY_FIELDS,
+    ),
+    "gym_inverteddoublependulum": Formulas(
+        partial(_near_default, noise=0.1, normal=True),
+        _observe_double_pendulum,
+        _reward_double_pendulum,
+        _poles_fell,
+        substeps=5,
+        reads=("site_xpos", "qfrc_constraint"),
+    ),
+    "gym_invertedpendulum": Formulas(
+        partial(_near_default, noise=0.01),
+        observe_joints,
+        lambda seen: jnp.where(_pole_fell(seen), 0.0, 1.0),
+        _pole_fell,
+        substeps=2,
+    ),
+    "gym_pusher": Formulas(
+        _start_pusher, _observe_pusher, _reward_pusher, substeps=5, reads=("xpos",)
+    ),
+    "gym_reacher": Formulas(
+        _start_reacher, _observe_reacher, _reward_reacher, substeps=2, reads=("xpos",)
+    ),
+    "gym_swimmer": Formulas(
+        partial(_near_default, noise=0.1),
+        partial(_without_place, skipped=2),
+        partial(_reward_runner, substeps=4, effort=1e-4),
+        substeps=4,
+    ),
+    "gym_walker2d": Formulas(
+        partial(_near_default, noise=5e-3),
+        _with_clipped_speed,
+        partial(_reward_stander, fallen=_walker_fell, substeps=4, effort=1e-3),
+        _walker_fell,
+        substeps=4,
+    ),
+}
+"""Formulas by the name of the task."""

@@ -1,0 +1,118 @@
+"""Gymnasium's MuJoCo tasks, one row each. Importing it loads no physics."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pixelbrax_jax.physics.task import Task, by_name
+
+
+@dataclass(frozen=True, eq=False)
+class GymTask(Task):
+    """A task of Gymnasium's.
+
+    Attributes:
+        original: Gymnasium's id.
+        model: file with the model, in Gymnasium's folder.
+        lookat: metres, the point that Gymnasium's camera looks at; None for the median of the
+            model's geoms.
+        distance: metres from there to the camera; None for the model's extent.
+        elevation: degrees of the camera's view above the horizon.
+        time_limit: control steps of an episode.
+    """
+
+    original: str
+    model: str
+    lookat: tuple[float, float, float] | None = None
+    distance: float | None = None
+    elevation: float = -45.0
+    time_limit: int = 1000
+
+    def other_names(self) -> tuple[str, ...]:
+        """Return Gymnasium's id of the task."""
+        return (*super().other_names(), self.original)
+
+
+def _gym(name: str, model: str, summary: str, **camera: object) -> GymTask:
+    short = name.lower()
+    return GymTask(
+        f"gym_{short}",
+        f"PixelBrax/Gym-{name}-v5",
+        summary,
+        f"{name}-v5",
+        model,
+        **camera,  # type: ignore[arg-type]
+    )
+
+
+TASKS = by_name(
+    [
+        _gym(
+            "Ant",
+            "ant.xml",
+            "A four-legged body runs along x, until it falls or jumps.",
+            distance=4.0,
+        ),
+        _gym(
+            "HalfCheetah",
+            "half_cheetah.xml",
+            "A planar two-legged body runs along x.",
+            distance=4.0,
+        ),
+        _gym(
+            "Hopper",
+            "hopper.xml",
+            "A planar one-legged body hops along x, until it falls.",
+            lookat=(0.0, 0.0, 1.15),
+            distance=3.0,
+            elevation=-20.0,
+        ),
+        _gym(
+            "Humanoid",
+            "humanoid.xml",
+            "A humanoid runs along x, until it falls.",
+            lookat=(0.0, 0.0, 2.0),
+            distance=4.0,
+            elevation=-20.0,
+        ),
+        _gym(
+            "HumanoidStandup",
+            "humanoidstandup.xml",
+            "A humanoid that lies stands up.",
+            lookat=(0.0, 0.0, 0.8925),
+            distance=4.0,
+            elevation=-20.0,
+        ),
+        _gym(
+            "InvertedDoublePendulum",
+            "inverted_double_pendulum.xml",
+            "A cart balances two poles in a row, until they fall.",
+            lookat=(0.0, 0.0, 0.12250000000000005),
+            distance=4.1225,
+        ),
+        _gym(
+            "InvertedPendulum",
+            "inverted_pendulum.xml",
+            "A cart balances a pole, until it falls.",
+            distance=2.04,
+        ),
+        _gym(
+            "Pusher",
+            "pusher_v5.xml",
+            "An arm pushes a cylinder to a goal.",
+            distance=4.0,
+            time_limit=100,
+        ),
+        _gym("Reacher", "reacher.xml", "A planar arm reaches for a target.", time_limit=50),
+        _gym("Swimmer", "swimmer.xml", "A planar chain of three bodies swims along x."),
+        _gym(
+            "Walker2d",
+            "walker2d_v5.xml",
+            "A planar two-legged body walks along x, until it falls.",
+            lookat=(0.0, 0.0, 1.15),
+            distance=4.0,
+            elevation=-20.0,
+        ),
+    ]
+)
+"""Gymnasium's MuJoCo tasks by name."""

@@ -1,0 +1,175 @@
+"""What a task of a MuJoCo model is made of."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from pixelbrax_jax.physics.mujoco.dynamics import Dynamics, Readings, State
+from pixelbrax_jax.physics.mujoco.opengl import mujoco
+from pixelbrax_jax.spatial import f32, quat_multiply, quat_to_mat, rotate
+
+
+class Start(struct.PyTreeNode):
+    """An initial state with fields of ``State``; None means at rest or without a target."""
+
+    qpos: jax.Array
+    qvel: jax.Array | None = None
+    target: jax.Array | None = None
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """What observations and rewards read of one environment's state, by the model's names.
+
+    Positions, velocities and their sensors are current; sensors of forces and accelerations are
+    from the beginning of the last physics step, as in DM Control. Positions are metres in the world
+    frame; rotations are matrices with the axes as columns, or unit quaternions (w, x, y, z).
+
+    Attributes:
+        state: positions, velocities, activations, the last controls (0 after a reset) and this
+            episode's target.
+        data: what MuJoCo computes from them, by its names of ``MjData``.
+    """
+
+    model: mujoco.MjModel
+    state: State
+    data: Readings
+
+    def joint_pos(self, *names: str) -> jax.Array:
+        """Return the positions of hinges and slides."""
+        return self.state.qpos[np.array([self.model.joint(name).qposadr[0] for name in names])]
+
+    def joint_vel(self, *names: str) -> jax.Array:
+        """Return the velocities of hinges and slides."""
+        return self.state.qvel[np.array([self.model.joint(name).dofadr[0] for name in names])]
+
+    def sensor(self, *names: str) -> jax.Array:
+        """Return the readings of sensors, concatenated."""
+        rows: list[int] = []
+        for name in names:
+            sensor = self.model.sensor(name)
+            rows.extend(range(sensor.adr[0], sensor.adr[0] + sensor.dim[0]))
+        return self.data.sensordata[np.array(rows)]
+
+    def sensors_of(self, *kinds: mujoco.mjtSensor) -> jax.Array:
+        """Return the readings of all sensors of some types, in the model's order."""
+        wanted = {int(kind) for kind in kinds}
+        rows = [i for i, kind in enumerate(self.model.sensor_type) if int(kind) in wanted]
+        return self.sensor(*(self.model.sensor(i).name for i in rows))
+
+    def xpos(self, body: str) -> jax.Array:
+        """Return (3,), the origin of a body."""
+        return self.data.xpos[self.model.body(body).id]
+
+    def xquat(self, body: str) -> jax.Array:
+        """Return (4,), the rotation of a body."""
+        return self.data.xquat[self.model.body(body).id]
+
+    def xmat(self, body: str) -> jax.Array:
+        """Return (3, 3), the rotation of a body."""
+        return quat_to_mat(self.xquat(body))
+
+    def xipos(self, body: str) -> jax.Array:
+        """Return (3,), the center of mass of a body."""
+        return self._place(self.model.body(body).id, self.model.body(body).ipos)
+
+    def geom_pos(self, name: str) -> jax.Array:
+        """Return (3,), the center of a geom."""
+        geom = self.model.geom(name)
+        return self._place(geom.bodyid[0], geom.pos)
+
+    def geom_mat(self, name: str) -> jax.Array:
+        """Return (3, 3), the rotation of a geom."""
+        geom = self.model.geom(name)
+        return self._rotation(geom.bodyid[0], geom.quat)
+
+    def site_pos(self, name: str) -> jax.Array:
+        """Return (3,), the center of a site."""
+        site = self.model.site(name)
+        return self._place(site.bodyid[0], site.pos)
+
+    def site_mat(self, name: str) -> jax.Array:
+        """Return (3, 3), the rotation of a site."""
+        site = self.model.site(name)
+        return self._rotation(site.bodyid[0], site.quat)
+
+    def _place(self, body: int, pos: np.ndarray) -> jax.Array:
+        return self.data.xpos[body] + rotate(self.data.xquat[body], f32(pos))
+
+    def _rotation(self, body: int, quat: np.ndarray) -> jax.Array:
+        return quat_to_mat(quat_multiply(self.data.xquat[body], f32(quat)))
+
+
+def joined(*parts: jax.Array | float) -> jax.Array:
+    """Return arrays and scalars, flattened and concatenated."""
+    return jnp.concatenate([jnp.ravel(jnp.asarray(part)) for part in parts])
+
+
+def observe_joints(seen: Snapshot) -> jax.Array:
+    """Return all joint positions and velocities."""
+    return joined(seen.state.qpos, seen.state.qvel)
+
+
+def _unchanged(model: mujoco.MjModel) -> None:
+    del model
+
+
+def never(seen: Snapshot) -> jax.Array:
+    """Return False: the task lasts until the time limit."""
+    del seen
+    return jnp.zeros((), bool)
+
+
+def nothing(seen: Snapshot) -> jax.Array:
+    """Return no numbers: rewards compare with nothing."""
+    del seen
+    return jnp.zeros(0)
+
+
+@dataclass(frozen=True, eq=False)
+class Formulas:
+    """Initial states, observation, reward and end of a task.
+
+    Attributes:
+        start: samples an initial state from a key.
+        observe: returns the observation.
+        reward: returns the reward.
+        terminated: returns whether the episode ends.
+        remember: returns what the next reward finds in ``State.remembered``.
+        substeps: physics steps per control step.
+        edit: changes the compiled model as DM Control's task does.
+        options: arguments of the model's generator.
+        camera: index of the task's camera in the model.
+        movable: names of the geoms, sites and lights that ``Start.target`` moves.
+        target_body: name of the body, fixed to the world, that it moves; empty for none.
+        reads_forces: whether observations use sensors of forces or accelerations.
+        starts_with_forces: whether these sensors are not 0 in an initial state.
+        is_small: whether a CPU steps the model faster by MuJoCo XLA.
+        out_of_reach: names of the geoms that never touch anything, which MuJoCo XLA then skips.
+        reads: fields of ``MjData`` that the formulas see as MuJoCo leaves them after its last step,
+            which computes them before it moves, as Gymnasium's do.
+    """
+
+    start: Callable[[Dynamics, jax.Array], Start]
+    observe: Callable[[Snapshot], jax.Array]
+    reward: Callable[[Snapshot], jax.Array]
+    terminated: Callable[[Snapshot], jax.Array] = never
+    remember: Callable[[Snapshot], jax.Array] = nothing
+    substeps: int = 1
+    edit: Callable[[mujoco.MjModel], None] = _unchanged
+    options: Mapping[str, Any] = field(default_factory=dict)
+    camera: int = 0
+    movable: tuple[str, ...] = ()
+    target_body: str = ""
+    reads_forces: bool = False
+    starts_with_forces: bool = False
+    is_small: bool = False
+    out_of_reach: tuple[str, ...] = ()
+    reads: tuple[str, ...] = ()

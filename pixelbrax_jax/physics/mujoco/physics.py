@@ -1,0 +1,152 @@
+"""Tasks of MuJoCo models as ``Physics``."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping
+from types import MappingProxyType
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pixelbrax_jax.flags import default_flags, under_default_flags
+from pixelbrax_jax.physics.divergence import GuardedPhysics
+from pixelbrax_jax.physics.mujoco.dynamics import Dynamics, Readings, State
+from pixelbrax_jax.physics.mujoco.formulas import Formulas, Snapshot, Start
+from pixelbrax_jax.physics.mujoco.native import compile_model, with_poses
+from pixelbrax_jax.physics.mujoco.opengl import mujoco
+from pixelbrax_jax.physics.mujoco.poses import check_pose, masses_below, with_unit_rotations
+from pixelbrax_jax.physics.mujoco.scene import COM_LINK, read_scene, tracked_body
+from pixelbrax_jax.physics.mujoco.viewpoints import unfit_cameras
+from pixelbrax_jax.spatial import f32, rotate
+from pixelbrax_jax.types import CameraRig, PhysicsState
+
+_UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+
+
+class MujocoPhysics(GuardedPhysics):
+    """A task of a MuJoCo model.
+
+    Links are the model's bodies without the world, then, if the task has them, ``camera/com``, the
+    center of mass that cameras and lights follow, and ``target``, this episode's target.
+    """
+
+    backend = "mujoco"
+    # XLA's CPU library YNNPACK is slower than XLA's own loops for the small sums and products of
+    # these models.
+    compiler_options = MappingProxyType({"xla_cpu_experimental_ynn_fusion_type": ""})
+
+    @default_flags()
+    def __init__(
+        self,
+        formulas: Formulas,
+        spec: mujoco.MjSpec,
+        *,
+        engine: str,
+        rigs: Mapping[str, CameraRig] = MappingProxyType({}),
+        identity: Hashable,
+    ):
+        """Compile the model, edited for the task, and read its scene; compile no program.
+
+        The default camera is the model's, or the first of ``rigs`` if it has none.
+        """
+        model, posed = compile_model(spec), with_poses(spec)
+        for edited in (model, posed):
+            formulas.edit(edited)
+        scene = read_scene(model, formulas.camera, movable=formulas.movable)
+        self.geoms, self.look = scene.geoms, scene.look
+        default = scene.rig or next(iter(rigs.values()), None)
+        self.rigs = {**scene.rigs, **rigs} | ({"default": default} if default else {})
+        self.unfit_cameras = unfit_cameras(model)
+        bodies = [model.body(i).name or f"link/{i - 1}" for i in range(1, model.nbody)]
+        self.link_names = (*bodies, *scene.links)
+        self.dynamics = Dynamics(
+            model,
+            posed,
+            engine=engine,
+            reads_forces=formulas.reads_forces,
+            is_small=formulas.is_small,
+            starts_with_forces=formulas.starts_with_forces,
+            out_of_reach=formulas.out_of_reach,
+            target_body=formulas.target_body,
+            reads=formulas.reads,
+        )
+        # Rounded, so that 0.0025 * 10 is 0.025.
+        self.dt = float(f"{model.opt.timestep * formulas.substeps:.6g}")
+        self.action_size = int(model.nu)
+        self._formulas = formulas
+        self._model = model
+        self._masses = masses_below(model, max(tracked_body(model), 0))
+        self._extra_links = scene.links
+        self._identity = identity
+        low, high = model.actuator_ctrlrange.T.astype(np.float32)
+        self._is_unit_range = bool((low == -1).all() and (high == 1).all())
+        self._control_range = low, high
+        first = jax.eval_shape(self.reset, jax.random.key(0))
+        self.state_size = int(first.obs.shape[0])
+
+    def control(self, action: jax.Array) -> jax.Array:
+        """Map an action (A,) from [-1, 1] to the control range of each actuator."""
+        action = jnp.asarray(action, jnp.float32)
+        if self._is_unit_range:
+            return action
+        low, high = self._control_range
+        return low + 0.5 * (action + 1) * (high - low)
+
+    def observe(self, state: State, readings: Readings) -> PhysicsState:
+        """Return poses, observation, reward and termination."""
+        seen = Snapshot(self._model, state, readings)
+        xpos, xquat = self._links(seen)
+        return PhysicsState(
+            engine=state.replace(remembered=self._formulas.remember(seen)),
+            xpos=xpos,
+            xquat=xquat,
+            obs=self._formulas.observe(seen).astype(jnp.float32),
+            reward=self._formulas.reward(seen).astype(jnp.float32),
+            terminated=self._formulas.terminated(seen),
+            non_finite=jnp.zeros((), bool),
+        )
+
+    def first(self, key: jax.Array) -> tuple[State, Readings]:
+        """Sample an initial state; return it and its readings."""
+        return self._settle(self._formulas.start(self.dynamics, key))
+
+    @under_default_flags
+    def from_qpos(
+        self, q: jax.Array, qd: jax.Array | None = None, *, key: jax.Array | None = None
+    ) -> PhysicsState:
+        """See ``Physics.from_qpos``; ``key`` samples a target that is not a joint."""
+        q, qd = check_pose(self._model, q, qd)
+        start = self._formulas.start(self.dynamics, jax.random.key(0) if key is None else key)
+        start = start.replace(qpos=with_unit_rotations(self._model, q), qvel=qd)
+        return self._guard_first(self.observe(*self._settle(start)))
+
+    def _settle(self, start: Start) -> tuple[State, Readings]:
+        state = self.dynamics.state(start.qpos, start.qvel, start.target)
+        readings = self.dynamics.first(state)
+        remembered = self._formulas.remember(Snapshot(self._model, state, readings))
+        return state.replace(remembered=remembered), readings
+
+    def move(self, state: State, action: jax.Array) -> tuple[State, Readings]:
+        """Advance by one control step; return the state and its readings."""
+        action = jnp.asarray(action, jnp.float32)
+        return self.dynamics.step(state.replace(ctrl=self.control(action)), self._formulas.substeps)
+
+    def _reset(self, key: jax.Array) -> PhysicsState:
+        return self.observe(*self.first(key))
+
+    def _step(self, state: PhysicsState, action: jax.Array) -> PhysicsState:
+        return self.observe(*self.move(state.engine, action))
+
+    def _watched(self, state: PhysicsState) -> Any:
+        return state.engine, state.xpos
+
+    def _links(self, seen: Snapshot) -> tuple[jax.Array, jax.Array]:
+        xpos, xquat = seen.data.xpos[1:], seen.data.xquat[1:]
+        centers = xpos + rotate(xquat, f32(self._model.body_ipos[1:]))
+        com = jnp.dot(self._masses, centers)
+        target = seen.state.target[:3]
+        rows = [(com if name == COM_LINK else target)[None] for name in self._extra_links]
+        upright = jnp.tile(jnp.array(_UPRIGHT), (len(rows), 1))
+        return jnp.concatenate([xpos, *rows]), jnp.concatenate([xquat, upright])

@@ -1,0 +1,1 @@
+"""Tests of Gymnasium's MuJoCo tasks."""
