@@ -79,18 +79,18 @@ class StatefulEnv:
         # Without `self` and `task` at the start and `options` at the end.
         own = list(inspect.signature(vars(adapter)["__init__"]).parameters)[2:-1]
         config = env_config(task, options, own)
-        self.is_limited = "episode_length" in options
+        self.is_limited = config.episode_length is not None
         if max_episode_steps not in (None, -1):
             calls = check_positive_int("max_episode_steps", max_episode_steps)
             limit = calls * config.action_repeat
             # The shorter one, as with Gymnasium's own TimeLimit around an environment.
-            limit = min(limit, config.episode_length) if self.is_limited else limit
+            limit = min(limit, config.episode_length or limit)
             config = env_config(config, {"episode_length": limit})
             self.is_limited = True
         self.env, self.params = _make(config)
         vector = VectorPixelEnv(self.env, num_envs, autoreset_mode)
         self.num_envs, self.single = vector.num_envs, single
-        self.episode_length = config.episode_length
+        self.episode_length = int(self.params.episode_length)
         height = check_positive_int("render_height", render_size[0])
         width = check_positive_int("render_width", render_size[1])
         check_fits(f"render_height={height}, render_width={width}", 3 * height * width)

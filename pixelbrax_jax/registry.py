@@ -22,8 +22,8 @@ _OWN_TASKS: dict[str, tuple[Callable[[], Physics], CameraRig | Camera | None]] =
 def list_envs(suite: str | None = None) -> tuple[str, ...]:
     """Return the names that ``make`` accepts, sorted.
 
-    ``suite`` is ``"brax"``, ``"dmc"`` (the DM Control Suite) or None for all tasks, including
-    registered ones; others raise ValueError.
+    ``suite`` is ``"brax"``, ``"dmc"`` (the DM Control Suite), ``"gym"`` (Gymnasium's MuJoCo tasks)
+    or None for all tasks, including registered ones; others raise ValueError.
     """
     if suite is None:
         return tuple(sorted([*TASKS, *_OWN_TASKS]))

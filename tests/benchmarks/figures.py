@@ -19,7 +19,7 @@ import pixelbrax_jax as pb
 from pixelbrax_gym.bench import report
 from pixelbrax_gym.bench.tables import table
 from pixelbrax_jax.tasks import BRAX_TASKS
-from tests.benchmarks import dmc_page, performance, results
+from tests.benchmarks import dmc_page, gym_page, performance, results
 from tests.benchmarks.cases import GROUPS
 from tests.benchmarks.pages import Figures, filled
 
@@ -86,6 +86,7 @@ PAGES: dict[str, Figures] = {
     "docs/accelerators.md": performance.ACCELERATORS,
     "docs/results.md": results.FIGURES,
     "docs/dmc.md": dmc_page.FIGURES,
+    "docs/gym-tasks.md": gym_page.FIGURES,
     "docs/tasks.md": {"tasks": brax_tasks},
     "docs/options.md": {"options": options},
     "docs/api.md": {

@@ -283,7 +283,7 @@ FORMULAS = {
         substeps=5,
         reads=_BODY_FIELDS,
     ),
-    "gym_inverteddoublependulum": Formulas(
+    "gym_inverted_double_pendulum": Formulas(
         partial(_near_default, noise=0.1, normal=True),
         _observe_double_pendulum,
         _reward_double_pendulum,
@@ -291,7 +291,7 @@ FORMULAS = {
         substeps=5,
         reads=("site_xpos", "qfrc_constraint"),
     ),
-    "gym_invertedpendulum": Formulas(
+    "gym_inverted_pendulum": Formulas(
         partial(_near_default, noise=0.01),
         observe_joints,
         lambda seen: jnp.where(_pole_fell(seen), 0.0, 1.0),

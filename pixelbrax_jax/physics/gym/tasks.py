@@ -34,7 +34,7 @@ class GymTask(Task):
 
 
 def _gym(name: str, model: str, summary: str, **camera: object) -> GymTask:
-    short = name.lower()
+    short = name.lower().replace("inverted", "inverted_").replace("double", "double_")
     return GymTask(
         f"gym_{short}",
         f"PixelBrax/Gym-{name}-v5",

@@ -15,9 +15,9 @@ class MujocoOptions:
     """Options of tasks that MuJoCo simulates; raises ValueError for one that is out of range."""
 
     engine: str = "auto"
-    """Engine of the DM Control Suite's tasks: ``mujoco`` (MuJoCo itself, on a CPU), ``xla`` (MuJoCo
-    XLA, on any device and with gradients), or ``auto``: ``mujoco`` in programs for a CPU, ``xla``
-    in others."""
+    """Engine of DM Control's and Gymnasium's tasks: ``mujoco`` (MuJoCo itself, on a CPU), ``xla``
+    (MuJoCo XLA, on any device and with gradients), or ``auto``: ``mujoco`` in programs for a CPU,
+    ``xla`` in others."""
 
     def __post_init__(self) -> None:
         check_choice("engine", self.engine, ENGINES)
