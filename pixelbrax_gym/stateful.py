@@ -79,12 +79,12 @@ class StatefulEnv:
         # Without `self` and `task` at the start and `options` at the end.
         own = list(inspect.signature(vars(adapter)["__init__"]).parameters)[2:-1]
         config = env_config(task, options, own)
-        self.is_limited = config.episode_length is not None
+        self.is_limited = "episode_length" in options
         if max_episode_steps not in (None, -1):
             calls = check_positive_int("max_episode_steps", max_episode_steps)
             limit = calls * config.action_repeat
             # The shorter one, as with Gymnasium's own TimeLimit around an environment.
-            limit = min(limit, config.episode_length or limit)
+            limit = min(limit, config.episode_length) if self.is_limited else limit
             config = env_config(config, {"episode_length": limit})
             self.is_limited = True
         self.env, self.params = _make(config)

@@ -99,9 +99,9 @@ class EnvConfig(BraxOptions, MujocoOptions, ProgramConfig):
     Control Suite ``default`` is ``dmc`` with the lights of its model."""
     shadows: bool | None = None
     """Whether geoms cast shadows. None keeps the choice of the look."""
-    episode_length: int | None = None
-    """Time limit in control steps. None takes the task's: 1000, but 50 for Gymnasium's reacher and
-    100 for its pusher."""
+    episode_length: int = 1000
+    """Time limit in control steps. That of the task holds if it is shorter: 50 for Gymnasium's
+    reacher, 100 for its pusher."""
     clips: str | PathLike[str] | ClipBank | None = None
     """Videos for the video distractors: a folder with DAVIS-2017 or with video files, a bank of
     ``load_clips``, or ``procedural``. None means ``procedural`` with a warning."""
@@ -114,9 +114,8 @@ class EnvConfig(BraxOptions, MujocoOptions, ProgramConfig):
             self._static(name)
         BraxOptions.__post_init__(self)
         MujocoOptions.__post_init__(self)
-        if self._static("episode_length") is not None:
-            limit = check_positive_int("episode_length", self.episode_length)
-            self._store("episode_length", limit)
+        episode_length = check_positive_int("episode_length", self._static("episode_length"))
+        self._store("episode_length", episode_length)
         if self.shadows is not None:
             self._store("shadows", check_bool("shadows", self.shadows))
         self._store("camera", from_plain(self.camera))

@@ -68,7 +68,7 @@ def make(task: str | EnvConfig, **options: Any) -> tuple[PixelEnv, EnvParams]:
         geoms=seen_from(physics.geoms, rig),
         rig=rig,
         look=_look(config, physics),
-        episode_length=np.int32(config.episode_length or physics.episode_length),
+        episode_length=np.int32(min(filter(None, (config.episode_length, physics.time_limit)))),
     )
     # Here, because a transfer in a program may be forbidden (`jax.transfer_guard`).
     return env, jax.device_put(params).replace(clips=_clips(config, env))

@@ -59,7 +59,7 @@ class Physics(abc.ABC):
         rigs: cameras by name; ``default`` is the task's. Without it the camera shows all geoms but
             the ground from a corner.
         unfit_cameras: why other cameras of the model cannot be rigs, by name.
-        episode_length: default time limit in control steps.
+        time_limit: control steps after which the task ends every episode; None for no such limit.
         followed_link: the link that a camera follows by default.
         look: lights, sky and ground of the model, used as looks ``default`` and ``dmc``.
         batch_last: whether a CPU is faster with the environments as last axis of a batch.
@@ -74,7 +74,7 @@ class Physics(abc.ABC):
     link_names: tuple[str, ...]
     rigs: Mapping[str, CameraRig] = MappingProxyType({})
     unfit_cameras: Mapping[str, str] = MappingProxyType({})
-    episode_length: int = 1000
+    time_limit: int | None = None
     followed_link: int = 0
     look: Look | None = None
     batch_last: bool = True

@@ -156,7 +156,8 @@ def test_a_forked_process_has_threads_of_its_own(physics):
     rows = 64
     state = [np.zeros((rows, n), np.float32) for n in (model.nq, model.nv, 0, model.nv, model.nu)]
     state[0][:] = model.qpos0
-    shapes = (model.nq,), (model.nv,), (0,), (model.nv,), (model.nbody, 3), (model.nbody, 4)
+    shapes = (model.nq,), (model.nv,), (0,), (model.nv,), (model.nq,)
+    shapes += (model.nbody, 3), (model.nbody, 4)
 
     def step():
         results = [np.zeros((rows, *s), np.float32) for s in (*shapes, (model.nsensordata,))]

@@ -33,7 +33,7 @@ def _load(task: str, engine: str) -> MujocoPhysics:
         FORMULAS[task],
         spec,
         engine=engine,
-        episode_length=TASKS[task].time_limit,
+        time_limit=TASKS[task].time_limit,
         rigs={"free": free_camera(TASKS[task], spec)},
         identity=Recipe(_load, (task, engine)),
     )

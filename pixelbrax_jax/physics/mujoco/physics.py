@@ -45,7 +45,7 @@ class MujocoPhysics(GuardedPhysics):
         *,
         engine: str,
         rigs: Mapping[str, CameraRig] = MappingProxyType({}),
-        episode_length: int = 1000,
+        time_limit: int | None = None,
         identity: Hashable,
     ):
         """Compile the model, edited for the task, and read its scene; compile no program.
@@ -80,7 +80,7 @@ class MujocoPhysics(GuardedPhysics):
         self._model = model
         self._masses = masses_below(model, max(tracked_body(model), 0))
         self._extra_links = scene.links
-        self.episode_length = episode_length
+        self.time_limit = time_limit
         self._identity = identity
         low, high = model.actuator_ctrlrange.T.astype(np.float32)
         self._is_unit_range = bool((low == -1).all() and (high == 1).all())

@@ -110,7 +110,7 @@ def _ours(task: str, states: dict[str, np.ndarray]) -> State:
     physics = make_physics(task)
     start = jax.eval_shape(physics.first, jax.random.key(0))[0]
     fields["target"] = fields["target"][:, : start.target.size]
-    return State(**fields)
+    return State(**fields, remembered=jnp.zeros((len(fields["qpos"]), 0)))
 
 
 @cache

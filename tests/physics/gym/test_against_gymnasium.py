@@ -29,7 +29,7 @@ def test_sizes_and_times(task):
     assert (physics.state_size,) == env.observation_space.shape
     assert (physics.action_size,) == env.action_space.shape
     assert physics.dt == pytest.approx(env.unwrapped.dt)
-    assert physics.episode_length == env.spec.max_episode_steps
+    assert physics.time_limit == env.spec.max_episode_steps
     low, high = (physics.control(jnp.full(physics.action_size, end)) for end in (-1.0, 1.0))
     np.testing.assert_allclose(low, env.action_space.low)
     np.testing.assert_allclose(high, env.action_space.high)
@@ -46,7 +46,7 @@ def test_initial_states_have_the_same_distribution(task):
         assert {name: again[name] for name in low if not again[name] > 0.01} == {}
 
 
-def test_the_time_limit_is_the_tasks():
+def test_the_shorter_time_limit_holds():
     options = {"height": 8, "width": 8}
     assert pb.make("gym_reacher", **options)[1].episode_length == 50
     assert pb.make("gym_reacher", **options, episode_length=7)[1].episode_length == 7
