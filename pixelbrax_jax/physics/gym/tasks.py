@@ -33,13 +33,12 @@ class GymTask(Task):
         return (*super().other_names(), self.original)
 
 
-def _gym(name: str, model: str, summary: str, **camera: object) -> GymTask:
-    short = name.lower().replace("inverted", "inverted_").replace("double", "double_")
+def _gym(name: str, original: str, model: str, summary: str, **camera: object) -> GymTask:
     return GymTask(
-        f"gym_{short}",
-        f"PixelBrax/Gym-{name}-v5",
+        f"gym_{name}",
+        f"PixelBrax/Gym-{original}-v5",
         summary,
-        f"{name}-v5",
+        f"{original}-v5",
         model,
         **camera,  # type: ignore[arg-type]
     )
@@ -48,18 +47,21 @@ def _gym(name: str, model: str, summary: str, **camera: object) -> GymTask:
 TASKS = by_name(
     [
         _gym(
+            "ant",
             "Ant",
             "ant.xml",
             "A four-legged body runs along x, until it falls or jumps.",
             distance=4.0,
         ),
         _gym(
+            "halfcheetah",
             "HalfCheetah",
             "half_cheetah.xml",
             "A planar two-legged body runs along x.",
             distance=4.0,
         ),
         _gym(
+            "hopper",
             "Hopper",
             "hopper.xml",
             "A planar one-legged body hops along x, until it falls.",
@@ -68,6 +70,7 @@ TASKS = by_name(
             elevation=-20.0,
         ),
         _gym(
+            "humanoid",
             "Humanoid",
             "humanoid.xml",
             "A humanoid runs along x, until it falls.",
@@ -76,6 +79,7 @@ TASKS = by_name(
             elevation=-20.0,
         ),
         _gym(
+            "humanoidstandup",
             "HumanoidStandup",
             "humanoidstandup.xml",
             "A humanoid that lies stands up.",
@@ -84,28 +88,32 @@ TASKS = by_name(
             elevation=-20.0,
         ),
         _gym(
+            "inverted_double_pendulum",
             "InvertedDoublePendulum",
             "inverted_double_pendulum.xml",
             "A cart balances two poles in a row, until they fall.",
-            lookat=(0.0, 0.0, 0.12250000000000005),
-            distance=4.1225,
         ),
         _gym(
+            "inverted_pendulum",
             "InvertedPendulum",
             "inverted_pendulum.xml",
             "A cart balances a pole, until it falls.",
             distance=2.04,
         ),
         _gym(
+            "pusher",
             "Pusher",
             "pusher_v5.xml",
             "An arm pushes a cylinder to a goal.",
             distance=4.0,
             time_limit=100,
         ),
-        _gym("Reacher", "reacher.xml", "A planar arm reaches for a target.", time_limit=50),
-        _gym("Swimmer", "swimmer.xml", "A planar chain of three bodies swims along x."),
         _gym(
+            "reacher", "Reacher", "reacher.xml", "A planar arm reaches for a target.", time_limit=50
+        ),
+        _gym("swimmer", "Swimmer", "swimmer.xml", "A planar chain of three bodies swims along x."),
+        _gym(
+            "walker2d",
             "Walker2d",
             "walker2d_v5.xml",
             "A planar two-legged body walks along x, until it falls.",
