@@ -79,12 +79,12 @@ def _programs_kept() -> Iterator[None]:
         folder = keep_programs()
     except FileNotFoundError:  # without a home folder none are kept
         folder = None
-    is_first = folder is not None and not folder.exists()
+    new = folder if folder and not folder.exists() else None
     yield
-    if is_first and folder is not None and folder.exists():
+    if new and new.exists():
         with suppress(OSError, ValueError):
             sys.stderr.write(
-                f"pixelbrax: the compiled programs are kept in {folder}, so that the next start is "
+                f"pixelbrax: the compiled programs are kept in {new}, so that the next start is "
                 f"faster; 'pixelbrax {_KEEP_NONE} COMMAND' keeps none.\n"
             )
 

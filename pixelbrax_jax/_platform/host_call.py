@@ -59,10 +59,14 @@ _Extension._fields_ = [
 ]
 
 
-class _Version(ctypes.Structure):
+class _Sized(ctypes.Structure):
+    """A structure with XLA's header: its size, and extensions."""
+
+    _fields_ = [("size", ctypes.c_size_t), ("extension", ctypes.c_void_p)]
+
+
+class _Version(_Sized):
     _fields_ = [
-        ("size", ctypes.c_size_t),
-        ("extension", ctypes.c_void_p),
         ("major", ctypes.c_int),
         ("minor", ctypes.c_int),
     ]
@@ -81,10 +85,8 @@ class _MetadataExtension(ctypes.Structure):
     _fields_ = [("base", _Extension), ("metadata", ctypes.POINTER(_Metadata))]
 
 
-class _Buffer(ctypes.Structure):
+class _Buffer(_Sized):
     _fields_ = [
-        ("size", ctypes.c_size_t),
-        ("extension", ctypes.c_void_p),
         ("dtype", ctypes.c_int),
         ("data", ctypes.c_void_p),
         ("rank", ctypes.c_int64),
@@ -92,10 +94,8 @@ class _Buffer(ctypes.Structure):
     ]
 
 
-class _Buffers(ctypes.Structure):
+class _Buffers(_Sized):
     _fields_ = [
-        ("size", ctypes.c_size_t),
-        ("extension", ctypes.c_void_p),
         ("count", ctypes.c_int64),
         ("types", ctypes.c_void_p),
         ("items", ctypes.POINTER(ctypes.POINTER(_Buffer))),
@@ -106,10 +106,8 @@ class _Text(ctypes.Structure):
     _fields_ = [("data", ctypes.c_void_p), ("length", ctypes.c_size_t)]
 
 
-class _Attributes(ctypes.Structure):
+class _Attributes(_Sized):
     _fields_ = [
-        ("size", ctypes.c_size_t),
-        ("extension", ctypes.c_void_p),
         ("count", ctypes.c_int64),
         ("types", ctypes.c_void_p),
         ("names", ctypes.c_void_p),
@@ -117,10 +115,8 @@ class _Attributes(ctypes.Structure):
     ]
 
 
-class _ErrorArguments(ctypes.Structure):
+class _ErrorArguments(_Sized):
     _fields_ = [
-        ("size", ctypes.c_size_t),
-        ("extension", ctypes.c_void_p),
         ("message", ctypes.c_char_p),
         ("code", ctypes.c_int),
     ]
@@ -131,10 +127,8 @@ _INTERNAL = 13
 """XLA's code of an internal error."""
 
 
-class _Api(ctypes.Structure):
+class _Api(_Sized):
     _fields_ = [
-        ("size", ctypes.c_size_t),
-        ("extension", ctypes.c_void_p),
         ("version", _Version),
         ("internal", ctypes.c_void_p),
         ("create_error", _CREATE_ERROR),

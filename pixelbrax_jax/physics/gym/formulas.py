@@ -163,14 +163,6 @@ def _reward_runner(seen: Snapshot, *, substeps: int, effort: float) -> jax.Array
     return _speed(seen, substeps) - _effort(seen, effort)
 
 
-def _reward_stander(
-    seen: Snapshot, *, fallen: Callable[[Snapshot], jax.Array], substeps: int, effort: float
-) -> jax.Array:
-    return _reward_runner(seen, substeps=substeps, effort=effort) + jnp.where(
-        fallen(seen), 0.0, 1.0
-    )
-
-
 def _ant_fell(seen: Snapshot) -> jax.Array:
     z = seen.state.qpos[2]
     return ~((z >= 0.2) & (z <= 1.0))
@@ -244,6 +236,18 @@ def _reward_pusher(seen: Snapshot) -> jax.Array:
     return -0.5 * near - away - _effort(seen, 0.1)
 
 
+def _stander(fell: Callable[[Snapshot], jax.Array]) -> Formulas:
+    """Make the task of a body that runs and ends when it falls."""
+    run = partial(_reward_runner, substeps=4, effort=1e-3)
+    return Formulas(
+        partial(_near_default, noise=5e-3),
+        _with_clipped_speed,
+        lambda seen: run(seen) + jnp.where(fell(seen), 0.0, 1.0),
+        fell,
+        substeps=4,
+    )
+
+
 FORMULAS = {
     "gym_ant": Formulas(
         partial(_near_default, noise=0.1, normal=True),
@@ -260,13 +264,7 @@ FORMULAS = {
         partial(_reward_runner, substeps=5, effort=0.1),
         substeps=5,
     ),
-    "gym_hopper": Formulas(
-        partial(_near_default, noise=5e-3),
-        _with_clipped_speed,
-        partial(_reward_stander, fallen=_hopper_fell, substeps=4, effort=1e-3),
-        _hopper_fell,
-        substeps=4,
-    ),
+    "gym_hopper": _stander(_hopper_fell),
     "gym_humanoid": Formulas(
         partial(_near_default, noise=1e-2),
         _observe_humanoid,
@@ -310,12 +308,6 @@ FORMULAS = {
         partial(_reward_runner, substeps=4, effort=1e-4),
         substeps=4,
     ),
-    "gym_walker2d": Formulas(
-        partial(_near_default, noise=5e-3),
-        _with_clipped_speed,
-        partial(_reward_stander, fallen=_walker_fell, substeps=4, effort=1e-3),
-        _walker_fell,
-        substeps=4,
-    ),
+    "gym_walker2d": _stander(_walker_fell),
 }
 """Formulas by the name of the task."""

@@ -50,7 +50,7 @@ class Readings(struct.PyTreeNode):
     """What MuJoCo computes from a state, by its names of ``MjData``; all float32.
 
     Positions, velocities and their sensors are current; sensors of forces and accelerations are
-    from the beginning of the last physics step.
+    from the start of the last physics step.
 
     Attributes:
         xpos: (B, 3) metres, origins of all bodies, of the world first.
@@ -91,7 +91,7 @@ class Dynamics:
         """Take a model and the same ``with_poses``. For the rest see ``Formulas``."""
         self.model = model
         self.engine = engine
-        self._steps_by_xla = engine == "xla" or (engine == "auto" and is_small)
+        self._steps_by_xla = engine == "auto" and is_small
         self._target_body = model.body(target_body).id if target_body else None
         self._xla_options: dict[str, Any] = {
             "reads_forces": reads_forces,

@@ -29,7 +29,7 @@ class Snapshot:
     """What observations and rewards read of one environment's state, by the model's names.
 
     Positions, velocities and their sensors are current; sensors of forces and accelerations are
-    from the beginning of the last physics step, as in DM Control. Positions are metres in the world
+    from the start of the last physics step, as in DM Control. Positions are metres in the world
     frame; rotations are matrices with the axes as columns, or unit quaternions (w, x, y, z).
 
     Attributes:

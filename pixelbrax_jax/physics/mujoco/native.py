@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache
+from itertools import pairwise
 from typing import TypeVar
 
 import numpy as np
@@ -65,7 +66,7 @@ class Native:
 
         Fills the first four, the change of ``qpos``, and ``xpos``, ``xquat`` and ``sensordata``.
         Positions, velocities and their sensors are those after the last step; sensors of forces and
-        accelerations those of its beginning. The accelerations are those of the last step, from its
+        accelerations those of its start. The accelerations are those of the last step, from its
         velocities. Then it fills the fields, as the last step and ``mj_rnePostConstraint`` leave
         them.
         """
@@ -115,27 +116,17 @@ class Native:
         fields: Sequence[np.ndarray],
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the same, with MuJoCo's own accelerations, and fill the fields."""
-        model = self._moving
         last, qacc = first.copy(), warmstart
-        sensors = np.empty((len(first), model.nsensordata))
+        sensors = np.empty((len(first), self._moving.nsensordata))
 
-        def step(start: int, stop: int) -> None:
-            with self._data(model, 1) as (data,):
-                views = [getattr(data, name) for name in self._fields]
-                for i in range(start, stop):
-                    mujoco.mj_setState(model, data, first[i], _STATE)
-                    data.ctrl, data.qacc_warmstart = ctrl[i], warmstart[i]
-                    mujoco.mj_step(model, data, num_steps)
-                    mujoco.mj_rnePostConstraint(model, data)
-                    mujoco.mj_getState(model, data, last[i], _STATE)
-                    qacc[i], sensors[i] = data.qacc_warmstart, data.sensordata
-                    for field, view in zip(fields, views, strict=True):
-                        field[i] = view
+        def step(data: mujoco.MjData, i: int) -> None:
+            data.ctrl, data.qacc_warmstart = ctrl[i], warmstart[i]
+            mujoco.mj_step(self._moving, data, num_steps)
+            mujoco.mj_rnePostConstraint(self._moving, data)
+            mujoco.mj_getState(self._moving, data, last[i], _STATE)
+            qacc[i], sensors[i] = data.qacc_warmstart, data.sensordata
 
-        half = len(first) // 2 if len(first) >= _FEWEST and _num_threads() > 1 else 0
-        other = _second_thread().submit(step, 0, half)
-        step(half, len(first))
-        other.result()
+        self._fill(fields, first, step)
         return last, qacc, sensors
 
     def first(self, qpos: np.ndarray, qvel: np.ndarray, *results: np.ndarray) -> None:
@@ -149,19 +140,36 @@ class Native:
         _, found = self._roll(self._resting, first, 1)
         _read(found[:, 0], xpos, xquat, sensordata)
         if fields:
-            self._read_fields(first, fields)
+            self._fill(fields, first, self._look)
 
-    def _read_fields(self, states: np.ndarray, fields: Sequence[np.ndarray]) -> None:
-        """Fill fields of ``MjData`` in states without controls."""
-        model = self._moving
-        with self._data(model, 1) as (data,):
-            views = [getattr(data, name) for name in self._fields]
-            for i, state in enumerate(states):
-                mujoco.mj_setState(model, data, state, _STATE)
-                data.ctrl, data.cfrc_ext = 0, 0
-                mujoco.mj_forward(model, data)
-                for field, view in zip(fields, views, strict=True):
-                    field[i] = view
+    def _look(self, data: mujoco.MjData, i: int) -> None:
+        del i
+        data.ctrl, data.cfrc_ext = 0, 0
+        mujoco.mj_forward(self._moving, data)
+
+    def _fill(
+        self,
+        fields: Sequence[np.ndarray],
+        states: np.ndarray,
+        compute: Callable[[mujoco.MjData, int], None],
+    ) -> None:
+        """Fill fields of ``MjData`` after ``compute`` of each state's data and row."""
+
+        def block(start: int, stop: int) -> None:
+            with self._data(self._moving, 1) as (data,):
+                views = [getattr(data, name) for name in self._fields]
+                for i in range(start, stop):
+                    mujoco.mj_setState(self._moving, data, states[i], _STATE)
+                    compute(data, i)
+                    for field, view in zip(fields, views, strict=True):
+                        field[i] = view
+
+        count = _num_threads(len(states))
+        edges = [len(states) * k // count for k in range(count + 1)]
+        others = [_threads().submit(block, *edge) for edge in pairwise(edges[1:])]
+        block(*edges[:2])
+        for other in others:
+            other.result()
 
     def clearances(self, qpos: np.ndarray, found: np.ndarray) -> None:
         """Fill (N, G) metres, by which each geom overlaps another, negative; infinity for none."""
@@ -189,9 +197,8 @@ class Native:
             controls = np.repeat(ctrl[:, None], num_steps, axis=1)
         states = np.empty((num_rows, num_steps, first.shape[1]))
         sensors = np.empty((num_rows, num_steps, model.nsensordata))
-        num_threads = _num_threads() if num_rows >= _FEWEST else 1
         with (
-            _rollout(num_threads) as rollout,
+            _rollout(_num_threads(num_rows)) as rollout,
             self._data(model, max(1, rollout.nthread)) as data,
         ):
             rollout.rollout(
@@ -247,7 +254,11 @@ def _without(model: mujoco.MjModel, features: int) -> mujoco.MjModel:
     return model
 
 
-def _num_threads() -> int:
+def _num_threads(num_rows: int) -> int:
+    return _num_cores() if num_rows >= _FEWEST else 1
+
+
+def _num_cores() -> int:
     available = getattr(os, "sched_getaffinity", None)
     return len(available(0)) if available else os.cpu_count() or 1
 
@@ -263,12 +274,12 @@ def _forget_pools() -> None:
     global _pools
     _abandoned.append(_pools)
     _pools = queue.SimpleQueue()
-    _second_thread.cache_clear()
+    _threads.cache_clear()
 
 
 @cache
-def _second_thread() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(_num_threads(), thread_name_prefix="pixelbrax-mujoco")
+def _threads() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(_num_cores(), thread_name_prefix="pixelbrax-mujoco")
 
 
 if hasattr(os, "register_at_fork"):
