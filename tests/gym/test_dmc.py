@@ -14,7 +14,7 @@ from torchrl.envs import check_env_specs
 
 import pixelbrax_gym
 import pixelbrax_jax
-from pixelbrax_jax.tasks import TASKS
+from pixelbrax_jax.tasks import DMC_TASKS, TASKS
 from tests.distractors.conftest import make_bank
 from tests.gym.test_vector_env import MODES
 
@@ -26,34 +26,35 @@ FAST = "dmc_pendulum_swingup"
 """The task whose programs compile soonest."""
 
 
-def every_task():
-    """Each task as a parameter; all but one are among the slow tests."""
-    return [
-        pytest.param(task, marks=() if task == FAST else pytest.mark.slow)
-        for task in pixelbrax_jax.list_envs(suite="dmc")
-    ]
+def among_slow(tasks):
+    """Tasks as parameters; all but one are among the slow tests."""
+    return [pytest.param(task, marks=() if task == FAST else pytest.mark.slow) for task in tasks]
 
 
-@pytest.mark.parametrize("task", every_task())
+EVERY_TASK = among_slow(pixelbrax_jax.list_envs(suite="dmc"))
+ONE_OF_EVERY_DOMAIN = among_slow({row.domain: task for task, row in DMC_TASKS.items()}.values())
+
+
+@pytest.mark.parametrize("task", EVERY_TASK)
 def test_our_own_checker(task):
     pixelbrax_jax.check_env(*pixelbrax_jax.make(task, obs_mode="both", **SIZE))
 
 
-@pytest.mark.parametrize("task", every_task())
+@pytest.mark.parametrize("task", EVERY_TASK)
 def test_checkers_of_single_environments(task):
     env = gymnasium.make(TASKS[task].gymnasium_id, **SIZE, **RENDER).unwrapped
     check_gymnasium_env(env)
     check_sb3_env(env)
 
 
-@pytest.mark.parametrize("task", every_task())
+@pytest.mark.parametrize("task", ONE_OF_EVERY_DOMAIN)
 def test_checker_of_vector_environments(task):
     check_vector(task, "next_step")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", sorted(set(MODES) - {"next_step"}))
-@pytest.mark.parametrize("task", every_task())
+@pytest.mark.parametrize("task", [FAST, "dmc_cheetah_run"])
 def test_checker_of_vector_environments_in_other_modes(task, mode):
     check_vector(task, mode)
 
@@ -74,14 +75,14 @@ def check_vector(task, mode):
 # Programs of these two are the same.
 
 
-@pytest.mark.parametrize("task", every_task())
+@pytest.mark.parametrize("task", ONE_OF_EVERY_DOMAIN)
 def test_checker_of_torchrl(task):
     env = pixelbrax_gym.TorchRLEnv(task, 2, obs_mode="both", **SIZE)
     check_env_specs(env)
     env.close()
 
 
-@pytest.mark.parametrize("task", every_task())
+@pytest.mark.parametrize("task", ONE_OF_EVERY_DOMAIN)
 def test_stable_baselines_vector_environments(task):
     env = pixelbrax_gym.SB3VecEnv(task, 2, obs_mode="both", episode_length=3, **SIZE)
     env.seed(0)
@@ -101,7 +102,7 @@ def test_stable_baselines_vector_environments(task):
     env.close()
 
 
-@pytest.mark.parametrize("task", every_task())
+@pytest.mark.parametrize("task", ONE_OF_EVERY_DOMAIN)
 def test_distractors_change_pixels_alone(task):
     """The same episodes, to rounding: other options make another program."""
     options = {"num_envs": 2, "obs_mode": "both", "output": "torch", **SIZE}

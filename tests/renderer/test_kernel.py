@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from functools import partial
 
 import jax
@@ -81,9 +82,13 @@ def test_it_draws_what_the_plain_one_draws(task, look):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("look", LOOKS)
-@pytest.mark.parametrize("task", BRAX_TASKS)
-def test_it_draws_every_task_in_every_look(task, look):
+@pytest.mark.parametrize(
+    ("task", "look"),
+    # Every task in the default look and another one, and every look.
+    [(task, "default") for task in BRAX_TASKS]
+    + list(zip(BRAX_TASKS, itertools.cycle(sorted(set(LOOKS) - {"default"})), strict=False)),
+)
+def test_it_draws_every_task_and_every_look(task, look):
     assert_same_pictures(task, LOOKS[look])
 
 
