@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from pixelbrax_jax.envs.vector import VectorPixelEnv as VectorPixelEnv
     from pixelbrax_jax.physics.base import Physics as Physics
     from pixelbrax_jax.physics.brax.engine import BraxPhysics as BraxPhysics
-    from pixelbrax_jax.physics.brax.mjcf import mjcf_physics as mjcf_physics
+    from pixelbrax_jax.physics.mujoco.formulas import Snapshot as Snapshot
+    from pixelbrax_jax.physics.mujoco.mjcf import mjcf_physics as mjcf_physics
     from pixelbrax_jax.policy import list_pretrained as list_pretrained
     from pixelbrax_jax.policy import load_policy as load_policy
     from pixelbrax_jax.registry import list_envs as list_envs
@@ -56,7 +57,8 @@ _PUBLIC = {
     "envs.vector": "VectorPixelEnv",
     "physics.base": "Physics",
     "physics.brax.engine": "BraxPhysics",
-    "physics.brax.mjcf": "mjcf_physics",
+    "physics.mujoco.formulas": "Snapshot",
+    "physics.mujoco.mjcf": "mjcf_physics",
     "policy": "list_pretrained load_policy",
     "registry": "list_envs register",
     "scene.look": "make_look",

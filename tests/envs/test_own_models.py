@@ -54,7 +54,7 @@ REACHER = """
 
 
 def near(before, after, action):
-    return -jnp.linalg.norm(after.xpos[2] - after.xpos[0])
+    return -jnp.linalg.norm(after.xpos("hand") - after.xpos("goal"))
 
 
 def anywhere(key):
@@ -72,7 +72,7 @@ def model():
 def task():
     pb.register(
         "own_reacher",
-        lambda: pb.mjcf_physics(REACHER, reward=near, reset=anywhere, backend="generalized"),
+        lambda: pb.mjcf_physics(REACHER, reward=near, reset=anywhere),
     )
     return "own_reacher"
 
@@ -194,9 +194,7 @@ def test_followed_body(change, body):
 def test_a_camera_named_default_is():
     pb.register(
         "own_view",
-        lambda: pb.mjcf_physics(
-            REACHER.replace('"above"', '"default"'), reward=near, backend="generalized"
-        ),
+        lambda: pb.mjcf_physics(REACHER.replace('"above"', '"default"'), reward=near),
     )
     np.testing.assert_allclose(pb.named_rigs("own_view")["default"].eye, [0, 0, 1])
 

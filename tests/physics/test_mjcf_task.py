@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pixelbrax_jax.physics.base import Physics
-from pixelbrax_jax.physics.brax.mjcf import mjcf_physics
+from pixelbrax_jax.physics.mujoco.mjcf import mjcf_physics
 
 # A cart with a leaning pole; the knob is a body without a joint, rotated by Euler angles.
 CART = """
@@ -37,17 +37,18 @@ CART = """
 
 
 def upright(before, after, action):
-    return after.xpos[1, 2] - before.xpos[1, 2] - jnp.sum(action**2)
+    rise = after.geom_pos("pole")[2] - before.geom_pos("pole")[2]
+    return rise - jnp.sum(action**2)
 
 
 def build(source=CART, **changes):
-    options = {"reward": upright, "backend": "generalized", "n_frames": 2} | changes
+    options = {"reward": upright, "n_frames": 2} | changes
     return mjcf_physics(source, **options)
 
 
 @pytest.fixture(scope="module")
 def cart(compiled):
-    return compiled(build(terminated=lambda s: jnp.abs(s.q[1]) > 1.0, reset_noise=0.05))
+    return compiled(build(terminated=lambda s: jnp.abs(s.qpos[1]) > 1.0, reset_noise=0.05))
 
 
 def test_facts(cart):
@@ -56,19 +57,18 @@ def test_facts(cart):
     assert physics.dt == 0.02
     assert physics.action_size == 2
     assert physics.state_size == 4
-    assert physics.link_names == ("cart", "link/1")
+    assert physics.link_names == ("cart", "link/1", "knob")
     assert physics.geoms.name == ("ground", "cart", "pole", "knob")
-    assert physics.geoms.link == (-1, 0, 1, 1)
+    assert physics.geoms.link == (-1, 0, 1, 2)
 
 
 def test_poses_are_mujocos(cart, geom_pose):
-    """Also of the fused body, whose rotation Brax's own loader would lose."""
     model = mujoco.MjModel.from_xml_string(CART)
     data = mujoco.MjData(model)
     state = cart.reset(jax.random.key(0))
-    data.qpos[:] = state.engine.pipeline.q
+    data.qpos[:] = state.engine.qpos
     mujoco.mj_kinematics(model, data)
-    np.testing.assert_allclose(state.xpos, data.xpos[1:3], atol=1e-6)
+    np.testing.assert_allclose(state.xpos, data.xpos[1:], atol=1e-6)
     for index in range(4):
         pos, mat = geom_pose(cart.physics.geoms, state, index)
         np.testing.assert_allclose(pos, data.geom_xpos[index], atol=1e-5)
@@ -87,10 +87,16 @@ def test_formulas(cart):
     before = cart.reset(jax.random.key(0))
     action = np.array([0.5, -0.25], np.float32)
     after = cart.step(before, action)
-    expected = float(after.xpos[1, 2] - before.xpos[1, 2]) - np.sum(action**2)
+    model = mujoco.MjModel.from_xml_string(CART)
+    data = mujoco.MjData(model)
+    data.qpos, data.qvel, data.ctrl = before.engine.qpos, before.engine.qvel, [-1 + 4 * 0.75, -0.25]
+    mujoco.mj_forward(model, data)
+    height = data.geom("pole").xpos[2]
+    mujoco.mj_step(model, data, 2)
+    np.testing.assert_allclose(after.obs, np.concatenate([data.qpos, data.qvel]), atol=1e-6)
+    mujoco.mj_forward(model, data)
+    expected = data.geom("pole").xpos[2] - height - np.sum(action**2)
     np.testing.assert_allclose(after.reward, expected, atol=1e-6)
-    joints = after.engine.pipeline
-    np.testing.assert_array_equal(after.obs, np.concatenate([joints.q, joints.qd]))
     assert not after.terminated
     leaning = cart.from_qpos(np.array([0, 1.1], np.float32))
     assert cart.step(leaning, action).terminated
@@ -101,17 +107,16 @@ def test_file_that_includes_another(tmp_path):
     (tmp_path / "scene.xml").write_text('<mujoco><include file="cart.xml"/></mujoco>')
     physics = build(tmp_path / "scene.xml", colors={"pole": (0, 1, 0)}, init_q=[0.5, 0])
     assert "pole" in physics.geoms.name
-    assert jax.eval_shape(physics.reset, jax.random.key(0)).xpos.shape == (2, 3)
+    assert jax.eval_shape(physics.reset, jax.random.key(0)).xpos.shape == (3, 3)
 
 
 def test_own_observation():
-    physics = build(observation=lambda s: jnp.concatenate([s.xpos[1], s.xquat[1]]))
+    physics = build(observe=lambda s: jnp.concatenate([s.xpos("knob"), s.xquat("knob")]))
     assert physics.state_size == 7
 
 
-@pytest.mark.slow
-def test_start_and_every_feature_of_mjx(compiled):
-    """Ball joints, tendons and equality constraints only exist on MJX."""
+def test_start_and_every_feature_of_mujoco(compiled):
+    """A keyframe, a ball joint, a tendon and an equality constraint."""
     xml = """
     <mujoco>
       <worldbody>
@@ -122,25 +127,26 @@ def test_start_and_every_feature_of_mjx(compiled):
       <tendon><fixed name="pull"><joint joint="x" coef="2"/></fixed></tendon>
       <equality><joint joint1="x" joint2="y"/></equality>
       <actuator><motor tendon="pull"/></actuator>
+      <sensor><accelerometer site="seat"/></sensor>
+      <keyframe><key qpos="0 0 3 4 1 2"/></keyframe>
     </mujoco>
-    """
-    start = [0.0, 0, 3, 4, 1, 2]
-    physics = mjcf_physics(
-        xml, reward=lambda *_: jnp.zeros(()), reset_noise=0.0, init_q=start, backend="mjx"
-    )
+    """.replace('<geom size=".1"/></body>', '<geom size=".1"/><site name="seat"/></body>', 1)
+
+    def forces(seen):
+        return jnp.concatenate([seen.qpos, seen.data.sensordata])
+
+    physics = mjcf_physics(xml, reward=lambda *_: jnp.zeros(()), reset_noise=0.0, observe=forces)
     assert physics.action_size == 1
     program = compiled(physics)
     state = program.reset(jax.random.key(0))
     np.testing.assert_allclose(state.obs[:6], [0, 0, 0.6, 0.8, 1, 2], atol=1e-6)
     after = program.step(state, np.ones(1, np.float32))
     assert not after.non_finite
-    assert after.obs[4] > 1
-    with pytest.raises(
-        ValueError,
-        match=r"'spring' backend does not simulate equality constraints \(equality 'equality/0'\); "
-        r"tendons \(tendon 'pull'\); ball joints \(joint 'ball'\); .* use backend='mjx'",
-    ):
-        mjcf_physics(xml, reward=lambda *_: jnp.zeros(()), backend="spring")
+    model = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(model)
+    data.qpos, data.ctrl = state.engine.qpos, 1
+    mujoco.mj_step(model, data, 5)
+    np.testing.assert_allclose(after.obs, [*data.qpos, *data.sensordata], atol=1e-5)
 
 
 def test_missing_file(tmp_path):
@@ -170,19 +176,22 @@ def test_models_that_are_no_task(xml, message):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"reward": lambda b, a, u: a.q}, r"reward must return a scalar number, got shape \(2,\)"),
-        ({"reward": lambda b, a, u: a.q[0] > 0}, "reward must return a scalar number, .* bool"),
+        (
+            {"reward": lambda b, a, u: a.qpos},
+            r"reward must return a scalar number, got shape \(2,\)",
+        ),
+        ({"reward": lambda b, a, u: a.qpos[0] > 0}, "reward must return a scalar number, .* bool"),
         ({"reward": lambda b, a, u: None}, "reward must return a scalar number, got None"),
-        ({"terminated": lambda a: a.q[0]}, "terminated must return a scalar bool, .* float32"),
-        ({"terminated": lambda a: a.q > 0}, r"terminated must return a scalar bool, .* \(2,\)"),
-        ({"observation": lambda a: a.xpos}, "observation must return a flat float array"),
-        ({"observation": lambda a: a.q[:0]}, "observation must return a flat float array"),
+        ({"terminated": lambda a: a.qpos[0]}, "terminated must return a scalar bool, .* float32"),
+        ({"terminated": lambda a: a.qpos > 0}, r"terminated must return a scalar bool, .* \(2,\)"),
+        ({"observe": lambda a: a.data.xpos}, "observe must return a flat float array"),
+        ({"observe": lambda a: a.qpos[:0]}, "observe must return a flat float array"),
         ({"init_q": np.zeros(3)}, r"init_q must have shape \(2,\), got \(3,\)"),
         ({"n_frames": 0}, "n_frames must be a positive integer, got 0"),
         ({"n_frames": 1.5}, "n_frames must be a positive integer, got 1.5"),
         ({"reset_noise": -1.0}, "reset_noise must be finite and not negative"),
         ({"reset_noise": float("nan")}, "reset_noise must be finite and not negative"),
-        ({"backend": "mjs"}, "unknown backend: 'mjs'. Did you mean 'mjx'"),
+        ({"engine": "mujco"}, "unknown engine: 'mujco'. Did you mean 'mujoco'"),
         ({"reset": lambda key: jnp.zeros(4)}, r"reset must return .* \(2,\) and velocities \(2,\)"),
         ({"reset": lambda key: (jnp.zeros(2), jnp.zeros(3))}, r"got \(\(2,\), \(3,\)\)"),
         (
@@ -198,12 +207,13 @@ def test_bad_arguments(change, message):
         build(**change)
 
 
-@pytest.mark.parametrize("backend", ["generalized", "mjx"])
-def test_models_beyond_mujoco_xla(backend):
+def test_models_beyond_mujoco_xla():
     option = CART.replace('timestep="0.01"', 'timestep="0.01" solver="PGS"')
-    with pytest.raises(ValueError, match=r"MuJoCo XLA, which loads .* cannot simulate .*SOL_PGS"):
-        build(option, backend=backend)
-
-
-def test_energy_is_only_reported():
-    build(CART.replace('"0.01"/>', '"0.01"><flag energy="enable"/></option>'))
+    physics = build(option)
+    state = jax.eval_shape(physics.reset, jax.random.key(0))
+    step = jax.jit(physics.step).trace(state, jnp.zeros(2))
+    with pytest.raises(ValueError, match=r"MuJoCo XLA cannot simulate .*SOL_PGS.*engine='mujoco'"):
+        step.lower(lowering_platforms=("cuda",))
+    motor = CART.replace('<motor name="turn"', '<motor armature="1" name="turn"')
+    with pytest.raises(ValueError, match=r"MuJoCo XLA does not simulate armature"):
+        build(motor, engine="xla")

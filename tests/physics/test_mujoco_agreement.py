@@ -1,4 +1,4 @@
-"""A model of the user's moves as MuJoCo moves it, in all that its backend does not refuse."""
+"""A model of the user's moves as MuJoCo moves it, by both engines."""
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from pixelbrax_jax.physics.brax.mjcf import mjcf_physics
+from pixelbrax_jax.physics.mujoco.mjcf import mjcf_physics
 
 SECONDS = 0.5
 
@@ -76,18 +76,16 @@ CONTACTS = """
 """
 
 MODELS = {"tree": TREE, "contacts": CONTACTS}
-TOLERANCE, WITH_CONTACTS = 1e-3, {"generalized": 2e-3}
+TOLERANCE = {"mujoco": 1e-5, "xla": 1e-3}
 """Metres and radians, of movements of half a metre and a radian; as docs/howto/own-task.md has
 them."""
 
 
-@pytest.mark.parametrize("backend", ["generalized", pytest.param("mjx", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("engine", ["mujoco", pytest.param("xla", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", MODELS)
-def test_motion(name, backend):
+def test_motion(name, engine):
     model = mujoco.MjModel.from_xml_string(MODELS[name])
-    physics = mjcf_physics(
-        MODELS[name], reward=lambda *_: jnp.zeros(()), n_frames=1, backend=backend
-    )
+    physics = mjcf_physics(MODELS[name], reward=lambda *_: jnp.zeros(()), n_frames=1, engine=engine)
     # An action is between the ends of the control range, or the control where there is none.
     limited = model.actuator_ctrllimited.astype(bool)
     low, high = np.where(limited, model.actuator_ctrlrange.T, [[-1.0], [1.0]])
@@ -115,5 +113,5 @@ def test_motion(name, backend):
     found = roll(model.qpos0, start, np.asarray(actions, np.float32))
     moved = np.ptp(expected, axis=0)
     assert moved[:6].min() > 5e-3
-    tolerance = WITH_CONTACTS.get(backend, TOLERANCE) if name == "contacts" else TOLERANCE
+    tolerance = TOLERANCE[engine]
     np.testing.assert_allclose(found, expected, rtol=0, atol=tolerance)

@@ -34,7 +34,7 @@ class State(struct.PyTreeNode):
         ctrl: (A,) float32, the last controls, for rewards.
         target: metres, this episode's target: (3,) float32; (7,) with a unit quaternion if it is a
             body; (0,) for tasks without one.
-        remembered: float32, what the next reward compares with; (0,) for most tasks.
+        remembered: arrays, what the next reward compares with; (0,) float32 for most tasks.
     """
 
     qpos: jax.Array
@@ -43,7 +43,7 @@ class State(struct.PyTreeNode):
     qacc_warmstart: jax.Array
     ctrl: jax.Array
     target: jax.Array
-    remembered: jax.Array
+    remembered: Any
 
 
 class Readings(struct.PyTreeNode):

@@ -42,6 +42,16 @@ class Snapshot:
     state: State
     data: Readings
 
+    @property
+    def qpos(self) -> jax.Array:
+        """All joint positions (Q,), in MuJoCo's order."""
+        return self.state.qpos
+
+    @property
+    def qvel(self) -> jax.Array:
+        """All joint velocities (V,), in MuJoCo's order."""
+        return self.state.qvel
+
     def joint_pos(self, *names: str) -> jax.Array:
         """Return the positions of hinges and slides."""
         return self.state.qpos[np.array([self.model.joint(name).qposadr[0] for name in names])]
@@ -146,7 +156,7 @@ class Formulas:
         substeps: physics steps per control step.
         edit: changes the compiled model as DM Control's task does.
         options: arguments of the model's generator.
-        camera: index of the task's camera in the model.
+        camera: index of the task's camera in the model; None for none.
         movable: names of the geoms, sites and lights that ``Start.target`` moves.
         target_body: name of the body, fixed to the world, that it moves; empty for none.
         reads_forces: whether observations use sensors of forces or accelerations.
@@ -161,11 +171,11 @@ class Formulas:
     observe: Callable[[Snapshot], jax.Array]
     reward: Callable[[Snapshot], jax.Array]
     terminated: Callable[[Snapshot], jax.Array] = never
-    remember: Callable[[Snapshot], jax.Array] = nothing
+    remember: Callable[[Snapshot], Any] = nothing
     substeps: int = 1
     edit: Callable[[mujoco.MjModel], None] = _unchanged
     options: Mapping[str, Any] = field(default_factory=dict)
-    camera: int = 0
+    camera: int | None = 0
     movable: tuple[str, ...] = ()
     target_body: str = ""
     reads_forces: bool = False

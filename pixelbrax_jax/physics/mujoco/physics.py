@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping
+from collections.abc import Collection, Hashable, Mapping
 from types import MappingProxyType
 from typing import Any
 
@@ -14,11 +14,13 @@ from pixelbrax_jax.flags import default_flags, under_default_flags
 from pixelbrax_jax.physics.divergence import GuardedPhysics
 from pixelbrax_jax.physics.mujoco.dynamics import Dynamics, Readings, State
 from pixelbrax_jax.physics.mujoco.formulas import Formulas, Snapshot, Start
+from pixelbrax_jax.physics.mujoco.geometry import VISIBLE_GROUPS
 from pixelbrax_jax.physics.mujoco.native import compile_model, with_poses
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
 from pixelbrax_jax.physics.mujoco.poses import check_pose, masses_below, with_unit_rotations
 from pixelbrax_jax.physics.mujoco.scene import COM_LINK, read_scene, tracked_body
 from pixelbrax_jax.physics.mujoco.viewpoints import unfit_cameras
+from pixelbrax_jax.physics.task import Color
 from pixelbrax_jax.spatial import f32, rotate
 from pixelbrax_jax.types import CameraRig, PhysicsState
 
@@ -46,18 +48,27 @@ class MujocoPhysics(GuardedPhysics):
         engine: str,
         rigs: Mapping[str, CameraRig] = MappingProxyType({}),
         time_limit: int | None = None,
+        colors: Mapping[str, Color] | None = None,
+        geom_groups: Collection[int] = VISIBLE_GROUPS,
         identity: Hashable,
     ):
         """Compile the model, edited for the task, and read its scene; compile no program.
 
-        The default camera is the model's, or the first of ``rigs`` if it has none.
+        The default camera is the model's, or the first of ``rigs`` if it has none. For ``colors``
+        and ``geom_groups`` see ``read_scene``.
         """
         model, posed = compile_model(spec), with_poses(spec)
         for edited in (model, posed):
             formulas.edit(edited)
-        scene = read_scene(model, formulas.camera, movable=formulas.movable)
+        scene = read_scene(
+            model,
+            formulas.camera,
+            movable=formulas.movable,
+            colors=colors,
+            geom_groups=geom_groups,
+        )
         self.geoms, self.look = scene.geoms, scene.look
-        default = scene.rig or next(iter(rigs.values()), None)
+        default = scene.rigs.get("default") or scene.rig or next(iter(rigs.values()), None)
         self.rigs = {**scene.rigs, **rigs} | ({"default": default} if default else {})
         self.unfit_cameras = unfit_cameras(model)
         bodies = [model.body(i).name or f"link/{i - 1}" for i in range(1, model.nbody)]
@@ -82,14 +93,15 @@ class MujocoPhysics(GuardedPhysics):
         self._extra_links = scene.links
         self.time_limit = time_limit
         self._identity = identity
-        low, high = model.actuator_ctrlrange.T.astype(np.float32)
+        limited = model.actuator_ctrllimited.astype(bool)
+        low, high = np.where(limited, model.actuator_ctrlrange.T, [[-1], [1]]).astype(np.float32)
         self._is_unit_range = bool((low == -1).all() and (high == 1).all())
         self._control_range = low, high
         first = jax.eval_shape(self.reset, jax.random.key(0))
         self.state_size = int(first.obs.shape[0])
 
     def control(self, action: jax.Array) -> jax.Array:
-        """Map an action (A,) from [-1, 1] to the control range of each actuator."""
+        """Map an action (A,) from [-1, 1] to the range of each control that has one."""
         action = jnp.asarray(action, jnp.float32)
         if self._is_unit_range:
             return action

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -22,6 +22,7 @@ from pixelbrax_jax.physics.mujoco.lighting import checker, mean_color, read_lamp
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
 from pixelbrax_jax.physics.mujoco.viewpoints import camera_name, read_rigs
 from pixelbrax_jax.physics.mujoco.viewpoints import tracked_body as tracked_body
+from pixelbrax_jax.physics.task import Color
 from pixelbrax_jax.spatial import f32
 from pixelbrax_jax.types import CameraRig, GeomKind, Geoms, Look, String
 
@@ -41,7 +42,7 @@ class ModelScene(NamedTuple):
     Attributes:
         geoms: geoms, visible sites (``site/<name>``) and the pieces of visible tendons
             (``tendon/<name>/<piece>``).
-        rig: the chosen camera; None if the model has none.
+        rig: the chosen camera; None without one.
         rigs: all cameras that can be rigs, by name.
         look: the model's lights, sky and ground.
         links: names of the links after those of the bodies, if the model needs them: ``camera/com``
@@ -57,18 +58,26 @@ class ModelScene(NamedTuple):
 
 
 def read_scene(
-    model: mujoco.MjModel, camera: int = 0, *, movable: Collection[str] = ()
+    model: mujoco.MjModel,
+    camera: int | None = 0,
+    *,
+    movable: Collection[str] = (),
+    colors: Mapping[str, Color] | None = None,
+    geom_groups: Collection[int] = VISIBLE_GROUPS,
 ) -> ModelScene:
     """Read what MuJoCo's renderer shows of a model by default.
 
-    Link i is body i + 1. ``camera`` is the index of one that can be a rig. Geoms, sites and lamps
-    of the world that ``movable`` names move together with the link ``target``, whose origin is the
-    first visible geom or site. A ValueError names something visible that cannot be rendered.
+    Link i is body i + 1. ``camera`` is the index of one that can be a rig, or None. Geoms, sites
+    and lamps of the world that ``movable`` names move together with the link ``target``, whose
+    origin is the first visible geom or site. ``colors`` replaces colors of geoms by name; geoms and
+    sites are visible in ``geom_groups``. A ValueError names something visible that cannot be
+    rendered.
     """
     links = [COM_LINK] if tracked_body(model) >= 0 else []
     com_link = model.nbody - 1 if links else -1
     target = model.nbody - 1 + len(links)
-    shapes, lamps = [*_textured_geoms(model), *site_shapes(model)], read_lamps(model, com_link)
+    geoms_seen = _textured_geoms(model, colors or {}, geom_groups)
+    shapes, lamps = [*geoms_seen, *site_shapes(model, geom_groups)], read_lamps(model, com_link)
     moving = [i for i, s in enumerate(shapes) if s.name.removeprefix("site/") in movable]
     if moving:
         links.append(TARGET_LINK)
@@ -81,18 +90,20 @@ def read_scene(
     geoms = as_geoms([*shapes, *pieces]).replace(strings=tuple(strings))
     rigs = read_rigs(model, com_link)
     look = read_look(model).replace(lamps=tuple(lamps.values()))
-    rig = rigs[camera_name(model, camera)] if model.ncam else None
+    rig = None if camera is None or not model.ncam else rigs[camera_name(model, camera)]
     return ModelScene(geoms, rig, rigs, look, tuple(links))
 
 
-def _textured_geoms(model: mujoco.MjModel) -> Iterator[Shape]:
+def _textured_geoms(
+    model: mujoco.MjModel, colors: Mapping[str, Color], groups: Collection[int]
+) -> Iterator[Shape]:
     """Yield the geoms with finite planes and checkers; other textures become their mean color."""
-    for shape in geom_shapes(model):
-        is_plane = shape.kind == GeomKind.PLANE
+    for shape in geom_shapes(model, colors=colors, geom_groups=groups):
+        is_plane, is_own = shape.kind == GeomKind.PLANE, shape.name in colors
         yield shape._replace(
-            rgb=mean_color(model, shape.row, shape.rgb),
+            rgb=shape.rgb if is_own else mean_color(model, shape.row, shape.rgb),
             bounded=bool(is_plane and (shape.size[:2] > 0).any()),
-            patterned=is_plane and checker(model, shape.row) is not None,
+            patterned=is_plane and not is_own and checker(model, shape.row) is not None,
         )
 
 

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax.physics.mujoco.compatibility import import_silenced, load_onto_own_device
+from pixelbrax_jax.physics.mujoco.omissions import check_simulated
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
 from pixelbrax_jax.physics.mujoco.substitutes import substituted
 
@@ -33,13 +34,23 @@ class Xla:
         out_of_reach: Iterable[str] = (),
         reads: Sequence[str] = (),
     ):
-        """Put a compiled model on the device; compile nothing. For the rest see ``Formulas``."""
+        """Put a compiled model on the device; compile nothing. For the rest see ``Formulas``.
+
+        A ValueError names what MuJoCo XLA does not simulate.
+        """
         load_onto_own_device(mjx_io)
+        check_simulated(model)
         self._model = model
         self._starts_with_forces = starts_with_forces or bool(reads)
         self._fields = tuple(reads)
         self.simulated = _simulated(model, out_of_reach)
-        self._mx = mjx.put_model(self.simulated, impl="jax")
+        try:
+            self._mx = mjx.put_model(self.simulated, impl="jax")
+        except NotImplementedError as error:
+            raise ValueError(
+                f"MuJoCo XLA cannot simulate this model: {error}. Compute on a CPU, with "
+                "engine='mujoco'."
+            ) from error
         self._moving = (
             self._mx if reads_forces else self._without(mujoco.mjtDisableBit.mjDSBL_SENSOR)
         )

@@ -1,0 +1,209 @@
+"""Tasks of a model in MuJoCo's format and a few functions."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Mapping
+from operator import attrgetter
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pixelbrax_jax.flags import default_flags
+from pixelbrax_jax.physics.base import ResetFn
+from pixelbrax_jax.physics.mujoco.compatibility import loading_silenced
+from pixelbrax_jax.physics.mujoco.dynamics import Dynamics
+from pixelbrax_jax.physics.mujoco.formulas import Formulas, Snapshot, Start, never, observe_joints
+from pixelbrax_jax.physics.mujoco.geometry import VISIBLE_GROUPS
+from pixelbrax_jax.physics.mujoco.omissions import check_simulated
+from pixelbrax_jax.physics.mujoco.opengl import mujoco
+from pixelbrax_jax.physics.mujoco.options import ENGINES
+from pixelbrax_jax.physics.mujoco.physics import MujocoPhysics
+from pixelbrax_jax.physics.mujoco.poses import with_unit_rotations
+from pixelbrax_jax.physics.mujoco.viewpoints import followed_body
+from pixelbrax_jax.physics.task import Color
+from pixelbrax_jax.types import PhysicsState
+from pixelbrax_jax.validation import check_choice, check_positive_int
+
+RewardFn = Callable[[Snapshot, Snapshot, jax.Array], jax.Array]
+
+_FORCES = int(mujoco.mjtStage.mjSTAGE_ACC)
+
+
+class MjcfPhysics(MujocoPhysics):
+    """A user's task of a MuJoCo model, made by ``mjcf_physics``."""
+
+    def __init__(self, reward: RewardFn, formulas: Formulas, spec: mujoco.MjSpec, **options: Any):
+        """See ``MujocoPhysics``; ``reward`` stands in for that of the formulas."""
+        self._reward = reward
+        super().__init__(formulas, spec, identity=None, **options)
+        self.followed_link = max(followed_body(self._model) - 1, 0)
+        # Its functions are checked before a program is traced.
+        first = jax.eval_shape(self.reset, jax.random.key(0))
+        jax.eval_shape(self.step, first, jnp.zeros(self.action_size))
+
+    def _step(self, state: PhysicsState, action: jax.Array) -> PhysicsState:
+        before = Snapshot(self._model, state.engine, state.engine.remembered)
+        engine, readings = self.move(state.engine, action)
+        reward = self._reward(before, Snapshot(self._model, engine, readings), action)
+        reward = _checked("reward", "a scalar number", reward, _is_number)
+        return self.observe(engine, readings).replace(reward=reward.astype(jnp.float32))
+
+
+@default_flags()
+def mjcf_physics(
+    source: str | Path,
+    *,
+    reward: RewardFn,
+    observe: Callable[[Snapshot], jax.Array] = observe_joints,
+    terminated: Callable[[Snapshot], jax.Array] = never,
+    reset: ResetFn | None = None,
+    init_q: np.typing.ArrayLike | None = None,
+    reset_noise: float | None = None,
+    n_frames: int = 5,
+    engine: str = "auto",
+    colors: Mapping[str, Color] | None = None,
+    geom_groups: Collection[int] = VISIBLE_GROUPS,
+) -> MjcfPhysics:
+    """Make physics of a model in MuJoCo's MJCF (or URDF) format.
+
+    MuJoCo itself simulates it in programs for a CPU, MuJoCo XLA in others. An action in [-1, 1] is
+    mapped linearly to an actuator's control range, or passed unchanged if the actuator has none.
+    What is seen are the model's geoms and sites (``site/<name>``), lights and sky. Its cameras are
+    viewpoints by name, see ``named_rigs``; without one named ``default``, a view from a corner
+    follows the first moving body with an actuator.
+
+    The functions are pure and take ONE environment, as a ``Snapshot``: ``seen.xpos("hand")``,
+    ``seen.sensor("touch")``, ``seen.state.qvel``.
+
+    Args:
+        source: a file, or the XML itself.
+        reward: maps the snapshots before and after a step and the (A,) action in [-1, 1] to a
+            scalar.
+        observe: maps a snapshot to the (S,) float state observation; by default all joint positions
+            and velocities.
+        terminated: maps the snapshot after a step to a () bool, true when the task ended.
+        reset: samples initial joint positions (Q,) and velocities (V,) from a PRNG key, in place of
+            ``init_q`` and ``reset_noise``. It can set a goal: a body with joints but no actuator.
+        init_q: (Q,) initial joint positions; None for the model's first keyframe, or ``qpos0``.
+        reset_noise: joint positions and velocities are sampled uniformly within plus or minus this
+            of ``init_q`` and 0 (metres, radians, per second); 0.01 by default.
+        n_frames: the model's time steps per control step.
+        engine: see ``MujocoOptions``.
+        colors: replacements for the model's colors by geom name, red, green, blue in [0, 1].
+        geom_groups: MuJoCo's groups of visible geoms and sites.
+
+    Raises:
+        FileNotFoundError: the file does not exist.
+        ValueError: the model cannot be compiled or rendered, has no joint or no actuator; ``reset``
+            is given with ``init_q`` or ``reset_noise``; or a function returns a wrong shape or
+            dtype.
+    """
+    check_choice("engine", engine, ENGINES)
+    if reset is not None and (reset_noise is not None or init_q is not None):
+        raise ValueError(
+            "reset samples the whole initial state: leave reset_noise and init_q out, and add the "
+            "noise in reset."
+        )
+    noise = 0.01 if reset_noise is None else float(reset_noise)
+    if not math.isfinite(noise) or noise < 0:
+        raise ValueError(f"reset_noise must be finite and not negative, got {reset_noise}")
+    substeps = check_positive_int("n_frames", n_frames)
+    spec, model = _load(source)
+    if engine == "xla":
+        check_simulated(model)
+    if model.nv == 0:
+        raise ValueError("the model has no joint, so nothing can move")
+    if model.nu == 0:
+        raise ValueError("the model has no actuator, so an agent could not act on it")
+    senses_forces = bool((model.sensor_needstage == _FORCES).any())
+    formulas = Formulas(
+        start=_start(model, reset, init_q, noise),
+        observe=lambda seen: _checked("observe", "a flat float array", observe(seen), _is_flat),
+        reward=_reward_of_a_step,
+        terminated=lambda seen: _checked("terminated", "a scalar bool", terminated(seen), _is_bool),
+        remember=attrgetter("data"),
+        camera=None,
+        substeps=substeps,
+        reads_forces=senses_forces,
+        starts_with_forces=senses_forces,
+    )
+    return MjcfPhysics(
+        reward, formulas, spec, engine=engine, colors=colors, geom_groups=geom_groups
+    )
+
+
+def _load(source: str | Path) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
+    is_xml = isinstance(source, str) and source.lstrip().startswith("<")
+    what = "the given XML" if is_xml else f"{str(source)!r}"
+    if not is_xml and not Path(source).is_file():
+        raise FileNotFoundError(f"there is no MJCF file {str(Path(source).absolute())!r}")
+    read = mujoco.MjSpec.from_string if is_xml else mujoco.MjSpec.from_file
+    try:
+        with loading_silenced():
+            spec = read(str(source))
+            return spec, spec.compile()
+    except ValueError as error:
+        raise ValueError(f"MuJoCo cannot compile {what}: {error}") from error
+
+
+def _start(
+    model: mujoco.MjModel, reset: ResetFn | None, init_q: np.typing.ArrayLike | None, noise: float
+) -> Callable[[Dynamics, jax.Array], Start]:
+    if init_q is None:
+        init_q = model.key_qpos[0] if model.nkey else model.qpos0
+    initial = np.asarray(init_q, np.float32)
+    if initial.shape != (model.nq,):
+        raise ValueError(f"init_q must have shape ({model.nq},), got {initial.shape}")
+
+    def around(key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        q_key, qd_key = jax.random.split(key)
+        qpos = jax.random.uniform(q_key, (model.nq,), minval=-noise, maxval=noise)
+        qvel = jax.random.uniform(qd_key, (model.nv,), minval=-noise, maxval=noise)
+        return qpos + initial, qvel
+
+    def start(dynamics: Dynamics, key: jax.Array) -> Start:
+        del dynamics
+        found = (reset or around)(key)
+        shapes = jax.tree.map(jnp.shape, found)
+        if not isinstance(shapes, tuple | list) or list(shapes) != [(model.nq,), (model.nv,)]:
+            raise ValueError(
+                f"reset must return joint positions ({model.nq},) and velocities ({model.nv},), "
+                f"got {shapes}"
+            )
+        qpos, qvel = (jnp.asarray(part, jnp.float32) for part in found)
+        return Start(with_unit_rotations(model, qpos), qvel)
+
+    return start
+
+
+def _reward_of_a_step(seen: Snapshot) -> jax.Array:
+    del seen
+    return jnp.zeros(())  # ``MjcfPhysics`` knows more: the snapshot before it, and the action.
+
+
+def _is_number(dtype: Any, shape: tuple[int, ...]) -> bool:
+    return bool(shape == () and jnp.issubdtype(dtype, jnp.number))
+
+
+def _is_bool(dtype: Any, shape: tuple[int, ...]) -> bool:
+    return bool(shape == () and dtype == jnp.bool_)
+
+
+def _is_flat(dtype: Any, shape: tuple[int, ...]) -> bool:
+    return len(shape) == 1 and shape[0] > 0 and jnp.issubdtype(dtype, jnp.floating)
+
+
+def _checked(
+    name: str, expected: str, result: Any, fits: Callable[[Any, tuple[int, ...]], bool]
+) -> jax.Array:
+    """Return a function's result; raise ValueError if its shape or dtype is wrong."""
+    shape, dtype = getattr(result, "shape", None), getattr(result, "dtype", None)
+    if shape is None or dtype is None:
+        raise ValueError(f"{name} must return {expected}, got {result!r}")
+    if not fits(dtype, shape):
+        raise ValueError(f"{name} must return {expected}, got shape {shape} and dtype {dtype}")
+    return jnp.asarray(result)
