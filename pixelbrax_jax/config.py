@@ -14,6 +14,7 @@ from pixelbrax_jax.distractors.clips import ClipBank
 from pixelbrax_jax.distractors.presets import as_tuple
 from pixelbrax_jax.physics.brax.tasks import BraxOptions
 from pixelbrax_jax.physics.mujoco.options import MujocoOptions
+from pixelbrax_jax.physics.ranges import Ranges, check_ranges
 from pixelbrax_jax.plain import from_plain
 from pixelbrax_jax.renderer.base import check_renderer
 from pixelbrax_jax.scene.look import make_look
@@ -107,6 +108,12 @@ class EnvConfig(BraxOptions, MujocoOptions, ProgramConfig):
     ``load_clips``, or ``procedural``. None means ``procedural`` with a warning."""
     split: str = "train"
     """Split of the clips: ``train``, ``test`` or another one they have; see ``load_clips``."""
+    dynamics: Ranges = ""
+    """Multipliers of a MuJoCo task's ``friction``, ``mass``, ``damping``, ``gain`` and ``gravity``:
+    ``friction=0.5:2,mass=1.2`` draws that of friction uniformly for each episode. In Python also
+    ``{"friction": (0.5, 2), "mass": 1.2}``."""
+    test_dynamics: Ranges = ""
+    """The same for the splits ``test`` and ``paper-test``; without it they have ``dynamics``."""
 
     def __post_init__(self) -> None:
         ProgramConfig.__post_init__(self)
@@ -114,6 +121,8 @@ class EnvConfig(BraxOptions, MujocoOptions, ProgramConfig):
             self._static(name)
         BraxOptions.__post_init__(self)
         MujocoOptions.__post_init__(self)
+        for name in ("dynamics", "test_dynamics"):
+            self._store(name, check_ranges(name, getattr(self, name)))
         episode_length = check_positive_int("episode_length", self._static("episode_length"))
         self._store("episode_length", episode_length)
         if self.shadows is not None:

@@ -307,6 +307,24 @@ class Clips(struct.PyTreeNode):
     length: jax.Array
 
 
+class DynamicsRanges(struct.PyTreeNode):
+    """Lowest and highest multipliers of a task's dynamics, drawn for each episode.
+
+    Attributes:
+        friction: (2,), of contacts.
+        mass: (2,), of all bodies, with their inertia.
+        damping: (2,), of joints and tendons.
+        gain: (2,), of the forces of actuators.
+        gravity: (2,).
+    """
+
+    friction: jax.Array
+    mass: jax.Array
+    damping: jax.Array
+    gain: jax.Array
+    gravity: jax.Array
+
+
 class EnvParams(struct.PyTreeNode):
     """Parameters of an environment that may be randomised; always an argument of jitted functions.
 
@@ -316,6 +334,7 @@ class EnvParams(struct.PyTreeNode):
         look: light, sky and ground.
         clips: background videos; None if no distractor shows any.
         episode_length: () int32, time limit in control steps.
+        dynamics: ranges of the dynamics' multipliers; None if nothing varies.
     """
 
     geoms: Geoms
@@ -323,6 +342,7 @@ class EnvParams(struct.PyTreeNode):
     look: Look
     clips: Clips | None = None
     episode_length: Any = np.int32(1000)
+    dynamics: DynamicsRanges | None = None
 
 
 class SimState(struct.PyTreeNode):

@@ -152,10 +152,14 @@ def _names_for_objects() -> ConstructorRegistry:
     from pixelbrax_jax.config import EnvConfig
 
     types, registry = get_type_hints(EnvConfig), ConstructorRegistry()
+    metavars = {types[name]: "NAME" for name in ("camera", "look")} | {
+        types["clips"]: "FOLDER",
+        types["dynamics"]: "NAME=LOW:HIGH,...",
+    }
 
     @registry.primitive_rule
     def names(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
-        if info.type not in [types[name] for name in ("camera", "look", "clips", "distractors")]:
+        if info.type != types["distractors"] and info.type not in metavars:
             return None
         if info.type == types["distractors"]:
             return PrimitiveConstructorSpec(
@@ -167,7 +171,7 @@ def _names_for_objects() -> ConstructorRegistry:
             )
         return PrimitiveConstructorSpec(
             nargs=1,
-            metavar="FOLDER" if info.type == types["clips"] else "NAME",
+            metavar=metavars[info.type],
             instance_from_str=lambda args: args[0],
             is_instance=lambda value: value is None or isinstance(value, str),
             str_from_instance=lambda value: [str(value)],

@@ -14,16 +14,17 @@ import numpy as np
 
 from pixelbrax_jax import registry
 from pixelbrax_jax.config import PROGRAM_OPTIONS, EnvConfig, env_config
-from pixelbrax_jax.distractors.clips import ClipBank, load_clips, warn_procedural
+from pixelbrax_jax.distractors.clips import HELD_OUT, ClipBank, load_clips, warn_procedural
 from pixelbrax_jax.distractors.presets import resolve
 from pixelbrax_jax.distractors.video import Video
 from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.extras import install_extra
 from pixelbrax_jax.flags import default_flags
 from pixelbrax_jax.physics.base import Physics
+from pixelbrax_jax.physics.ranges import as_arrays
 from pixelbrax_jax.scene.cameras import choose_rig, rig_from_corner, seen_from, with_sides
 from pixelbrax_jax.scene.look import make_look
-from pixelbrax_jax.types import CameraRig, Clips, EnvParams, Look
+from pixelbrax_jax.types import CameraRig, Clips, DynamicsRanges, EnvParams, Look
 
 
 @default_flags()
@@ -69,6 +70,7 @@ def make(task: str | EnvConfig, **options: Any) -> tuple[PixelEnv, EnvParams]:
         rig=rig,
         look=_look(config, physics),
         episode_length=np.int32(min(filter(None, (config.episode_length, physics.time_limit)))),
+        dynamics=_dynamics(config, physics),
     )
     # Here, because a transfer in a program may be forbidden (`jax.transfer_guard`).
     return env, jax.device_put(params).replace(clips=_clips(config, env))
@@ -138,6 +140,18 @@ def _look(config: EnvConfig, physics: Physics) -> Look:
     return make_look(look, shadows=config.shadows)
 
 
+def _dynamics(config: EnvConfig, physics: Physics) -> DynamicsRanges | None:
+    for name in ("dynamics", "test_dynamics"):
+        if (value := getattr(config, name)) and not physics.varies:
+            raise ValueError(
+                f"{name}={value!r} is only for tasks that MuJoCo simulates, those of the DM "
+                "Control Suite, of Gymnasium, and your own of mjcf_physics, not for task "
+                f"{config.task!r}."
+            )
+    is_test = config.split in HELD_OUT.values()
+    return as_arrays((is_test and config.test_dynamics) or config.dynamics)
+
+
 def _check_device() -> None:
     """Start JAX; raise a RuntimeError with the fix if it has no device."""
     try:
@@ -157,7 +171,7 @@ def _clips(config: EnvConfig, env: PixelEnv) -> Clips | None:
     videos = [link for link in env.chain.links if isinstance(link, Video)]
     if clips is not None and not videos and env.obs_mode != "state":
         raise ValueError("clips are given without a video: add 'video' to the distractors.")
-    if split != "train" and not config.distractors:
+    if split != "train" and not config.distractors and not config.test_dynamics:
         raise ValueError(
             f"split={split!r} is given without a distractor that has splits: add one, such as "
             "'video', to the distractors."

@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from pixelbrax_jax.types import EnvParams
+from pixelbrax_jax.types import DynamicsRanges, EnvParams
 
 _TWO_OR_THREE = "2 or 3"
 
@@ -19,6 +19,7 @@ _NAMES: dict[tuple[int | str, ...], str] = {
         look.highlight look.ground_pitch look.headlight look.lamps.cos_cutoff look.lamps.diffuse
         look.lamps.highlight
     """,
+    (2,): " ".join(f"dynamics.{name}" for name in DynamicsRanges.__annotations__),
     (3,): "rig.track rig.eye rig.target rig.up look.light look.lamps.pos look.lamps.axis",
     (2, 3): "look.ground_rgb geoms.strings.ends",
     (_TWO_OR_THREE, 3): "look.sky",

@@ -16,14 +16,15 @@ from pixelbrax_jax.distractors.presets import as_tuple
 from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.memory import check_fits
 from pixelbrax_jax.physics.base import Physics, check_physics
+from pixelbrax_jax.physics.ranges import sample
 from pixelbrax_jax.renderer.base import draw, render
 from pixelbrax_jax.renderer.choice import why_no_kernel
 from pixelbrax_jax.scene.place import place
 from pixelbrax_jax.types import EnvParams, EnvState, Frame, Scene, SimState, Timestep
 from pixelbrax_jax.validation import check_positive_int
 
-_RESET_STREAM = 0
-"""Random stream of physics resets, folded into an episode's key."""
+_RESET_STREAM, _DYNAMICS_STREAM = 0, 2**31
+"""Random streams of physics resets and varied dynamics, folded into an episode's key."""
 
 
 @dataclass(frozen=True)
@@ -223,10 +224,14 @@ class PixelEnv(ProgramConfig):
         episode_key = jax.random.fold_in(key, episode)
         physics_key = jax.random.fold_in(episode_key, _RESET_STREAM)
         physics: Any = self.physics
+        varied = {}
+        if params.dynamics is not None:
+            dynamics_key = jax.random.fold_in(episode_key, _DYNAMICS_STREAM)
+            varied["dynamics"] = sample(params.dynamics, dynamics_key)
         if pose is None:
-            first = physics.reset(physics_key)
+            first = physics.reset(physics_key, *varied.values())
         else:
-            first = physics.from_qpos(*pose, key=physics_key)
+            first = physics.from_qpos(*pose, key=physics_key, **varied)
         return SimState(
             physics=first,
             episode=episode,

@@ -60,6 +60,8 @@ class Physics(abc.ABC):
             the ground from a corner.
         unfit_cameras: why other cameras of the model cannot be rigs, by name.
         time_limit: control steps after which the task ends every episode; None for no such limit.
+        varies: whether ``reset`` and ``from_qpos`` also take ``dynamics``: (5,) float32 multipliers
+            in the order of ``DynamicsRanges``, for the whole episode.
         followed_link: the link that a camera follows by default.
         look: lights, sky and ground of the model, used as looks ``default`` and ``dmc``.
         batch_last: whether a CPU is faster with the environments as last axis of a batch.
@@ -75,6 +77,7 @@ class Physics(abc.ABC):
     rigs: Mapping[str, CameraRig] = MappingProxyType({})
     unfit_cameras: Mapping[str, str] = MappingProxyType({})
     time_limit: int | None = None
+    varies: bool = False
     followed_link: int = 0
     look: Look | None = None
     batch_last: bool = True

@@ -38,7 +38,7 @@ class GuardedPhysics(Physics):
     a ``Recipe``, a pickle contains nothing else."""
 
     @abc.abstractmethod
-    def _reset(self, key: jax.Array) -> PhysicsState:
+    def _reset(self, key: jax.Array, *dynamics: jax.Array) -> PhysicsState:
         """Sample an initial state, finite or not; see ``Physics.reset``."""
 
     @abc.abstractmethod
@@ -69,9 +69,9 @@ class GuardedPhysics(Physics):
 
     @partial(jax.jit, static_argnums=0, inline=True)
     @under_default_flags
-    def reset(self, key: jax.Array) -> PhysicsState:
+    def reset(self, key: jax.Array, *dynamics: jax.Array) -> PhysicsState:
         """See ``Physics.reset``."""
-        return self._guard_first(self._reset(key))
+        return self._guard_first(self._reset(key, *dynamics))
 
     @partial(jax.jit, static_argnums=0, inline=True)
     @under_default_flags

@@ -33,12 +33,14 @@ def write_clips(folder: Path, names: str) -> Path:
     return folder
 
 
-def config(clips: Path | str | None, split: str = "train", distractors: str = "video") -> PPOConfig:
+def config(
+    clips: Path | str | None, split: str = "train", distractors: str = "video", **settings: object
+) -> PPOConfig:
     return PPOConfig().replace(
-        task="inverted_pendulum",
         distractors=distractors,
         clips=None if clips is None else str(clips),
         split=split,
+        **{"task": "inverted_pendulum"} | settings,
         **SIZE,
     )
 
@@ -111,9 +113,21 @@ def test_clips_of_another_folder_are_those_of_training_by_their_content(tmp_path
 def test_without_clips_nothing_is_held_out():
     colors = config(None, distractors="color")
     assert splits_of(colors) == ("clean", "train")
-    with pytest.raises(ValueError, match="needs clips, but the run has none; its splits: 'clean'"):
+    with pytest.raises(ValueError, match=r"needs clips or test_dynamics, .*; its splits: 'clean'"):
         make_split(colors, "test")
     assert splits_of(config("procedural", distractors="dcs-easy")) == ("clean", "train", "test")
+
+
+def test_varied_dynamics_have_splits():
+    plain = config(None, task="gym_hopper").replace(distractors=())
+    assert splits_of(plain) == ("clean",)
+    varied = plain.replace(dynamics="mass=2", test_dynamics="mass=3:4")
+    assert splits_of(varied) == ("clean", "train", "test")
+    ranges = [params.dynamics for _, (_, params) in make_splits(varied)]
+    assert ranges[0] is None
+    assert [list(r.mass) for r in ranges[1:]] == [[2, 2], [3, 4]]
+    with pytest.raises(ValueError, match="needs distractors or dynamics, but the run has none"):
+        make_split(plain, "train")
 
 
 def test_a_folder_that_is_elsewhere_is_told_with_the_place(tmp_path, monkeypatch):

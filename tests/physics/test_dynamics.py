@@ -154,7 +154,8 @@ def test_a_forked_process_has_threads_of_its_own(physics):
     """Without JAX, which cannot be used after a fork."""
     engine, model = physics.dynamics.native, physics.dynamics.model
     rows = 64
-    state = [np.zeros((rows, n), np.float32) for n in (model.nq, model.nv, 0, model.nv, model.nu)]
+    sizes = (model.nq, model.nv, 0, model.nv, model.nu, 0)
+    state = [np.zeros((rows, size), np.float32) for size in sizes]
     state[0][:] = model.qpos0
     shapes = (model.nq,), (model.nv,), (0,), (model.nv,), (model.nq,)
     shapes += (model.nbody, 3), (model.nbody, 4)

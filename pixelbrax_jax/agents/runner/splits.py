@@ -8,6 +8,7 @@ from typing import Any
 from pixelbrax_jax.agents.config import TrainConfig, make_env
 from pixelbrax_jax.agents.runner.progress import Report, silent
 from pixelbrax_jax.agents.runner.settings import clip_digests
+from pixelbrax_jax.distractors.clips import HELD_OUT
 from pixelbrax_jax.distractors.presets import resolve
 from pixelbrax_jax.distractors.video import Video
 from pixelbrax_jax.envs.pixel_env import PixelEnv
@@ -16,12 +17,14 @@ from pixelbrax_jax.validation import check_choice
 
 SPLITS = ("clean", "train", "test")
 
-HELD_OUT = {"train": "test", "paper-train": "paper-test"}
-"""Test split of each training split. Other splits serve for both, with test clips from another
-folder."""
-
-WITHOUT_DISTRACTORS: dict[str, Any] = {"distractors": (), "clips": None, "split": "train"}
-"""Options that remove all distractors from an environment."""
+CLEAN: dict[str, Any] = {
+    "distractors": (),
+    "clips": None,
+    "split": "train",
+    "dynamics": "",
+    "test_dynamics": "",
+}
+"""Options that remove all distractors from an environment, and varied dynamics."""
 
 
 class NoSplitError(ValueError):
@@ -31,10 +34,15 @@ class NoSplitError(ValueError):
 def splits_of(config: TrainConfig) -> tuple[str, ...]:
     """Return the names of the splits that fit the settings."""
     env = config.env
-    if not env.distractors:
+    if not (env.distractors or env.dynamics or env.test_dynamics):
         return SPLITS[:1]
-    plays = any(isinstance(link, Video) for link in resolve(env.distractors, env.task))
-    return SPLITS if plays else SPLITS[:2]
+    return SPLITS if plays_clips(config) or env.test_dynamics else SPLITS[:2]
+
+
+def plays_clips(config: TrainConfig) -> bool:
+    """Return whether the settings have a video distractor."""
+    env = config.env
+    return any(isinstance(link, Video) for link in resolve(env.distractors, env.task))
 
 
 def make_splits(
@@ -46,9 +54,9 @@ def make_splits(
 ) -> Iterator[tuple[str, tuple[PixelEnv, EnvParams]]]:
     """Yield name, environment and parameters of each split.
 
-    ``clean`` has no distractors. ``train`` has those of the training. ``test`` has the same
-    distractors with other clips: split ``test``, or ``paper-test`` if training uses
-    ``paper-train``. ``train`` needs distractors, and ``test`` needs video distractors.
+    ``clean`` has neither distractors nor varied dynamics. ``train`` has those of the training.
+    ``test`` has the same distractors with other clips: split ``test``, or ``paper-test`` if
+    training uses ``paper-train``; and ``test_dynamics``. It needs one of them.
 
     Without ``names`` it yields all available splits and reports the missing ones. ``shown`` are
     ``clip_digests`` of the training's clips; None uses the clips of ``config``. Errors are those of
@@ -79,14 +87,13 @@ def make_split(
     check_choice("split", name, SPLITS)
     names = splits_of(config)
     if name not in names:
-        has_any = bool(config.env.distractors)
-        lacks = "clips" if has_any else "distractors"
+        lacks = "clips or test_dynamics" if len(names) > 1 else "distractors or dynamics"
         raise ValueError(
             f"split {name!r} needs {lacks}, but the run has none; its splits: "
             f"{', '.join(map(repr, names))}."
         )
     if name == "clean":
-        return _make(config, **WITHOUT_DISTRACTORS)
+        return _make(config, **CLEAN)
     if name == "train":
         env, params = _make(config)
         if shown and clip_digests(params.clips) != list(shown):
@@ -100,6 +107,8 @@ def make_split(
         env, params = make_env(config, obs_mode="pixels", split=split)
     except (ValueError, FileNotFoundError) as error:
         raise NoSplitError(str(error)) from error
+    if not plays_clips(config):
+        return env, params
     shown = shown or clip_digests(_make(config)[1].clips)
     played = clip_digests(params.clips)
     if shared := sum(digest in shown for digest in played):

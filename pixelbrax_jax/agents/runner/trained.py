@@ -28,7 +28,7 @@ from pixelbrax_jax.agents.runner.settings import (
     former_settings,
     unknown_settings,
 )
-from pixelbrax_jax.agents.runner.splits import WITHOUT_DISTRACTORS, splits_of
+from pixelbrax_jax.agents.runner.splits import CLEAN, plays_clips
 from pixelbrax_jax.agents.train_state import Networks
 from pixelbrax_jax.distractors.presets import as_tuple
 from pixelbrax_jax.envs.vector import VectorPixelEnv
@@ -102,7 +102,7 @@ def load_trained(
     if not 0 <= run < num_seeds:
         raise ValueError(f"run must be from 0 to {num_seeds - 1}, got {run}.")
     # The networks depend on the observations of training, which may include the state.
-    env, params = make_env(config, **WITHOUT_DISTRACTORS)
+    env, params = make_env(config, **CLEAN)
     algorithm = ALGORITHMS[about["algorithm"]](config, VectorPixelEnv(env, config.num_envs))
     runs = Runs(algorithm, num_seeds)
     template = runs.template(params).networks
@@ -123,7 +123,7 @@ def with_clips(agent: Trained, clips: str | None) -> tuple[TrainConfig, Sequence
     config, shown = agent.algorithm.config, agent.clips
     if clips is None:
         return config, shown
-    if "test" not in splits_of(config):
+    if not plays_clips(config):
         raise ValueError(
             f"--clips {clips} needs a run with a video distractor; its distractors are "
             f"{', '.join(map(str, as_tuple(config.env.distractors))) or 'none'}."

@@ -34,6 +34,7 @@ class State(struct.PyTreeNode):
         ctrl: (A,) float32, the last controls, for rewards.
         target: metres, this episode's target: (3,) float32; (7,) with a unit quaternion if it is a
             body; (0,) for tasks without one.
+        multipliers: (5,) float32, of the dynamics in this episode; (0,) if nothing varies.
         remembered: arrays, what the next reward compares with; (0,) float32 for most tasks.
     """
 
@@ -43,6 +44,7 @@ class State(struct.PyTreeNode):
     qacc_warmstart: jax.Array
     ctrl: jax.Array
     target: jax.Array
+    multipliers: jax.Array
     remembered: Any
 
 
@@ -121,6 +123,7 @@ class Dynamics:
         qpos: jax.Array,
         qvel: jax.Array | None = None,
         target: jax.typing.ArrayLike | None = None,
+        multipliers: jax.Array | None = None,
     ) -> State:
         """Return a state without control or activation; without velocities it is at rest."""
         model = self.model
@@ -131,13 +134,14 @@ class Dynamics:
             qacc_warmstart=jnp.zeros(model.nv),
             ctrl=jnp.zeros(model.nu),
             target=jnp.zeros(0) if target is None else jnp.asarray(target, jnp.float32),
+            multipliers=jnp.zeros(0) if multipliers is None else jnp.asarray(multipliers),
             remembered=jnp.zeros(0),
         )
 
     def step(self, state: State, num_steps: int) -> tuple[State, Readings]:
         """Advance by at least one physics step with the state's controls."""
         names = ("qpos", "qvel", "act", "qacc_warmstart")
-        arrays = [getattr(state, name) for name in (*names, "ctrl")]
+        arrays = [getattr(state, name) for name in (*names, "ctrl", "multipliers")]
         shapes = [x.shape for x in (*arrays[:4], state.qpos)] + self._shapes
         results = self._call("step", arrays, shapes, num_steps)
         state = state.replace(**dict(zip(names, results, strict=False)))
@@ -145,7 +149,7 @@ class Dynamics:
 
     def first(self, state: State) -> Readings:
         """Return the readings of a first state; actuators are off, as in DM Control's resets."""
-        results = self._call("first", [state.qpos, state.qvel], self._shapes)
+        results = self._call("first", [state.qpos, state.qvel, state.multipliers], self._shapes)
         return self._readings(state, jnp.zeros_like(state.qpos), results)
 
     def _readings(self, state: State, moved: jax.Array, results: list[jax.Array]) -> Readings:

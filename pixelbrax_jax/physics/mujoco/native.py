@@ -8,13 +8,14 @@ import queue
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, partial
 from itertools import pairwise
 from typing import TypeVar
 
 import numpy as np
 
 from pixelbrax_jax.physics.mujoco.compatibility import loading_silenced
+from pixelbrax_jax.physics.mujoco.multipliers import MultipliedModels
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
 
 from mujoco.rollout import Rollout  # isort: skip  # MuJoCo is imported without OpenGL above
@@ -26,6 +27,7 @@ _STATE = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
 _OFF = mujoco.mjtDisableBit
 
 _Thing = TypeVar("_Thing")
+_Models = Sequence[mujoco.MjModel]
 
 
 class Native:
@@ -60,27 +62,29 @@ class Native:
         self._is_force = stages == int(mujoco.mjtStage.mjSTAGE_ACC)
         self._rest = np.concatenate([[0], model.qpos0, np.zeros(model.nv + model.na)])
         self._idle: dict[int, queue.SimpleQueue[list[mujoco.MjData]]] = {}
+        self._multiplied: dict[int, queue.SimpleQueue[MultipliedModels]] = {}
 
     def step(self, num_steps: int, *arrays: np.ndarray) -> None:
         """Advance ``qpos, qvel, act, qacc_warmstart, ctrl`` by at least one physics step.
 
-        Fills the first four, the change of ``qpos``, and ``xpos``, ``xquat`` and ``sensordata``.
-        Positions, velocities and their sensors are those after the last step; sensors of forces and
-        accelerations those of its start. The accelerations are those of the last step, from its
-        velocities. Then it fills the fields, as the last step and ``mj_rnePostConstraint`` leave
-        them.
+        The sixth array has multipliers of the dynamics, or no columns. Fills the first four, the
+        change of ``qpos``, and ``xpos``, ``xquat`` and ``sensordata``. Positions, velocities and
+        their sensors are those after the last step; sensors of forces and accelerations those of
+        its start. The accelerations are those of the last step, from its velocities. Then it fills
+        the fields, as the last step and ``mj_rnePostConstraint`` leave them.
         """
         model = self._moving
-        qpos, qvel, act, warmstart, ctrl, *results = arrays
+        qpos, qvel, act, warmstart, ctrl, multipliers, *results = arrays
         is_bad = ~(np.abs(ctrl) < mujoco.mjMAXVAL).all(axis=1)
         ctrl = np.where(is_bad[:, None], 0, ctrl)  # MuJoCo would do so without an error
         first = np.concatenate([np.zeros((len(qpos), 1)), qpos, qvel, act], 1, dtype=np.float64)
         moved, xpos, xquat, sensordata, *fields = results[4:]
         begin = first, ctrl.astype(np.float64), warmstart.astype(np.float64)
-        if fields:
-            last, qacc, sensors = self._step_each(num_steps, *begin, fields)
-        else:
-            last, qacc, sensors = self._step_all(num_steps, *begin)
+        with self._models(model, multipliers) as models:
+            if fields:
+                last, qacc, sensors = self._step_each(models, num_steps, *begin, fields)
+            else:
+                last, qacc, sensors = self._step_all(models, num_steps, *begin)
         # MuJoCo may end a row's steps where it warns.
         is_bad |= np.abs(last[:, 0] - num_steps * model.opt.timestep) > model.opt.timestep / 2
         is_bad |= ~(np.abs(qacc) < mujoco.mjMAXVAL).all(axis=1)
@@ -97,11 +101,16 @@ class Native:
         sensordata[:, self._is_force] = sensors[:, self._is_force]
 
     def _step_all(
-        self, num_steps: int, first: np.ndarray, ctrl: np.ndarray, warmstart: np.ndarray
+        self,
+        models: _Models,
+        num_steps: int,
+        first: np.ndarray,
+        ctrl: np.ndarray,
+        warmstart: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the last states, accelerations from their velocities, and sensors."""
         model = self._moving
-        states, sensors = self._roll(model, first, num_steps, ctrl, warmstart)
+        states, sensors = self._roll(model, first, num_steps, ctrl, warmstart, models=models)
         last, before = states[:, -1], states[:, -2] if num_steps > 1 else first
         velocities = slice(1 + model.nq, 1 + model.nq + model.nv)
         qacc = (last - before)[:, velocities] / model.opt.timestep
@@ -109,6 +118,7 @@ class Native:
 
     def _step_each(
         self,
+        models: _Models,
         num_steps: int,
         first: np.ndarray,
         ctrl: np.ndarray,
@@ -121,15 +131,17 @@ class Native:
 
         def step(data: mujoco.MjData, i: int) -> None:
             data.ctrl, data.qacc_warmstart = ctrl[i], warmstart[i]
-            mujoco.mj_step(self._moving, data, num_steps)
-            mujoco.mj_rnePostConstraint(self._moving, data)
-            mujoco.mj_getState(self._moving, data, last[i], _STATE)
+            mujoco.mj_step(models[i], data, num_steps)
+            mujoco.mj_rnePostConstraint(models[i], data)
+            mujoco.mj_getState(models[i], data, last[i], _STATE)
             qacc[i], sensors[i] = data.qacc_warmstart, data.sensordata
 
         self._fill(fields, first, step)
         return last, qacc, sensors
 
-    def first(self, qpos: np.ndarray, qvel: np.ndarray, *results: np.ndarray) -> None:
+    def first(
+        self, qpos: np.ndarray, qvel: np.ndarray, multipliers: np.ndarray, *results: np.ndarray
+    ) -> None:
         """Compute what ``qpos`` and ``qvel`` say, with actuators off, as DM Control's resets do.
 
         Fills ``xpos``, ``xquat``, ``sensordata`` and the fields, with ``cfrc_ext`` 0.
@@ -137,15 +149,17 @@ class Native:
         xpos, xquat, sensordata, *fields = results
         parts = [np.zeros((len(qpos), 1)), qpos, qvel, np.zeros((len(qpos), self._moving.na))]
         first = np.concatenate(parts, 1, dtype=np.float64)
-        _, found = self._roll(self._resting, first, 1)
+        with self._models(self._resting, multipliers) as models:
+            _, found = self._roll(self._resting, first, 1, models=models)
         _read(found[:, 0], xpos, xquat, sensordata)
         if fields:
-            self._fill(fields, first, self._look)
+            with self._models(self._moving, multipliers) as models:
+                self._fill(fields, first, partial(self._look, models))
 
-    def _look(self, data: mujoco.MjData, i: int) -> None:
-        del i
+    @staticmethod
+    def _look(models: _Models, data: mujoco.MjData, i: int) -> None:
         data.ctrl, data.cfrc_ext = 0, 0
-        mujoco.mj_forward(self._moving, data)
+        mujoco.mj_forward(models[i], data)
 
     def _fill(
         self,
@@ -189,6 +203,7 @@ class Native:
         num_steps: int,
         ctrl: np.ndarray | None = None,
         warmstart: np.ndarray | None = None,
+        models: _Models = (),
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return (N, num_steps, ...) states after each step, and sensors before it."""
         num_rows = len(first)
@@ -202,7 +217,7 @@ class Native:
             self._data(model, max(1, rollout.nthread)) as data,
         ):
             rollout.rollout(
-                [model] * num_rows,
+                models or [model] * num_rows,
                 data,
                 np.ascontiguousarray(first),
                 controls,
@@ -213,6 +228,16 @@ class Native:
                 skip_checks=True,
             )
         return states, sensors
+
+    @contextmanager
+    def _models(self, model: mujoco.MjModel, multipliers: np.ndarray) -> Iterator[_Models]:
+        """Yield a model for each row of (N, 5) or (N, 0) multipliers."""
+        if not multipliers.shape[1]:
+            yield [model] * len(multipliers)
+            return
+        idle = self._multiplied.setdefault(id(model), queue.SimpleQueue())
+        with _borrowed(idle, lambda: MultipliedModels(model)) as models:
+            yield models.of_rows(multipliers)
 
     @contextmanager
     def _data(self, model: mujoco.MjModel, count: int) -> Iterator[list[mujoco.MjData]]:

@@ -35,6 +35,7 @@ class MujocoPhysics(GuardedPhysics):
     """
 
     backend = "mujoco"
+    varies = True
     # XLA's CPU library YNNPACK is slower than XLA's own loops for the small sums and products of
     # these models.
     compiler_options = MappingProxyType({"xla_cpu_experimental_ynn_fusion_type": ""})
@@ -122,22 +123,27 @@ class MujocoPhysics(GuardedPhysics):
             non_finite=jnp.zeros((), bool),
         )
 
-    def first(self, key: jax.Array) -> tuple[State, Readings]:
+    def first(self, key: jax.Array, dynamics: jax.Array | None = None) -> tuple[State, Readings]:
         """Sample an initial state; return it and its readings."""
-        return self._settle(self._formulas.start(self.dynamics, key))
+        return self._settle(self._formulas.start(self.dynamics, key), dynamics)
 
     @under_default_flags
     def from_qpos(
-        self, q: jax.Array, qd: jax.Array | None = None, *, key: jax.Array | None = None
+        self,
+        q: jax.Array,
+        qd: jax.Array | None = None,
+        *,
+        key: jax.Array | None = None,
+        dynamics: jax.Array | None = None,
     ) -> PhysicsState:
         """See ``Physics.from_qpos``; ``key`` samples a target that is not a joint."""
         q, qd = check_pose(self._model, q, qd)
         start = self._formulas.start(self.dynamics, jax.random.key(0) if key is None else key)
         start = start.replace(qpos=with_unit_rotations(self._model, q), qvel=qd)
-        return self._guard_first(self.observe(*self._settle(start)))
+        return self._guard_first(self.observe(*self._settle(start, dynamics)))
 
-    def _settle(self, start: Start) -> tuple[State, Readings]:
-        state = self.dynamics.state(start.qpos, start.qvel, start.target)
+    def _settle(self, start: Start, dynamics: jax.Array | None) -> tuple[State, Readings]:
+        state = self.dynamics.state(start.qpos, start.qvel, start.target, dynamics)
         readings = self.dynamics.first(state)
         remembered = self._formulas.remember(Snapshot(self._model, state, readings))
         return state.replace(remembered=remembered), readings
@@ -147,8 +153,8 @@ class MujocoPhysics(GuardedPhysics):
         action = jnp.asarray(action, jnp.float32)
         return self.dynamics.step(state.replace(ctrl=self.control(action)), self._formulas.substeps)
 
-    def _reset(self, key: jax.Array) -> PhysicsState:
-        return self.observe(*self.first(key))
+    def _reset(self, key: jax.Array, *dynamics: jax.Array) -> PhysicsState:
+        return self.observe(*self.first(key, *dynamics))
 
     def _step(self, state: PhysicsState, action: jax.Array) -> PhysicsState:
         return self.observe(*self.move(state.engine, action))

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax.physics.mujoco.compatibility import import_silenced, load_onto_own_device
+from pixelbrax_jax.physics.mujoco.multipliers import multiplied
 from pixelbrax_jax.physics.mujoco.omissions import check_simulated
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
 from pixelbrax_jax.physics.mujoco.substitutes import substituted
@@ -68,18 +69,19 @@ class Xla:
         act: jax.Array,
         qacc_warmstart: jax.Array,
         ctrl: jax.Array,
+        multipliers: jax.Array,
     ) -> Arrays:
         """See ``Native.step``."""
-        first = qpos
+        first, model = qpos, _changed(self._moving, multipliers)
 
         def one(carry: Arrays) -> Arrays:
             qpos, qvel, act, warmstart, *_ = carry
             data = self._data(qpos, qvel, act=act, qacc_warmstart=warmstart, ctrl=ctrl)
             with substituted(self._model):
-                data = mjx.step(self._moving, data)
+                data = mjx.step(model, data)
             return (
                 *(data.qpos, data.qvel, data.act, data.qacc_warmstart),
-                *(data.sensordata, *self._left(data, is_after_step=True)),
+                *(data.sensordata, *self._left(model, data, is_after_step=True)),
             )
 
         carry: Arrays = (qpos, qvel, act, qacc_warmstart, jnp.zeros(self._model.nsensordata))
@@ -94,21 +96,22 @@ class Xla:
         moved = qpos - first
         return qpos, qvel, act, warmstart, moved, *self._readings(data), *left
 
-    def first(self, qpos: jax.Array, qvel: jax.Array) -> Arrays:
+    def first(self, qpos: jax.Array, qvel: jax.Array, multipliers: jax.Array) -> Arrays:
         """See ``Native.first``; without forces where no observation of a first state has any."""
         data = self._data(qpos, qvel)
         left: Arrays = ()
         if self._starts_with_forces:
+            model = _changed(self._passive, multipliers)
             with substituted(self._model):
-                forward = mjx.forward(self._passive, data)
+                forward = mjx.forward(model, data)
             data = data.replace(sensordata=forward.sensordata)
-            left = self._left(forward, is_after_step=False)
+            left = self._left(model, forward, is_after_step=False)
         return *self._readings(data), *left
 
-    def _left(self, data: Any, *, is_after_step: bool) -> Arrays:
+    def _left(self, model: Any, data: Any, *, is_after_step: bool) -> Arrays:
         """Return the fields of ``MjData`` that a step leaves."""
         if is_after_step and "cfrc_ext" in self._fields:
-            data = smooth.rne_postconstraint(self._mx, data)
+            data = smooth.rne_postconstraint(model, data)
         return tuple(getattr(data, name) for name in self._fields)
 
     def clearances(self, qpos: jax.Array) -> Arrays:
@@ -136,6 +139,10 @@ class Xla:
     def _data(self, qpos: jax.Array, qvel: jax.Array, **fields: jax.Array) -> Any:
         data = mjx.make_data(self.simulated, impl="jax")
         return data.replace(qpos=qpos, qvel=qvel, **fields)
+
+
+def _changed(model: Any, multipliers: jax.Array) -> Any:
+    return model.tree_replace(multiplied(model, multipliers)) if len(multipliers) else model
 
 
 def _simulated(model: mujoco.MjModel, out_of_reach: Iterable[str]) -> mujoco.MjModel:

@@ -180,7 +180,7 @@ def test_a_long_chain_is_computed_once():
     qpos = jax.random.normal(jax.random.key(0), (4, model.nq))
 
     def places(qpos):
-        return dynamics.xla.first(qpos, jnp.zeros(model.nv))[0]
+        return dynamics.xla.first(qpos, jnp.zeros(model.nv), jnp.zeros(0))[0]
 
     lowered = jax.jit(jax.vmap(places)).lower(qpos)
     compiled = lowered.compile(compiler_options=optimized())

@@ -1,0 +1,79 @@
+"""Ranges of multipliers of a task's dynamics, as options."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from numbers import Real
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pixelbrax_jax.types import DynamicsRanges
+from pixelbrax_jax.validation import check_choice
+
+MULTIPLIERS = tuple(DynamicsRanges.__annotations__)
+"""Names of what is multiplied, in the order of a state's multipliers."""
+
+Ranges = str | Mapping[str, float | tuple[float, float]]
+
+
+def check_ranges(option: str, value: Any) -> str:
+    """Return ranges as text, ``"friction=0.5:2.0,gravity=0.8"``, sorted by name.
+
+    ``value`` is such a text, or a mapping from names to a multiplier or to the lowest and highest.
+
+    Raises:
+        TypeError: it is neither.
+        ValueError: a name is unknown, or the numbers are not positive, finite and in order.
+    """
+    if isinstance(value, str):
+        parts = [part.partition("=") for part in value.split(",") if part]
+        value = {name.strip(): tuple(numbers.split(":")) for name, _, numbers in parts}
+    if not isinstance(value, Mapping):
+        raise TypeError(
+            f"{option} must be a text such as 'friction=0.5:2,mass=1.2' or a dictionary such as "
+            f"{{'friction': (0.5, 2), 'mass': 1.2}}, got {value!r}."
+        )
+    for name in value:
+        check_choice(f"multiplier in {option}", name, MULTIPLIERS)
+    found = {name: _range(option, name, value[name]) for name in MULTIPLIERS if name in value}
+    return ",".join(
+        f"{name}={low!r}" + (f":{high!r}" if high != low else "")
+        for name, (low, high) in found.items()
+    )
+
+
+def _range(option: str, name: str, numbers: Any) -> tuple[float, float]:
+    pair = (numbers,) if isinstance(numbers, Real) else numbers
+    try:
+        low, high = (float(number) for number in (pair * 2 if len(pair) == 1 else pair))
+    except (TypeError, ValueError):
+        low = high = math.nan
+    if not 0 < low <= high < math.inf:
+        raise ValueError(
+            f"{option} of {name} must be a positive number or two, the lowest first, got "
+            f"{numbers!r}."
+        )
+    return low, high
+
+
+def as_arrays(value: Ranges) -> DynamicsRanges | None:
+    """Return ranges as ``check_ranges`` takes them as arrays; None if nothing varies."""
+    text = check_ranges("dynamics", value)
+    if not text:
+        return None
+    ranges = {name: np.ones(2, np.float32) for name in MULTIPLIERS}
+    for part in text.split(","):
+        name, _, numbers = part.partition("=")
+        low, _, high = numbers.partition(":")
+        ranges[name] = np.array([low, high or low], np.float32)
+    return DynamicsRanges(**ranges)  # type: ignore[arg-type]
+
+
+def sample(ranges: DynamicsRanges, key: jax.Array) -> jax.Array:
+    """Return (5,) float32 multipliers, uniform in their ranges."""
+    low, high = jnp.stack([getattr(ranges, name) for name in MULTIPLIERS], axis=1)
+    return low + (high - low) * jax.random.uniform(key, low.shape)
