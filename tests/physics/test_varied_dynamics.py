@@ -172,7 +172,7 @@ def test_texts_and_dictionaries_are_the_same():
     ("value", "error", "message"),
     [
         ({"weight": 1}, ValueError, "unknown multiplier in dynamics: 'weight'"),
-        ("fricton=1", ValueError, "Did you mean 'friction'"),
+        ("frictions=1", ValueError, "Did you mean 'friction'"),
         ({"mass": (2, 1)}, ValueError, r"dynamics of mass must be a positive .* got \(2, 1\)"),
         ("mass", ValueError, "positive number or two"),
         ("mass=1:2:3", ValueError, "positive number or two"),
