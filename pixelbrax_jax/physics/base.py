@@ -61,6 +61,7 @@ class Physics(abc.ABC):
         unfit_cameras: why other cameras of the model cannot be rigs, by name.
         time_limit: control steps after which the task ends every episode; None for no such limit.
         followed_link: the link that a camera follows by default.
+        hull_errors: metres by name of a mesh, how far what is drawn leaves its convex hull.
         look: lights, sky and ground of the model, used as looks ``default`` and ``dmc``.
         batch_last: whether a CPU is faster with the environments as last axis of a batch.
         compiler_options: XLA options for fast programs on a CPU.
@@ -76,6 +77,7 @@ class Physics(abc.ABC):
     unfit_cameras: Mapping[str, str] = MappingProxyType({})
     time_limit: int | None = None
     followed_link: int = 0
+    hull_errors: Mapping[str, float] = MappingProxyType({})
     look: Look | None = None
     batch_last: bool = True
     compiler_options: Mapping[str, Any] = MappingProxyType({})

@@ -15,6 +15,7 @@ from pixelbrax_jax import spatial
 from pixelbrax_jax.renderer import shading
 from pixelbrax_jax.renderer.intersect import (
     Axes,
+    Fold,
     Hit,
     Vector,
     at_least,
@@ -99,7 +100,7 @@ def see(view: View, ray: Vector, near: Near | None = None) -> Frame:
     look, geoms, shape, count = view.look, view.geoms, ray[0].shape, len(view.order)
 
     def solid(g: int) -> _Solid:
-        return _solid(view, g)
+        return _solid(view, g, in_kernel=near is not None)
 
     def hit(g: int) -> Hit:
         return solid(g).hit(ray, solid(g).center)
@@ -214,15 +215,17 @@ def render(
 class _Solid(NamedTuple):
     center: Vector
     axes: Axes
-    size: Vector
+    size: Vector | Fold
     hit: Callable[[Vector, Vector], Hit]
     """Where rays enter it, with its center at another place."""
 
 
-def _solid(view: View, g: int) -> _Solid:
+def _solid(view: View, g: int, in_kernel: bool) -> _Solid:
     geoms = view.geoms
     x, y, z = (tuple(view.xmat[g, k, axis] for k in range(3)) for axis in range(3))
-    size = tuple(geoms.size[g, k] for k in range(3))
+    size: Vector | Fold = tuple(geoms.size[g, k] for k in range(3))
+    if geoms.kind[g] == GeomKind.MESH:
+        size = _planes(geoms, g, in_kernel)
     hit = partial(
         intersect,
         geoms.kind[g],
@@ -232,6 +235,25 @@ def _solid(view: View, g: int) -> _Solid:
         distant=geoms.distant,
     )
     return _Solid(tuple(view.pos[g, k] for k in range(3)), (x, y, z), size, hit)
+
+
+def _planes(geoms: Geoms, g: int, in_kernel: bool) -> Fold:
+    rows = geoms.rows_of_planes(g)
+
+    def plane(row: Any) -> Vector:
+        return tuple(geoms.planes[row, k] for k in range(4))  # type: ignore[index]
+
+    def fold(update: Callable[[Any, Vector], Any], value: Any) -> Any:
+        if in_kernel:
+            # A loop, because hundreds of planes in a row would take minutes to compile.
+            first, end = (np.int32(row) for row in rows)
+            return jax.lax.fori_loop(first, end, lambda row, old: update(old, plane(row)), value)
+        # On a CPU a loop would keep images of all values.
+        for row in range(*rows):
+            value = update(value, plane(row))
+        return value
+
+    return fold
 
 
 def _vector(array: Any) -> Vector:

@@ -24,7 +24,13 @@ from pixelbrax_jax.physics.mujoco.compatibility import (
     import_silenced,
     known_warnings_silenced,
 )
-from pixelbrax_jax.physics.mujoco.geometry import VISIBLE_GROUPS, as_geoms, geom_shapes, site_shapes
+from pixelbrax_jax.physics.mujoco.geometry import (
+    VISIBLE_GROUPS,
+    as_geoms,
+    geom_shapes,
+    hull_errors,
+    site_shapes,
+)
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
 from pixelbrax_jax.physics.mujoco.poses import check_pose, masses_below, with_unit_rotations
 from pixelbrax_jax.physics.mujoco.scene import COM_LINK, tracked_body
@@ -132,6 +138,7 @@ class BraxPhysics(GuardedPhysics):
                 self.link_names += (COM_LINK,)
                 self._com_masses = masses_below(model, tracked_body(model))
         self.rigs = rigs
+        self.hull_errors = hull_errors(shapes)
         self.geoms = as_geoms([shape._replace(material="") for shape in shapes])
         self._model = model
         self._source = env

@@ -57,6 +57,7 @@ class MujocoPhysics(GuardedPhysics):
             formulas.edit(edited)
         scene = read_scene(model, formulas.camera, movable=formulas.movable)
         self.geoms, self.look = scene.geoms, scene.look
+        self.hull_errors = scene.hull_errors
         default = scene.rig or next(iter(rigs.values()), None)
         self.rigs = {**scene.rigs, **rigs} | ({"default": default} if default else {})
         self.unfit_cameras = unfit_cameras(model)
