@@ -238,22 +238,26 @@ def _solid(view: View, g: int, in_kernel: bool) -> _Solid:
 
 
 def _planes(geoms: Geoms, g: int, in_kernel: bool) -> Fold:
-    rows = geoms.rows_of_planes(g)
+    first, end = geoms.rows_of_planes(g)
+    planes: Any = geoms.planes
 
-    def plane(row: Any) -> Vector:
-        return tuple(geoms.planes[row, k] for k in range(4))  # type: ignore[index]
+    def in_a_loop(prepare: Callable, update: Callable, value: Any) -> Any:
+        # Hundreds of planes in a row would take minutes to compile.
+        def one(row: jax.Array, value: Any) -> Any:
+            return update(value, prepare(tuple(planes[row, k] for k in range(4))))
 
-    def fold(update: Callable[[Any, Vector], Any], value: Any) -> Any:
-        if in_kernel:
-            # A loop, because hundreds of planes in a row would take minutes to compile.
-            first, end = (np.int32(row) for row in rows)
-            return jax.lax.fori_loop(first, end, lambda row, old: update(old, plane(row)), value)
-        # On a CPU a loop would keep images of all values.
-        for row in range(*rows):
-            value = update(value, plane(row))
+        return jax.lax.fori_loop(np.int32(first), np.int32(end), one, value)
+
+    def in_a_row(prepare: Callable, update: Callable, value: Any) -> Any:
+        # A loop would keep images of all values. The barrier keeps what differs by plane alone out
+        # of the loop over pixels.
+        columns = prepare(tuple(planes[first:end, k] for k in range(4)))
+        columns = jax.lax.optimization_barrier(columns)
+        for row in range(end - first):
+            value = update(value, tuple(column[row] for column in columns))
         return value
 
-    return fold
+    return in_a_loop if in_kernel else in_a_row
 
 
 def _vector(array: Any) -> Vector:

@@ -20,10 +20,10 @@ from pixelbrax_jax.types import GeomKind
 
 Vector = Sequence[Any]
 Axes = tuple[Vector, Vector, Vector]
-Fold = Callable[[Callable[[Any, Vector], Any], Any], Any]
-"""``fold(update, value)`` applies ``value = update(value, plane)`` for each half-space of a mesh,
-and returns the last value. A plane is its outer unit normal and its distance from the center, in
-the geom's frame."""
+Fold = Callable[[Callable[[Vector], Vector], Callable[[Any, Vector], Any], Any], Any]
+"""``fold(prepare, update, value)`` applies ``value = update(value, prepare(plane))`` for each
+half-space of a mesh, and returns the last value. A plane is its outer unit normal and its distance
+from the center, in the geom's frame."""
 
 _TINY = 1e-7
 """Avoids a division by zero for a ray parallel to an axis or a face."""
@@ -213,19 +213,17 @@ def _mesh(ray: Vector, pos: Vector, axes: Axes, size: Fold) -> Hit:
     o = [-dot(pos, axis) for axis in axes]
     shape = jnp.broadcast_shapes(jnp.shape(ray[0]), jnp.shape(pos[0]))
 
+    def prepare(plane: Vector) -> Vector:
+        *own, offset = plane
+        # Outside of the planes that the ray crosses inwards, inside of the others.
+        side = offset - dot(own, o) if by_ray else dot(own, d)
+        inv = 1.0 / jnp.where(jnp.abs(side) < _TINY, _TINY, side)
+        return (*own, *(n * inv for n in own), offset * inv, inv < 0.0)
+
     def cut(best: tuple[Any, ...], plane: Vector) -> tuple[Any, ...]:
         enter, leave, *normal = best
-        *own, offset = plane
-        if by_ray:
-            # Outside of the planes that the ray crosses inwards, inside of the others.
-            scalar = offset - dot(own, o)
-            inv = 1.0 / jnp.where(jnp.abs(scalar) < _TINY, _TINY, scalar)
-            order = dot([n * inv for n in own], d)
-        else:
-            scalar = dot(own, d)
-            inv = 1.0 / jnp.where(jnp.abs(scalar) < _TINY, _TINY, scalar)
-            order = dot([n * inv for n in own], o) - offset * inv
-        inwards = inv < 0.0
+        *own, x, y, z, shift, inwards = plane
+        order = dot((x, y, z), d) if by_ray else dot((x, y, z), o) - shift
         first = inwards & (order < enter)
         enter = jnp.where(first, order, enter)
         leave = jnp.where(inwards, leave, at_least(order, leave))
@@ -233,7 +231,7 @@ def _mesh(ray: Vector, pos: Vector, axes: Axes, size: Fold) -> Hit:
 
     never = jnp.full(shape, _FAR)
     start = (never, jnp.full(shape, _TINY) if by_ray else -never, *[jnp.zeros(shape)] * 3)
-    enter, leave, *normal = size(cut, start)
+    enter, leave, *normal = size(prepare, cut, start)
     hit = (enter >= leave) & (enter < _FAR)
     t = jnp.where(hit, 1.0 / enter if by_ray else -enter, -1.0)
     return Hit(t, lambda v, ray_v: dot(normal, [dot(axis, v) for axis in axes]))
