@@ -183,16 +183,22 @@ def _kind_name(number: int) -> str:
 def _check_kinds(model: mujoco.MjModel, groups: Collection[int]) -> None:
     """Raise a ValueError that names everything visible that has no formula."""
     found = []
-    for kind in ("geom", "flex", "skin"):
-        for i in range(getattr(model, f"n{kind}")):
-            group, rgba = getattr(model, f"{kind}_group")[i], getattr(model, f"{kind}_rgba")[i]
-            name, label = getattr(model, kind)(i).name, kind
-            if kind == "geom":
-                label = _kind_name(model.geom_type[i])
-                rgba = resolve_rgba(model, rgba, model.geom_matid[i])
-            is_known = label.upper() in GeomKind.__members__
-            if group in groups and rgba[3] > 0 and not is_known:
-                found.append(f"{label} {name or f'{label}/{i}'!r} (group {group})")
+    objects = (
+        ("geom", mujoco.mjtObj.mjOBJ_GEOM),
+        ("flex", mujoco.mjtObj.mjOBJ_FLEX),
+        ("skin", mujoco.mjtObj.mjOBJ_SKIN),
+    )
+    for element, number in objects:
+        groups_of, colors = getattr(model, f"{element}_group"), getattr(model, f"{element}_rgba")
+        for i, (group, rgba) in enumerate(zip(groups_of, colors, strict=True)):
+            kind, shown = element, rgba
+            if element == "geom":
+                kind = _kind_name(model.geom_type[i])
+                shown = resolve_rgba(model, rgba, model.geom_matid[i])
+            is_known = kind.upper() in GeomKind.__members__
+            if group in groups and shown[3] > 0 and not is_known:
+                name = mujoco.mj_id2name(model, number, i) or f"{kind}/{i}"
+                found.append(f"{kind} {name!r} (group {group})")
     if found:
         raise ValueError(
             f"cannot be rendered: {', '.join(found)}. Supported geoms: "
