@@ -215,7 +215,7 @@ def render(
 class _Solid(NamedTuple):
     center: Vector
     axes: Axes
-    size: Vector | Fold
+    size: Any
     hit: Callable[[Vector, Vector], Hit]
     """Where rays enter it, with its center at another place."""
 
@@ -223,7 +223,7 @@ class _Solid(NamedTuple):
 def _solid(view: View, g: int, in_kernel: bool) -> _Solid:
     geoms = view.geoms
     x, y, z = (tuple(view.xmat[g, k, axis] for k in range(3)) for axis in range(3))
-    size: Vector | Fold = tuple(geoms.size[g, k] for k in range(3))
+    size: Any = tuple(geoms.size[g, k] for k in range(3))
     if geoms.kind[g] == GeomKind.MESH:
         size = _planes(geoms, g, in_kernel)
     hit = partial(

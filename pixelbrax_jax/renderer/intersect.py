@@ -259,13 +259,13 @@ def intersect(
     ray: Vector,
     pos: Vector,
     axes: Axes,
-    size: Vector | Fold,
+    size: Any,
     bounded: bool = False,
     distant: bool = False,
 ) -> Hit:
     """Return where unit rays from the origin enter a geom.
 
-    ``pos`` is its center in metres, and ``size`` that of ``Geoms``, for a mesh its half-spaces.
+    ``pos`` is its center in metres; ``size`` is a vector as in ``Geoms``, for a mesh a ``Fold``.
     """
     if bounded and kind == GeomKind.PLANE:
         return _rectangle(ray, pos, axes, size)

@@ -149,6 +149,14 @@ def test_missing_file(tmp_path):
             build(path)
 
 
+def test_meshes_are_convex_hulls():
+    mesh = """<asset><mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset>
+    <worldbody><geom name="statue" type="mesh" mesh="m"/>"""
+    physics = build(CART.replace("<worldbody>", mesh))
+    assert physics.geoms.num_planes[physics.geoms.name.index("statue")] == 4
+    assert physics.hull_errors == {"statue": 0.0}
+
+
 HILLS = """<asset><hfield name="h" nrow="3" ncol="3" size="1 1 1 1"/></asset>
 <worldbody><geom name="hills" type="hfield" hfield="h"/>"""
 
