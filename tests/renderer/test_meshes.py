@@ -21,6 +21,7 @@ from pixelbrax_jax.spatial import look_at, make_rig
 from pixelbrax_jax.types import FAR
 from tests.renderer import scenes
 from tests.renderer.mujoco_rays import cast_rays
+from tests.renderer.test_lamps import LAMP
 
 RENDERERS = ("reference", "fused", "pallas")
 SIZE = 32
@@ -31,7 +32,7 @@ pytestmark = pytest.mark.usefixtures("interpreted")
 
 def box_scene(kind):
     """A slanted box or the same mesh beside a ball on the ground, with shadows and a lamp."""
-    look = make_look("default", shadows=True)
+    look = make_look("default", shadows=True).replace(lamps=(LAMP,))
     size = HALF if kind == GeomKind.BOX else (float(np.linalg.norm(HALF)), 0, 0)
     mesh = {"planes": scenes.box_planes(HALF), "num_planes": (0, 6, 0)}
     scene = scenes.scene_of(
