@@ -24,7 +24,13 @@ from pixelbrax_jax.physics.mujoco.compatibility import (
     import_silenced,
     known_warnings_silenced,
 )
-from pixelbrax_jax.physics.mujoco.geometry import VISIBLE_GROUPS, as_geoms, geom_shapes, site_shapes
+from pixelbrax_jax.physics.mujoco.geometry import (
+    VISIBLE_GROUPS,
+    as_geoms,
+    geom_shapes,
+    hull_errors,
+    site_shapes,
+)
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
 from pixelbrax_jax.physics.mujoco.poses import (
     center_of_mass,
@@ -134,6 +140,7 @@ class BraxPhysics(GuardedPhysics):
             if any(rig.link == com_link for rig in rigs.values()):
                 self.link_names += (COM_LINK,)
         self.rigs = rigs
+        self.hull_errors = hull_errors(shapes)
         self.geoms = as_geoms([shape._replace(material="") for shape in shapes])
         self._model = model
         self._source = env

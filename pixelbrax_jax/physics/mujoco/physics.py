@@ -68,6 +68,7 @@ class MujocoPhysics(GuardedPhysics):
             geom_groups=geom_groups,
         )
         self.geoms, self.look = scene.geoms, scene.look
+        self.hull_errors = scene.hull_errors
         default = scene.rigs.get("default") or scene.rig or next(iter(rigs.values()), None)
         self.rigs = {**scene.rigs, **rigs} | ({"default": default} if default else {})
         self.unfit_cameras = unfit_cameras(model)
