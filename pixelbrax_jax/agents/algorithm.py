@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -87,6 +87,11 @@ class Algorithm(ABC):
 
         Needs only the networks in ``acting``. A key samples the actions; None returns the best.
         """
+
+    def warnings(self, record: Mapping[str, float]) -> list[str]:
+        """Return what a user should know about a record of the metrics; told once in a run."""
+        del record
+        return []
 
     @property
     def auxiliary_every(self) -> int:
