@@ -65,6 +65,7 @@ _DRQV2 = {
     "action_repeat": 2,
     "num_envs": 1,
     "num_steps": 2,
+    "buffer_size": 1_000_000,
     "total_steps": 1_100_000,
 }
 # For many environments, small images and few updates, after Squint (arXiv 2602.21203).
@@ -124,6 +125,7 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
             "num_envs": 256,
             "batch_size": 512,
             "learning_starts": 10_000,
+            "buffer_size": 1_000_000,
             "std_steps": 500_000,
             "hidden_dim": 512,
             "bfloat16": True,

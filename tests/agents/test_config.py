@@ -19,7 +19,7 @@ from pixelbrax_jax.config import EnvConfig
 from pixelbrax_jax.distractors.video import Video
 from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.types import Camera
-from tests.agents.small import SMALL, ball_envs
+from tests.agents.small import SMALL, ball_envs, settings_of
 
 CONFIGS = (PPOConfig, PPGConfig, DCPGConfig)
 
@@ -163,9 +163,10 @@ def test_the_environment_is_the_one_that_is_described():
 )
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_environments_that_are_not_those_of_the_settings_are_told(name, changes, message):
-    config = ALGORITHMS[name].config_class(**SMALL | {"total_steps": 10_000_000})
+    kind = ALGORITHMS[name]
+    config = kind.config_class(**settings_of(kind) | {"total_steps": 10_000_000})
     with pytest.raises(ValueError, match=re.escape(message)):
-        ALGORITHMS[name](config.replace(**changes), ball_envs())
+        kind(config.replace(**changes), ball_envs())
 
 
 class Unhashable(VectorPixelEnv):

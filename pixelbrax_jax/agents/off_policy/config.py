@@ -22,7 +22,7 @@ CRITICS = ("clipped", "c51")
 
 @dataclass(frozen=True)
 class DrQv2Config(TrainConfig):
-    """Settings of DrQ-v2; the defaults are those of its code where it has the setting."""
+    """Settings of DrQ-v2; but for ``num_envs`` and ``buffer_size`` the defaults are its code's."""
 
     memory_settings: ClassVar[tuple[str, ...]] = ("buffer_size",)
 
@@ -41,7 +41,7 @@ class DrQv2Config(TrainConfig):
     """Number of steps T of each environment between updates."""
     replay_ratio: Positive = 0.5
     """Updates per step of one environment: an iteration has replay_ratio x N x T of them."""
-    buffer_size: PositiveInt = 1_000_000
+    buffer_size: PositiveInt = 100_000
     """Steps of all environments that the replay stores, rounded up to whole iterations."""
     learning_starts: PositiveInt = 2000
     """Steps of all environments with uniform actions; learning begins when so many are stored."""

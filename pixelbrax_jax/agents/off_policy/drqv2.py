@@ -112,6 +112,7 @@ class DrQv2(Algorithm):
         std = jnp.float32(schedule(steps))
 
         def choose(pixels: jax.Array, seen: None, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+            del seen
             noise_key, uniform_key = jax.random.split(key)
             action = noisy(self.act(state.networks, pixels), std, noise_key)
             uniform = jax.random.uniform(uniform_key, action.shape, minval=-1.0)
@@ -266,7 +267,7 @@ class DrQv2(Algorithm):
         loss = batch.mean(error)
         metrics = {
             "loss/critic": loss,
-            "q/mean": batch.mean(self._values(outputs).mean(0)),
+            "q/mean": batch.mean(self.values(outputs).mean(0)),
             "q/target_mean": batch.mean(goal.mean(0)),
             "q/target_min": goal.min(),
             "q/target_max": goal.max(),
@@ -285,12 +286,12 @@ class DrQv2(Algorithm):
         """Return the negative value of the actor's noisy action, twice."""
         mean_action = self._apply("actor", {"actor": actor}, features)
         action = noisy(mean_action, std, key, self.config.std_clip)
-        values = self._values(self._apply("critic", networks, features, action))
+        values = self.values(self._apply("critic", networks, features, action))
         value = values.min(0) if self.config.critic == "clipped" else values.mean(0)
         loss = -batch.mean(value)
         return loss, loss
 
-    def _values(self, outputs: jax.Array) -> jax.Array:
+    def values(self, outputs: jax.Array) -> jax.Array:
         """Map (2, B, outputs) of the critic to (2, B) values."""
         if self.config.critic == "clipped":
             return outputs[..., 0]
@@ -300,10 +301,10 @@ class DrQv2(Algorithm):
         self, outputs: jax.Array, next_outputs: jax.Array, batch: Batch
     ) -> tuple[jax.Array, jax.Array]:
         """Return the (B,) errors summed over both Q functions, and their targets (2 or 1, B)."""
-        values = self._values(next_outputs)
+        values = self.values(next_outputs)
         if self.config.critic == "clipped":
             goal = batch.reward + batch.discount * values.min(0)
-            return jnp.sum((self._values(outputs) - goal) ** 2, 0), goal[None]
+            return jnp.sum((self.values(outputs) - goal) ** 2, 0), goal[None]
         moved = batch.reward[:, None] + batch.discount[:, None] * self._atoms
         goal = projected(jax.nn.softmax(next_outputs), moved, self._atoms)
         entropy = -jnp.sum(goal * jax.nn.log_softmax(outputs), -1)
