@@ -22,7 +22,8 @@ class Algorithm(ABC):
     """An algorithm with its settings and environments, as pure functions.
 
     Equal settings in equal environments share compiled programs. ``acting`` names the networks that
-    ``act`` needs.
+    ``act`` needs. With several runs in one program, a CPU computes ``iterate`` for one run after
+    the other, which copies their states; with ``vmaps_runs`` it computes ``jax.vmap`` of it.
 
     Raises:
         ValueError: the environments contradict the settings.
@@ -34,6 +35,7 @@ class Algorithm(ABC):
     name: ClassVar[str]
     config_class: ClassVar[type[TrainConfig]] = TrainConfig
     acting: ClassVar[tuple[str, ...]] = ("actor",)
+    vmaps_runs: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         """Check the environments."""

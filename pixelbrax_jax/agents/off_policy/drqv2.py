@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import optax
 from flax import linen as nn
 
+from pixelbrax_jax._platform.batches import one_run_after_the_other
 from pixelbrax_jax.agents.algorithm import Algorithm
 from pixelbrax_jax.agents.config import TrainConfig
 from pixelbrax_jax.agents.networks.encoders import LAYERS, Convolutions, scaled
@@ -61,6 +62,8 @@ class DrQv2(Algorithm):
     name: ClassVar[str] = "drqv2"
     config_class: ClassVar[type[TrainConfig]] = DrQv2Config
     acting: ClassVar[tuple[str, ...]] = ("encoder", "actor")
+    # The replay is too large to be copied.
+    vmaps_runs: ClassVar[bool] = True
 
     @cached_property
     def modules(self) -> dict[str, nn.Module]:
@@ -111,10 +114,12 @@ class DrQv2(Algorithm):
         schedule = optax.linear_schedule(config.initial_std, config.final_std, config.std_steps)
         std = jnp.float32(schedule(steps))
 
+        act = one_run_after_the_other(self.act)
+
         def choose(pixels: jax.Array, seen: None, key: jax.Array) -> tuple[jax.Array, jax.Array]:
             del seen
             noise_key, uniform_key = jax.random.split(key)
-            action = noisy(self.act(state.networks, pixels), std, noise_key)
+            action = noisy(act(state.networks, pixels), std, noise_key)
             uniform = jax.random.uniform(uniform_key, action.shape, minval=-1.0)
             action = jnp.where(steps < config.learning_starts, uniform, action)
             return action, action
@@ -165,6 +170,7 @@ class DrQv2(Algorithm):
         config, replay = self.config, state.replay
         keys = jax.random.split(stream_key(state, UPDATES), config.num_updates)
         start = (state.networks, state.opt_state, state.target)
+        update = one_run_after_the_other(self._update)
 
         # The loop reads the replay and does not carry it: XLA would copy it in every turn.
         def step(carry: Any, inputs: tuple[jax.Array, jax.Array]) -> tuple[Any, Metrics]:
@@ -174,7 +180,7 @@ class DrQv2(Algorithm):
                 sample_key, config.batch_size, config.env.frame_stack, config.n_step, config.gamma
             )
             batch = self._augmented(batch, shift_key)
-            return self._update(carry, batch, std, update_key, state.iteration, number)
+            return update(carry, batch, std, update_key, state.iteration, number)
 
         def learn() -> tuple[Any, Metrics]:
             carry, metrics = jax.lax.scan(step, start, (jnp.arange(config.num_updates), keys))

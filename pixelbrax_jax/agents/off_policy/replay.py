@@ -134,7 +134,7 @@ class Replay(struct.PyTreeNode):
             grouped = values.reshape(groups, -1, *values.shape[2:])
             index = env[..., None] * self.slots + time % self.slots
             picked = jax.vmap(lambda values, index: values[index])(grouped, index)
-            return picked.reshape(-1, *picked.shape[2:])
+            return picked.reshape(env.size, *picked.shape[2:])
 
         def stacked(time: jax.Array) -> jax.Array:
             """Map (G, B / G) times to (B, H, W, 3 K) pixels; a first frame repeats."""
