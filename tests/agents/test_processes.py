@@ -16,11 +16,21 @@ import pytest
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
 ROOT = Path(__file__).parents[2]
-PHASIC = "--num-policy-phases 3 --aux-minibatches 3 --aux-epochs 1"
-EXTRA = {"ppo": "--update-epochs 1", "ppg": PHASIC, "dcpg": PHASIC}
+MINIBATCHES = "--num-minibatches 2"
+PHASIC = f"{MINIBATCHES} --num-policy-phases 3 --aux-minibatches 3 --aux-epochs 1"
+REPLAY = (
+    "--replay-ratio 0.125 --buffer-size 256 --learning-starts 64 --batch-size 8 --hidden-dim 16 "
+    "--checkpoint-replay"
+)
+EXTRA = {
+    "ppo": f"{MINIBATCHES} --update-epochs 1",
+    "ppg": PHASIC,
+    "dcpg": PHASIC,
+    "drqv2": REPLAY,
+}
 TINY = (
     "--task inverted_pendulum --height 18 --width 18 --frame-stack 2 --encoder small --num-envs 4 "
-    "--num-steps 8 --num-minibatches 2 --no-progress"
+    "--num-steps 8 --no-progress"
 )
 PER_ITERATION = 32
 AS_USERS = {"XLA_FLAGS": ""}
