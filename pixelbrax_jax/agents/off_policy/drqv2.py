@@ -116,7 +116,7 @@ class DrQv2(Algorithm):
 
         act = one_run_after_the_other(self.act)
 
-        def choose(pixels: jax.Array, seen: None, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        def choose(pixels: jax.Array, seen: jax.Array | None, key: jax.Array) -> tuple[jax.Array, jax.Array]:
             del seen
             noise_key, uniform_key = jax.random.split(key)
             action = noisy(act(state.networks, pixels), std, noise_key)
