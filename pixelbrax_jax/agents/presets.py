@@ -66,6 +66,7 @@ _DRQV2 = {
     "num_envs": 1,
     "num_steps": 2,
     "buffer_size": 1_000_000,
+    "saturation_coef": 0.0,
     "total_steps": 1_100_000,
 }
 # For many environments, small images and few updates, after Squint (arXiv 2602.21203).
@@ -75,7 +76,6 @@ _SMALL_DRQV2 = {
     "action_repeat": 2,
     "replay_ratio": 0.125,
     "learning_rate": 3e-4,
-    "layer_norm": True,
 }
 
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {

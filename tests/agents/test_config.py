@@ -39,7 +39,7 @@ POSITIVE = (
 FINITE = ("v_min", "v_max")
 POSITIVE_OR_0 = (
     "max_grad_norm", "ent_coef", "vf_coef", "beta_clone", "aux_value_coef", "value_distill_coef",
-    "dynamics_coef",
+    "dynamics_coef", "saturation_coef",
 )  # fmt: skip
 CHOICES = ("encoder", "policy", "normalize_advantage", "layout", "critic")
 UNCHECKED = {

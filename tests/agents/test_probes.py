@@ -173,7 +173,7 @@ def values_of(algorithm, networks, images):
     """The mean of both Q functions at the best action."""
     module = algorithm.modules
     features = module["encoder"].apply(networks["encoder"], scaled(images))
-    action = module["actor"].apply(networks["actor"], features)
+    action = jnp.tanh(module["actor"].apply(networks["actor"], features))
     outputs = module["critic"].apply(networks["critic"], features, action)
     return algorithm.values(outputs).mean(0)
 

@@ -37,7 +37,7 @@ class Head(nn.Module):
 
 
 class DeterministicActor(nn.Module):
-    """A policy without a distribution of its own: exploration adds noise to its action."""
+    """A policy whose action is the ``tanh`` of the output; exploration adds noise to it."""
 
     action_size: int
     feature_dim: int
@@ -46,9 +46,9 @@ class DeterministicActor(nn.Module):
 
     @nn.compact
     def __call__(self, features: jax.Array) -> jax.Array:
-        """Map (B, F) features to (B, A) actions in (-1, 1)."""
+        """Map (B, F) features to (B, A)."""
         x = Trunk(self.feature_dim)(features)
-        return jnp.tanh(Head(self.hidden_dim, self.action_size, self.layer_norm)(x))
+        return Head(self.hidden_dim, self.action_size, self.layer_norm)(x)
 
 
 class TwinQ(nn.Module):

@@ -22,7 +22,11 @@ CRITICS = ("clipped", "c51")
 
 @dataclass(frozen=True)
 class DrQv2Config(TrainConfig):
-    """Settings of DrQ-v2; but for ``num_envs`` and ``buffer_size`` the defaults are its code's."""
+    """Settings of DrQ-v2.
+
+    The defaults are those of its code, but for ``num_envs``, ``buffer_size`` and
+    ``saturation_coef``.
+    """
 
     memory_settings: ClassVar[tuple[str, ...]] = ("buffer_size",)
 
@@ -68,6 +72,8 @@ class DrQv2Config(TrainConfig):
     v_max: Finite = 20.0
     """Largest return that ``c51`` represents."""
 
+    saturation_coef: NotNegative = 1e-3
+    """Weight of the mean square of the actor's output before ``tanh``, which keeps its gradient."""
     feature_dim: PositiveInt = 50
     """Size of the bounded features behind the encoder."""
     hidden_dim: PositiveInt = 1024

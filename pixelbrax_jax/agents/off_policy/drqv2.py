@@ -116,7 +116,9 @@ class DrQv2(Algorithm):
 
         act = one_run_after_the_other(self.act)
 
-        def choose(pixels: jax.Array, seen: jax.Array | None, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        def choose(
+            pixels: jax.Array, seen: jax.Array | None, key: jax.Array
+        ) -> tuple[jax.Array, jax.Array]:
             del seen
             noise_key, uniform_key = jax.random.split(key)
             action = noisy(act(state.networks, pixels), std, noise_key)
@@ -141,7 +143,7 @@ class DrQv2(Algorithm):
     def act(self, networks: Networks, pixels: jax.Array, key: jax.Array | None = None) -> jax.Array:
         """See ``Algorithm.act``; sampled actions have the noise at the end of the schedule."""
         features = self._apply("encoder", networks, scaled(pixels))
-        action = self._apply("actor", networks, features)
+        action = jnp.tanh(self._apply("actor", networks, features))
         return action if key is None else noisy(action, self.config.final_std, key)
 
     def warnings(self, record: Mapping[str, float]) -> list[str]:
@@ -265,7 +267,7 @@ class DrQv2(Algorithm):
         features = self._apply("encoder", learners, scaled(batch.pixels))
         # The encoder has no target: the online one encodes both observations.
         later = self._apply("encoder", networks, scaled(batch.next_pixels))
-        mean_action = self._apply("actor", networks, later)
+        mean_action = jnp.tanh(self._apply("actor", networks, later))
         action = noisy(mean_action, std, key, self.config.std_clip)
         outputs = self._apply("critic", learners, features, batch.action)
         next_outputs = self._apply("critic", {"critic": target}, later, action)
@@ -289,13 +291,13 @@ class DrQv2(Algorithm):
         std: jax.Array,
         key: jax.Array,
     ) -> tuple[jax.Array, jax.Array]:
-        """Return the negative value of the actor's noisy action, twice."""
-        mean_action = self._apply("actor", {"actor": actor}, features)
-        action = noisy(mean_action, std, key, self.config.std_clip)
+        """Return the loss of the actor, and the negative value of its noisy action."""
+        output = self._apply("actor", {"actor": actor}, features)
+        action = noisy(jnp.tanh(output), std, key, self.config.std_clip)
         values = self.values(self._apply("critic", networks, features, action))
         value = values.min(0) if self.config.critic == "clipped" else values.mean(0)
         loss = -batch.mean(value)
-        return loss, loss
+        return loss + self.config.saturation_coef * jnp.mean(output**2), loss
 
     def values(self, outputs: jax.Array) -> jax.Array:
         """Map (2, B, outputs) of the critic to (2, B) values."""
