@@ -105,6 +105,16 @@ def test_a_resumed_run_goes_on_with_or_without_its_replay(tmp_path, stored):
         assert same(resumed.state.env_state.sim.episode, whole.env_state.sim.episode)
 
 
+def test_a_replay_that_does_not_fit_beside_the_state_is_told_with_the_largest(tmp_path):
+    config = LATE.config.replace(buffer_size=640, memory_budget_gb=0.7e-3)
+    options = RunConfig(str(tmp_path), progress=False)
+    with pytest.raises(MemoryError, match=r"Lower buffer_size .* the largest that fits is") as info:
+        run(DrQv2(config, ball_envs()), PARAMS, options)
+    largest = int(re.findall(r"buffer_size=(\d+)", str(info.value))[-1])
+    assert 32 <= largest < 640
+    run(DrQv2(config.replace(buffer_size=largest), ball_envs()), PARAMS, options)
+
+
 def test_returns_outside_the_range_of_c51_are_told_once(tmp_path):
     narrow = replace(LATE.config, critic="c51", v_min=-0.01, v_max=0.01)
     lines = []
