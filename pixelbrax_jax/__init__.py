@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from pixelbrax_jax.physics.brax.engine import BraxPhysics as BraxPhysics
     from pixelbrax_jax.physics.mujoco.formulas import Snapshot as Snapshot
     from pixelbrax_jax.physics.mujoco.mjcf import mjcf_physics as mjcf_physics
+    from pixelbrax_jax.physics.mujoco.playground import playground_physics as playground_physics
     from pixelbrax_jax.policy import list_pretrained as list_pretrained
     from pixelbrax_jax.policy import load_policy as load_policy
     from pixelbrax_jax.registry import list_envs as list_envs
@@ -59,6 +60,7 @@ _PUBLIC = {
     "physics.brax.engine": "BraxPhysics",
     "physics.mujoco.formulas": "Snapshot",
     "physics.mujoco.mjcf": "mjcf_physics",
+    "physics.mujoco.playground": "playground_physics",
     "policy": "list_pretrained load_policy",
     "registry": "list_envs register",
     "scene.look": "make_look",

@@ -27,8 +27,8 @@ _PLATFORMS = {"cpu": "cpu", "gpu": "gpu", "cuda": "gpu", "rocm": "gpu", "tpu": "
 """Platform of each accepted name: JAX's platforms and default backends."""
 
 _MOST_INTERSECTIONS = 50
-"""Largest number of intersections per pixel (geoms times rays: one to the camera and one to each
-lamp) that XLA's newer emitters still compile to one fast loop."""
+"""Largest number of intersections per pixel (geoms and planes of meshes, times rays: one to the
+camera and one to each lamp) that XLA's newer emitters still compile to one fast loop."""
 
 
 def compiler_options(env: Any = None, platform: str | None = None) -> dict[str, Any]:
@@ -112,7 +112,8 @@ def _options(physics: Any, platform: str | None = None) -> dict[str, Any]:
         if physics is not None:
             chosen |= physics.compiler_options
             rays = 1 + len(physics.look.lamps if physics.look else ())
-            if len(physics.geoms.kind) * rays > _MOST_INTERSECTIONS:
+            shapes = len(physics.geoms.kind) + sum(physics.geoms.num_planes)
+            if shapes * rays > _MOST_INTERSECTIONS:
                 # The newer ones split long loops and compute shared values again in each part:
                 # rendering DM Control's swimmer15 takes 250 times as long.
                 chosen.setdefault(_EMITTERS, False)

@@ -63,6 +63,7 @@ class GeomKind(IntEnum):
     ELLIPSOID = 4, 3, "largest"
     CYLINDER = 5, 2, "first", True
     BOX = 6, 3, "diagonal"
+    MESH = 7, 1, "first"
 
 
 class String(struct.PyTreeNode):
@@ -89,7 +90,8 @@ class Geoms(struct.PyTreeNode):
         link: (G,) static, index of the geom's link, -1 for the world.
         material: (G,) static, row of ``rgb``.
         name: (G,) static, the model's geom name, or ``kind/index`` without one.
-        size: (G, 3), MuJoCo's size of each kind: radius, half length, half extents.
+        size: (G, 3), MuJoCo's size of each kind: radius, half length, half extents; of a mesh the
+            radius of the sphere around its center that contains it.
         pos: (G, 3), in the link's frame.
         quat: (G, 4), in the link's frame.
         rgb: (M, 3), one color per material.
@@ -100,6 +102,11 @@ class Geoms(struct.PyTreeNode):
         distant: static, whether the camera is more than a thousand radii of a sphere or capsule
             away, so that float32 needs the longer formulas of ``renderer.intersect``.
         strings: strings, whose capsules are among the geoms.
+        num_planes: (G,) static, number of half-spaces of each mesh, 0 for other kinds. Empty
+            without meshes.
+        planes: (P, 4), the half-spaces whose intersections are the meshes, those of the first mesh
+            first: outer unit normal, and distance from the geom's center, in the geom's frame. They
+            must bound the mesh on all sides. None without meshes.
         material_name: (M,) static, the model's material of the first geom of each color. Empty if
             none is known.
     """
@@ -116,6 +123,8 @@ class Geoms(struct.PyTreeNode):
     patterned: tuple[bool, ...] = struct.field(pytree_node=False, default=())
     distant: bool = struct.field(pytree_node=False, default=False)
     strings: tuple[String, ...] = ()
+    num_planes: tuple[int, ...] = struct.field(pytree_node=False, default=())
+    planes: jax.Array | None = None
     material_name: tuple[str, ...] = struct.field(pytree_node=False, default=())
 
     def is_bounded(self, geom: int) -> bool:
@@ -126,6 +135,16 @@ class Geoms(struct.PyTreeNode):
         """Return whether a geom is a plane with the look's pattern."""
         plane = self.kind[geom] == GeomKind.PLANE
         return plane and (not self.patterned or self.patterned[geom])
+
+    def rows_of_planes(self, geom: int) -> tuple[int, int]:
+        """Return the first row of a mesh's planes and the row after the last one."""
+        if not self.num_planes or self.planes is None:
+            raise ValueError(
+                f"geom {self.name[geom]!r} is a mesh, and the geoms have no planes: set num_planes "
+                "and planes."
+            )
+        first = sum(self.num_planes[:geom])
+        return first, first + self.num_planes[geom]
 
 
 class PhysicsState(struct.PyTreeNode):

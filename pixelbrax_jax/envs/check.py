@@ -72,7 +72,8 @@ def _same_structure(expected: Any, actual: Any, what: str) -> None:
     rule = f"{what} must keep its structure"
     for before, after in zip(_describe(expected), _describe(actual), strict=False):
         _require(before == after, f"{rule}: {before} became {after}")
-    _require(str(jax.tree.structure(expected)) == str(jax.tree.structure(actual)), rule)
+    wanted: Any = jax.tree.structure(expected)
+    _require(wanted == jax.tree.structure(actual), rule)
 
 
 def _check_timestep(env: PixelEnv, timestep: Timestep, origin: str) -> None:

@@ -25,6 +25,7 @@ _NAMES: dict[tuple[int | str, ...], str] = {
     (_TWO_OR_THREE, 3): "look.sky",
     ("G", 3): "geoms.size geoms.pos",
     ("G", 4): "geoms.quat",
+    ("P", 4): "geoms.planes",
     ("M", 3): "geoms.rgb",
     ("C",): "clips.first clips.length",
     ("T", "H", "W"): "clips.packed",
@@ -74,6 +75,7 @@ def split_params(params: EnvParams, num_envs: int) -> ParamRows:
     found, tree = jax.tree_util.tree_flatten_with_path(params)
     geoms = params.geoms
     sizes = {"G": len(geoms.kind), "M": max(geoms.material, default=-1) + 1}
+    sizes["P"] = sum(geoms.num_planes)
     is_own = tuple(_has_rows(path, np.shape(leaf), num_envs, sizes) for path, leaf in found)
     pairs = [(leaf, own) for (_, leaf), own in zip(found, is_own, strict=True)]
     return ParamRows(

@@ -23,7 +23,7 @@ _CAPABILITY = 8.0
 
 _HEIGHT, _WIDTH = 24, 40
 
-_EYES = ((-2.0, -4.25, 2.25), (0.5, -4.25, 1.75))
+_EYES = ((-2.0, -4.25, 2.25), (0.72, -4.25, 1.75))
 """Camera positions of the check, metres. No edge goes through the middle of a pixel."""
 
 Draw = Callable[[Scene, int, int], Frame]
@@ -174,6 +174,9 @@ def _scene(eye: jax.Array) -> Scene:
     x = jnp.linspace(-1.8, 1.5, len(kinds))
     pos = jnp.stack([x, 0.3 * jnp.cos(3.0 * x), jnp.full(len(kinds), 0.6)], axis=1)
     target, up = jnp.array([0.0, 0.0, 0.5]), jnp.array([0.0, 0.0, 1.0])
+    # The mesh is an octahedron, whose corners are 0.29 m from its center.
+    signs = jnp.stack(jnp.meshgrid(*[jnp.array([-1.0, 1.0])] * 3), axis=-1).reshape(8, 3)
+    planes = jnp.concatenate([spatial.unit(signs), jnp.full((8, 1), 0.17)], axis=1)
     geoms = Geoms(
         kind=kinds,
         link=(-1,) * len(kinds),
@@ -183,6 +186,8 @@ def _scene(eye: jax.Array) -> Scene:
         pos=pos,
         quat=quat,
         rgb=jnp.linspace(0.1, 0.9, 3 * len(kinds)).reshape(-1, 3),
+        num_planes=tuple(len(planes) if kind == GeomKind.MESH else 0 for kind in kinds),
+        planes=planes,
     )
     lamp = Lamp(
         link=-1,

@@ -15,6 +15,7 @@ from pixelbrax_jax import spatial
 from pixelbrax_jax.renderer import shading
 from pixelbrax_jax.renderer.intersect import (
     Axes,
+    Fold,
     Hit,
     Vector,
     at_least,
@@ -99,7 +100,7 @@ def see(view: View, ray: Vector, near: Near | None = None) -> Frame:
     look, geoms, shape, count = view.look, view.geoms, ray[0].shape, len(view.order)
 
     def solid(g: int) -> _Solid:
-        return _solid(view, g)
+        return _solid(view, g, in_kernel=near is not None)
 
     def hit(g: int) -> Hit:
         return solid(g).hit(ray, solid(g).center)
@@ -214,15 +215,17 @@ def render(
 class _Solid(NamedTuple):
     center: Vector
     axes: Axes
-    size: Vector
+    size: Any
     hit: Callable[[Vector, Vector], Hit]
     """Where rays enter it, with its center at another place."""
 
 
-def _solid(view: View, g: int) -> _Solid:
+def _solid(view: View, g: int, in_kernel: bool) -> _Solid:
     geoms = view.geoms
     x, y, z = (tuple(view.xmat[g, k, axis] for k in range(3)) for axis in range(3))
-    size = tuple(geoms.size[g, k] for k in range(3))
+    size: Any = tuple(geoms.size[g, k] for k in range(3))
+    if geoms.kind[g] == GeomKind.MESH:
+        size = _planes(geoms, g, in_kernel)
     hit = partial(
         intersect,
         geoms.kind[g],
@@ -232,6 +235,29 @@ def _solid(view: View, g: int) -> _Solid:
         distant=geoms.distant,
     )
     return _Solid(tuple(view.pos[g, k] for k in range(3)), (x, y, z), size, hit)
+
+
+def _planes(geoms: Geoms, g: int, in_kernel: bool) -> Fold:
+    first, end = geoms.rows_of_planes(g)
+    planes: Any = geoms.planes
+
+    def in_a_loop(prepare: Callable, update: Callable, value: Any) -> Any:
+        # Hundreds of planes in a row would take minutes to compile.
+        def one(row: jax.Array, value: Any) -> Any:
+            return update(value, prepare(tuple(planes[row, k] for k in range(4))))
+
+        return jax.lax.fori_loop(np.int32(first), np.int32(end), one, value)
+
+    def in_a_row(prepare: Callable, update: Callable, value: Any) -> Any:
+        # A loop would keep images of all values. The barrier keeps what differs by plane alone out
+        # of the loop over pixels.
+        columns = prepare(tuple(planes[first:end, k] for k in range(4)))
+        columns = jax.lax.optimization_barrier(columns)
+        for row in range(end - first):
+            value = update(value, tuple(column[row] for column in columns))
+        return value
+
+    return in_a_loop if in_kernel else in_a_row
 
 
 def _vector(array: Any) -> Vector:

@@ -20,9 +20,16 @@ from pixelbrax_jax.types import GeomKind
 
 Vector = Sequence[Any]
 Axes = tuple[Vector, Vector, Vector]
+Fold = Callable[[Callable[[Vector], Vector], Callable[[Any, Vector], Any], Any], Any]
+"""``fold(prepare, update, value)`` applies ``value = update(value, prepare(plane))`` for each
+half-space of a mesh, and returns the last value. A plane is its outer unit normal and its distance
+from the center, in the geom's frame."""
 
 _TINY = 1e-7
 """Avoids a division by zero for a ray parallel to an axis or a face."""
+
+_FAR = 1e30
+"""Larger than any distance, and than one over it."""
 
 
 class Hit(NamedTuple):
@@ -196,13 +203,48 @@ def _box(ray: Vector, pos: Vector, axes: Axes, size: Vector) -> Hit:
     return Hit(t, normal_dot)
 
 
-_BY_KIND = {
+def _mesh(ray: Vector, pos: Vector, axes: Axes, size: Fold) -> Hit:
+    # Whichever of ray and geom is in scalars divides, so that a pixel needs no quotient per plane.
+    # If it is the ray, `order` is minus the distance at which the ray crosses a plane, else one
+    # over it. Both are linear in the pixel's numbers. Either way the ray enters through the plane
+    # of least order among those it crosses inwards, if that is not below those crossed outwards.
+    by_ray = jnp.ndim(ray[0]) > 0
+    d = [dot(ray, axis) for axis in axes]
+    o = [-dot(pos, axis) for axis in axes]
+    shape = jnp.broadcast_shapes(jnp.shape(ray[0]), jnp.shape(pos[0]))
+
+    def prepare(plane: Vector) -> Vector:
+        *own, offset = plane
+        # Outside of the planes that the ray crosses inwards, inside of the others.
+        side = offset - dot(own, o) if by_ray else dot(own, d)
+        inv = 1.0 / jnp.where(jnp.abs(side) < _TINY, _TINY, side)
+        return (*own, *(n * inv for n in own), offset * inv, inv < 0.0)
+
+    def cut(best: tuple[Any, ...], plane: Vector) -> tuple[Any, ...]:
+        enter, leave, *normal = best
+        *own, x, y, z, shift, inwards = plane
+        order = dot((x, y, z), d) if by_ray else dot((x, y, z), o) - shift
+        first = inwards & (order < enter)
+        enter = jnp.where(first, order, enter)
+        leave = jnp.where(inwards, leave, at_least(order, leave))
+        return enter, leave, *(jnp.where(first, n, m) for n, m in zip(own, normal, strict=True))
+
+    never = jnp.full(shape, _FAR)
+    start = (never, jnp.full(shape, _TINY) if by_ray else -never, *[jnp.zeros(shape)] * 3)
+    enter, leave, *normal = size(prepare, cut, start)
+    hit = (enter >= leave) & (enter < _FAR)
+    t = jnp.where(hit, 1.0 / enter if by_ray else -enter, -1.0)
+    return Hit(t, lambda v, ray_v: dot(normal, [dot(axis, v) for axis in axes]))
+
+
+_BY_KIND: dict[GeomKind, Callable[[Vector, Vector, Axes, Any], Hit]] = {
     GeomKind.PLANE: _plane,
     GeomKind.SPHERE: _sphere,
     GeomKind.CAPSULE: _capsule,
     GeomKind.ELLIPSOID: _ellipsoid,
     GeomKind.CYLINDER: _cylinder,
     GeomKind.BOX: _box,
+    GeomKind.MESH: _mesh,
 }
 
 _FAR_FORMS = {GeomKind.SPHERE: _distant_sphere, GeomKind.CAPSULE: _distant_capsule}
@@ -217,11 +259,14 @@ def intersect(
     ray: Vector,
     pos: Vector,
     axes: Axes,
-    size: Vector,
+    size: Any,
     bounded: bool = False,
     distant: bool = False,
 ) -> Hit:
-    """Return where unit rays from the origin enter a geom; ``pos`` is its center in metres."""
+    """Return where unit rays from the origin enter a geom.
+
+    ``pos`` is its center in metres; ``size`` is a vector as in ``Geoms``, for a mesh a ``Fold``.
+    """
     if bounded and kind == GeomKind.PLANE:
         return _rectangle(ray, pos, axes, size)
     kind = GeomKind(kind)

@@ -91,6 +91,8 @@ def pixel_rays(camera: Camera, height: int, width: int, rows: jax.Array) -> jax.
 def _cast(scene: Scene, g: int, origin: jax.Array, rays: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return distances at which rays enter a geom (``inf`` if never), and normals, world frame."""
     geoms, xmat, size = scene.geoms, scene.xmat[g], scene.geoms.size[g]
+    if geoms.kind[g] == GeomKind.MESH:
+        size = jnp.asarray(geoms.planes)[slice(*geoms.rows_of_planes(g))]
     d = rays @ xmat
     o = jnp.broadcast_to((origin - scene.pos[g]) @ xmat, d.shape)
     t, normal = _LOCAL[GeomKind(geoms.kind[g])](o, d, size)
@@ -214,6 +216,18 @@ def _box(o: jax.Array, d: jax.Array, size: jax.Array) -> tuple[jax.Array, jax.Ar
     return t, jax.nn.one_hot(face, 3, dtype=d.dtype) * outward
 
 
+def _mesh(o: jax.Array, d: jax.Array, planes: jax.Array) -> tuple[jax.Array, jax.Array]:
+    normals, offsets = planes[:, :3], planes[:, 3]
+    along = d @ normals.T
+    safe = jnp.where(jnp.abs(along) < 1e-7, 1e-7, along)
+    crossed = (offsets - o @ normals.T) / safe
+    entries = jnp.where(safe < 0.0, crossed, -jnp.inf)
+    entry = jnp.max(entries, axis=-1)
+    leave = jnp.min(jnp.where(safe > 0.0, crossed, jnp.inf), axis=-1)
+    t = jnp.where((entry <= leave) & (entry > 0.0), entry, jnp.inf)
+    return t, normals[jnp.argmax(entries, axis=-1)]
+
+
 _LOCAL = {
     GeomKind.PLANE: _plane,
     GeomKind.SPHERE: _sphere,
@@ -221,6 +235,7 @@ _LOCAL = {
     GeomKind.ELLIPSOID: _ellipsoid,
     GeomKind.CYLINDER: _cylinder,
     GeomKind.BOX: _box,
+    GeomKind.MESH: _mesh,
 }
 assert set(_LOCAL) == set(GeomKind), f"no formulas: {set(GeomKind) - set(_LOCAL)}"
 

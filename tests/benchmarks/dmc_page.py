@@ -85,8 +85,9 @@ def physics() -> str:
         off = sum(task["control_step"]["velocities_off"] for task in tasks)
         states = sum(task["states"] for task in tasks)
         p = min(task["initial_states"]["lowest_p"] for task in tasks)
+        apart = min((n for task in tasks if (n := task["episode"]["apart"])), default="never")
         shown = [f"{error:.0e}" for error in errors]
-        lines.append([domain, len(tasks), *shown, f"{off} of {states}", f"{p:.2g}"])
+        lines.append([domain, len(tasks), *shown, f"{off} of {states}", apart, f"{p:.2g}"])
     heads = (
         "domain",
         "tasks",
@@ -95,6 +96,7 @@ def physics() -> str:
         "reward, a step on",
         "velocity, a step on: median",
         "beyond 0.01",
+        "episodes part after",
         "lowest p",
     )
     return table(heads, lines)

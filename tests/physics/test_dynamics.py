@@ -142,8 +142,8 @@ def test_small_models_are_stepped_by_mujoco_xla():
 
 
 def test_engines_are_options_of_the_suite():
-    with pytest.raises(ValueError, match="unknown engine: 'mjx'"):
-        pb.make(TASK, engine="mjx")
+    with pytest.raises(ValueError, match=r"unknown engine: 'mujco'\. Did you mean 'mujoco'"):
+        pb.make(TASK, engine="mujco")
     with pytest.raises(ValueError, match="engine='xla' is only for tasks of the DM Control Suite"):
         pb.make("ant", engine="xla")
 

@@ -146,13 +146,16 @@ CLOTH = """
     ("xml", "message"),
     [
         (
-            MESH.format(more=""),
-            r"geom 'shell' is a mesh, which cannot be rendered; supported: plane, sphere, "
-            r"capsule, ellipsoid, cylinder, box\. Replace it by these primitives, .* alpha 0",
+            HILLS,
+            r"cannot be rendered: hfield 'hfield/0' \(group 0\)\. Supported geoms: plane, sphere, "
+            r"capsule, ellipsoid, cylinder, box, mesh\. Replace the others .* alpha 0",
         ),
-        (HILLS, "geom 'hfield/0' is a hfield, which cannot be rendered"),
-        (SKIN.format(more='group="2"'), r"skin 'hide' cannot be rendered: .* alpha 0, .*2"),
-        (CLOTH, "flex 'cloth' cannot be rendered"),
+        (SKIN.format(more='group="2"'), r"cannot be rendered: skin 'hide' \(group 2\)"),
+        (CLOTH, "cannot be rendered: flex 'cloth'"),
+        (
+            SKIN.format(more="").replace("</mujoco>", "") + HILLS.replace("<mujoco>", ""),
+            r"hfield 'hfield/0' \(group 0\), skin 'hide' \(group 0\)\. S",
+        ),
     ],
 )
 def test_what_cannot_be_drawn_is_named(xml, message):

@@ -155,8 +155,16 @@ def test_missing_file(tmp_path):
             build(path)
 
 
-MESH = """<asset><mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset>
-<worldbody><geom name="statue" type="mesh" mesh="m"/>"""
+def test_meshes_are_convex_hulls():
+    mesh = """<asset><mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset>
+    <worldbody><geom name="statue" type="mesh" mesh="m"/>"""
+    physics = build(CART.replace("<worldbody>", mesh))
+    assert physics.geoms.num_planes[physics.geoms.name.index("statue")] == 4
+    assert physics.hull_errors == {"statue": 0.0}
+
+
+HILLS = """<asset><hfield name="h" nrow="3" ncol="3" size="1 1 1 1"/></asset>
+<worldbody><geom name="hills" type="hfield" hfield="h"/>"""
 
 
 @pytest.mark.parametrize(
@@ -165,7 +173,7 @@ MESH = """<asset><mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset>
         ("<mujoco><wrldbody/></mujoco>", r"MuJoCo cannot compile the given XML: (.|\n)*wrldbody"),
         (CART[: CART.index("<actuator>")] + "</mujoco>", "the model has no actuator"),
         ('<mujoco><worldbody><geom size=".1"/></worldbody></mujoco>', "the model has no joint"),
-        (CART.replace("<worldbody>", MESH), "geom 'statue' is a mesh, which cannot be rendered"),
+        (CART.replace("<worldbody>", HILLS), "cannot be rendered: hfield 'hills'"),
     ],
 )
 def test_models_that_are_no_task(xml, message):

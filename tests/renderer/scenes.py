@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from pixelbrax_jax import Camera, Geoms, Look, make_look
+from pixelbrax_jax import Camera, GeomKind, Geoms, Look, make_look
 from pixelbrax_jax.spatial import look_at
 from pixelbrax_jax.types import FAR, Scene
 
@@ -25,7 +25,7 @@ PRIMITIVES_MJCF = """
 
 
 def primitives() -> mujoco.MjModel:
-    """One geom of every kind that can be drawn."""
+    """One geom of every kind that can be drawn, but no mesh."""
     return mujoco.MjModel.from_xml_string(PRIMITIVES_MJCF)
 
 
@@ -95,8 +95,15 @@ def random_scene(seed: int, look: Look | None = None) -> Scene:
 
 
 def one_geom(kind: int, size, eye, *, pos=(0.0, 0.0, 0.0), target=(0.0, 0.0, 0.0), fovy=40.0):
-    """A scene with a single geom, axes along the world's."""
-    return scene_of((kind, size, pos), camera=camera(eye, target, fovy))
+    """A scene with a single geom, axes along the world's; a mesh is a box."""
+    planes = {"planes": box_planes(size), "num_planes": (6,)} if kind == GeomKind.MESH else {}
+    return scene_of((kind, size, pos), camera=camera(eye, target, fovy), **planes)
+
+
+def box_planes(half) -> jnp.ndarray:
+    """Half-spaces of a box, as a mesh has them."""
+    normals = np.concatenate([np.eye(3), -np.eye(3)])
+    return jnp.asarray(np.column_stack([normals, [*half, *half]]), jnp.float32)
 
 
 def assert_alike(one, other, colors: float) -> None:

@@ -24,13 +24,23 @@ from pixelbrax_jax.physics.mujoco.compatibility import (
     import_silenced,
     known_warnings_silenced,
 )
-from pixelbrax_jax.physics.mujoco.geometry import VISIBLE_GROUPS, as_geoms, geom_shapes, site_shapes
+from pixelbrax_jax.physics.mujoco.geometry import (
+    VISIBLE_GROUPS,
+    as_geoms,
+    geom_shapes,
+    hull_errors,
+    site_shapes,
+)
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
-from pixelbrax_jax.physics.mujoco.poses import check_pose, masses_below, with_unit_rotations
-from pixelbrax_jax.physics.mujoco.scene import COM_LINK, tracked_body
+from pixelbrax_jax.physics.mujoco.poses import (
+    center_of_mass,
+    check_pose,
+    with_unit_rotations,
+)
+from pixelbrax_jax.physics.mujoco.scene import COM_LINK
 from pixelbrax_jax.physics.mujoco.viewpoints import followed_body, read_rigs, unfit_cameras
 from pixelbrax_jax.physics.task import Color
-from pixelbrax_jax.spatial import quat_normalize, rotate
+from pixelbrax_jax.spatial import quat_normalize
 from pixelbrax_jax.types import CameraRig, PhysicsState
 
 with import_silenced():
@@ -122,7 +132,6 @@ class BraxPhysics(GuardedPhysics):
         self.link_names = tuple(
             model.body(i).name or f"link/{i - 1}" for i in range(1, model.nbody)
         )
-        self._com_masses: np.ndarray | None = None
         if rigs is None:
             shapes += site_shapes(model, geom_groups)
             self.followed_link = max(followed_body(model) - 1, 0)
@@ -130,8 +139,8 @@ class BraxPhysics(GuardedPhysics):
             rigs, self.unfit_cameras = read_rigs(model, com_link), unfit_cameras(model)
             if any(rig.link == com_link for rig in rigs.values()):
                 self.link_names += (COM_LINK,)
-                self._com_masses = masses_below(model, tracked_body(model))
         self.rigs = rigs
+        self.hull_errors = hull_errors(shapes)
         self.geoms = as_geoms([shape._replace(material="") for shape in shapes])
         self._model = model
         self._source = env
@@ -226,11 +235,9 @@ class BraxPhysics(GuardedPhysics):
         )
 
     def _links(self, seen: Kinematics) -> tuple[jax.Array, jax.Array]:
-        if self._com_masses is None:
+        if self.link_names[-1] != COM_LINK:
             return seen.xpos, seen.xquat
-        offsets = jnp.asarray(self._model.body_ipos[1:], jnp.float32)
-        centers = seen.xpos + rotate(seen.xquat, offsets)
-        com = self._com_masses @ centers
+        com = center_of_mass(self._model, seen.xpos, seen.xquat)
         upright = jnp.array([[1.0, 0.0, 0.0, 0.0]], jnp.float32)
         return jnp.concatenate([seen.xpos, com[None]]), jnp.concatenate([seen.xquat, upright])
 

@@ -116,7 +116,7 @@ class Dynamics:
 
         # The first use may be within a program that is being traced.
         with jax.ensure_compile_time_eval():
-            return Xla(self.model, **self._xla_options)
+            return Xla(self.model, plain=self.engine == "mjx", **self._xla_options)
 
     def state(
         self,
@@ -173,7 +173,7 @@ class Dynamics:
     ) -> list[jax.Array]:
         arrays = [jnp.asarray(x, jnp.float32) for x in arrays]
         function = _Function(self, method, options, tuple(shapes))
-        if self.engine == "xla" or (method == "step" and self._steps_by_xla):
+        if self.engine in ("xla", "mjx") or (method == "step" and self._steps_by_xla):
             return list(function.elsewhere(*arrays))
         return call(function, *arrays)
 

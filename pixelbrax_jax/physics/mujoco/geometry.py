@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from pixelbrax_jax.physics.mujoco.hulls import mesh_hull
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
 from pixelbrax_jax.physics.task import Color
 from pixelbrax_jax.types import GeomKind, Geoms
@@ -22,7 +23,8 @@ _DEFAULT_RGBA = np.array([0.5, 0.5, 0.5, 1.0], np.float32)
 class Shape(NamedTuple):
     """One visible shape; fields as in ``Geoms``, with its color and its material's name.
 
-    ``row`` is its place among the model's geoms or sites.
+    ``row`` is its place among the model's geoms or sites. ``planes`` are the (K, 4) half-spaces of
+    a mesh, as in ``Geoms``, and ``error`` how far they leave its convex hull, in metres.
     """
 
     kind: GeomKind
@@ -36,6 +38,8 @@ class Shape(NamedTuple):
     bounded: bool = False
     patterned: bool = False
     row: int = -1
+    planes: np.ndarray | None = None
+    error: float = 0.0
 
 
 def as_geoms(shapes: Sequence[Shape]) -> Geoms:
@@ -47,6 +51,8 @@ def as_geoms(shapes: Sequence[Shape]) -> Geoms:
         keys.append((shape.kind == GeomKind.PLANE, rgb))
         materials.setdefault(keys[-1], shape.material)
     rows = list(materials)
+    planes = [shape.planes for shape in shapes if shape.planes is not None]
+    counts = tuple(0 if shape.planes is None else len(shape.planes) for shape in shapes)
 
     def stack(arrays: Iterable[object]) -> jnp.ndarray:
         return jnp.asarray(np.stack([np.asarray(array, np.float32) for array in arrays]))
@@ -62,8 +68,15 @@ def as_geoms(shapes: Sequence[Shape]) -> Geoms:
         rgb=stack(rgb for _, rgb in rows),
         bounded=tuple(shape.bounded for shape in shapes),
         patterned=tuple(shape.patterned for shape in shapes),
+        num_planes=counts if planes else (),
+        planes=jnp.asarray(np.concatenate(planes)) if planes else None,
         material_name=tuple(materials.values()) if any(materials.values()) else (),
     )
+
+
+def hull_errors(shapes: Sequence[Shape]) -> dict[str, float]:
+    """Return by name how far what is drawn of each mesh leaves its convex hull, in metres."""
+    return {shape.name: shape.error for shape in shapes if shape.kind == GeomKind.MESH}
 
 
 def geom_shapes(
@@ -76,7 +89,7 @@ def geom_shapes(
     """Return the geoms that MuJoCo's viewer shows, without textures, in the model's order.
 
     Geoms of hidden groups or with alpha 0 are left out; any other alpha is opaque. Planes are
-    infinite, and ground.
+    infinite, and ground. Meshes are convex hulls of few faces, see ``hulls``.
 
     Args:
         model: a compiled model; link i is its body i + 1.
@@ -106,7 +119,7 @@ def geom_shapes(
                 f"drawn_radius must be a positive number for a sphere, got {radius!r} for geom "
                 f"{name!r}, a {kind}."
             )
-    _check_surfaces(model, geom_groups)
+    _check_kinds(model, geom_groups)
     shapes = []
     for shape in _shown(model, "geom", geom_groups):
         shape.size[0] = drawn_radius.get(shape.name, shape.size[0])
@@ -137,15 +150,10 @@ def _shown(model: mujoco.MjModel, element: str, groups: Collection[int]) -> Iter
         kind_name, own_name = _kind_name(field("type")), getattr(model, element)(i).name
         prefix = "site" if element == "site" else kind_name
         name = own_name if own_name and element == "geom" else f"{prefix}/{own_name or i}"
-        if kind_name.upper() not in GeomKind.__members__:
-            raise ValueError(
-                f"geom {name!r} is a {kind_name}, which cannot be rendered; supported: "
-                f"{', '.join(kind.name.lower() for kind in GeomKind)}. Replace it by these "
-                f"primitives, hide it with alpha 0, or leave its group ({int(field('group'))}) out "
-                "of geom_groups."
-            )
         kind = GeomKind[kind_name.upper()]
-        size = np.array(field("size"), np.float32)
+        size, planes, error = np.array(field("size"), np.float32), None, 0.0
+        if kind == GeomKind.MESH:
+            planes, size[0], error = mesh_hull(model, int(field("dataid")))
         size[kind.num_sizes :] = 0
         yield Shape(
             kind=kind,
@@ -158,6 +166,8 @@ def _shown(model: mujoco.MjModel, element: str, groups: Collection[int]) -> Iter
             rgb=tuple(rgba[:3]),
             material=material_name(model, field("matid")),
             row=i,
+            planes=planes,
+            error=error,
         )
 
 
@@ -170,18 +180,32 @@ def _kind_name(number: int) -> str:
     return mujoco.mjtGeom(int(number)).name.removeprefix("mjGEOM_").lower()
 
 
-def _check_surfaces(model: mujoco.MjModel, groups: Collection[int]) -> None:
-    flexes = (mujoco.mjtObj.mjOBJ_FLEX, model.nflex, model.flex_group, model.flex_rgba)
-    skins = (mujoco.mjtObj.mjOBJ_SKIN, model.nskin, model.skin_group, model.skin_rgba)
-    for element, count, group, rgba in (flexes, skins):
-        kind = element.name.removeprefix("mjOBJ_").lower()
-        for i in range(count):
-            if group[i] in groups and rgba[i, 3] > 0:
-                name = mujoco.mj_id2name(model, element, i) or f"{kind}/{i}"
-                raise ValueError(
-                    f"{kind} {name!r} cannot be rendered: hide it with alpha 0, leave its group "
-                    f"({int(group[i])}) out of geom_groups, or remove it from the model."
-                )
+def _check_kinds(model: mujoco.MjModel, groups: Collection[int]) -> None:
+    """Raise a ValueError that names everything visible that has no formula."""
+    found = []
+    objects = (
+        ("geom", mujoco.mjtObj.mjOBJ_GEOM),
+        ("flex", mujoco.mjtObj.mjOBJ_FLEX),
+        ("skin", mujoco.mjtObj.mjOBJ_SKIN),
+    )
+    for element, number in objects:
+        groups_of, colors = getattr(model, f"{element}_group"), getattr(model, f"{element}_rgba")
+        for i, (group, rgba) in enumerate(zip(groups_of, colors, strict=True)):
+            kind, shown = element, rgba
+            if element == "geom":
+                kind = _kind_name(model.geom_type[i])
+                shown = resolve_rgba(model, rgba, model.geom_matid[i])
+            is_known = kind.upper() in GeomKind.__members__
+            if group in groups and shown[3] > 0 and not is_known:
+                name = mujoco.mj_id2name(model, number, i) or f"{kind}/{i}"
+                found.append(f"{kind} {name!r} (group {group})")
+    if found:
+        raise ValueError(
+            f"cannot be rendered: {', '.join(found)}. Supported geoms: "
+            f"{', '.join(kind.name.lower() for kind in GeomKind)}. Replace the others by these, "
+            "hide them with alpha 0, leave their groups out of geom_groups, or remove them from "
+            "the model."
+        )
 
 
 def resolve_rgba(model: mujoco.MjModel, own: np.ndarray, material: int) -> np.ndarray:

@@ -113,7 +113,7 @@ def mjcf_physics(
         raise ValueError(f"reset_noise must be finite and not negative, got {reset_noise}")
     substeps = check_positive_int("n_frames", n_frames)
     spec, model = _load(source)
-    if engine == "xla":
+    if engine in ("xla", "mjx"):
         check_simulated(model)
     if model.nv == 0:
         raise ValueError("the model has no joint, so nothing can move")

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from pixelbrax_jax.validation import check_choice
 
-ENGINES = ("auto", "mujoco", "xla")
+ENGINES = ("auto", "mujoco", "xla", "mjx")
 """Names of the engines."""
 
 
@@ -16,8 +16,8 @@ class MujocoOptions:
 
     engine: str = "auto"
     """Engine of DM Control's and Gymnasium's tasks: ``mujoco`` (MuJoCo itself, on a CPU), ``xla``
-    (MuJoCo XLA, on any device and with gradients), or ``auto``: ``mujoco`` in programs for a CPU,
-    ``xla`` in others."""
+    (MuJoCo XLA, on any device and with gradients), ``mjx`` (the same with no stage of our own), or
+    ``auto``: ``mujoco`` in programs for a CPU, ``xla`` in others."""
 
     def __post_init__(self) -> None:
         check_choice("engine", self.engine, ENGINES)

@@ -17,11 +17,10 @@ from pixelbrax_jax.physics.mujoco.formulas import Formulas, Snapshot, Start
 from pixelbrax_jax.physics.mujoco.geometry import VISIBLE_GROUPS
 from pixelbrax_jax.physics.mujoco.native import compile_model, with_poses
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
-from pixelbrax_jax.physics.mujoco.poses import check_pose, masses_below, with_unit_rotations
-from pixelbrax_jax.physics.mujoco.scene import COM_LINK, read_scene, tracked_body
+from pixelbrax_jax.physics.mujoco.poses import center_of_mass, check_pose, with_unit_rotations
+from pixelbrax_jax.physics.mujoco.scene import COM_LINK, read_scene
 from pixelbrax_jax.physics.mujoco.viewpoints import unfit_cameras
 from pixelbrax_jax.physics.task import Color
-from pixelbrax_jax.spatial import f32, rotate
 from pixelbrax_jax.types import CameraRig, PhysicsState
 
 _UPRIGHT = (1.0, 0.0, 0.0, 0.0)
@@ -69,6 +68,7 @@ class MujocoPhysics(GuardedPhysics):
             geom_groups=geom_groups,
         )
         self.geoms, self.look = scene.geoms, scene.look
+        self.hull_errors = scene.hull_errors
         default = scene.rigs.get("default") or scene.rig or next(iter(rigs.values()), None)
         self.rigs = {**scene.rigs, **rigs} | ({"default": default} if default else {})
         self.unfit_cameras = unfit_cameras(model)
@@ -90,7 +90,6 @@ class MujocoPhysics(GuardedPhysics):
         self.action_size = int(model.nu)
         self._formulas = formulas
         self._model = model
-        self._masses = masses_below(model, max(tracked_body(model), 0))
         self._extra_links = scene.links
         self.time_limit = time_limit
         self._identity = identity
@@ -164,8 +163,7 @@ class MujocoPhysics(GuardedPhysics):
 
     def _links(self, seen: Snapshot) -> tuple[jax.Array, jax.Array]:
         xpos, xquat = seen.data.xpos[1:], seen.data.xquat[1:]
-        centers = xpos + rotate(xquat, f32(self._model.body_ipos[1:]))
-        com = jnp.dot(self._masses, centers)
+        com = center_of_mass(self._model, xpos, xquat)
         target = seen.state.target[:3]
         rows = [(com if name == COM_LINK else target)[None] for name in self._extra_links]
         upright = jnp.tile(jnp.array(_UPRIGHT), (len(rows), 1))

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
-from pixelbrax_jax.spatial import quat_normalize
+from pixelbrax_jax.physics.mujoco.viewpoints import tracked_body
+from pixelbrax_jax.spatial import f32, quat_normalize, rotate
 
 
 def check_pose(
@@ -35,6 +36,15 @@ def with_unit_rotations(model: mujoco.MjModel, q: jax.Array) -> jax.Array:
             continue
         q = q.at[rotation].set(quat_normalize(q[rotation]))
     return q
+
+
+def center_of_mass(model: mujoco.MjModel, xpos: jax.Array, xquat: jax.Array) -> jax.Array:
+    """Return (3,), the center of mass of the subtree of the tracked body, else of the model.
+
+    ``xpos`` (B, 3) and ``xquat`` (B, 4) are the poses of all bodies but the world.
+    """
+    masses = masses_below(model, max(tracked_body(model), 0))
+    return jnp.dot(masses, xpos + rotate(xquat, f32(model.body_ipos[1:])))
 
 
 def masses_below(model: mujoco.MjModel, root: int) -> np.ndarray:

@@ -14,6 +14,7 @@ from pixelbrax_jax.physics.mujoco.geometry import (
     Shape,
     as_geoms,
     geom_shapes,
+    hull_errors,
     material_name,
     resolve_rgba,
     site_shapes,
@@ -48,6 +49,7 @@ class ModelScene(NamedTuple):
         links: names of the links after those of the bodies, if the model needs them: ``camera/com``
             at the center of mass of the subtree of ``tracked_body(model)``, and ``target`` for what
             is movable and visible. Neither turns.
+        hull_errors: metres by name of a mesh, how far what is drawn leaves its convex hull.
     """
 
     geoms: Geoms
@@ -55,6 +57,7 @@ class ModelScene(NamedTuple):
     rigs: dict[str, CameraRig]
     look: Look
     links: tuple[str, ...]
+    hull_errors: dict[str, float]
 
 
 def read_scene(
@@ -91,7 +94,7 @@ def read_scene(
     rigs = read_rigs(model, com_link)
     look = read_look(model).replace(lamps=tuple(lamps.values()))
     rig = None if camera is None or not model.ncam else rigs[camera_name(model, camera)]
-    return ModelScene(geoms, rig, rigs, look, tuple(links))
+    return ModelScene(geoms, rig, rigs, look, tuple(links), hull_errors(shapes))
 
 
 def _textured_geoms(

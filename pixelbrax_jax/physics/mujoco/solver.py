@@ -33,15 +33,6 @@ _EQUALITY, _FRICTION, _ONE_SIDED, _CONE = range(4)
 _Carry = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
 
 
-def is_supported(model: mujoco.MjModel) -> bool:
-    """Return whether the solver supports the model: pyramids, or elliptic cones of one condim."""
-    dimensions = {*model.geom_condim.tolist(), *model.pair_dim.tolist()}
-    return bool(
-        model.opt.solver == mujoco.mjtSolver.mjSOL_NEWTON
-        and (model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL or len(dimensions) == 1)
-    )
-
-
 class _Problem(NamedTuple):
     """Minimise ``(a - smooth) M (a - smooth) / 2 + sum(cost(J a - reference))`` over ``a``.
 

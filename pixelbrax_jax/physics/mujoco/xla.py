@@ -9,11 +9,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from pixelbrax_jax.physics.mujoco import stages
 from pixelbrax_jax.physics.mujoco.compatibility import import_silenced, load_onto_own_device
 from pixelbrax_jax.physics.mujoco.multipliers import multiplied
 from pixelbrax_jax.physics.mujoco.omissions import check_simulated
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
-from pixelbrax_jax.physics.mujoco.substitutes import substituted
 
 with import_silenced():
     from mujoco import mjx
@@ -34,9 +34,11 @@ class Xla:
         starts_with_forces: bool = False,
         out_of_reach: Iterable[str] = (),
         reads: Sequence[str] = (),
+        plain: bool = False,
     ):
         """Put a compiled model on the device; compile nothing. For the rest see ``Formulas``.
 
+        ``plain`` takes MuJoCo XLA's own step, as models do that ``stages`` do not support.
         A ValueError names what MuJoCo XLA does not simulate.
         """
         load_onto_own_device(mjx_io)
@@ -44,6 +46,7 @@ class Xla:
         self._model = model
         self._starts_with_forces = starts_with_forces or bool(reads)
         self._fields = tuple(reads)
+        self._stages: Any = mjx if plain or not stages.is_supported(model) else stages
         self.simulated = _simulated(model, out_of_reach)
         try:
             self._mx = mjx.put_model(self.simulated, impl="jax")
@@ -77,8 +80,7 @@ class Xla:
         def one(carry: Arrays) -> Arrays:
             qpos, qvel, act, warmstart, *_ = carry
             data = self._data(qpos, qvel, act=act, qacc_warmstart=warmstart, ctrl=ctrl)
-            with substituted(self._model):
-                data = mjx.step(model, data)
+            data = self._stages.step(model, data)
             return (
                 *(data.qpos, data.qvel, data.act, data.qacc_warmstart),
                 *(data.sensordata, *self._left(model, data, is_after_step=True)),
@@ -102,8 +104,7 @@ class Xla:
         left: Arrays = ()
         if self._starts_with_forces:
             model = _changed(self._passive, multipliers)
-            with substituted(self._model):
-                forward = mjx.forward(model, data)
+            forward = self._stages.forward(model, data)
             data = data.replace(sensordata=forward.sensordata)
             left = self._left(model, forward, is_after_step=False)
         return *self._readings(data), *left
@@ -116,9 +117,8 @@ class Xla:
 
     def clearances(self, qpos: jax.Array) -> Arrays:
         """See ``Native.clearances``; of geoms that do not overlap it may be a distance."""
-        with substituted(self._model):
-            data = mjx.kinematics(self._mx, self._data(qpos, jnp.zeros(self._model.nv)))
-            contact = mjx.collision(self._mx, data)._impl.contact
+        data = mjx.kinematics(self._mx, self._data(qpos, jnp.zeros(self._model.nv)))
+        contact = mjx.collision(self._mx, data)._impl.contact
         distances = contact.dist - contact.includemargin
         found = jnp.full(self._model.ngeom, jnp.inf)
         for geoms in contact.geom.T:
@@ -127,13 +127,12 @@ class Xla:
 
     def _readings(self, data: Any) -> Arrays:
         """Return ``xpos, xquat, sensordata``; sensors of forces are those of ``data``."""
-        with substituted(self._model):
-            data = mjx.kinematics(self._mx, data)
-            data = mjx.com_pos(self._mx, data)
-            data = mjx.com_vel(self._mx, data)
-            if self._model.nsensor:
-                data = mjx.sensor_pos(self._mx, data)
-                data = mjx.sensor_vel(self._mx, data)
+        data = mjx.kinematics(self._mx, data)
+        data = mjx.com_pos(self._mx, data)
+        data = mjx.com_vel(self._mx, data)
+        if self._model.nsensor:
+            data = mjx.sensor_pos(self._mx, data)
+            data = mjx.sensor_vel(self._mx, data)
         return data.xpos, data.xquat, data.sensordata
 
     def _data(self, qpos: jax.Array, qvel: jax.Array, **fields: jax.Array) -> Any:

@@ -29,6 +29,7 @@ RESULTS = Path(__file__).parents[3] / "docs" / "dmc" / "physics.json"
 
 STATES = 200
 EPISODES = 500
+LENGTH = 1000
 
 
 def same_state(task: str, count: int) -> dict[str, float]:
@@ -72,6 +73,31 @@ def control_step(task: str, count: int, **episodes: int) -> dict[str, float]:
     }
 
 
+def episode(task: str, length: int) -> dict[str, Any]:
+    """Compare an episode of both sides, from the same state with the same random actions.
+
+    ``apart`` is the number of control steps after which a joint position differs by 0.01, if any.
+    """
+    theirs = oracle.episode(task, length)
+    physics = make_physics(task)
+    low, high = physics._control_range
+    actions = jnp.asarray(2 * (theirs.action - low) / (high - low) - 1, jnp.float32)
+    state = jax.tree.map(lambda x: x[0], _ours(task, theirs.before))
+
+    def step(state: State, action: jax.Array) -> tuple[State, tuple[jax.Array, jax.Array]]:
+        after = physics.observe(*physics.move(state, action))
+        return after.engine, (after.engine.qpos, after.reward)
+
+    start = physics.observe(state, jax.jit(physics.dynamics.first)(state)).engine
+    qpos, rewards = jax.jit(lambda start: jax.lax.scan(step, start, actions))(start)[1]
+    far = _relative(qpos, theirs.after["qpos"]).max(axis=1) > 1e-2
+    return {
+        "apart": int(np.argmax(far)) + 1 if far.any() else None,
+        "return": float(np.sum(rewards)),
+        "return_of_dm_control": float(theirs.after["reward"].sum()),
+    }
+
+
 def initial_states(task: str, episodes: int, seed: int = 0) -> dict[str, float]:
     """p values of Kolmogorov and Smirnov's test, by coordinate, of both sides' initial states.
 
@@ -110,7 +136,8 @@ def _ours(task: str, states: dict[str, np.ndarray]) -> State:
     physics = make_physics(task)
     start = jax.eval_shape(physics.first, jax.random.key(0))[0]
     fields["target"] = fields["target"][:, : start.target.size]
-    return State(**fields, remembered=jnp.zeros((len(fields["qpos"]), 0)))
+    nothing = jnp.zeros((len(fields["qpos"]), 0))
+    return State(**fields, multipliers=nothing, remembered=nothing)
 
 
 @cache
@@ -144,6 +171,7 @@ def main() -> None:
             "states": arguments.states,
             "same_state": same_state(task, arguments.states),
             "control_step": control_step(task, arguments.states),
+            "episode": episode(task, LENGTH),
             "initial_states": {
                 "episodes": arguments.episodes,
                 "coordinates": len(p_values),

@@ -98,6 +98,17 @@ def transitions(
     return Transitions(_stack(before[:count]), np.array(actions[:count]), _stack(after[:count]))
 
 
+def episode(task: str, length: int, seed: int = 0) -> Transitions:
+    """Make the transitions of an episode of random actions, from its initial state on."""
+    env = load(task, seed)
+    spec = env.action_spec()
+    random = np.random.RandomState(seed + 1)
+    actions = random.uniform(spec.minimum, spec.maximum, (length, *spec.shape))
+    seen = [record(env, env.reset())]
+    seen += [record(env, env.step(action)) for action in actions]
+    return Transitions(_stack(seen[:-1]), actions, _stack(seen[1:]))
+
+
 @cache
 def starts(task: str, count: int, seed: int = 0) -> dict[str, np.ndarray]:
     """Initial states of episodes."""

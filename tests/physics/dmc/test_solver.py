@@ -7,12 +7,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from mujoco.mjx._src import collision_driver
-from mujoco.mjx._src import solver as theirs
 
 from pixelbrax_jax._platform.interpreter import batch_last
-from pixelbrax_jax.physics.mujoco import elimination
-from pixelbrax_jax.physics.mujoco.solver import is_supported
+from pixelbrax_jax.physics.mujoco import elimination, stages
+from pixelbrax_jax.physics.mujoco.stages import is_supported
 from pixelbrax_jax.physics.mujoco.xla import Xla
 
 # Two arms with dry friction, limits and a joint that follows another; a ball that slides and rolls.
@@ -57,18 +55,12 @@ def last(function):
     return batch_last(function, (0, 0))
 
 
-def after_a_step(model, qpos, qvel, batch=jax.vmap):
-    """Our ``qpos, qvel, act, qacc`` after a step.
-
-    MuJoCo XLA's own functions are in their places again.
-    """
-    before = theirs.solve, dict(collision_driver._COLLISION_FUNC)
-    engine = Xla(model)
-    act, ctrl, accelerations = jnp.zeros(model.na), jnp.zeros(model.nu), jnp.zeros(model.nv)
-    move = batch(lambda q, v: engine.step(1, q, v, act, accelerations, ctrl)[:4])
-    found = jax.jit(move)(jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32))
-    assert before == (theirs.solve, collision_driver._COLLISION_FUNC)
-    return found
+def after_a_step(model, qpos, qvel, batch=jax.vmap, **options):
+    """Our ``qpos, qvel, act, qacc`` after a step."""
+    engine = Xla(model, **options)
+    rest = [jnp.zeros(size) for size in (model.na, model.nv, model.nu, 0)]
+    move = batch(lambda q, v: engine.step(1, q, v, *rest)[:4])
+    return jax.jit(move)(jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32))
 
 
 def mujocos(model, qpos, qvel, function):
@@ -164,3 +156,33 @@ def test_solutions_are_numpys(unknowns, batch):
 def test_matrices_of_other_kinds_have_no_solution(unknowns):
     matrix = jnp.diag(jnp.ones(unknowns).at[1].set(-1.0))
     assert jnp.isnan(elimination.solve(matrix, jnp.ones(unknowns))).all()
+
+
+STAGES = ("collide", "solve", "_solve_inertia")
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "RK4"])
+def test_each_stage_of_our_own_is_used_and_agrees_with_mujoco_xlas(integrator, monkeypatch):
+    xml = MODEL.format(cone="pyramidal", condim=3, arms=3)
+    model = mujoco.MjModel.from_xml_string(
+        xml.replace("<option", f'<option integrator="{integrator}"')
+    )
+    used = []
+    for name in STAGES:
+        monkeypatch.setattr(stages, name, recorded(getattr(stages, name), used))
+    qpos, qvel = states(model)
+    ours = after_a_step(model, qpos, qvel)
+    assert set(used) == {*STAGES}
+    theirs = after_a_step(model, qpos, qvel, plain=True)
+    for one, other in zip(ours[:2], theirs[:2], strict=True):
+        scale = np.maximum(1.0, np.abs(other).max(axis=1, keepdims=True))
+        far = (np.abs(one - other) / scale).max(axis=1)
+        assert np.quantile(far, 0.9) < 1e-3
+
+
+def recorded(function, used):
+    def record(*args):
+        used.append(function.__name__)
+        return function(*args)
+
+    return record

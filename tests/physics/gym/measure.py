@@ -101,7 +101,7 @@ def states_of(physics: Any, rows: dict[str, np.ndarray]) -> State:
     """Return states of Gymnasium as a batch of ours."""
 
     def one(qpos, qvel, act, warmstart, ctrl, xpos, xipos):  # type: ignore[no-untyped-def]
-        state = State(qpos, qvel, act, warmstart, ctrl, jnp.zeros(0), jnp.zeros(0))
+        state = State(qpos, qvel, act, warmstart, ctrl, *3 * [jnp.zeros(0)])
         fields = {"xpos": xpos, "xipos": xipos}
         readings = Readings(xpos, None, None, jnp.zeros_like(qpos), fields)
         remember = physics._formulas.remember

@@ -1,0 +1,153 @@
+"""Environments of MuJoCo Playground as tasks."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from pixelbrax_jax.flags import default_flags
+from pixelbrax_jax.physics.divergence import GuardedPhysics, Recipe
+from pixelbrax_jax.physics.mujoco.compatibility import (
+    import_silenced,
+    load_onto_own_device,
+    loading_silenced,
+)
+from pixelbrax_jax.physics.mujoco.geometry import VISIBLE_GROUPS
+from pixelbrax_jax.physics.mujoco.poses import center_of_mass
+from pixelbrax_jax.physics.mujoco.scene import read_scene
+from pixelbrax_jax.physics.mujoco.viewpoints import followed_body, unfit_cameras
+from pixelbrax_jax.physics.task import Color
+from pixelbrax_jax.types import PhysicsState
+
+with import_silenced():
+    from mujoco import mjx
+    from mujoco.mjx._src import io as mjx_io
+
+
+class PlaygroundPhysics(GuardedPhysics):
+    """A task of MuJoCo Playground, made by ``playground_physics``."""
+
+    backend = "mjx"
+
+    @default_flags()
+    def __init__(
+        self,
+        env: Any,
+        *,
+        colors: Mapping[str, Color] | None = None,
+        geom_groups: Collection[int] = VISIBLE_GROUPS,
+        identity: Recipe | None = None,
+    ):
+        """Take an environment without wrappers and read its scene; compile no program."""
+        for name in ("mj_model", "mjx_model", "reset", "step", "dt", "action_size"):
+            if not hasattr(env, name):
+                raise ValueError(
+                    f"env must be an environment of MuJoCo Playground or its name, got a "
+                    f"{type(env).__name__}, which has no {name}."
+                )
+        if env.mjx_model.impl.value != "jax":
+            raise ValueError(
+                f"env computes with impl={env.mjx_model.impl.value!r}, which needs MuJoCo Warp: "
+                "load it with config_overrides={'impl': 'jax'}."
+            )
+        model = env.mj_model
+        scene = read_scene(model, None, colors=colors, geom_groups=geom_groups)
+        self.geoms, self.look, self.rigs = scene.geoms, scene.look, scene.rigs
+        self.unfit_cameras = unfit_cameras(model)
+        bodies = [model.body(i).name or f"link/{i - 1}" for i in range(1, model.nbody)]
+        self.link_names = (*bodies, *scene.links)
+        self.followed_link = max(followed_body(model) - 1, 0)
+        self.dt = float(f"{float(env.dt):.6g}")
+        self.action_size = int(env.action_size)
+        config = getattr(env, "_config", {})
+        self.time_limit = config.get("episode_length")
+        self._has_com = bool(scene.links)
+        self._env = env
+        self._identity = identity
+        key = jax.eval_shape(lambda: jax.random.key_data(jax.random.key(0)))
+        first = jax.eval_shape(env.reset, key)
+        self._dtypes = jax.tree.map(lambda leaf: leaf.dtype, first)
+        obs = jax.eval_shape(_flat, first.obs)
+        self.state_size = int(obs.shape[0])
+
+    def _reset(self, key: jax.Array, *dynamics: jax.Array) -> PhysicsState:
+        del dynamics  # they do not vary
+        return self._state(self._env.reset(jax.random.key_data(key)))
+
+    def _step(self, state: PhysicsState, action: jax.Array) -> PhysicsState:
+        return self._state(self._env.step(state.engine, jnp.asarray(action, jnp.float32)))
+
+    def _watched(self, state: PhysicsState) -> Any:
+        return state.engine.data.qpos, state.engine.data.qvel
+
+    def _state(self, found: Any) -> PhysicsState:
+        """Return Playground's state as ours, with poses that fit its joint positions."""
+        # With fixed dtypes a jitted step is not traced again for its own output.
+        engine = jax.tree.map(jnp.asarray, found, self._dtypes)
+        poses = mjx.kinematics(self._env.mjx_model, engine.data)
+        xpos, xquat = poses.xpos[1:], poses.xquat[1:]
+        if self._has_com:
+            com = center_of_mass(self._env.mj_model, xpos, xquat)
+            xpos = jnp.concatenate([xpos, com[None]])
+            xquat = jnp.concatenate([xquat, jnp.array([[1.0, 0.0, 0.0, 0.0]])])
+        return PhysicsState(
+            engine=engine,
+            xpos=xpos,
+            xquat=xquat,
+            obs=_flat(found.obs),
+            reward=jnp.asarray(found.reward, jnp.float32),
+            terminated=jnp.asarray(found.done) > 0.5,
+            non_finite=jnp.zeros((), bool),
+        )
+
+
+def playground_physics(
+    env: Any,
+    config_overrides: Mapping[str, Any] | None = None,
+    *,
+    colors: Mapping[str, Color] | None = None,
+    geom_groups: Collection[int] = VISIBLE_GROUPS,
+) -> PlaygroundPhysics:
+    """Make physics of an environment of MuJoCo Playground (package ``playground``).
+
+    States, observations, rewards and ends are the environment's; pictures are PixelBrax's. MuJoCo
+    XLA simulates it on every device. Actions, which Playground expects in [-1, 1], are passed on.
+    Its ``episode_length`` is the task's time limit.
+
+    Args:
+        env: a name of Playground's registry, such as ``"CartpoleBalance"``, or an environment
+            without wrappers, with ``impl="jax"``.
+        config_overrides: changes of the environment's configuration, for a name.
+        colors: replacements for the model's colors by geom name, red, green, blue in [0, 1].
+        geom_groups: MuJoCo's groups of visible geoms and sites.
+
+    Raises:
+        ImportError: Playground is not installed.
+        ValueError: the name is unknown, ``env`` is not such an environment, or its model cannot be
+            rendered.
+    """
+    load_onto_own_device(mjx_io)
+    if not isinstance(env, str):
+        return PlaygroundPhysics(env, colors=colors, geom_groups=geom_groups)
+    try:
+        with import_silenced():
+            from mujoco_playground import registry
+    except ImportError as error:
+        raise ImportError(
+            f"MuJoCo Playground cannot be imported ({error}); try: pip install playground"
+        ) from error
+    defaults = registry.get_default_config(env)
+    plain = {"impl": "jax"} if "impl" in defaults else {}
+    with loading_silenced():
+        made = registry.load(env, config_overrides=plain | dict(config_overrides or {}))
+    return PlaygroundPhysics(made, colors=colors, geom_groups=geom_groups)
+
+
+def _flat(obs: Any) -> jax.Array:
+    """Return an observation as (S,) float32; of several by name, ``state``."""
+    if isinstance(obs, Mapping):
+        obs = obs["state"] if "state" in obs else jnp.concatenate(jax.tree.leaves(obs))
+    return jnp.asarray(obs, jnp.float32)
