@@ -154,6 +154,15 @@ def play_torchrl() -> dict[str, Any]:
     return found | {"step": (td["next", "pixels"].numpy(), td["next", "reward"].numpy())}
 
 
+PHASIC = {"num-minibatches": 2, "num-policy-phases": 2, "aux-minibatches": 2}
+OWN_OPTIONS = {
+    "ppo": {"num-minibatches": 2},
+    "ppg": PHASIC,
+    "dcpg": PHASIC,
+    "drqv2": {"replay-ratio": 0.25, "learning-starts": 8, "batch-size": 4, "buffer-size": 16},
+}
+
+
 def train(name: str) -> dict[str, Any]:
     """``pixelbrax train``, and the policy that it leaves."""
     from pixelbrax_gym.cli import main as pixelbrax
@@ -162,9 +171,9 @@ def train(name: str) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         options = {
             **{"task": TASK, "height": 18, "width": 18, "frame-stack": 1, "encoder": "small"},
-            **{"num-envs": 2, "num-steps": 4, "num-minibatches": 2, "total-steps": 16},
+            **{"num-envs": 2, "num-steps": 4, "total-steps": 16},
             **{"num-evals": 1, "eval-episodes": 2, "episode-length": 6, "output-dir": folder},
-            **({"num-policy-phases": 2, "aux-minibatches": 2} if name != "ppo" else {}),
+            **OWN_OPTIONS[name],
         }
         words = [word for pair in options.items() for word in (f"--{pair[0]}", str(pair[1]))]
         with contextlib.redirect_stdout(sys.stderr):

@@ -121,7 +121,7 @@ def _report(line: str) -> None:
 
 def parse(algorithm: str, arguments: Sequence[str]) -> tuple[Launch, TrainConfig, RunConfig]:
     """Parse the options of an algorithm; raise a ValueError if a setting is out of range."""
-    from pixelbrax_jax.agents.presets import PRESETS, preset
+    from pixelbrax_jax.agents.presets import preset, preset_names
     from pixelbrax_jax.agents.runner.settings import RunConfig
 
     # Defaults are those of a preset, which may be those of a task.
@@ -140,7 +140,8 @@ def parse(algorithm: str, arguments: Sequence[str]) -> tuple[Launch, TrainConfig
         parsed = tyro.cli(
             command,
             prog=f"pixelbrax train {algorithm}",
-            description=f"Trains {algorithm.upper()} from pixels; presets: {', '.join(PRESETS)}.",
+            description=f"Trains {algorithm.upper()} from pixels; presets: "
+            f"{', '.join(preset_names(algorithm))}.",
             default=command(**parts),
             args=arguments,
         )

@@ -46,6 +46,23 @@ def map_runs(function: Callable[[Any], Any], runs: Any) -> Any:
     )
 
 
+def one_run_after_the_other(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return ``function``, the ``jax.vmap`` of which is ``map_runs``; it has no gradient."""
+    mapped = jax.custom_batching.custom_vmap(function)
+
+    @mapped.def_vmap
+    def map_all(size: int, batched: Any, *arguments: Any) -> tuple[Any, Any]:
+        def spread(x: jax.Array, is_batched: bool) -> jax.Array:
+            return x if is_batched else jnp.broadcast_to(x, (size, *x.shape))
+
+        arguments = jax.tree.map(spread, arguments, tuple(batched))
+        result = map_runs(lambda one: function(*one), arguments)
+        return result, jax.tree.map(lambda _: True, result)
+
+    called: Callable[..., Any] = mapped
+    return called
+
+
 def _step_chunks(
     step: Step, last: bool, state: Any, rows: Any, shared: Any
 ) -> tuple[Any, jax.Array]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -22,7 +22,8 @@ class Algorithm(ABC):
     """An algorithm with its settings and environments, as pure functions.
 
     Equal settings in equal environments share compiled programs. ``acting`` names the networks that
-    ``act`` needs.
+    ``act`` needs. With several runs in one program, a CPU computes ``iterate`` for one run after
+    the other, which copies their states; with ``vmaps_runs`` it computes ``jax.vmap`` of it.
 
     Raises:
         ValueError: the environments contradict the settings.
@@ -34,6 +35,7 @@ class Algorithm(ABC):
     name: ClassVar[str]
     config_class: ClassVar[type[TrainConfig]] = TrainConfig
     acting: ClassVar[tuple[str, ...]] = ("actor",)
+    vmaps_runs: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         """Check the environments."""
@@ -87,6 +89,11 @@ class Algorithm(ABC):
 
         Needs only the networks in ``acting``. A key samples the actions; None returns the best.
         """
+
+    def warnings(self, record: Mapping[str, float]) -> list[str]:
+        """Return what a user should know about a record of the metrics; told once in a run."""
+        del record
+        return []
 
     @property
     def auxiliary_every(self) -> int:

@@ -37,9 +37,16 @@ def check_count(name: str, value: object) -> None:
         raise ValueError(f"{name} must be a whole number of at least 0, got {value!r}.")
 
 
+def check_finite(name: str, value: object) -> None:
+    """Raise a ValueError unless the setting is a finite number."""
+    if not isinstance(value, Real) or isinstance(value, bool) or not math.isfinite(value):
+        raise ValueError(f"{name} must be a finite number, got {value!r}.")
+
+
 PositiveInt = Annotated[int, check_positive_int]
 Count = Annotated[int, check_count]
 Fraction = Annotated[float, check_fraction]
+Finite = Annotated[float, check_finite]
 Positive = Annotated[float, check_positive]
 NotNegative = Annotated[float, partial(check_positive, or_zero=True)]
 
@@ -113,6 +120,13 @@ class TrainConfig:
     def bytes_per_iteration(self) -> int:
         """Bytes of the frames that an iteration stores besides the state."""
         return 0
+
+    def to_fit(self, excess: float) -> str:
+        """Say how a run that takes ``excess`` bytes too much is made to fit."""
+        del excess
+        return (
+            f"Lower {', '.join(self.memory_settings)} or the image size, or raise memory_budget_gb."
+        )
 
     def replace(self, **settings: Any) -> Self:
         """Return a copy with changed settings, also of the environment, such as ``height=64``.

@@ -59,9 +59,28 @@ _CPU = _FAST | {
 _PPG = {"layout": "detach", "aux_epochs": 1}
 _DCPG = {"num_policy_phases": 2, "aux_epochs": 2, "update_epochs": 2}
 
+# The settings of DrQ-v2's code; the classes' defaults have the rest.
+_DRQV2 = {
+    "look": "dmc",
+    "action_repeat": 2,
+    "num_envs": 1,
+    "num_steps": 2,
+    "buffer_size": 1_000_000,
+    "saturation_coef": 0.0,
+    "total_steps": 1_100_000,
+}
+# For many environments, small images and few updates, after Squint (arXiv 2602.21203).
+_SMALL_DRQV2 = {
+    "height": 32,
+    "width": 32,
+    "action_repeat": 2,
+    "replay_ratio": 0.125,
+    "learning_rate": 3e-4,
+}
+
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     # The defaults of each class.
-    "default": {},
+    "default": {name: {} for name in ALGORITHMS},
     # Lyu et al.'s scripts for Brax (the code of arXiv 2502.00021).
     "deacrep": {
         "ppo": _DEACREP | {"update_epochs": 1},
@@ -87,6 +106,31 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
         "ppo": _CPU | {"layout": "shared", "update_epochs": 2},
         "ppg": _CPU | _PPG | {"policy_epochs": 2, "value_epochs": 2, "num_policy_phases": 2},
         "dcpg": _CPU | _DCPG,
+        "drqv2": _SMALL_DRQV2
+        | {
+            "encoder": "patch",
+            "num_steps": 4,
+            "hidden_dim": 256,
+            "buffer_size": 250_000,
+            "total_steps": 800_000,
+        },
+    },
+    # Yarats et al. for the DM Control Suite (the code of arXiv 2107.09645).
+    "drqv2": {"drqv2": _DRQV2 | {"task": "dmc_cartpole_swingup"}},
+    # For a GPU.
+    "fast": {
+        "drqv2": _SMALL_DRQV2
+        | {
+            "encoder": "small",
+            "num_envs": 256,
+            "batch_size": 512,
+            "learning_starts": 10_000,
+            "buffer_size": 1_000_000,
+            "std_steps": 500_000,
+            "hidden_dim": 512,
+            "bfloat16": True,
+            "total_steps": 4_000_000,
+        },
     },
 }
 """Changes to the defaults, by preset and algorithm."""
@@ -119,6 +163,33 @@ _CPU_DMC_TASKS: dict[str, dict[str, Any]] = {
 _CPU_SHARES = {"ppo": 1.0, "ppg": 0.7, "dcpg": 0.6}
 """Number of steps relative to PPO, whose updates are faster."""
 
+_DRQV2_TASKS = (
+    # total_steps, std_steps, tasks
+    (
+        1_100_000,
+        100_000,
+        "ball_in_cup_catch cartpole_balance cartpole_balance_sparse cartpole_swingup finger_spin "
+        "hopper_stand pendulum_swingup walker_stand walker_walk",
+    ),
+    (
+        3_100_000,
+        500_000,
+        "acrobot_swingup cartpole_swingup_sparse cheetah_run finger_turn_easy finger_turn_hard "
+        "hopper_hop quadruped_run quadruped_walk reacher_easy reacher_hard walker_run",
+    ),
+    (30_100_000, 2_000_000, "humanoid_run humanoid_stand humanoid_walk"),
+)
+
+
+def _drqv2_settings(task: str) -> dict[str, Any]:
+    """Return what DrQ-v2's code changes for a task besides its length and schedule."""
+    if task.startswith("walker"):
+        return {"batch_size": 512, "n_step": 1}
+    if task.startswith("humanoid"):
+        return {"feature_dim": 100, "learning_rate": 8e-5}
+    return {"buffer_size": 100_000} if task == "quadruped_run" else {}
+
+
 TASK_SETTINGS: dict[str, dict[str, dict[str, dict[str, Any]]]] = {
     "cpu": {
         algorithm: {
@@ -129,8 +200,20 @@ TASK_SETTINGS: dict[str, dict[str, dict[str, dict[str, Any]]]] = {
         | (_CPU_DMC_TASKS if algorithm == "ppo" else {})
         for algorithm, share in _CPU_SHARES.items()
     },
+    "drqv2": {
+        "drqv2": {
+            f"dmc_{task}": {"total_steps": total, "std_steps": over} | _drqv2_settings(task)
+            for total, over, tasks in _DRQV2_TASKS
+            for task in tasks.split()
+        }
+    },
 }
-"""Further changes, by preset, algorithm and task; these presets support no other tasks."""
+"""Further changes, by preset, algorithm and task; where there are some, other tasks are errors."""
+
+
+def preset_names(algorithm: str) -> list[str]:
+    """Return the names of the presets that have settings for an algorithm."""
+    return [name for name, settings in PRESETS.items() if algorithm in settings]
 
 
 def preset(
@@ -138,15 +221,21 @@ def preset(
 ) -> TrainConfig:
     """Return the settings of a preset, with ``changes`` as in ``TrainConfig.replace``.
 
-    The algorithm is ``"ppo"``, ``"ppg"`` or ``"dcpg"``; the name is ``"default"``, ``"deacrep"``,
-    ``"procgen"``, ``"ci"`` or ``"cpu"``. ``task=None`` uses the preset's task.
+    The algorithm is ``"ppo"``, ``"ppg"``, ``"dcpg"`` or ``"drqv2"``; the name is one of
+    ``PRESETS`` that has the algorithm. ``task=None`` uses the preset's task.
 
     Raises:
-        ValueError: a name is unknown, a setting is out of range, or the preset lacks the task.
+        ValueError: a name is unknown, a setting is out of range, or the preset lacks the algorithm
+            or the task.
     """
     check_choice("algorithm", algorithm, ALGORITHMS)
     check_choice("preset", name, PRESETS)
-    kind, settings = ALGORITHMS[algorithm].config_class, PRESETS[name].get(algorithm, {})
+    if algorithm not in PRESETS[name]:
+        raise ValueError(
+            f"the preset {name!r} has no settings for {algorithm}; use one of "
+            f"{', '.join(preset_names(algorithm))}."
+        )
+    kind, settings = ALGORITHMS[algorithm].config_class, PRESETS[name][algorithm]
     if task is not None:
         settings = settings | {"task": task}
     if of_tasks := TASK_SETTINGS.get(name, {}).get(algorithm):

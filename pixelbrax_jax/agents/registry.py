@@ -8,6 +8,7 @@ import jax
 
 from pixelbrax_jax.agents.algorithm import Algorithm, train_function
 from pixelbrax_jax.agents.config import TrainConfig, make_env
+from pixelbrax_jax.agents.off_policy.drqv2 import DrQv2
 from pixelbrax_jax.agents.on_policy.dcpg import DCPG
 from pixelbrax_jax.agents.on_policy.ppg import PPG
 from pixelbrax_jax.agents.on_policy.ppo import PPO
@@ -16,7 +17,7 @@ from pixelbrax_jax.agents.train_state import Metrics, TrainState
 from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.types import EnvParams
 
-ALGORITHMS: dict[str, type[Algorithm]] = {kind.name: kind for kind in (PPO, PPG, DCPG)}
+ALGORITHMS: dict[str, type[Algorithm]] = {kind.name: kind for kind in (PPO, PPG, DCPG, DrQv2)}
 """Algorithm classes by name."""
 
 

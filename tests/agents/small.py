@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pixelbrax_jax import EnvParams, PixelEnv, VectorPixelEnv
-from pixelbrax_jax.agents import DCPG, PPG, PPO
+from pixelbrax_jax.agents import DCPG, PPG, PPO, DrQv2
 from pixelbrax_jax.agents.algorithm import Algorithm
 from pixelbrax_jax.agents.train_state import TrainState
 from pixelbrax_jax.config import EnvConfig
@@ -36,6 +36,21 @@ SMALL: dict[str, Any] = {
 ABOUT: dict[str, Any] = {"algorithm": "ppg", "config": {}}
 """What is stored with the checkpoints of no run in particular."""
 PHASIC = {"num_policy_phases": 2, "aux_minibatches": 4, "aux_epochs": 2}
+REPLAY = {
+    "replay_ratio": 0.125,
+    "buffer_size": 64,
+    "learning_starts": 32,
+    "batch_size": 8,
+    "n_step": 2,
+    "feature_dim": 8,
+    "hidden_dim": 16,
+}
+
+
+def settings_of(kind: type[Algorithm]) -> dict[str, Any]:
+    """Return those settings of ``SMALL``, ``PHASIC`` and ``REPLAY`` that the algorithm has."""
+    known = kind.config_class.__dataclass_fields__
+    return {name: x for name, x in (SMALL | PHASIC | REPLAY).items() if name in known}
 
 
 def ball_envs() -> VectorPixelEnv:
@@ -81,9 +96,8 @@ class Agent:
 
 
 def small_agent(kind: type[Algorithm], **settings: Any) -> Agent:
-    """An agent of ``SMALL`` and, if it has such phases, ``PHASIC``, with other settings."""
-    phasic = PHASIC if "aux_epochs" in kind.config_class.__dataclass_fields__ else {}
-    return Agent(kind(kind.config_class(**SMALL | phasic | settings), ball_envs()))
+    """An agent of ``settings_of``, with other settings."""
+    return Agent(kind(kind.config_class(**settings_of(kind) | settings), ball_envs()))
 
 
 AGENTS = {
@@ -93,6 +107,9 @@ AGENTS = {
     # With everything there is: a critic of its own, an averaged actor, and a dynamics head.
     "decoupled": small_agent(DCPG, decoupled=True, dynamics_coef=1.0),
 }
+"""On-policy algorithms."""
+
+DRQV2 = small_agent(DrQv2)
 
 
 def with_iterate(

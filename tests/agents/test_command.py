@@ -13,7 +13,6 @@ from pixelbrax_gym.cli import main
 from pixelbrax_gym.cli.train import parse
 from pixelbrax_jax.agents.config import describe
 from pixelbrax_jax.agents.presets import PRESETS, TASK_SETTINGS, preset
-from pixelbrax_jax.agents.registry import ALGORITHMS
 from pixelbrax_jax.agents.runner import train
 from pixelbrax_jax.agents.runner.trained import load_config
 from pixelbrax_jax.tasks import TASKS
@@ -32,8 +31,10 @@ TINY = (
 )
 
 
-@pytest.mark.parametrize("name", PRESETS)
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.parametrize(
+    ("algorithm", "name"),
+    [(algorithm, name) for name, settings in PRESETS.items() for algorithm in settings],
+)
 def test_every_preset_is_valid_and_comes_back_from_json(algorithm, name):
     config = preset(algorithm, name)
     stored = {"algorithm": algorithm, "config": describe(config) | {"seed": 3}}
@@ -42,7 +43,11 @@ def test_every_preset_is_valid_and_comes_back_from_json(algorithm, name):
 
 @pytest.mark.parametrize(
     ("algorithm", "task"),
-    [(algorithm, task) for algorithm in ALGORITHMS for task in TASK_SETTINGS["cpu"][algorithm]],
+    [
+        (algorithm, task)
+        for algorithm, of_tasks in TASK_SETTINGS["cpu"].items()
+        for task in of_tasks
+    ],
 )
 def test_a_preset_may_have_settings_of_a_task(algorithm, task):
     line = ["--preset", "cpu", "--task", task, "--num-steps", "64"]
@@ -159,7 +164,7 @@ def test_a_process_is_not_left_alone_silently(given, capsys):
 
 def test_without_arguments_it_tells_what_there_is(capsys):
     assert main(["train"]) == 0
-    assert "{ppo,ppg,dcpg}" in capsys.readouterr().out
+    assert "{ppo,ppg,dcpg,drqv2}" in capsys.readouterr().out
 
 
 # imageio never closes FFmpeg's pipes itself.

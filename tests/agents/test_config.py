@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from pixelbrax_jax.agents.config import TrainConfig, describe, make_env
+from pixelbrax_jax.agents.off_policy.config import DrQv2Config
 from pixelbrax_jax.agents.on_policy.config import OnPolicyConfig
 from pixelbrax_jax.agents.on_policy.dcpg import DCPGConfig
 from pixelbrax_jax.agents.on_policy.ppg import PPGConfig
@@ -19,29 +20,35 @@ from pixelbrax_jax.config import EnvConfig
 from pixelbrax_jax.distractors.video import Video
 from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.types import Camera
-from tests.agents.small import SMALL, ball_envs
+from tests.agents.small import SMALL, ball_envs, settings_of
 
-CONFIGS = (PPOConfig, PPGConfig, DCPGConfig)
+CONFIGS = (PPOConfig, PPGConfig, DCPGConfig, DrQv2Config)
 
 COUNTS = (
     "height", "width", "frame_stack", "action_repeat", "episode_length", "total_steps", "num_envs",
     "num_steps", "num_minibatches", "update_epochs", "policy_epochs", "value_epochs",
-    "num_policy_phases", "aux_minibatches",
+    "num_policy_phases", "aux_minibatches", "buffer_size", "learning_starts", "batch_size",
+    "n_step", "policy_delay", "num_atoms", "feature_dim", "hidden_dim", "std_steps",
 )  # fmt: skip
 COUNTS_OR_0 = ("random_shift", "aux_epochs")
-SHARES = ("gamma", "gae_lambda", "clip_coef", "target_rate")
-POSITIVE = ("learning_rate", "initial_std", "adam_eps", "memory_budget_gb", "target_kl")
+SHARES = ("gamma", "gae_lambda", "clip_coef", "target_rate", "tau")
+POSITIVE = (
+    "learning_rate", "initial_std", "adam_eps", "memory_budget_gb", "target_kl", "replay_ratio",
+    "final_std", "std_clip",
+)  # fmt: skip
+FINITE = ("v_min", "v_max")
 POSITIVE_OR_0 = (
     "max_grad_norm", "ent_coef", "vf_coef", "beta_clone", "aux_value_coef", "value_distill_coef",
-    "dynamics_coef",
+    "dynamics_coef", "saturation_coef",
 )  # fmt: skip
-CHOICES = ("encoder", "policy", "normalize_advantage", "layout")
+CHOICES = ("encoder", "policy", "normalize_advantage", "layout", "critic")
 UNCHECKED = {
     # Options of the environment, checked with those of every other one.
     "task", "backend", "engine", "reward_preset", "distractors", "clips", "camera", "look",
-    "shadows", "split", "obs_mode", "renderer",
+    "shadows", "split", "obs_mode", "renderer", "dynamics", "test_dynamics",
     # Truth values.
     "state_critic", "anneal", "normalize_reward", "clip_value", "decoupled",
+    "checkpoint_replay", "layer_norm", "bfloat16",
 }  # fmt: skip
 NAN, INF = float("nan"), float("inf")
 
@@ -51,6 +58,7 @@ BAD = [
     (SHARES, r"lie in \[0, 1\]", (-0.1, 1.5, NAN, "1")),
     (POSITIVE, "a positive number", (0, -1.0, NAN, INF, "1")),
     (POSITIVE_OR_0, "at least 0", (-1.0, NAN, INF, "1")),
+    (FINITE, "a finite number", (NAN, INF, True, "1")),
     (CHOICES, "unknown .*llowed: .*, ", ("Nonesuch", None, 3)),
 ]
 
@@ -133,9 +141,9 @@ def test_iterations_are_rounded_up_and_count_control_steps():
 
 @pytest.mark.parametrize("config", CONFIGS)
 def test_a_description_is_json_and_gives_the_settings_back(config):
-    changed = config().replace(distractors=("video", "dcs-easy"), num_envs=7)
+    changed = config().replace(distractors=("video", "dcs-easy"), num_envs=6)
     settings = json.loads(json.dumps(describe(changed)))
-    assert settings["num_envs"] == 7
+    assert settings["num_envs"] == 6
     assert config().replace(**settings) == changed
 
 
@@ -163,9 +171,10 @@ def test_the_environment_is_the_one_that_is_described():
 )
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_environments_that_are_not_those_of_the_settings_are_told(name, changes, message):
-    config = ALGORITHMS[name].config_class(**SMALL | {"total_steps": 10_000_000})
+    kind = ALGORITHMS[name]
+    config = kind.config_class(**settings_of(kind) | {"total_steps": 10_000_000})
     with pytest.raises(ValueError, match=re.escape(message)):
-        ALGORITHMS[name](config.replace(**changes), ball_envs())
+        kind(config.replace(**changes), ball_envs())
 
 
 class Unhashable(VectorPixelEnv):

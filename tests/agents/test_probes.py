@@ -18,6 +18,9 @@ import pytest
 
 from pixelbrax_jax import Physics, PhysicsState, PixelEnv, VectorPixelEnv
 from pixelbrax_jax.agents.networks.actor_critic import Actor, Critic
+from pixelbrax_jax.agents.networks.encoders import scaled
+from pixelbrax_jax.agents.off_policy.config import DrQv2Config
+from pixelbrax_jax.agents.off_policy.drqv2 import DrQv2
 from pixelbrax_jax.agents.on_policy.dcpg import DCPG, DCPGConfig
 from pixelbrax_jax.agents.on_policy.ppg import PPG, PPGConfig
 from pixelbrax_jax.agents.on_policy.ppo import PPO, PPOConfig
@@ -112,21 +115,38 @@ SHARED = {
     "encoder": "small",
     "num_envs": 16,
     "num_steps": 8,
-    "num_minibatches": 2,
     "gamma": GAMMA,
-    "initial_std": 0.5,
     "learning_rate": 3e-3,
     # What remains of the noise of single minibatches goes with the step size.
     "anneal": True,
     "total_steps": 16 * 8 * 60,
-    "normalize_reward": False,
+}
+ON_POLICY = SHARED | {"num_minibatches": 2, "initial_std": 0.5, "normalize_reward": False}
+REPLAY = {
+    "replay_ratio": 0.125,
+    "buffer_size": 4096,
+    "learning_starts": 512,
+    "batch_size": 64,
+    "n_step": 2,
+    "random_shift": 0,
+    "tau": 0.1,
+    "feature_dim": 32,
+    "hidden_dim": 64,
+    "std_steps": 4096,
 }
 PHASIC = {"num_policy_phases": 2, "aux_minibatches": 4, "aux_epochs": 4}
 
 AGENTS = {
-    "ppo": (PPO, PPOConfig(**SHARED, update_epochs=4)),
-    "ppg": (PPG, PPGConfig(**SHARED, **PHASIC, policy_epochs=2, value_epochs=2)),
-    "dcpg": (DCPG, DCPGConfig(**SHARED, **PHASIC, update_epochs=2)),
+    "ppo": (PPO, PPOConfig(**ON_POLICY, update_epochs=4)),
+    "ppg": (PPG, PPGConfig(**ON_POLICY, **PHASIC, policy_epochs=2, value_epochs=2)),
+    "dcpg": (DCPG, DCPGConfig(**ON_POLICY, **PHASIC, update_epochs=2)),
+    "drqv2": (DrQv2, DrQv2Config(**SHARED, **REPLAY)),
+    "c51": (
+        DrQv2,
+        DrQv2Config(
+            **SHARED, **REPLAY, critic="c51", v_min=-2.0, v_max=5.0, num_atoms=29, policy_delay=2
+        ),
+    ),
 }
 
 
@@ -149,6 +169,15 @@ def images(envs):
     return image(jnp.arange(len(NAMES)))
 
 
+def values_of(algorithm, networks, images):
+    """The mean of both Q functions at the best action."""
+    module = algorithm.modules
+    features = module["encoder"].apply(networks["encoder"], scaled(images))
+    action = jnp.tanh(module["actor"].apply(networks["actor"], features))
+    outputs = module["critic"].apply(networks["critic"], features, action)
+    return algorithm.values(outputs).mean(0)
+
+
 @pytest.fixture(scope="module", params=AGENTS)
 def learned(request, envs, images):
     """Values and mean actions by place, of an agent that has learned."""
@@ -166,7 +195,9 @@ def learned(request, envs, images):
     state = algorithm.init(jax.random.key(0), PARAMS)
     for _ in range(config.num_iterations // number):
         state = phase(state)
-    if "critic" in state.networks:
+    if isinstance(algorithm, DrQv2):
+        values = values_of(algorithm, state.networks, images)
+    elif "critic" in state.networks:
         values = Critic("small").apply(state.networks["critic"], images)
     else:
         actor = Actor("small", 1, config.policy, has_value=True)
@@ -190,3 +221,53 @@ def test_a_place_is_worth_what_it_is(learned, place):
 @pytest.mark.parametrize("place", TARGETS)
 def test_the_mean_action_is_the_best_one(learned, place):
     assert learned.action[place] == pytest.approx(TARGETS[place], abs=0.25)
+
+
+class Memory(Probes):
+    """A place on the left or right, then one in the middle, rewarded 1 or -1 by the first."""
+
+    def reset(self, key: jax.Array) -> PhysicsState:
+        return self.at(jax.random.randint(key, (), 0, 2))
+
+    def step(self, state: PhysicsState, action: jax.Array) -> PhysicsState:
+        del action
+        place = state.engine
+        following = self.at(jnp.minimum(place + 2, 3))
+        reward = jnp.array([0.0, 0.0, 1.0, -1.0])[place]
+        return following.replace(reward=reward, terminated=place > 1)
+
+    @staticmethod
+    def at(place: jax.Array) -> PhysicsState:
+        first = Probes.at(jnp.array([1, 3, 7, 7])[place])
+        return first.replace(engine=jnp.int32(place))
+
+
+def test_a_stack_tells_what_the_second_newest_frame_shows():
+    settings = SHARED | REPLAY | {"total_steps": 16 * 8 * 40}
+    config = DrQv2Config(**settings).replace(frame_stack=2, episode_length=5)
+    params, options = limited(5), OPTIONS | {"frame_stack": 2}
+    env = PixelEnv(Memory(), **options)
+    algorithm = DrQv2(config, VectorPixelEnv(env, config.num_envs))
+
+    @partial(jax.jit, compiler_options=optimized())
+    def iterate(state):
+        return algorithm.iterate(state, params)[0]
+
+    state = algorithm.init(jax.random.key(0), params)
+    for _ in range(config.num_iterations):
+        state = iterate(state)
+
+    @jax.jit
+    @jax.vmap
+    def stack(place):
+        sim = env.reset_sim(jax.random.key(0), jnp.uint32(0), params)
+        frames = env.blank_frames()
+        for number, now in enumerate((place, place + 2)):
+            seen = sim.replace(physics=Memory.at(now))
+            frames = env.push_frame(frames, seen, jnp.bool_(number == 0), params)
+        return frames
+
+    pixels = stack(jnp.arange(2))
+    assert np.array_equal(pixels[0, ..., 3:], pixels[1, ..., 3:]), "the newest frames are alike"
+    values = values_of(algorithm, state.networks, pixels)
+    np.testing.assert_allclose(values, [1.0, -1.0], atol=0.1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import socket
@@ -16,11 +17,21 @@ import pytest
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
 ROOT = Path(__file__).parents[2]
-PHASIC = "--num-policy-phases 3 --aux-minibatches 3 --aux-epochs 1"
-EXTRA = {"ppo": "--update-epochs 1", "ppg": PHASIC, "dcpg": PHASIC}
+MINIBATCHES = "--num-minibatches 2"
+PHASIC = f"{MINIBATCHES} --num-policy-phases 3 --aux-minibatches 3 --aux-epochs 1"
+REPLAY = (
+    "--replay-ratio 0.125 --buffer-size 256 --learning-starts 64 --batch-size 8 --hidden-dim 16 "
+    "--checkpoint-replay"
+)
+EXTRA = {
+    "ppo": f"{MINIBATCHES} --update-epochs 1",
+    "ppg": PHASIC,
+    "dcpg": PHASIC,
+    "drqv2": REPLAY,
+}
 TINY = (
     "--task inverted_pendulum --height 18 --width 18 --frame-stack 2 --encoder small --num-envs 4 "
-    "--num-steps 8 --num-minibatches 2 --no-progress"
+    "--num-steps 8 --no-progress"
 )
 PER_ITERATION = 32
 AS_USERS = {"XLA_FLAGS": ""}
@@ -117,24 +128,38 @@ def test_a_run_on_four_devices_goes_on_to_the_bit(tmp_path):
     assert_equal(parts, whole)
 
 
-def test_frames_stay_on_their_devices(tmp_path):
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [
+        (
+            "ppg",
+            {"num_minibatches": 2, "num_policy_phases": 2, "aux_minibatches": 4},
+        ),
+        (
+            "drqv2",
+            {"replay_ratio": 0.125, "buffer_size": 128, "learning_starts": 64, "batch_size": 16},
+        ),
+    ],
+)
+def test_frames_stay_on_their_devices(name, settings):
     """What devices tell each other is gradients, not frames."""
     code = r"""
-import jax, re
+import jax, json, re, sys
 from pixelbrax_jax.agents.config import make_env
-from pixelbrax_jax.agents.on_policy.ppg import PPG, PPGConfig
+from pixelbrax_jax.agents.registry import ALGORITHMS
 from pixelbrax_jax.agents.runner.devices import replicate, state_shardings
 from pixelbrax_jax.config import EnvConfig
 from pixelbrax_jax.envs.sharded import ShardedVectorEnv, make_env_mesh
 
-config = PPGConfig(
+kind = ALGORITHMS[sys.argv[1]]
+config = kind.config_class(
     env=EnvConfig(task="inverted_pendulum", height=18, width=18, frame_stack=2),
-    encoder="small", num_envs=8, num_steps=8, num_minibatches=2, num_policy_phases=2,
-    aux_minibatches=4, total_steps=1024, random_shift=1,
+    encoder="small", num_envs=8, num_steps=8,
+    total_steps=1024, random_shift=1, **json.loads(sys.argv[2]),
 )
 env, params = make_env(config)
 mesh = make_env_mesh()
-algorithm = PPG(config, ShardedVectorEnv(env, config.num_envs, mesh))
+algorithm = kind(config, ShardedVectorEnv(env, config.num_envs, mesh))
 params = replicate(mesh, params)
 template = jax.eval_shape(algorithm.init, jax.random.key(0), params)
 shardings = state_shardings(mesh, template)
@@ -142,7 +167,9 @@ state = jax.tree.map(
     lambda leaf, sharding: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding),
     template, shardings,
 )
-jobs = ((algorithm.iterate, (state, params)), (algorithm.auxiliary, (state,)))
+jobs = [(algorithm.iterate, (state, params))]
+if algorithm.auxiliary_every:
+    jobs.append((algorithm.auxiliary, (state,)))
 for job, arguments in jobs:
     text = jax.jit(job).lower(*arguments).compile().as_text()
     moves = re.compile(r" (all-gather|all-to-all|collective-permute)(-start)?\(")
@@ -151,7 +178,8 @@ for job, arguments in jobs:
     assert "all-reduce" in text
 """
     environ = os.environ | FOUR_DEVICES
-    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT, env=environ)
+    command = [sys.executable, "-c", code, name, json.dumps(settings)]
+    subprocess.run(command, check=True, cwd=ROOT, env=environ)
 
 
 def test_two_processes_learn_what_one_learns(tmp_path):

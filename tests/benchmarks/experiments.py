@@ -31,7 +31,6 @@ from pixelbrax_gym.bench.machine import describe_cpu
 from pixelbrax_gym.cli.train import parse
 from pixelbrax_jax.agents.config import TrainConfig
 from pixelbrax_jax.agents.presets import TASK_SETTINGS, preset
-from pixelbrax_jax.agents.registry import ALGORITHMS
 from pixelbrax_jax.agents.runner.checkpoint import read_about
 from pixelbrax_jax.agents.runner.metrics import read_metrics
 from pixelbrax_jax.agents.runner.trained import load_config
@@ -43,6 +42,7 @@ KEPT = DOCS / "results" / "runs"
 KEPT_DMC = DOCS / "dmc" / "runs"
 PRETRAINED = Path(pixelbrax_jax.__file__).parent / "pretrained"
 EPISODES = 32
+ALGORITHMS = ("ppo", "ppg", "dcpg")
 TASKS = ("halfcheetah", "walker2d", "ant", "humanoid")
 DISTRACTED = ("halfcheetah", "walker2d")
 DISTRACTORS = {

@@ -17,9 +17,8 @@ from pathlib import Path
 
 from pixelbrax_gym.bench.machine import describe_cpu
 from pixelbrax_jax.agents.presets import preset
-from pixelbrax_jax.agents.registry import ALGORITHMS
 from pixelbrax_jax.agents.runner.metrics import read_metrics
-from tests.benchmarks.experiments import TASKS
+from tests.benchmarks.experiments import ALGORITHMS, TASKS
 from tests.benchmarks.results import FOLDER
 
 KEPT = FOLDER / "pace.json"

@@ -12,18 +12,17 @@ import torch
 
 from pixelbrax_gym import TorchPolicy
 from pixelbrax_jax.agents.runner.trained import save_policy
-from tests.agents.small import PHASIC, SMALL, Agent, ball_envs, same
+from tests.agents.small import SMALL, Agent, ball_envs, same, small_agent
 from tests.gpu.processes import deterministic
 
 pytestmark = pytest.mark.gpu
 
 
-@pytest.mark.parametrize("name", ["ppo", "ppg", "dcpg"])
+@pytest.mark.parametrize("name", ["ppo", "ppg", "dcpg", "drqv2"])
 def test_the_same_key_gives_the_same_run(name):
     from pixelbrax_jax.agents.registry import ALGORITHMS
 
-    settings = SMALL | ({} if name == "ppo" else PHASIC)
-    agent = Agent(ALGORITHMS[name](ALGORITHMS[name].config_class(**settings), ball_envs()))
+    agent = small_agent(ALGORITHMS[name])
     one, other = (agent.run(agent.init(), 4)[0] for _ in range(2))
     assert same(one, other)
 

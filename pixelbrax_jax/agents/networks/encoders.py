@@ -13,6 +13,11 @@ from flax import linen as nn
 
 Pads = tuple[tuple[int, int], tuple[int, int]]
 
+Layers = tuple[tuple[int, int, int], ...]
+"""Channels, size and stride of each convolution."""
+
+Initializer = Callable[..., jax.Array]
+
 
 def convolve(x: jax.Array, kernel: jax.Array, stride: int, pads: Pads) -> jax.Array:
     """Cross-correlate (B, H, W, C) with (h, w, C, D); on a CPU matrix products are faster."""
@@ -63,12 +68,13 @@ class Conv(nn.Module):
     size: int
     stride: int = 1
     padding: str = "VALID"
+    kernel_init: Initializer = nn.initializers.lecun_normal()
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         """Map (B, H, W, C) float32 to (B, H', W', features)."""
         shape = (self.size, self.size, x.shape[-1], self.features)
-        kernel = self.param("kernel", nn.initializers.lecun_normal(), shape)
+        kernel = self.param("kernel", self.kernel_init, shape)
         bias = self.param("bias", nn.initializers.zeros, (self.features,))
         rows, columns = jax.lax.padtype_to_pads(
             x.shape[1:3], shape[:2], (self.stride, self.stride), self.padding
@@ -90,20 +96,25 @@ def max_pool(x: jax.Array) -> jax.Array:
     return reduce(jnp.maximum, windows)
 
 
-def dense(size: int, gain: float = math.sqrt(2.0), name: str | None = None) -> nn.Dense:
-    """Make a layer with orthogonal weights.
+def orthogonal(gain: float) -> Initializer:
+    """Return an initialiser of orthogonal weights.
 
     Under ``jax.vmap`` the weights are sampled one by one, because the batched QR decomposition of
     jaxlib 0.10 can deadlock on a CPU with few cores.
     """
     initializer = nn.initializers.orthogonal(gain)
 
-    def orthogonal(key: jax.Array, shape: tuple[int, ...], dtype: Any = jnp.float32) -> jax.Array:
+    def sample(key: jax.Array, shape: tuple[int, ...], dtype: Any = jnp.float32) -> jax.Array:
         one_by_one = jax.custom_batching.sequential_vmap(lambda key: initializer(key, shape, dtype))
         matrix: jax.Array = one_by_one(key)
         return matrix
 
-    return nn.Dense(size, kernel_init=orthogonal, name=name)
+    return sample
+
+
+def dense(size: int, gain: float = math.sqrt(2.0), name: str | None = None) -> nn.Dense:
+    """Make a layer with orthogonal weights."""
+    return nn.Dense(size, kernel_init=orthogonal(gain), name=name)
 
 
 class Impala(nn.Module):
@@ -126,14 +137,14 @@ class Stack(nn.Module):
     """Convolutions without padding, and a dense layer.
 
     Attributes:
-        layers: (channels, size, stride) of each convolution.
+        layers: the convolutions.
         features: number of features F.
         center: number that is subtracted from the input. Positive inputs give all weights of a
             filter gradients of the same sign, and large steps then turn most filters off.
         bounded: whether features are normalised and pass ``tanh`` instead of ``relu``.
     """
 
-    layers: tuple[tuple[int, int, int], ...]
+    layers: Layers
     features: int
     center: float = 0.0
     bounded: bool = False
@@ -149,16 +160,38 @@ class Stack(nn.Module):
         return jnp.tanh(nn.LayerNorm()(x)) if self.bounded else nn.relu(x)
 
 
+class Convolutions(nn.Module):
+    """Centered pixels and convolutions without padding, with orthogonal weights."""
+
+    layers: Layers
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """Map (B, H, W, C) in [0, 1] to (B, F) features."""
+        x = x - 0.5
+        for channels, size, stride in self.layers:
+            x = nn.relu(Conv(channels, size, stride, kernel_init=orthogonal(math.sqrt(2.0)))(x))
+        return _flat(x)
+
+
+LAYERS: dict[str, Layers] = {
+    # DQN's (Mnih et al., Nature 518, 2015).
+    "nature": ((32, 8, 4), (64, 4, 2), (64, 3, 1)),
+    # Kostrikov et al., arXiv 2004.13649.
+    "drq": ((32, 3, 2), *[(32, 3, 1)] * 3),
+    # For small images and slow processors.
+    "small": ((16, 4, 2), (32, 4, 2), (32, 3, 1)),
+    # First over disjoint patches (Dosovitskiy et al., arXiv 2010.11929).
+    "patch": ((32, 4, 4), (32, 2, 2), (32, 3, 1)),
+}
+"""Convolutions by name of the encoder."""
+
 ENCODERS: dict[str, Callable[[], nn.Module]] = {
     "impala": Impala,
-    # DQN's (Mnih et al., Nature 518, 2015).
-    "nature": partial(Stack, ((32, 8, 4), (64, 4, 2), (64, 3, 1)), 512, name="Nature_0"),
-    # Kostrikov et al., arXiv 2004.13649.
-    "drq": partial(Stack, ((32, 3, 2), *[(32, 3, 1)] * 3), 50, bounded=True, name="DrQ_0"),
-    # For small images and slow processors.
-    "small": partial(Stack, ((16, 4, 2), (32, 4, 2), (32, 3, 1)), 128, 0.5, name="Small_0"),
-    # First over disjoint patches (Dosovitskiy et al., arXiv 2010.11929).
-    "patch": partial(Stack, ((32, 4, 4), (32, 2, 2), (32, 3, 1)), 256, 0.5, name="Patch_0"),
+    "nature": partial(Stack, LAYERS["nature"], 512, name="Nature_0"),
+    "drq": partial(Stack, LAYERS["drq"], 50, bounded=True, name="DrQ_0"),
+    "small": partial(Stack, LAYERS["small"], 128, 0.5, name="Small_0"),
+    "patch": partial(Stack, LAYERS["patch"], 256, 0.5, name="Patch_0"),
 }
 
 SMALLEST = {"impala": 1, "nature": 36, "drq": 15, "small": 18, "patch": 24}

@@ -76,8 +76,7 @@ def check_memory(algorithm: Algorithm, template: TrainState, report: Report) -> 
         where = f" in each of {memories} memories" if memories > 1 else ""
         raise MemoryError(
             f"frames and state need {needed / 1e9:.2f} GB{where}, but only {limit / 1e9:.2f} GB "
-            f"may be used. Lower {', '.join(config.memory_settings)} or the image size, or raise "
-            "memory_budget_gb."
+            f"may be used. {config.to_fit((needed - limit) * memories / template.iteration.size)}"
         )
 
 

@@ -28,7 +28,8 @@ class Runs:
     """``num_seeds`` runs of an algorithm; equal objects share compiled programs.
 
     Several runs add a leading axis to states and metrics. An accelerator computes them in parallel,
-    a CPU one after another, because convolutions with one kernel per run are slow there.
+    a CPU one after another, because convolutions with one kernel per run are slow there (an
+    algorithm with ``vmaps_runs`` sees to that itself).
     """
 
     algorithm: Algorithm
@@ -77,7 +78,11 @@ class Runs:
     def _each(self, function: Callable[..., Any], first: Any, *others: Any) -> Any:
         if self.num_seeds == 1:
             return function(first, *others)
-        return map_runs(lambda first: function(first, *others), first)
+
+        def one(first: Any) -> Any:
+            return function(first, *others)
+
+        return jax.vmap(one)(first) if self.algorithm.vmaps_runs else map_runs(one, first)
 
     def _spread(self, state: TrainState, metrics: Metrics) -> tuple[TrainState, Metrics]:
         """Shard the state over the devices and replicate the metrics."""

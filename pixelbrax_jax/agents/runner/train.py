@@ -126,6 +126,10 @@ def run(
             if _goes_on(checkpoints, options, messages):
                 state = _restored(checkpoints, template, algorithm, messages)
                 if left_out := parts_not_kept(state):
+                    messages(
+                        f"not in the checkpoint: {', '.join(left_out)}; filled anew before "
+                        "learning goes on"
+                    )
                     fresh = runs.init(seed, env_params)
                     state = state.replace(**{name: getattr(fresh, name) for name in left_out})
             else:
@@ -193,6 +197,7 @@ class _Run:
     """Metrics of iterations since the last record."""
     record: dict[str, float] = field(default_factory=dict)
     results: dict[str, Result] = field(default_factory=dict)
+    warned: bool = False
     since: tuple[float, int] = (0.0, 0)
     """Time and steps at the last record."""
 
@@ -310,6 +315,10 @@ class _Run:
         for record in records:
             self.check_finite(record, steps)
         self.record = summarize(records)
+        if not self.warned:
+            for line in self.algorithm.warnings(self.record):
+                self.report(line)
+                self.warned = True
         if self.options.log_training_metrics:
             then, steps_then = self.since
             speed = (steps - steps_then) / (time.perf_counter() - then)
