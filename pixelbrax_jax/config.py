@@ -14,8 +14,8 @@ from pixelbrax_jax.distractors.clips import ClipBank
 from pixelbrax_jax.distractors.presets import as_tuple
 from pixelbrax_jax.physics.brax.tasks import BraxOptions
 from pixelbrax_jax.physics.mujoco.options import MujocoOptions
-from pixelbrax_jax.physics.ranges import Ranges, check_ranges
 from pixelbrax_jax.plain import from_plain
+from pixelbrax_jax.ranges import Ranges, check_ranges
 from pixelbrax_jax.renderer.base import check_renderer
 from pixelbrax_jax.scene.look import make_look
 from pixelbrax_jax.types import Camera, CameraRig, Look
@@ -112,8 +112,6 @@ class EnvConfig(BraxOptions, MujocoOptions, ProgramConfig):
     """Multipliers of a MuJoCo task's ``friction``, ``mass``, ``damping``, ``gain`` and ``gravity``:
     ``friction=0.5:2,mass=1.2`` draws that of friction uniformly for each episode. In Python also
     ``{"friction": (0.5, 2), "mass": 1.2}``."""
-    test_dynamics: Ranges = ""
-    """The same for the splits ``test`` and ``paper-test``; without it they have ``dynamics``."""
 
     def __post_init__(self) -> None:
         ProgramConfig.__post_init__(self)
@@ -121,8 +119,7 @@ class EnvConfig(BraxOptions, MujocoOptions, ProgramConfig):
             self._static(name)
         BraxOptions.__post_init__(self)
         MujocoOptions.__post_init__(self)
-        for name in ("dynamics", "test_dynamics"):
-            self._store(name, check_ranges(name, getattr(self, name)))
+        self._store("dynamics", check_ranges("dynamics", self.dynamics))
         episode_length = check_positive_int("episode_length", self._static("episode_length"))
         self._store("episode_length", episode_length)
         if self.shadows is not None:

@@ -21,7 +21,7 @@ from pixelbrax_jax.validation import check_positive_int
 if TYPE_CHECKING:
     from pixelbrax_gym.gymnasium.env import GymnasiumEnv
 
-ENV_OPTIONS = ("backend", "camera", "look", "shadows", "distractors", "clips", "split")
+ENV_OPTIONS = ("backend", "camera", "look", "shadows", "distractors", "clips", "split", "dynamics")
 """Environment options of the command; those not given keep their defaults."""
 
 Act = Callable[[np.ndarray], np.ndarray]
@@ -51,6 +51,8 @@ class Options:
     """Clips of video distractors: a folder, or procedural."""
     split: str | None = None
     """Split of the clips: train, test or another split of the folder."""
+    dynamics: str | None = None
+    """Varied dynamics, such as friction=0.5:2,gravity=0.8."""
     observation: bool = False
     """Shows the pixels of the observation, enlarged."""
     size: int = 336

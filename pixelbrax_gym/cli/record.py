@@ -42,12 +42,13 @@ def run(arguments: Sequence[str]) -> int:
     """Run the command."""
     options = parse("record", Options, arguments)
     agent = load(options)
-    from pixelbrax_jax.agents.runner.splits import SPLITS, make_split
+    from pixelbrax_jax.agents.runner.splits import SPLITS, make_split, splits_of
     from pixelbrax_jax.agents.runner.trained import with_clips
 
     for name in ("grid", "size", "num_frames"):
         check_positive_int(name, getattr(options, name))
-    split = options.split or ("train" if agent.algorithm.config.env.distractors else "clean")
+    has_train = "train" in splits_of(agent.algorithm.config)
+    split = options.split or ("train" if has_train else "clean")
     check_choice("split", split, SPLITS)
     config, shown = with_clips(agent, options.clips)
     env, params = make_split(config, split, shown)

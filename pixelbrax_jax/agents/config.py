@@ -14,6 +14,7 @@ from pixelbrax_jax.config import ENV_OPTIONS, EnvConfig
 from pixelbrax_jax.distractors.presets import as_tuple
 from pixelbrax_jax.envs.making import make
 from pixelbrax_jax.envs.pixel_env import PixelEnv
+from pixelbrax_jax.ranges import Ranges, check_ranges
 from pixelbrax_jax.types import EnvParams
 from pixelbrax_jax.validation import (
     check_choice,
@@ -65,6 +66,10 @@ class TrainConfig:
     env: EnvConfig = EnvConfig()  # noqa: RUF009 (it is frozen)
     """Sets the environment's options; camera, look, clips and distractors are names."""
 
+    test_dynamics: Ranges = ""
+    """Option ``dynamics`` of the split ``test`` in evaluations; without it they have that of the
+    training."""
+
     memory_settings: ClassVar[tuple[str, ...]] = ("num_envs",)
     """Settings that reduce memory when they are lowered."""
 
@@ -95,6 +100,7 @@ class TrainConfig:
         """Check the settings."""
         _check_env(self.env)
         check_annotated(self)
+        object.__setattr__(self, "test_dynamics", check_ranges("test_dynamics", self.test_dynamics))
         check_choice("encoder", self.encoder, ENCODERS)
         if self.memory_budget_gb is not None:
             check_positive("memory_budget_gb", self.memory_budget_gb)

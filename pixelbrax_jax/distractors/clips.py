@@ -26,10 +26,6 @@ from pixelbrax_jax.validation import check_choice, check_positive_int
 MAX_BYTES = 2 * 1024**3
 """Default limit of a bank's device memory."""
 
-HELD_OUT = {"train": "test", "paper-train": "paper-test"}
-"""Test split of each training split. Other splits serve for both, with test clips from another
-folder."""
-
 _CACHE_VERSION = 2
 """Increased when the same files give other pixels."""
 

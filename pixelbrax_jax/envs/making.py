@@ -14,14 +14,14 @@ import numpy as np
 
 from pixelbrax_jax import registry
 from pixelbrax_jax.config import PROGRAM_OPTIONS, EnvConfig, env_config
-from pixelbrax_jax.distractors.clips import HELD_OUT, ClipBank, load_clips, warn_procedural
+from pixelbrax_jax.distractors.clips import ClipBank, load_clips, warn_procedural
 from pixelbrax_jax.distractors.presets import resolve
 from pixelbrax_jax.distractors.video import Video
 from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.extras import install_extra
 from pixelbrax_jax.flags import default_flags
 from pixelbrax_jax.physics.base import Physics
-from pixelbrax_jax.physics.ranges import as_arrays
+from pixelbrax_jax.ranges import as_arrays
 from pixelbrax_jax.scene.cameras import choose_rig, rig_from_corner, seen_from, with_sides
 from pixelbrax_jax.scene.look import make_look
 from pixelbrax_jax.types import CameraRig, Clips, DynamicsRanges, EnvParams, Look
@@ -141,15 +141,13 @@ def _look(config: EnvConfig, physics: Physics) -> Look:
 
 
 def _dynamics(config: EnvConfig, physics: Physics) -> DynamicsRanges | None:
-    for name in ("dynamics", "test_dynamics"):
-        if (value := getattr(config, name)) and not physics.varies:
-            raise ValueError(
-                f"{name}={value!r} is only for tasks that MuJoCo simulates, those of the DM "
-                "Control Suite, of Gymnasium, and your own of mjcf_physics, not for task "
-                f"{config.task!r}."
-            )
-    is_test = config.split in HELD_OUT.values()
-    return as_arrays((is_test and config.test_dynamics) or config.dynamics)
+    if config.dynamics and not physics.varies:
+        raise ValueError(
+            f"dynamics={config.dynamics!r} is only for tasks that MuJoCo simulates, those of the "
+            "DM Control Suite, of Gymnasium, and your own of mjcf_physics, not for task "
+            f"{config.task!r}."
+        )
+    return as_arrays(config.dynamics)
 
 
 def _check_device() -> None:
@@ -171,7 +169,7 @@ def _clips(config: EnvConfig, env: PixelEnv) -> Clips | None:
     videos = [link for link in env.chain.links if isinstance(link, Video)]
     if clips is not None and not videos and env.obs_mode != "state":
         raise ValueError("clips are given without a video: add 'video' to the distractors.")
-    if split != "train" and not config.distractors and not config.test_dynamics:
+    if split != "train" and not config.distractors:
         raise ValueError(
             f"split={split!r} is given without a distractor that has splits: add one, such as "
             "'video', to the distractors."

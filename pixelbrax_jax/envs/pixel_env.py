@@ -16,7 +16,7 @@ from pixelbrax_jax.distractors.presets import as_tuple
 from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.memory import check_fits
 from pixelbrax_jax.physics.base import Physics, check_physics
-from pixelbrax_jax.physics.ranges import sample
+from pixelbrax_jax.ranges import sample
 from pixelbrax_jax.renderer.base import draw, render
 from pixelbrax_jax.renderer.choice import why_no_kernel
 from pixelbrax_jax.scene.place import place
@@ -225,7 +225,11 @@ class PixelEnv(ProgramConfig):
         physics_key = jax.random.fold_in(episode_key, _RESET_STREAM)
         physics: Any = self.physics
         varied = {}
-        if params.dynamics is not None:
+        if params is not None and params.dynamics is not None:
+            if not physics.varies:
+                raise ValueError(
+                    f"params.dynamics must be None: a {type(physics).__name__} does not vary."
+                )
             dynamics_key = jax.random.fold_in(episode_key, _DYNAMICS_STREAM)
             varied["dynamics"] = sample(params.dynamics, dynamics_key)
         if pose is None:

@@ -63,7 +63,8 @@ class Physics(abc.ABC):
         varies: whether ``reset`` and ``from_qpos`` also take ``dynamics``: (5,) float32 multipliers
             in the order of ``DynamicsRanges``, for the whole episode.
         followed_link: the link that a camera follows by default.
-        hull_errors: metres by name of a mesh, how far what is drawn leaves its convex hull.
+        hull_errors: metres by name of a mesh geom: largest distance of the drawn shape from the
+            convex hull of the mesh.
         look: lights, sky and ground of the model, used as looks ``default`` and ``dmc``.
         batch_last: whether a CPU is faster with the environments as last axis of a batch.
         compiler_options: XLA options for fast programs on a CPU.

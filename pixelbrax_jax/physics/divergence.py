@@ -38,7 +38,7 @@ class GuardedPhysics(Physics):
     a ``Recipe``, a pickle contains nothing else."""
 
     @abc.abstractmethod
-    def _reset(self, key: jax.Array, *dynamics: jax.Array) -> PhysicsState:
+    def _reset(self, key: jax.Array) -> PhysicsState:
         """Sample an initial state, finite or not; see ``Physics.reset``."""
 
     @abc.abstractmethod

@@ -8,7 +8,7 @@ import pytest
 
 import pixelbrax_jax as pb
 from pixelbrax_jax.physics.mujoco.multipliers import MultipliedModels, multiplied
-from pixelbrax_jax.physics.ranges import MULTIPLIERS, as_arrays, check_ranges, sample
+from pixelbrax_jax.ranges import MULTIPLIERS, as_arrays, check_ranges, sample
 
 SLOPE = """
 <mujoco>
@@ -151,13 +151,6 @@ def test_a_range_for_each_environment():
     np.testing.assert_array_equal(state.sim.physics.engine.multipliers[:, 4], [0.5, 2.0])
 
 
-def test_the_test_split_has_ranges_of_its_own():
-    options = {"dynamics": "mass=1:1.5", "test_dynamics": "mass=2:3"}
-    for split, bounds in (("train", [1, 1.5]), ("test", [2, 3])):
-        _, params = make(1, split=split, **options)
-        np.testing.assert_array_equal(params.dynamics.mass, bounds)
-
-
 def test_texts_and_dictionaries_are_the_same():
     text = "friction=0.5:2.0,gravity=0.8"
     for same in (text, "gravity=.8, friction=.5:2", {"gravity": 0.8, "friction": (0.5, 2)}):
@@ -179,6 +172,8 @@ def test_texts_and_dictionaries_are_the_same():
         ("mass=0", ValueError, "positive number or two"),
         ({"mass": float("nan")}, ValueError, "positive number or two"),
         ({"mass": ()}, ValueError, "positive number or two"),
+        ({"mass": "12"}, ValueError, "positive number or two"),
+        ("mass=1,mass=2", ValueError, "dynamics must have each name once"),
         (3, TypeError, "dynamics must be a text such as 'friction=0.5:2,mass=1.2'"),
     ],
 )

@@ -186,7 +186,8 @@ class DrQv2(Algorithm):
 
         def learn() -> tuple[Any, Metrics]:
             carry, metrics = jax.lax.scan(step, start, (jnp.arange(config.num_updates), keys))
-            return carry, jax.tree.map(jnp.mean, metrics)
+            extremes = {"q/target_min": jnp.min, "q/target_max": jnp.max}
+            return carry, {k: extremes.get(k, jnp.mean)(v) for k, v in metrics.items()}
 
         def wait() -> tuple[Any, Metrics]:
             shapes = jax.eval_shape(learn)[1]

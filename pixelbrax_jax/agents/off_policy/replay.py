@@ -108,8 +108,8 @@ class Replay(struct.PyTreeNode):
         """Sample transitions uniformly, with replacement.
 
         The environments form gcd(N, B) groups, each of which gives equally many transitions, so
-        that devices share a batch equally. A first step has K - 1 stored steps before it and n
-        after it.
+        that devices share a batch equally. The first step of a transition has K - 1 stored steps
+        before it and n after it.
         """
         num_envs = self.reward.shape[0]
         groups = math.gcd(num_envs, batch_size)

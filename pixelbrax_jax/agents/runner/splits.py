@@ -8,7 +8,6 @@ from typing import Any
 from pixelbrax_jax.agents.config import TrainConfig, make_env
 from pixelbrax_jax.agents.runner.progress import Report, silent
 from pixelbrax_jax.agents.runner.settings import clip_digests
-from pixelbrax_jax.distractors.clips import HELD_OUT
 from pixelbrax_jax.distractors.presets import resolve
 from pixelbrax_jax.distractors.video import Video
 from pixelbrax_jax.envs.pixel_env import PixelEnv
@@ -17,12 +16,15 @@ from pixelbrax_jax.validation import check_choice
 
 SPLITS = ("clean", "train", "test")
 
+HELD_OUT = {"train": "test", "paper-train": "paper-test"}
+"""Test split of each training split. Other splits serve for both, with test clips from another
+folder."""
+
 CLEAN: dict[str, Any] = {
     "distractors": (),
     "clips": None,
     "split": "train",
     "dynamics": "",
-    "test_dynamics": "",
 }
 """Options that remove all distractors from an environment, and varied dynamics."""
 
@@ -34,9 +36,9 @@ class NoSplitError(ValueError):
 def splits_of(config: TrainConfig) -> tuple[str, ...]:
     """Return the names of the splits that fit the settings."""
     env = config.env
-    if not (env.distractors or env.dynamics or env.test_dynamics):
+    if not (env.distractors or env.dynamics or config.test_dynamics):
         return SPLITS[:1]
-    return SPLITS if plays_clips(config) or env.test_dynamics else SPLITS[:2]
+    return SPLITS if plays_clips(config) or config.test_dynamics else SPLITS[:2]
 
 
 def plays_clips(config: TrainConfig) -> bool:
@@ -102,12 +104,14 @@ def make_split(
                 "of the training."
             )
         return env, params
-    split = HELD_OUT.get(config.env.split, config.env.split)
+    plays, split = plays_clips(config), config.env.split
+    split = HELD_OUT.get(split, split) if plays else split
+    dynamics = config.test_dynamics or config.env.dynamics
     try:
-        env, params = make_env(config, obs_mode="pixels", split=split)
+        env, params = make_env(config, obs_mode="pixels", split=split, dynamics=dynamics)
     except (ValueError, FileNotFoundError) as error:
         raise NoSplitError(str(error)) from error
-    if not plays_clips(config):
+    if not plays:
         return env, params
     shown = shown or clip_digests(_make(config)[1].clips)
     played = clip_digests(params.clips)

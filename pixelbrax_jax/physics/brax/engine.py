@@ -150,9 +150,8 @@ class BraxPhysics(GuardedPhysics):
         self._identity = uuid4() if identity is None else identity
         self._check_shapes()
 
-    def _reset(self, key: jax.Array, *dynamics: jax.Array) -> PhysicsState:
+    def _reset(self, key: jax.Array) -> PhysicsState:
         """See ``Physics.reset``. ``key`` may be typed, or uint32 like Brax's."""
-        del dynamics  # they do not vary
         return self._first_state(self._env, key)
 
     @under_default_flags

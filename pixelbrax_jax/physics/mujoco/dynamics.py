@@ -15,6 +15,7 @@ from flax import struct
 
 from pixelbrax_jax._platform.host_call import host_call, register
 from pixelbrax_jax._platform.row_function import call
+from pixelbrax_jax.physics.mujoco.multipliers import check_varies
 from pixelbrax_jax.physics.mujoco.native import Native
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
 from pixelbrax_jax.spatial import quat_normalize
@@ -127,6 +128,8 @@ class Dynamics:
     ) -> State:
         """Return a state without control or activation; without velocities it is at rest."""
         model = self.model
+        if multipliers is not None:
+            check_varies(model)
         return State(
             qpos=jnp.asarray(qpos, jnp.float32),
             qvel=jnp.zeros(model.nv) if qvel is None else jnp.asarray(qvel, jnp.float32),

@@ -37,17 +37,17 @@ class Hull(NamedTuple):
     error: float
 
 
-def mesh_hull(model: mujoco.MjModel, mesh: int, faces: int = FACES) -> Hull:
+def mesh_hull(model: mujoco.MjModel, mesh: int) -> Hull:
     """Return the hull of a model's mesh, in the frame of its geoms."""
     first, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
     vertices = np.ascontiguousarray(model.mesh_vert[first : first + count], np.float32)
-    return _of_bytes(vertices.tobytes(), faces)
+    return _of_bytes(vertices.tobytes())
 
 
 # A model is read more than once, and large meshes take a tenth of a second.
 @lru_cache(maxsize=64)
-def _of_bytes(vertices: bytes, faces: int) -> Hull:
-    return enclose(np.frombuffer(vertices, np.float32).reshape(-1, 3), faces)
+def _of_bytes(vertices: bytes) -> Hull:
+    return enclose(np.frombuffer(vertices, np.float32).reshape(-1, 3))
 
 
 def enclose(points: np.ndarray, faces: int = FACES) -> Hull:

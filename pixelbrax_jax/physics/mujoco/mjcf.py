@@ -92,7 +92,7 @@ def mjcf_physics(
         reset_noise: joint positions and velocities are sampled uniformly within plus or minus this
             of ``init_q`` and 0 (metres, radians, per second); 0.01 by default.
         n_frames: the model's time steps per control step.
-        engine: see ``MujocoOptions``.
+        engine: ``auto``, ``mujoco``, ``xla`` or ``mjx``, as for the DM Control Suite.
         colors: replacements for the model's colors by geom name, red, green, blue in [0, 1].
         geom_groups: MuJoCo's groups of visible geoms and sites.
 
@@ -201,6 +201,8 @@ def _checked(
     name: str, expected: str, result: Any, fits: Callable[[Any, tuple[int, ...]], bool]
 ) -> jax.Array:
     """Return a function's result; raise ValueError if its shape or dtype is wrong."""
+    if isinstance(result, (bool, int, float)):
+        result = jnp.asarray(result)
     shape, dtype = getattr(result, "shape", None), getattr(result, "dtype", None)
     if shape is None or dtype is None:
         raise ValueError(f"{name} must return {expected}, got {result!r}")

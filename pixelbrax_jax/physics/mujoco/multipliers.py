@@ -10,6 +10,11 @@ import numpy as np
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
 
 _MUSCLE = int(mujoco.mjtGain.mjGAIN_MUSCLE)
+_KINDS = [int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE), _MUSCLE]
+_DAMPING = (
+    *("dof_damping", "dof_dampingpoly", "tendon_damping", "tendon_dampingpoly"),
+    *("actuator_damping", "actuator_dampingpoly"),
+)
 _FORCE_OF_MUSCLES = [False, False, True, True] + 6 * [False]
 _GAINS = 3 * [True] + 7 * [False]
 
@@ -32,12 +37,25 @@ def multiplied(model: Any, multipliers: Any) -> dict[str, Any]:
         "body_subtreemass": model.body_subtreemass * mass,
         # Inertia of bodies for which MuJoCo does not compute it anew.
         "dof_M0": (model.dof_M0 - model.dof_armature) * mass + model.dof_armature,
-        "dof_damping": model.dof_damping * damping,
-        "tendon_damping": model.tendon_damping * damping,
+        # MuJoCo XLA's models have some.
+        **{name: getattr(model, name) * damping for name in _DAMPING if hasattr(model, name)},
         "actuator_gainprm": model.actuator_gainprm * gains,
         "actuator_biasprm": model.actuator_biasprm * gains,
         "opt.gravity": model.opt.gravity * gravity,
     }
+
+
+def check_varies(model: mujoco.MjModel) -> None:
+    """Raise a ValueError that names the actuators whose gain has no multiplier."""
+    other = [
+        repr(model.actuator(i).name or f"actuator/{i}")
+        for i in np.flatnonzero(~np.isin(model.actuator_gaintype, _KINDS))
+    ]
+    if other:
+        raise ValueError(
+            f"dynamics cannot vary with actuator {', '.join(other)}: its gain must be fixed, "
+            "affine or a muscle's."
+        )
 
 
 class MultipliedModels:
@@ -50,8 +68,11 @@ class MultipliedModels:
         self._multipliers = np.empty((0, 0))
 
     def of_rows(self, multipliers: np.ndarray) -> list[mujoco.MjModel]:
-        """Return models for (N, 5) multipliers; rows that equal the last ones cost nothing."""
-        before, self._multipliers = self._multipliers, multipliers.copy()
+        """Return models for (N, 5) multipliers.
+
+        A row that equals that of the last call in its place costs nothing.
+        """
+        before, self._multipliers = self._multipliers, np.empty((0, 0))
         for i, row in enumerate(multipliers):
             if i == len(self._copies):
                 self._copies.append(copy.copy(self._model))
@@ -60,4 +81,5 @@ class MultipliedModels:
             for name, value in multiplied(self._model, row.astype(float)).items():
                 owner = self._copies[i].opt if name == "opt.gravity" else self._copies[i]
                 getattr(owner, name.removeprefix("opt."))[:] = value
+        self._multipliers = multipliers.copy()
         return self._copies[: len(multipliers)]

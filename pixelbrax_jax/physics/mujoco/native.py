@@ -96,7 +96,8 @@ class Native:
         for result in results[:4]:
             result[is_bad] = np.nan
         moved[:] = (last - first)[:, edges[0] : edges[1]]
-        _, found = self._roll(self._still, last, 1)
+        with self._models(self._still, multipliers) as models:
+            _, found = self._roll(self._still, last, 1, models=models)
         _read(found[:, 0], xpos, xquat, sensordata)
         sensordata[:, self._is_force] = sensors[:, self._is_force]
 
@@ -158,7 +159,7 @@ class Native:
 
     @staticmethod
     def _look(models: _Models, data: mujoco.MjData, i: int) -> None:
-        data.ctrl, data.cfrc_ext = 0, 0
+        data.ctrl, data.cfrc_ext, data.qacc_warmstart = 0, 0, 0
         mujoco.mj_forward(models[i], data)
 
     def _fill(
@@ -260,6 +261,16 @@ def compile_model(spec: mujoco.MjSpec) -> mujoco.MjModel:
     """Compile a model without MuJoCo's known warnings."""
     with loading_silenced():
         return spec.compile()
+
+
+def without_textures(spec: mujoco.MjSpec) -> mujoco.MjSpec:
+    """Return a copy without textures, which take most of a model's memory."""
+    spec = spec.copy()
+    for material in spec.materials:
+        material.textures = [""] * len(material.textures)
+    for texture in list(spec.textures):
+        spec.delete(texture)
+    return spec
 
 
 def with_poses(spec: mujoco.MjSpec) -> mujoco.MjModel:

@@ -45,7 +45,8 @@ def _features(model: mujoco.MjModel) -> Iterator[tuple[str, str, Any]]:
     yield "armature", "actuator", model.actuator_armature
     yield "damping", "actuator", model.actuator_damping
     yield "polynomial damping", "actuator", model.actuator_dampingpoly
-    off = [bool(model.opt.disableactuator >> int(group) & 1) for group in model.actuator_group]
+    disabled = [group for group in range(31) if model.opt.disableactuator >> group & 1]
+    off = np.isin(model.actuator_group, disabled)
     yield "option actuatorgroupdisable", "actuator", off
     yield "ellipsoid fluid forces", "geom", model.geom_fluid
     yield "surface velocity", "geom", model.geom_surfacevel

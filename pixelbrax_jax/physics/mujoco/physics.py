@@ -15,7 +15,7 @@ from pixelbrax_jax.physics.divergence import GuardedPhysics
 from pixelbrax_jax.physics.mujoco.dynamics import Dynamics, Readings, State
 from pixelbrax_jax.physics.mujoco.formulas import Formulas, Snapshot, Start
 from pixelbrax_jax.physics.mujoco.geometry import VISIBLE_GROUPS
-from pixelbrax_jax.physics.mujoco.native import compile_model, with_poses
+from pixelbrax_jax.physics.mujoco.native import compile_model, with_poses, without_textures
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
 from pixelbrax_jax.physics.mujoco.poses import center_of_mass, check_pose, with_unit_rotations
 from pixelbrax_jax.physics.mujoco.scene import COM_LINK, read_scene
@@ -57,8 +57,9 @@ class MujocoPhysics(GuardedPhysics):
         The default camera is the model's, or the first of ``rigs`` if it has none. For ``colors``
         and ``geom_groups`` see ``read_scene``.
         """
-        model, posed = compile_model(spec), with_poses(spec)
-        for edited in (model, posed):
+        bare = without_textures(spec)
+        model, simulated, posed = compile_model(spec), compile_model(bare), with_poses(bare)
+        for edited in (model, simulated, posed):
             formulas.edit(edited)
         scene = read_scene(
             model,
@@ -75,7 +76,7 @@ class MujocoPhysics(GuardedPhysics):
         bodies = [model.body(i).name or f"link/{i - 1}" for i in range(1, model.nbody)]
         self.link_names = (*bodies, *scene.links)
         self.dynamics = Dynamics(
-            model,
+            simulated,
             posed,
             engine=engine,
             reads_forces=formulas.reads_forces,

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax.flags import default_flags
-from pixelbrax_jax.physics.divergence import GuardedPhysics, Recipe
+from pixelbrax_jax.physics.divergence import GuardedPhysics
 from pixelbrax_jax.physics.mujoco.compatibility import (
     import_silenced,
     load_onto_own_device,
@@ -39,7 +39,6 @@ class PlaygroundPhysics(GuardedPhysics):
         *,
         colors: Mapping[str, Color] | None = None,
         geom_groups: Collection[int] = VISIBLE_GROUPS,
-        identity: Recipe | None = None,
     ):
         """Take an environment without wrappers and read its scene; compile no program."""
         for name in ("mj_model", "mjx_model", "reset", "step", "dt", "action_size"):
@@ -48,6 +47,10 @@ class PlaygroundPhysics(GuardedPhysics):
                     f"env must be an environment of MuJoCo Playground or its name, got a "
                     f"{type(env).__name__}, which has no {name}."
                 )
+        if getattr(env, "unwrapped", env) is not env:
+            raise ValueError(
+                f"env must be without wrappers, got a {type(env).__name__}: pass env.unwrapped."
+            )
         if env.mjx_model.impl.value != "jax":
             raise ValueError(
                 f"env computes with impl={env.mjx_model.impl.value!r}, which needs MuJoCo Warp: "
@@ -56,6 +59,7 @@ class PlaygroundPhysics(GuardedPhysics):
         model = env.mj_model
         scene = read_scene(model, None, colors=colors, geom_groups=geom_groups)
         self.geoms, self.look, self.rigs = scene.geoms, scene.look, scene.rigs
+        self.hull_errors = scene.hull_errors
         self.unfit_cameras = unfit_cameras(model)
         bodies = [model.body(i).name or f"link/{i - 1}" for i in range(1, model.nbody)]
         self.link_names = (*bodies, *scene.links)
@@ -66,15 +70,13 @@ class PlaygroundPhysics(GuardedPhysics):
         self.time_limit = config.get("episode_length")
         self._has_com = bool(scene.links)
         self._env = env
-        self._identity = identity
         key = jax.eval_shape(lambda: jax.random.key_data(jax.random.key(0)))
         first = jax.eval_shape(env.reset, key)
         self._dtypes = jax.tree.map(lambda leaf: leaf.dtype, first)
         obs = jax.eval_shape(_flat, first.obs)
         self.state_size = int(obs.shape[0])
 
-    def _reset(self, key: jax.Array, *dynamics: jax.Array) -> PhysicsState:
-        del dynamics  # they do not vary
+    def _reset(self, key: jax.Array) -> PhysicsState:
         return self._state(self._env.reset(jax.random.key_data(key)))
 
     def _step(self, state: PhysicsState, action: jax.Array) -> PhysicsState:
@@ -115,7 +117,8 @@ def playground_physics(
 
     States, observations, rewards and ends are the environment's; pictures are PixelBrax's. MuJoCo
     XLA simulates it on every device. Actions, which Playground expects in [-1, 1], are passed on.
-    Its ``episode_length`` is the task's time limit.
+    Its ``episode_length`` ends an episode if it is shorter than the option of that name. Its
+    ``action_repeat``, which Playground's training applies, is left to the option ``action_repeat``.
 
     Args:
         env: a name of Playground's registry, such as ``"CartpoleBalance"``, or an environment
@@ -131,6 +134,8 @@ def playground_physics(
     """
     load_onto_own_device(mjx_io)
     if not isinstance(env, str):
+        if config_overrides is not None:
+            raise ValueError("config_overrides are for a name; make env with them instead.")
         return PlaygroundPhysics(env, colors=colors, geom_groups=geom_groups)
     try:
         with import_silenced():
@@ -150,4 +155,8 @@ def _flat(obs: Any) -> jax.Array:
     """Return an observation as (S,) float32; of several by name, ``state``."""
     if isinstance(obs, Mapping):
         obs = obs["state"] if "state" in obs else jnp.concatenate(jax.tree.leaves(obs))
+    if obs.ndim != 1:
+        raise ValueError(
+            f"observations must be vectors, got shape {obs.shape}: load it without vision."
+        )
     return jnp.asarray(obs, jnp.float32)

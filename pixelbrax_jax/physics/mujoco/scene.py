@@ -49,7 +49,8 @@ class ModelScene(NamedTuple):
         links: names of the links after those of the bodies, if the model needs them: ``camera/com``
             at the center of mass of the subtree of ``tracked_body(model)``, and ``target`` for what
             is movable and visible. Neither turns.
-        hull_errors: metres by name of a mesh, how far what is drawn leaves its convex hull.
+        hull_errors: metres by name of a mesh geom: largest distance of the drawn shape from the
+            convex hull of the mesh.
     """
 
     geoms: Geoms

@@ -1,4 +1,4 @@
-"""A step of MuJoCo XLA, made of its stages with three of our own in their places.
+"""A step of MuJoCo XLA in which three of the stages are ours.
 
 They are the constraint solver (``solver``), the solution for inertia, and the frames of contacts
 between planes and capsules. ``mjx.step`` has the others in the same order.
@@ -53,9 +53,9 @@ def forward(model: Any, data: Any) -> Any:
     force = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator + applied
     acceleration = _solve_inertia(model, data, data._impl.M, force)
     data = data.replace(qfrc_smooth=force, qacc_smooth=acceleration)
-    if data._impl.efc_J.size == 0:
-        return data.replace(qacc=acceleration)
-    return mjx.sensor_acc(model, solve(model, data))
+    is_free = data._impl.efc_J.size == 0
+    data = data.replace(qacc=acceleration) if is_free else solve(model, data)
+    return mjx.sensor_acc(model, data)
 
 
 def collide(model: Any, data: Any) -> Any:
@@ -139,4 +139,6 @@ def _runge_kutta(model: Any, data: Any) -> Any:
         total = tuple(a + b for a, b in zip(total, added, strict=True))
     mean_velocity, acceleration, act_dot = total
     data = data.replace(qpos=first.qpos, qvel=first.qvel, act=first.act, time=first.time)
+    # As in MuJoCo, whose later stages have no sensors.
+    data = data.replace(sensordata=first.sensordata)
     return mjx_forward._advance(model, data, act_dot, acceleration, mean_velocity)

@@ -96,7 +96,8 @@ class Xla:
         qpos, qvel, act, warmstart, sensors, *left = carry
         data = self._data(qpos, qvel, act=act, ctrl=ctrl, sensordata=sensors)
         moved = qpos - first
-        return qpos, qvel, act, warmstart, moved, *self._readings(data), *left
+        readings = self._readings(_changed(self._mx, multipliers), data)
+        return qpos, qvel, act, warmstart, moved, *readings, *left
 
     def first(self, qpos: jax.Array, qvel: jax.Array, multipliers: jax.Array) -> Arrays:
         """See ``Native.first``; without forces where no observation of a first state has any."""
@@ -107,7 +108,7 @@ class Xla:
             forward = self._stages.forward(model, data)
             data = data.replace(sensordata=forward.sensordata)
             left = self._left(model, forward, is_after_step=False)
-        return *self._readings(data), *left
+        return *self._readings(_changed(self._mx, multipliers), data), *left
 
     def _left(self, model: Any, data: Any, *, is_after_step: bool) -> Arrays:
         """Return the fields of ``MjData`` that a step leaves."""
@@ -125,14 +126,14 @@ class Xla:
             found = found.at[geoms].min(distances)
         return (found,)
 
-    def _readings(self, data: Any) -> Arrays:
+    def _readings(self, model: Any, data: Any) -> Arrays:
         """Return ``xpos, xquat, sensordata``; sensors of forces are those of ``data``."""
-        data = mjx.kinematics(self._mx, data)
-        data = mjx.com_pos(self._mx, data)
-        data = mjx.com_vel(self._mx, data)
+        data = mjx.kinematics(model, data)
+        data = mjx.com_pos(model, data)
+        data = mjx.com_vel(model, data)
         if self._model.nsensor:
-            data = mjx.sensor_pos(self._mx, data)
-            data = mjx.sensor_vel(self._mx, data)
+            data = mjx.sensor_pos(model, data)
+            data = mjx.sensor_vel(model, data)
         return data.xpos, data.xquat, data.sensordata
 
     def _data(self, qpos: jax.Array, qvel: jax.Array, **fields: jax.Array) -> Any:

@@ -17,6 +17,9 @@ from pixelbrax_jax.validation import check_choice
 MULTIPLIERS = tuple(DynamicsRanges.__annotations__)
 """Names of what is multiplied, in the order of a state's multipliers."""
 
+_LARGEST = 1e9
+"""Bound of multipliers, far beyond what a simulation survives."""
+
 Ranges = str | Mapping[str, float | tuple[float, float]]
 
 
@@ -31,7 +34,10 @@ def check_ranges(option: str, value: Any) -> str:
     """
     if isinstance(value, str):
         parts = [part.partition("=") for part in value.split(",") if part]
-        value = {name.strip(): tuple(numbers.split(":")) for name, _, numbers in parts}
+        names = [name.strip() for name, _, _ in parts]
+        if len(set(names)) < len(names):
+            raise ValueError(f"{option} must have each name once, got {value!r}.")
+        value = {name: tuple(p[2].split(":")) for name, p in zip(names, parts, strict=True)}
     if not isinstance(value, Mapping):
         raise TypeError(
             f"{option} must be a text such as 'friction=0.5:2,mass=1.2' or a dictionary such as "
@@ -47,12 +53,12 @@ def check_ranges(option: str, value: Any) -> str:
 
 
 def _range(option: str, name: str, numbers: Any) -> tuple[float, float]:
-    pair = (numbers,) if isinstance(numbers, Real) else numbers
     try:
+        pair = (numbers,) if isinstance(numbers, Real) else tuple(numbers)
         low, high = (float(number) for number in (pair * 2 if len(pair) == 1 else pair))
     except (TypeError, ValueError):
         low = high = math.nan
-    if not 0 < low <= high < math.inf:
+    if isinstance(numbers, str) or not 0 < low <= high < _LARGEST:
         raise ValueError(
             f"{option} of {name} must be a positive number or two, the lowest first, got "
             f"{numbers!r}."
