@@ -47,16 +47,17 @@ ALLOWED: dict[str, set[str]] = {
     # The list of tasks, which loads no physics.
     "pixelbrax_jax.tasks": _below("physics"),
     "pixelbrax_jax.plain": _below("distractors"),
-    "pixelbrax_jax.config": _below("plain", *LAYERS),
+    "pixelbrax_jax.ranges": {"pixelbrax_jax.types", "pixelbrax_jax.validation"},
+    "pixelbrax_jax.config": _below("plain", "ranges", *LAYERS),
     # What differs by device: it knows nothing of PixelBrax.
     "pixelbrax_jax._platform": set(),
     "pixelbrax_jax.registry": _below("tasks", "physics"),
-    "pixelbrax_jax.envs": _below("config", "registry", *LAYERS),
+    "pixelbrax_jax.envs": _below("config", "ranges", "registry", *LAYERS),
     # The package itself, which names what is public.
     "pixelbrax_jax": _below("config", "envs", "registry", "policy", *LAYERS),
     "pixelbrax_jax.agents": {
         "pixelbrax_jax",
-        *_below("config", "envs", "policy", "registry", "distractors"),
+        *_below("config", "envs", "policy", "ranges", "registry", "distractors"),
     },
     "pixelbrax_gym": {
         "pixelbrax_jax",

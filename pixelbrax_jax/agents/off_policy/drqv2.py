@@ -296,7 +296,10 @@ class DrQv2(Algorithm):
         output = self._apply("actor", {"actor": actor}, features)
         action = noisy(jnp.tanh(output), std, key, self.config.std_clip)
         values = self.values(self._apply("critic", networks, features, action))
-        value = values.min(0) if self.config.critic == "clipped" else values.mean(0)
+        # The gradient of `min` compares values with the result, and is NaN if XLA rounds a copy of
+        # them otherwise.
+        least = jnp.where(values[0] < values[1], values[0], values[1])
+        value = least if self.config.critic == "clipped" else values.mean(0)
         loss = -batch.mean(value)
         return loss + self.config.saturation_coef * jnp.mean(output**2), loss
 
