@@ -32,6 +32,14 @@ def check_ranges(option: str, value: Any) -> str:
         TypeError: it is neither.
         ValueError: a name is unknown, or the numbers are not positive, finite and in order.
     """
+    return ",".join(
+        f"{name}={low!r}" + (f":{high!r}" if high != low else "")
+        for name, (low, high) in _parse(option, value).items()
+    )
+
+
+def _parse(option: str, value: Any) -> dict[str, tuple[float, float]]:
+    """Return the lowest and highest multiplier by name; raise the errors of ``check_ranges``."""
     if isinstance(value, str):
         parts = [part.partition("=") for part in value.split(",") if part]
         names = [name.strip() for name, _, _ in parts]
@@ -45,11 +53,7 @@ def check_ranges(option: str, value: Any) -> str:
         )
     for name in value:
         check_choice(f"multiplier in {option}", name, MULTIPLIERS)
-    found = {name: _range(option, name, value[name]) for name in MULTIPLIERS if name in value}
-    return ",".join(
-        f"{name}={low!r}" + (f":{high!r}" if high != low else "")
-        for name, (low, high) in found.items()
-    )
+    return {name: _range(option, name, value[name]) for name in MULTIPLIERS if name in value}
 
 
 def _range(option: str, name: str, numbers: Any) -> tuple[float, float]:
@@ -68,14 +72,10 @@ def _range(option: str, name: str, numbers: Any) -> tuple[float, float]:
 
 def as_arrays(value: Ranges) -> DynamicsRanges | None:
     """Return ranges as ``check_ranges`` takes them as arrays; None if nothing varies."""
-    text = check_ranges("dynamics", value)
-    if not text:
+    found = _parse("dynamics", value)
+    if not found:
         return None
-    ranges = {name: np.ones(2, np.float32) for name in MULTIPLIERS}
-    for part in text.split(","):
-        name, _, numbers = part.partition("=")
-        low, _, high = numbers.partition(":")
-        ranges[name] = np.array([low, high or low], np.float32)
+    ranges = {name: np.array(found.get(name, (1, 1)), np.float32) for name in MULTIPLIERS}
     return DynamicsRanges(**ranges)  # type: ignore[arg-type]
 
 

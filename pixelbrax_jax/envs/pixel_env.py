@@ -225,7 +225,7 @@ class PixelEnv(ProgramConfig):
         physics_key = jax.random.fold_in(episode_key, _RESET_STREAM)
         physics: Any = self.physics
         varied = {}
-        if params is not None and params.dynamics is not None:
+        if params.dynamics is not None:
             if not physics.varies:
                 raise ValueError(
                     f"params.dynamics must be None: a {type(physics).__name__} does not vary."

@@ -11,7 +11,7 @@ import pytest
 import pixelbrax_jax as pb
 from pixelbrax_jax.physics.mujoco.geometry import site_shapes
 from pixelbrax_jax.physics.mujoco.viewpoints import followed_body
-from tests.envs.toy import Ball
+from tests.envs.toy import Ball, limited
 
 REACHER = """
 <mujoco>
@@ -250,4 +250,4 @@ def test_a_pose_of_a_task_of_dm_control_under_flags_of_jax(flag):
 def test_physics_without_poses():
     env = pb.PixelEnv(Ball(), obs_mode="state")
     with pytest.raises(TypeError, match=r"Ball cannot start in a chosen pose: give it"):
-        env.from_qpos(jnp.zeros(1), None, jax.random.key(0), None)
+        env.from_qpos(jnp.zeros(1), None, jax.random.key(0), limited(6))

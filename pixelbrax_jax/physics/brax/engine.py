@@ -33,8 +33,9 @@ from pixelbrax_jax.physics.mujoco.geometry import (
 )
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
 from pixelbrax_jax.physics.mujoco.poses import (
-    center_of_mass,
+    body_names,
     check_pose,
+    with_center_of_mass,
     with_unit_rotations,
 )
 from pixelbrax_jax.physics.mujoco.scene import COM_LINK
@@ -129,9 +130,7 @@ class BraxPhysics(GuardedPhysics):
         self.dt = float(f"{float(env.dt):.6g}")
         self.action_size = int(env.action_size)
         self.backend: str = env.backend
-        self.link_names = tuple(
-            model.body(i).name or f"link/{i - 1}" for i in range(1, model.nbody)
-        )
+        self.link_names = body_names(model)
         if rigs is None:
             shapes += site_shapes(model, geom_groups)
             self.followed_link = max(followed_body(model) - 1, 0)
@@ -236,9 +235,7 @@ class BraxPhysics(GuardedPhysics):
     def _links(self, seen: Kinematics) -> tuple[jax.Array, jax.Array]:
         if self.link_names[-1] != COM_LINK:
             return seen.xpos, seen.xquat
-        com = center_of_mass(self._model, seen.xpos, seen.xquat)
-        upright = jnp.array([[1.0, 0.0, 0.0, 0.0]], jnp.float32)
-        return jnp.concatenate([seen.xpos, com[None]]), jnp.concatenate([seen.xquat, upright])
+        return with_center_of_mass(self._model, seen.xpos, seen.xquat)
 
     def _init(self, q: jax.Array, qd: jax.Array, *args: Any, **kwargs: Any) -> Any:
         q = with_unit_rotations(self._model, q)

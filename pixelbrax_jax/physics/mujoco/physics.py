@@ -17,7 +17,12 @@ from pixelbrax_jax.physics.mujoco.formulas import Formulas, Snapshot, Start
 from pixelbrax_jax.physics.mujoco.geometry import VISIBLE_GROUPS
 from pixelbrax_jax.physics.mujoco.native import compile_model, with_poses, without_textures
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
-from pixelbrax_jax.physics.mujoco.poses import center_of_mass, check_pose, with_unit_rotations
+from pixelbrax_jax.physics.mujoco.poses import (
+    body_names,
+    center_of_mass,
+    check_pose,
+    with_unit_rotations,
+)
 from pixelbrax_jax.physics.mujoco.scene import COM_LINK, read_scene
 from pixelbrax_jax.physics.mujoco.viewpoints import unfit_cameras
 from pixelbrax_jax.physics.task import Color
@@ -73,8 +78,7 @@ class MujocoPhysics(GuardedPhysics):
         default = scene.rigs.get("default") or scene.rig or next(iter(rigs.values()), None)
         self.rigs = {**scene.rigs, **rigs} | ({"default": default} if default else {})
         self.unfit_cameras = unfit_cameras(model)
-        bodies = [model.body(i).name or f"link/{i - 1}" for i in range(1, model.nbody)]
-        self.link_names = (*bodies, *scene.links)
+        self.link_names = body_names(model) + scene.links
         self.dynamics = Dynamics(
             simulated,
             posed,

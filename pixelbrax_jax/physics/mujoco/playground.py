@@ -16,7 +16,7 @@ from pixelbrax_jax.physics.mujoco.compatibility import (
     loading_silenced,
 )
 from pixelbrax_jax.physics.mujoco.geometry import VISIBLE_GROUPS
-from pixelbrax_jax.physics.mujoco.poses import center_of_mass
+from pixelbrax_jax.physics.mujoco.poses import body_names, with_center_of_mass
 from pixelbrax_jax.physics.mujoco.scene import read_scene
 from pixelbrax_jax.physics.mujoco.viewpoints import followed_body, unfit_cameras
 from pixelbrax_jax.physics.task import Color
@@ -61,8 +61,7 @@ class PlaygroundPhysics(GuardedPhysics):
         self.geoms, self.look, self.rigs = scene.geoms, scene.look, scene.rigs
         self.hull_errors = scene.hull_errors
         self.unfit_cameras = unfit_cameras(model)
-        bodies = [model.body(i).name or f"link/{i - 1}" for i in range(1, model.nbody)]
-        self.link_names = (*bodies, *scene.links)
+        self.link_names = body_names(model) + scene.links
         self.followed_link = max(followed_body(model) - 1, 0)
         self.dt = float(f"{float(env.dt):.6g}")
         self.action_size = int(env.action_size)
@@ -92,9 +91,7 @@ class PlaygroundPhysics(GuardedPhysics):
         poses = mjx.kinematics(self._env.mjx_model, engine.data)
         xpos, xquat = poses.xpos[1:], poses.xquat[1:]
         if self._has_com:
-            com = center_of_mass(self._env.mj_model, xpos, xquat)
-            xpos = jnp.concatenate([xpos, com[None]])
-            xquat = jnp.concatenate([xquat, jnp.array([[1.0, 0.0, 0.0, 0.0]])])
+            xpos, xquat = with_center_of_mass(self._env.mj_model, xpos, xquat)
         return PhysicsState(
             engine=engine,
             xpos=xpos,

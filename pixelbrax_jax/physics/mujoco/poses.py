@@ -47,6 +47,19 @@ def center_of_mass(model: mujoco.MjModel, xpos: jax.Array, xquat: jax.Array) -> 
     return jnp.dot(masses, xpos + rotate(xquat, f32(model.body_ipos[1:])))
 
 
+def with_center_of_mass(
+    model: mujoco.MjModel, xpos: jax.Array, xquat: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Return poses (B, 3) and (B, 4) with a row for the center of mass, which never turns."""
+    com, upright = center_of_mass(model, xpos, xquat), jnp.array([[1.0, 0.0, 0.0, 0.0]])
+    return jnp.concatenate([xpos, com[None]]), jnp.concatenate([xquat, upright])
+
+
+def body_names(model: mujoco.MjModel) -> tuple[str, ...]:
+    """Return names of all bodies but the world, ``link/<index>`` for one without."""
+    return tuple(model.body(i).name or f"link/{i - 1}" for i in range(1, model.nbody))
+
+
 def masses_below(model: mujoco.MjModel, root: int) -> np.ndarray:
     """Return (bodies - 1,) float32, each body's fraction of the mass of ``root``'s subtree."""
     below = np.zeros(model.nbody, bool)
