@@ -110,7 +110,7 @@ class DrQv2Config(TrainConfig):
             raise ValueError(
                 f"the replay needs {self.replay_bytes:,} bytes, but memory_budget_gb="
                 f"{self.memory_budget_gb} allows {int(self.memory_budget_gb * 1e9):,}; "
-                f"{self.room_for(self.memory_budget_gb * 1e9)}"
+                f"{self.largest_that_fits(self.memory_budget_gb * 1e9)}"
             )
 
     def _check_updates(self) -> None:
@@ -182,14 +182,14 @@ class DrQv2Config(TrainConfig):
 
     def to_fit(self, excess: float) -> str:
         """See ``TrainConfig.to_fit``."""
-        room = self.room_for(max(0.0, self.replay_bytes - excess))
-        return f"{super().to_fit(excess)} Of the replay, {room}"
+        largest = self.largest_that_fits(max(0.0, self.replay_bytes - excess))
+        return f"{super().to_fit(excess)} Of the replay, {largest}"
 
     @property
     def _frame_bytes(self) -> int:
         return self.env.height * self.env.width * 3
 
-    def room_for(self, num_bytes: float) -> str:
+    def largest_that_fits(self, num_bytes: float) -> str:
         """Tell the largest ``buffer_size`` whose frames take at most so many bytes."""
         per_iteration = self.num_envs * self.num_steps
         largest = int(num_bytes // (self._frame_bytes * per_iteration)) * per_iteration
