@@ -28,6 +28,7 @@ FOUNDATIONS = {
     "video",
     "ffmpeg",
     "cache",
+    "processor",
 }
 LAYERS = {"physics", "scene", "renderer", "distractors"}
 """They never import each other; `envs` joins them."""

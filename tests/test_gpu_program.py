@@ -21,6 +21,8 @@ pytestmark = [pytest.mark.gpu_program, pytest.mark.timeout(900)]
 
 KEPT = Path(__file__).parents[1] / "docs" / "benchmarks" / "programs.json"
 N = 1024
+SPILLED = 0 if jax.version.__version_info__ < (0, 12) else None
+"""Bytes; XLA writes no PTX from jax 0.12 on, where they are not known."""
 
 
 @cache
@@ -58,7 +60,7 @@ def test_the_renderer_is_one_large_kernel(task):
     assert values["launches"] <= 8
     assert values["temporary_bytes"] <= 0.3 * values["output_bytes"]
     assert values["read_bytes"] + values["written_bytes"] <= 1.2 * values["output_bytes"]
-    assert values["spilled"] == 0
+    assert values["spilled"] == SPILLED
 
 
 @pytest.mark.parametrize(
@@ -73,7 +75,7 @@ def test_the_renderer_is_one_large_kernel(task):
 def test_distractors_and_shadows_are_part_of_that_kernel(options, large):
     values = compiled("ant", "renderer", **options)
     assert values["large_kernels"] == large, "of a video one gathers the pixels"
-    assert values["spilled"] == 0
+    assert values["spilled"] == SPILLED
 
 
 @pytest.mark.parametrize("program", ["state step", "step"])

@@ -45,6 +45,7 @@ def is_known(flag: str) -> bool:
         return False
     for path in Path(spec.origin).parent.glob("libjax_common*"):
         with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
-            if text.find(flag.encode()) >= 0:
+            # Without the zeros it is a field of a message, too.
+            if text.find(b"\0" + flag.encode() + b"\0") >= 0:
                 return True
     return False

@@ -121,10 +121,10 @@ def needs_extra(name: str) -> Iterator[None]:
 
 
 def _help() -> str:
-    lines = []
+    lines, width = [], max(map(len, commands())) + 2
     for name in commands():
         about = (import_module(f"{__name__}.{name}").__doc__ or "").partition("\n")[0]
-        lines.append(f"  {name:10}{about}\n")
+        lines.append(f"  {name:{width}}{about}\n")
     return (
         f"usage: pixelbrax [{_KEEP_NONE}] COMMAND [options]\n\n"
         "Continuous control from pixels, on JAX.\n\n"

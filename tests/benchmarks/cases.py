@@ -11,8 +11,8 @@ from pathlib import Path
 
 from pixelbrax_gym.bench import runner
 from pixelbrax_gym.bench.cases import FULL, TASKS, Case, Group
-from pixelbrax_gym.bench.machine import num_cores
 from pixelbrax_gym.bench.tables import interleaved
+from pixelbrax_jax.processor import num_cores
 from pixelbrax_jax.tasks import DMC_TASKS
 from tests.benchmarks import tables
 from tests.benchmarks.ahead import tables as compiled

@@ -27,13 +27,13 @@ from importlib.metadata import version
 from pathlib import Path
 
 import pixelbrax_jax
-from pixelbrax_gym.bench.machine import describe_cpu
 from pixelbrax_gym.cli.train import parse
 from pixelbrax_jax.agents.config import TrainConfig
 from pixelbrax_jax.agents.presets import TASK_SETTINGS, preset
 from pixelbrax_jax.agents.runner.checkpoint import read_about
 from pixelbrax_jax.agents.runner.metrics import read_metrics
 from pixelbrax_jax.agents.runner.trained import load_config
+from pixelbrax_jax.processor import describe_cpu
 from pixelbrax_jax.stop_signals import handling
 from pixelbrax_jax.tasks import DMC_TASKS
 

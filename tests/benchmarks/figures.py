@@ -18,6 +18,7 @@ from pathlib import Path
 import pixelbrax_jax as pb
 from pixelbrax_gym.bench import report
 from pixelbrax_gym.bench.tables import table
+from pixelbrax_gym.cli import _leaderboard as leaderboard
 from pixelbrax_jax.tasks import BRAX_TASKS
 from tests.benchmarks import dmc_page, gym_page, performance, results
 from tests.benchmarks.cases import GROUPS
@@ -85,6 +86,7 @@ PAGES: dict[str, Figures] = {
     "docs/performance.md": performance.PERFORMANCE,
     "docs/accelerators.md": performance.ACCELERATORS,
     "docs/results.md": results.FIGURES,
+    "docs/leaderboard.md": {"board": lambda: leaderboard.page(ROOT / "docs/leaderboard")},
     "docs/dmc.md": dmc_page.FIGURES,
     "docs/gym-tasks.md": gym_page.FIGURES,
     "docs/tasks.md": {"tasks": brax_tasks},

@@ -15,9 +15,9 @@ import tempfile
 from operator import itemgetter
 from pathlib import Path
 
-from pixelbrax_gym.bench.machine import describe_cpu
 from pixelbrax_jax.agents.presets import preset
 from pixelbrax_jax.agents.runner.metrics import read_metrics
+from pixelbrax_jax.processor import describe_cpu
 from tests.benchmarks.experiments import ALGORITHMS, TASKS
 from tests.benchmarks.results import FOLDER
 

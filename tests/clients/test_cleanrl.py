@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 
 from tests.clients import cleanrl_ppo
-from tests.clients.ball import ID, LIMIT, SIZE, make
+from tests.clients.ball import ID, LIMIT, SIZE, assert_same_images, make
 
 GRAY = np.array([0.2125, 0.7154, 0.0721])
 
@@ -43,7 +43,7 @@ def replay(args, i, obs, actions, rewards, dones, gray):
     returns, total, ended = [], 0.0, False
     for t in range(len(actions)):
         assert dones[t] == ended
-        assert_array_equal(obs[t], as_stacked(frames) if gray else frame)
+        assert_same_images(obs[t], as_stacked(frames) if gray else frame)
         if ended:
             frame, _ = env.reset()
             frames, reward, ended = [frame, frame], 0.0, False

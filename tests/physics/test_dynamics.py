@@ -65,7 +65,7 @@ def test_bits_do_not_depend_on_the_number_of_environments_nor_of_threads(physics
     many = play(physics, 33)
     few = play(physics, 3)
     jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[:3], b), many, few)
-    monkeypatch.setattr(native, "_num_cores", lambda: 3)
+    monkeypatch.setattr(native, "num_cores", lambda: 3)
     monkeypatch.setattr(native, "_pools", queue.SimpleQueue())
     jax.tree.map(np.testing.assert_array_equal, many, play(physics, 33))
 

@@ -22,6 +22,7 @@ from pixelbrax_jax.agents.config import (
     describe,
 )
 from pixelbrax_jax.cache import whole_path
+from pixelbrax_jax.processor import name_cpu
 from pixelbrax_jax.types import Clips
 from pixelbrax_jax.validation import check_choice
 
@@ -110,8 +111,11 @@ def former_settings(kind: type[TrainConfig]) -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of packages, and number and kind of devices."""
-    found = {"devices": f"{jax.device_count()} x {jax.devices()[0].device_kind}"}
+    """Return the versions of packages, the processor, and number and kind of devices."""
+    found = {
+        "devices": f"{jax.device_count()} x {jax.devices()[0].device_kind}",
+        "processor": name_cpu(),
+    }
     for name in _PACKAGES:
         with suppress(metadata.PackageNotFoundError):
             found[name] = metadata.version(name)

@@ -17,6 +17,7 @@ import numpy as np
 from pixelbrax_jax.physics.mujoco.compatibility import loading_silenced
 from pixelbrax_jax.physics.mujoco.multipliers import MultipliedModels
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
+from pixelbrax_jax.processor import num_cores
 
 from mujoco.rollout import Rollout  # isort: skip  # MuJoCo is imported without OpenGL above
 
@@ -291,12 +292,7 @@ def _without(model: mujoco.MjModel, features: int) -> mujoco.MjModel:
 
 
 def _num_threads(num_rows: int) -> int:
-    return _num_cores() if num_rows >= _FEWEST else 1
-
-
-def _num_cores() -> int:
-    available = getattr(os, "sched_getaffinity", None)
-    return len(available(0)) if available else os.cpu_count() or 1
+    return num_cores() if num_rows >= _FEWEST else 1
 
 
 _pools: queue.SimpleQueue[Rollout] = queue.SimpleQueue()
@@ -315,7 +311,7 @@ def _forget_pools() -> None:
 
 @cache
 def _threads() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(_num_cores(), thread_name_prefix="pixelbrax-mujoco")
+    return ThreadPoolExecutor(num_cores(), thread_name_prefix="pixelbrax-mujoco")
 
 
 if hasattr(os, "register_at_fork"):

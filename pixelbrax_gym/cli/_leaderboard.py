@@ -1,0 +1,169 @@
+"""Entries of a leaderboard, made from training runs, and its tables.
+
+An entry is a JSON file: what was trained, on which processor, and the returns of the mean action
+over frames and over seconds of training.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pixelbrax_gym.bench.tables import table
+from pixelbrax_jax.agents.runner.checkpoint import read_about
+from pixelbrax_jax.agents.runner.metrics import read_metrics
+
+MINUTES = (5, 15, 30)
+FRAMES = (100_000, 500_000, 1_000_000)
+PUBLISHED = "published.json"
+"""File beside the entries with returns at frames that others published, by agent and task."""
+
+Entry = dict[str, Any]
+
+
+def entry(folder: str | Path, agent: str | None = None) -> Entry:
+    """Read the entry of a run from its output folder; ``agent`` names it, default its algorithm.
+
+    Seconds are those of training: without evaluations, and without the compilation, which is the
+    excess of the first iteration over the second.
+
+    Raises:
+        CheckpointError: the folder has no checkpoint.
+        ValueError: the run has too few evaluations, several seeds, or distractors.
+    """
+    folder = Path(folder)
+    about = read_about(folder / "checkpoints")
+    config = about["config"]
+    if config["seeds"] > 1:
+        raise ValueError(f"{folder} has seeds={config['seeds']} in one program; an entry has one.")
+    if config["distractors"]:
+        raise ValueError(
+            f"{folder} trained with distractors={config['distractors']}; the leaderboard has runs "
+            "without."
+        )
+    records = read_metrics(folder / "metrics.jsonl")
+    evaluations = [record for record in records if "eval/clean/return" in record]
+    if len(evaluations) < 2:
+        raise ValueError(
+            f"{folder} has {len(evaluations)} evaluations; train with --num-evals 20 or more."
+        )
+    steps, seconds, compilation = _clock(records)
+    at = [record["steps"] for record in evaluations]
+    return {
+        "task": config["task"],
+        "agent": agent or about["algorithm"],
+        "algorithm": about["algorithm"],
+        "seed": config["seed"],
+        "processor": about["versions"]["processor"],
+        "devices": about["versions"]["devices"],
+        "versions": about["versions"],
+        "config": config,
+        "compile_seconds": round(compilation, 1),
+        "frames": at,
+        "seconds": [round(float(x), 1) for x in np.interp(at, steps, seconds)],
+        "return": [round(record["eval/clean/return"], 2) for record in evaluations],
+        "standard_error": [
+            round(record.get("eval/clean/standard_error", 0.0), 2) for record in evaluations
+        ],
+    }
+
+
+def _clock(records: Iterable[Mapping[str, float]]) -> tuple[list[float], list[float], float]:
+    """Return steps, the seconds of training up to each, and those of compilation."""
+    training = [record for record in records if "speed/steps_per_second" in record]
+    if len(training) < 2:
+        raise ValueError("the run has too few records; train with --log-training-metrics.")
+    steps = [0.0, *(record["steps"] for record in training)]
+    rates = [record["speed/steps_per_second"] for record in training]
+    durations = list(np.diff(steps) / rates)
+    usual = durations[1] * steps[1] / (steps[2] - steps[1])
+    compilation = max(0.0, durations[0] - usual)
+    durations[0] -= compilation
+    return steps, [0.0, *np.cumsum(durations)], compilation
+
+
+def file_name(of: Entry) -> str:
+    """Return the name of an entry's file."""
+    agent = "".join(c if c.isalnum() else "-" for c in of["agent"].lower())
+    return f"{agent}-{of['task']}-{of['seed']}.json"
+
+
+def add(of: Entry, folder: str | Path) -> Path:
+    """Write an entry into a folder; return its file.
+
+    Raises:
+        FileExistsError: the folder has another entry of this agent, task and seed.
+    """
+    path = Path(folder) / file_name(of)
+    if path.exists() and json.loads(path.read_text("utf-8")) != of:
+        raise FileExistsError(
+            f"{path} is another run of this agent, task and seed: delete it, or name the agent "
+            "otherwise with --agent."
+        )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(of) + "\n", "utf-8")
+    return path
+
+
+def read(folder: str | Path) -> list[Entry]:
+    """Read all entries of a folder."""
+    files = sorted(Path(folder).glob("*.json"))
+    return [json.loads(f.read_text("utf-8")) for f in files if f.name != PUBLISHED]
+
+
+def return_at(of: Entry, clock: str, when: float) -> float:
+    """Return an entry's return at a number of ``"frames"`` or ``"seconds"``; NaN beyond its end.
+
+    It is interpolated between evaluations; before the first one it is that of the first.
+    """
+    times = of[clock]
+    # Iterations end a little before a round number.
+    if when > 1.02 * times[-1]:
+        return math.nan
+    return float(np.interp(when, times, of["return"]))
+
+
+def interquartile_mean(scores: Iterable[float]) -> float:
+    """Return the mean of the middle half, as rliable computes it (arXiv 2108.13264)."""
+    ordered = np.sort(list(scores))
+    cut = len(ordered) // 4
+    return float(np.mean(ordered[cut : len(ordered) - cut]))
+
+
+def page(folder: str | Path) -> str:
+    """Return the table of a folder's entries in Markdown, a row for each task and agent."""
+    groups: dict[tuple[str, str], list[Entry]] = {}
+    for one in read(folder):
+        groups.setdefault((one["task"], one["agent"]), []).append(one)
+    file = Path(folder) / PUBLISHED
+    published = json.loads(file.read_text("utf-8"))["agents"] if file.exists() else {}
+    heads = ["task", "agent", "seeds", *(f"{minutes} min" for minutes in MINUTES)]
+    heads += [f"{frames // 1000:,}k frames" for frames in FRAMES]
+    lines = []
+    for task in sorted({task for task, _ in groups}):
+        for (_, agent), runs in sorted(item for item in groups.items() if item[0][0] == task):
+            times = [_shown(runs, "seconds", 60.0 * minutes) for minutes in MINUTES]
+            counts = [_shown(runs, "frames", frames) for frames in FRAMES]
+            lines.append([f"`{task}`", agent, len(runs), *times, *counts])
+        for agent, about in published.items():
+            if found := about["returns"].get(task):
+                counts = [f"{found[str(n)]:.0f}" if str(n) in found else "" for n in FRAMES]
+                lines.append(
+                    [f"`{task}`", f"{agent}, published", about["seeds"], "", "", "", *counts]
+                )
+    return table(heads, lines)
+
+
+def _shown(runs: list[Entry], clock: str, when: float) -> str:
+    scores = [x for run in runs if not math.isnan(x := return_at(run, clock, when))]
+    if not scores:
+        return ""
+    middle = f"{interquartile_mean(scores):.0f}"
+    if len(scores) == 1:
+        return middle
+    return f"{middle} ({min(scores):.0f} to {max(scores):.0f})"

@@ -1,0 +1,121 @@
+"""Entries and tables of the leaderboard, from runs whose records are made here."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+
+from pixelbrax_gym import cli
+from pixelbrax_gym.cli._leaderboard import interquartile_mean, read, return_at
+from pixelbrax_jax.agents.runner.checkpoint import FORMAT
+
+SPEED = 100.0
+"""Steps per second after the first record."""
+
+
+def make_run(folder, task="ant", seed=0, returns=(10.0, 20.0, 40.0), every=1000, **config):
+    """A run as training leaves it: 5 s of compilation, and evaluations that take 60 s each."""
+    about = {
+        "format": FORMAT,
+        "algorithm": "ppo",
+        "steps": every * len(returns),
+        "config": {"task": task, "seed": seed, "seeds": 1, "distractors": []} | config,
+        "versions": {"processor": "a CPU, 2 cores", "devices": "1 x cpu", "jax": "1.0"},
+    }
+    path = folder / "checkpoints" / str(about["steps"]) / "about"
+    path.mkdir(parents=True)
+    (path / "metadata").write_text(json.dumps(about))
+    records, clock = [], 5.0
+    for i in range(2 * len(returns)):
+        clock += every / 2 / SPEED
+        rate = SPEED if i else every / 2 / (5.0 + every / 2 / SPEED)
+        steps = {"steps": (i + 1) * every // 2, "seconds": clock}
+        records.append(steps | {"speed/steps_per_second": rate})
+        if i % 2:
+            clock += 60.0
+            result = {"eval/clean/return": returns[i // 2], "eval/clean/standard_error": 1.0}
+            records.append(steps | {"seconds": clock} | result)
+    (folder / "metrics.jsonl").write_text("".join(json.dumps(r) + "\n" for r in records))
+    return str(folder)
+
+
+def leaderboard(*arguments):
+    return cli.main(["leaderboard", *map(str, arguments)])
+
+
+def test_an_entry_has_seconds_of_training_alone(tmp_path):
+    run = make_run(tmp_path / "run")
+    assert leaderboard(run, "--folder", tmp_path / "board") == 0
+    (one,) = read(tmp_path / "board")
+    assert one["frames"] == [1000, 2000, 3000]
+    assert one["seconds"] == [10.0, 20.0, 30.0]
+    assert one["compile_seconds"] == 5.0
+    assert one["return"] == [10.0, 20.0, 40.0]
+    assert one["processor"] == "a CPU, 2 cores"
+    assert one["agent"] == one["algorithm"] == "ppo"
+
+
+def test_returns_between_evaluations_are_interpolated(tmp_path):
+    leaderboard(make_run(tmp_path / "run"), "--folder", tmp_path)
+    (one,) = read(tmp_path)
+    assert return_at(one, "seconds", 25.0) == 30.0
+    assert return_at(one, "frames", 500) == 10.0
+    assert return_at(one, "frames", 3050) == 40.0
+    assert math.isnan(return_at(one, "frames", 3100))
+
+
+def test_the_table_has_a_row_for_each_task_and_agent(tmp_path, capsys):
+    board = tmp_path / "board"
+    for seed, scale in enumerate((1, 2, 3, 100)):
+        returns = [scale, scale]
+        run = make_run(tmp_path / str(seed), seed=seed, returns=returns, every=50_000)
+        assert leaderboard(run, "--agent", "PPO, mine", "--folder", board) == 0
+    published = {"agents": {"Other": {"seeds": 5, "returns": {"ant": {"500000": 7.2}}}}}
+    (board / "published.json").write_text(json.dumps(published))
+    capsys.readouterr()
+    assert leaderboard("--folder", board) == 0
+    _, _, ours, theirs = (
+        [cell.strip() for cell in line.split("|")[1:-1]]
+        for line in capsys.readouterr().out.splitlines()
+    )
+    # 100,000 frames take 1,000 seconds.
+    assert ours == ["`ant`", "PPO, mine", "4", "2 (1 to 100)", "2 (1 to 100)", "", *ours[6:]]
+    assert ours[6:] == ["2 (1 to 100)", "", ""]
+    assert theirs == ["`ant`", "Other, published", "5", "", "", "", "", "7", ""]
+
+
+@pytest.mark.parametrize(
+    ("scores", "expected"),
+    [([3.0], 3.0), ([1.0, 2.0, 6.0], 3.0), ([0.0, 2.0, 4.0, 90.0], 3.0), (range(8), 3.5)],
+)
+def test_the_interquartile_mean_is_that_of_the_middle_half(scores, expected):
+    assert interquartile_mean(scores) == expected
+
+
+def test_another_run_is_not_overwritten(tmp_path, capsys):
+    first, second = (make_run(tmp_path / str(i), returns=(i, i)) for i in (1, 2))
+    assert leaderboard(first, "--folder", tmp_path / "board") == 0
+    assert leaderboard(first, "--folder", tmp_path / "board") == 0
+    assert leaderboard(second, "--folder", tmp_path / "board") == 1
+    assert "name the agent otherwise with --agent" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"seeds": 2}, "seeds=2"),
+        ({"distractors": ["color"]}, "distractors="),
+        ({"returns": (1.0,)}, "--num-evals"),
+    ],
+)
+def test_a_run_that_does_not_fit_is_refused(tmp_path, capsys, changes, told):
+    assert leaderboard(make_run(tmp_path / "run", **changes), "--folder", tmp_path) == 1
+    assert told in capsys.readouterr().err
+    assert not read(tmp_path)
+
+
+def test_a_folder_without_a_run_is_named(tmp_path, capsys):
+    assert leaderboard(tmp_path / "none", "--folder", tmp_path) == 1
+    assert str(tmp_path / "none") in capsys.readouterr().err
