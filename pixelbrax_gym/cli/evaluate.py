@@ -153,7 +153,7 @@ def _compare(agent: Trained, options: Options, report: Callable[[str], None]) ->
             num_episodes=episodes,
             physics=physics,
             picture=picture,
-            report=report,
+            report=lambda line: report(f"{where}: {line}"),
         )
     row = {"steps": agent.steps, "seed": agent.seed, "split": "clean", "in": where}
     return row | {"episodes": episodes} | here.scalars | paired(here, there)
