@@ -155,8 +155,9 @@ def _compare(agent: Trained, options: Options, report: Callable[[str], None]) ->
             picture=picture,
             report=lambda line: report(f"{where}: {line}"),
         )
-    row = {"steps": agent.steps, "seed": agent.seed, "split": "clean", "in": where}
-    return row | {"episodes": episodes} | here.scalars | paired(here, there)
+    row = {"task": env.task, "in": where, "steps": agent.steps, "seed": agent.seed}
+    row |= {"split": "clean", "episodes": episodes}
+    return row | here.scalars | paired(here, there)
 
 
 def _write(row: dict[str, Any]) -> None:

@@ -146,7 +146,7 @@ def test_our_picture_of_dm_controls_physics_is_the_same(monkeypatch, capsys):
     assert main([*LINE, "dm_control_physics"]) == 0
     told = capsys.readouterr()
     row = json.loads(told.out)
-    assert row["in"] == "dm_control_physics"
+    assert (row["task"], row["in"]) == ("dmc_cartpole_swingup", "dm_control_physics")
     assert (row["split"], row["steps"], row["episodes"], row["length"]) == ("clean", 16, 2, 30.0)
     # Single pixels round otherwise.
     assert row["return_there"] == pytest.approx(row["return"], rel=1e-3)

@@ -136,15 +136,15 @@ def _import_suite() -> Any:
             "or 3.12."
         ) from error
     except Exception as error:
-        raise _no_opengl(error) from error
+        raise _no_opengl(error, "cannot be imported") from error
     return suite
 
 
-def _no_opengl(why: object) -> ImportError:
+def _no_opengl(why: object, what: str = "has no OpenGL") -> ImportError:
     chosen = os.environ.get(_VARIABLE)
     state = "unset" if chosen is None else repr(chosen)
     return ImportError(
-        f"dm_control has no OpenGL with {_VARIABLE} {state}: {why} Set {_VARIABLE}=egl (a GPU's "
-        f"driver, or Debian's libegl1 and libgl1-mesa-dri), {_VARIABLE}=osmesa (Debian's "
-        f"libosmesa6) or, with a display, {_VARIABLE}=glfw; without pictures {_VARIABLE}=disable."
+        f"dm_control {what} with {_VARIABLE} {state}: {why} Set {_VARIABLE}=egl (a GPU's driver, "
+        f"or Debian's libegl1 and libgl1-mesa-dri), {_VARIABLE}=osmesa (Debian's libosmesa6) or, "
+        f"with a display, {_VARIABLE}=glfw; without pictures {_VARIABLE}=disable."
     )

@@ -10,16 +10,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from pixelbrax_jax.physics.dmc.suite import SuiteEnv
 from pixelbrax_jax.tasks import DMC_TASKS
 from tests.physics.dmc import oracle
 
-pytest.importorskip("dm_control", exc_type=ImportError)
-suite = pytest.importorskip("pixelbrax_jax.physics.dmc.suite")
+pytestmark = pytest.mark.usefixtures("dm_control")
 
 
 def started(task: str, size: tuple[int, int] | None = None):
     """DM Control's environment in an initial state of its own, and ours started in that state."""
-    theirs, env = oracle.load(task, seed=1), suite.SuiteEnv(task, size=size)
+    theirs, env = oracle.load(task, seed=1), SuiteEnv(task, size=size)
     seen = oracle.record(theirs, theirs.reset())
     env.start(SimpleNamespace(engine=SimpleNamespace(**seen)))
     return theirs, env, seen
@@ -54,17 +54,17 @@ def test_the_picture_is_dm_controls(task):
 
 
 def test_a_camera_is_one_of_the_models():
-    assert suite.SuiteEnv("dmc_walker_walk", camera="back")._camera == 1
+    assert SuiteEnv("dmc_walker_walk", camera="back")._camera == 1
     with pytest.raises(ValueError, match=r"camera of 'walker': 'front'; allowed: back, side"):
-        suite.SuiteEnv("dmc_walker_walk", camera="front")
+        SuiteEnv("dmc_walker_walk", camera="front")
     with pytest.raises(ValueError, match="size=None means no pictures"):
-        suite.SuiteEnv("dmc_pendulum_swingup").render()
+        SuiteEnv("dmc_pendulum_swingup").render()
 
 
 def test_a_missing_dm_control_is_told(monkeypatch):
     monkeypatch.setitem(sys.modules, "dm_control", None)
     with pytest.raises(ImportError, match=r'dm_control cannot be .*pip install "pixelbrax\[dmc\]"'):
-        suite.SuiteEnv("dmc_pendulum_swingup")
+        SuiteEnv("dmc_pendulum_swingup")
 
 
 def test_missing_opengl_is_told():
