@@ -69,7 +69,7 @@ ALLOWED: dict[str, set[str]] = {
     "pixelbrax_gym.cli": {
         "pixelbrax_gym",
         "pixelbrax_jax",
-        *_below("config", "tasks", "policy", "distractors", "agents"),
+        *_below("config", "tasks", "policy", "physics", "distractors", "agents"),
     },
 }
 """Package -> the packages that it may import besides itself."""
@@ -83,8 +83,8 @@ HOMES: dict[str, tuple[str, ...]] = {
         "pixelbrax_gym/torchrl/",
         "pixelbrax_gym/bench/adapters.py",
     ),
-    # Its models are read as files.
-    "dm_control": (),
+    # The models of our tasks are read as files.
+    "dm_control": ("pixelbrax_jax/physics/dmc/suite.py",),
     "torchrl": ("pixelbrax_gym/torchrl/",),
     "tensordict": ("pixelbrax_gym/torchrl/",),
     "stable_baselines3": ("pixelbrax_gym/sb3/",),
@@ -92,7 +92,12 @@ HOMES: dict[str, tuple[str, ...]] = {
 }
 """Third party -> the only files and folders that may import it."""
 
-_DISTRIBUTIONS = {"PIL": "pillow", "orbax": "orbax-checkpoint", "tensorboardX": "tensorboardx"}
+_DISTRIBUTIONS = {
+    "PIL": "pillow",
+    "dm_control": "dm_control",
+    "orbax": "orbax-checkpoint",
+    "tensorboardX": "tensorboardx",
+}
 """Import name -> what is installed, where the two differ."""
 
 NO_NAMES = {"utils", "helpers", "common", "misc"}

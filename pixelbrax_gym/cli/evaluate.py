@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
 from pixelbrax_gym.cli import CommandError, needs_extra, parse, say
+from pixelbrax_jax.tasks import SUITES
 from pixelbrax_jax.validation import check_positive_int
 
 if TYPE_CHECKING:
@@ -49,6 +51,12 @@ class Options(AgentOptions):
     split: tuple[Literal["clean", "train", "test"], ...] = ()
     """Splits to evaluate; default: clean, with distractors also train, and test if it has clips
     that training does not show."""
+    where: Annotated[
+        Literal["dm_control", "dm_control_physics", "dm_control_picture"] | None, arg(name="in")
+    ] = None
+    """Plays split clean also in dm_control, from the same initial states, and compares the returns:
+    dm_control (its physics and its OpenGL picture), dm_control_physics (with our picture) or
+    dm_control_picture (with our physics). Needs a task of the DM Control Suite."""
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -62,6 +70,9 @@ def run(arguments: Sequence[str]) -> int:
 
     report, episodes = partial(say, "evaluate"), options.episodes
     check_positive_int("episodes", episodes)
+    if options.where is not None:
+        _write(_compare(agent, options, report))
+        return 0
     config, shown = with_clips(agent, options.clips)
     if options.clips and not shown:
         clips = options.clips
@@ -71,8 +82,7 @@ def run(arguments: Sequence[str]) -> int:
         row = {"steps": agent.steps, "seed": agent.seed, "split": name, "episodes": episodes}
         if params.clips is not None:
             row["clips"] = place_of(str(config.env.clips or "procedural"))
-        sys.stdout.write(json.dumps(row | result.scalars) + "\n")
-        sys.stdout.flush()
+        _write(row | result.scalars)
     return 0
 
 
@@ -92,3 +102,64 @@ def load(options: AgentOptions) -> Trained:
     if steps is not None or best or run:
         raise ValueError("--steps, --best and --run need the folder of a run, not --pretrained.")
     return load_pretrained(options.pretrained)
+
+
+def _compare(agent: Trained, options: Options, report: Callable[[str], None]) -> dict[str, Any]:
+    """Play the same episodes here and in dm_control; return the row."""
+    from pixelbrax_jax.agents.runner.evaluate import Evaluator, paired
+    from pixelbrax_jax.agents.runner.splits import make_split
+    from pixelbrax_jax.agents.runner.transfer import play_in
+
+    config, episodes, where = agent.algorithm.config, options.episodes, options.where
+    env = config.env
+    if env.task not in (tasks := SUITES["dmc"].tasks):
+        raise ValueError(
+            f"--in {where} needs a task of the DM Control Suite, but the task of the run is "
+            f"{env.task!r}; allowed: {', '.join(tasks)}."
+        )
+    if options.clips is not None or set(options.split) - {"clean"}:
+        raise ValueError(
+            f"--in {where} plays split clean alone, because dm_control has no distractors: leave "
+            "out --clips and --split."
+        )
+    from pixelbrax_jax.physics.dmc.suite import SuiteEnv
+
+    physics, picture = where != "dm_control_picture", where != "dm_control_physics"
+    for name, value in (("distractors", env.distractors), ("dynamics", env.dynamics)):
+        if value:
+            report(f"{name}={value!r} of the run are left out, here and in dm_control")
+    if picture and (env.look not in ("default", "dmc") or env.shadows is not None):
+        report(f"dm_control shows its own look, not look={env.look!r}, shadows={env.shadows}")
+    try:
+        simulator = SuiteEnv(
+            env.task,
+            camera=str(env.camera) if picture else "default",
+            size=(env.height, env.width) if picture else None,
+        )
+    except (ImportError, ValueError) as error:
+        fix = " --in dm_control_physics takes our picture instead." if picture else ""
+        raise CommandError(f"--in {where}: {error}{fix}") from error
+    with closing(simulator):
+        clean, params = make_split(config, "clean")
+        player, networks = agent.algorithm, agent.networks
+        here = Evaluator(player, clean, params, num_episodes=episodes)(networks)
+        report(f"here: return {here.mean:.1f}")
+        there = play_in(
+            simulator,
+            player,
+            networks,
+            clean,
+            params,
+            num_episodes=episodes,
+            physics=physics,
+            picture=picture,
+            report=lambda line: report(f"{where}: {line}"),
+        )
+    row = {"task": env.task, "in": where, "steps": agent.steps, "seed": agent.seed}
+    row |= {"split": "clean", "episodes": episodes}
+    return row | here.scalars | paired(here, there)
+
+
+def _write(row: dict[str, Any]) -> None:
+    sys.stdout.write(json.dumps(row) + "\n")
+    sys.stdout.flush()

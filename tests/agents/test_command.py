@@ -131,6 +131,11 @@ def test_a_task_of_the_dm_control_suite_from_training_to_the_film(capsys, tmp_pa
     told = json.loads(capsys.readouterr().out)
     assert 0.0 <= told["return"] <= 1000.0
     assert told["length"] == 1000.0, "no episode ends before the time limit"
+    assert main(["evaluate", folder, "--episodes", "2", "--in", "dm_control_physics"]) == 0
+    there = json.loads(capsys.readouterr().out)
+    assert there["return"] == told["return"]
+    # Episodes part in time, when single pixels round otherwise.
+    assert abs(there["difference"]) < 5.0
     assert main(["record", folder, "--num-frames", "3", "--output", str(tmp_path / "a.gif")]) == 0
     assert len(imageio.imread(tmp_path / "a.gif", index=None)) == 3
 

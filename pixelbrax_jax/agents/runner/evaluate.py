@@ -17,6 +17,9 @@ from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.types import EnvParams, EnvState
 
+EPISODES = 1_000_003
+"""Seed of the evaluated episodes, whatever the seed of the training."""
+
 
 @dataclass(frozen=True)
 class Result:
@@ -45,7 +48,7 @@ class Result:
 class Evaluator:
     """Runs ``num_episodes`` complete episodes with mean actions, the same ones every time.
 
-    Episode i starts from ``fold_in(key(1_000_003), i)``, whatever the seed of the training.
+    Episode i starts from ``fold_in(key(EPISODES), i)``.
     """
 
     def __init__(
@@ -84,7 +87,7 @@ def _play(
         over |= timestep.terminated | timestep.truncated
         return state, number + 1, (over, returns, lengths)
 
-    state, _ = envs.reset(jax.random.key(1_000_003), params)
+    state, _ = envs.reset(jax.random.key(EPISODES), params)
     nothing = jnp.zeros(envs.num_envs)
     results = (nothing.astype(bool), nothing, nothing.astype(jnp.int32))
     carry = jax.lax.while_loop(goes_on, step, (state, jnp.int32(0), results))
@@ -103,6 +106,26 @@ def together(runs: Sequence[Result]) -> tuple[Result, dict[str, float]]:
         lengths=np.concatenate([run.lengths for run in runs]),
     )
     return result, logged | result.scalars
+
+
+def paired(here: Result, there: Result) -> dict[str, float]:
+    """Compare the returns of the same episodes in two places.
+
+    ``difference`` is the mean of there minus here. For at least 2 episodes it has a standard error
+    and, by Student's t distribution, a 95 % interval from ``difference_low`` to
+    ``difference_high``.
+    """
+    from scipy import stats
+
+    differences = there.returns - here.returns
+    mean, count = float(differences.mean()), len(differences)
+    compared = {"return_there": there.mean, "difference": mean}
+    if count > 1:
+        error = float(differences.std(ddof=1) / np.sqrt(count))
+        reach = float(stats.t.ppf(0.975, count - 1)) * error
+        compared["difference_standard_error"] = error
+        compared |= {"difference_low": mean - reach, "difference_high": mean + reach}
+    return compared
 
 
 def interquartile_mean(scores: np.ndarray) -> tuple[float, float, float]:

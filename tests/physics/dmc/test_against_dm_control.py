@@ -25,18 +25,11 @@ EACH = [
     for task in DMC_TASKS
 ]
 
+pytestmark = pytest.mark.usefixtures("dm_control")
+
 COMPARED = {DMC_TASKS[name].domain for name in FAST}
 OF_OTHER_DOMAINS = {row.domain: row.name for row in DMC_TASKS.values()}
 """Domain -> one of its tasks."""
-
-
-@pytest.fixture(autouse=True, scope="module")
-def dm_control():
-    pytest.importorskip("dm_control", exc_type=ImportError)
-    try:
-        oracle.load("dmc_pendulum_swingup")
-    except AttributeError as error:
-        pytest.skip(f"this dm_control and this mujoco do not go together: {error}")
 
 
 def number_of_states(task: str) -> int:
