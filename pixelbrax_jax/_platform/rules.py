@@ -100,7 +100,7 @@ def _elementwise(eqn: core.JaxprEqn, inputs: Sequence[Operand], size: int) -> li
 
 _NAMED_AXES_NAMES = """
 argmax argmin cumlogsumexp cummax cummin cumprod cumsum reduce_and reduce_max reduce_min reduce_or
-reduce_prod reduce_sum rev split squeeze
+reduce_prod reduce_sum rev split squeeze unstack
 """
 
 

@@ -166,7 +166,10 @@ def test_fresh_episodes_are_those_of_same_step_autoreset(limit):
     np.testing.assert_array_equal(states.info["truncation"], expected.truncated)
     np.testing.assert_array_equal(states.reward, expected.reward)
     np.testing.assert_array_equal(states.obs["state"], expected.obs["state"])
-    np.testing.assert_array_equal(states.obs[PIXELS], unit(expected.obs["pixels"]))
+    # Programs differ in rounding: a level.
+    difference = np.abs(states.obs[PIXELS] - unit(expected.obs["pixels"]))
+    assert difference.max() < 1.5 / 255
+    assert np.mean(difference > 0) < 1e-4
     final, sums = expected.info["final_info"], states.info["episode_metrics"]
     np.testing.assert_array_equal(sums["length"][ended], final["episode_length"][ended])
     # The same sum in the same order.

@@ -75,6 +75,7 @@ FUNCTIONS = {
     "reshape in another order": lambda x: jnp.outer(x, TABLE[1]).reshape(-1, order="F"),
     "transpose": lambda x: jnp.outer(x, TABLE[2]).T,
     "slices": lambda x: (x[1:], x[::-1], x[0:3:2], jnp.split(x, 3)),
+    "unstack": lambda x: jnp.unstack(jnp.outer(x, TABLE[0]), axis=1),
     "pad": lambda x: jnp.pad(x, (1, 2), constant_values=4.0),
     "pad with a row's own": lambda x: jax.lax.pad(x, x[0], ((1, 0, 1),)),
     "concatenate": lambda x: jnp.concatenate([x, TABLE[0], jnp.zeros(1)]),
