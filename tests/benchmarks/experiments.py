@@ -8,9 +8,9 @@
 
 A run that was cut short, by Ctrl-C or by --minutes, goes on from its checkpoint at the next call.
 Of a finished one docs/results/runs/<name>.json is kept, or docs/dmc/runs/<name>.json of a task of
-the DM Control Suite; `tests.benchmarks.figures` draws all of them, with the minutes that follow
-from the speed that `tests.benchmarks.pace` measures apart. The best policy of each of Brax's tasks
-goes into the package, for --pretrained.
+the DM Control Suite; of DrQ-v2 an entry of docs/leaderboard. `tests.benchmarks.figures` draws all
+of them, with the minutes that follow from the speed that `tests.benchmarks.pace` measures apart.
+The best policy of each task goes into the package, for --pretrained.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 import pixelbrax_jax
+from pixelbrax_gym.cli import _leaderboard as leaderboard
 from pixelbrax_gym.cli.train import parse
 from pixelbrax_jax.agents.config import TrainConfig
 from pixelbrax_jax.agents.presets import TASK_SETTINGS, preset
@@ -40,10 +41,25 @@ from pixelbrax_jax.tasks import DMC_TASKS
 DOCS = Path(__file__).parents[2] / "docs"
 KEPT = DOCS / "results" / "runs"
 KEPT_DMC = DOCS / "dmc" / "runs"
+LEADERBOARD = DOCS / "leaderboard"
 PRETRAINED = Path(pixelbrax_jax.__file__).parent / "pretrained"
 EPISODES = 32
 ALGORITHMS = ("ppo", "ppg", "dcpg")
 TASKS = ("halfcheetah", "walker2d", "ant", "humanoid")
+TIMED = (
+    "dmc_cartpole_swingup",
+    "dmc_walker_walk",
+    "dmc_cheetah_run",
+    "dmc_finger_spin",
+    "dmc_ball_in_cup_catch",
+    "dmc_reacher_easy",
+    "dmc_hopper_stand",
+    "dmc_walker_stand",
+    "dmc_pendulum_swingup",
+    "dmc_cartpole_balance_sparse",
+    *TASKS,
+)
+"""Tasks of the leaderboard."""
 DISTRACTED = ("halfcheetah", "walker2d")
 DISTRACTORS = {
     "video": ("--distractors", "paper-video", "--clips", "procedural"),
@@ -92,6 +108,9 @@ def experiments() -> dict[str, list[str]]:
             more = ("--reward-preset", "brax", "--num-evals", "3")
             add(algorithm, "walker2d", seed, *more, name="brax")
     for seed in range(3):
+        for task in TIMED:
+            add("drqv2", task, seed, "--num-evals", "40")
+    for seed in range(3):
         for task in TASK_SETTINGS["cpu"]["ppo"]:
             if task in DMC_TASKS:
                 add("ppo", task, seed, "--num-evals", "3")
@@ -100,6 +119,8 @@ def experiments() -> dict[str, list[str]]:
 
 def kept_at(name: str) -> Path:
     """The file that keeps a run."""
+    if name.startswith("drqv2"):
+        return LEADERBOARD / f"{name}.json"
     return (KEPT_DMC if name.split("-")[1] in DMC_TASKS else KEPT) / f"{name}.json"
 
 
@@ -128,6 +149,9 @@ def gpu_experiments() -> dict[str, list[str]]:
 def record(folder: Path, arguments: list[str]) -> dict:
     """What is kept of a finished run: settings, returns over steps and time, evaluations."""
     about = read_about(folder / "checkpoints")
+    command = {"command": shlex.join(["pixelbrax", *arguments]), "revision": REVISION}
+    if about["algorithm"] == "drqv2":
+        return command | leaderboard.entry(folder)
     records = read_metrics(folder / "metrics.jsonl")
     training = [r for r in records if "episode/return" in r]
     evaluations = [
@@ -138,9 +162,7 @@ def record(folder: Path, arguments: list[str]) -> dict:
     ]
     physics = ("mujoco", "mujoco-mjx") if about["config"]["task"] in DMC_TASKS else ("brax",)
     packages = ("jax", "jaxlib", *physics, "pixelbrax")
-    return {
-        "command": shlex.join(["pixelbrax", *arguments]),
-        "revision": REVISION,
+    return command | {
         "algorithm": about["algorithm"],
         "config": about["config"],
         "machine": describe_cpu(),
@@ -158,7 +180,12 @@ def offer(task: str, folder: Path, kept: dict) -> None:
 
     Returns by other rewards compare with none of the preset's.
     """
-    about, last = PRETRAINED / f"{task}.json", kept["evaluations"][-1]
+    about = PRETRAINED / f"{task}.json"
+    if "evaluations" in kept:
+        last = kept["evaluations"][-1]
+    else:
+        names = {"clean/return": "return", "clean/standard_error": "standard_error"}
+        last = {name: kept[key][-1] for name, key in (names | {"steps": "frames"}).items()}
     reward = preset(kept["algorithm"], "cpu", task).env.reward_preset
     if kept["config"]["reward_preset"] != reward:
         return
@@ -245,7 +272,9 @@ def main() -> int:
         kept = record(folder, arguments)
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(kept) + "\n")
-        if kept["config"]["task"] in TASKS and not kept["config"]["distractors"]:
+        # DrQ-v2 has other rewards on Brax's tasks.
+        own = kept["algorithm"] != "drqv2" or kept["config"]["task"] in DMC_TASKS
+        if own and not kept["config"]["distractors"]:
             offer(kept["config"]["task"], folder, kept)
     if failed:
         print(f"failed: {', '.join(failed)}", file=sys.stderr)
