@@ -111,11 +111,13 @@ $(VENV)/.installed-%: $(VENV)/.created pyproject.toml constraints.txt
 	@$(PIP) -e ".[$*]"
 	@touch $@
 
-# With no constraints pip takes the newest releases.
+# With no constraints pip takes the newest releases. Of dm_control only models are read; what else it
+# requires has no wheels for this Python.
 .venv-newest/.installed: pyproject.toml
 	@echo "Installing PixelBrax with the newest releases into .venv-newest ..."
 	@$(NEWEST_PYTHON) -m venv --clear .venv-newest
 	@.venv-newest/bin/python -m pip install --quiet --disable-pip-version-check -e ".[test]"
+	@.venv-newest/bin/python -m pip install --quiet --disable-pip-version-check --no-deps dm_control
 	@touch $@
 
 .venv-oldest/.installed: pyproject.toml tests/oldest_releases.py

@@ -22,8 +22,6 @@ def fraction_changed(one: np.ndarray, other: np.ndarray) -> float:
 
 @pytest.mark.parametrize("task", TASKS)
 def test_images_are_those_that_were_accepted(task):
-    if task.startswith("dmc_"):
-        pytest.importorskip("dm_control")
     image, golden = draw(task), kept(task)
     assert image.shape == golden.shape
     assert fraction_changed(image, golden) <= EDGES
