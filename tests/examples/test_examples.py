@@ -113,7 +113,7 @@ def test_skrl_ppo(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:rich is experimental")
-@pytest.mark.timeout(900)
+@pytest.mark.timeout(2400)
 @pytest.mark.parametrize("name", ["torchrl_ppo", "sb3_ppo"])
 def test_agents_learn(name, tmp_path):
     figures = load(name).main(["--output-dir", str(tmp_path)])
