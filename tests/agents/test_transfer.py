@@ -35,7 +35,7 @@ def waver(obs: jax.Array) -> jax.Array:
 
 
 def suite_env(task: str, **options: Any) -> Any:
-    pytest.importorskip("dm_control", exc_type=ImportError)
+    pytest.importorskip("dm_control.suite", exc_type=ImportError)
     from pixelbrax_jax.physics.dmc.suite import SuiteEnv
 
     return SuiteEnv(task, **options)
@@ -141,7 +141,7 @@ def is_loaded(monkeypatch: pytest.MonkeyPatch, policy: Any = waver, **options: A
 
 
 def test_our_picture_of_dm_controls_physics_is_the_same(monkeypatch, capsys):
-    pytest.importorskip("dm_control", exc_type=ImportError)
+    pytest.importorskip("dm_control.suite", exc_type=ImportError)
     is_loaded(monkeypatch, distractors=("color",))
     assert main([*LINE, "dm_control_physics"]) == 0
     told = capsys.readouterr()
@@ -156,7 +156,7 @@ def test_our_picture_of_dm_controls_physics_is_the_same(monkeypatch, capsys):
 
 
 def test_dm_controls_picture(monkeypatch, capsys):
-    pytest.importorskip("dm_control", exc_type=ImportError)
+    pytest.importorskip("dm_control.suite", exc_type=ImportError)
     if os.environ.get("MUJOCO_GL") not in ("egl", "osmesa"):
         pytest.skip("MUJOCO_GL names no renderer without a window; egl and osmesa are such")
     is_loaded(monkeypatch, lambda pixels: jnp.ones((len(pixels), 1)), look="original")

@@ -9,7 +9,7 @@ from tests.physics.dmc import oracle
 
 @pytest.fixture(scope="session")
 def dm_control():
-    pytest.importorskip("dm_control", exc_type=ImportError)
+    pytest.importorskip("dm_control.suite", exc_type=ImportError)
     try:
         oracle.load("dmc_pendulum_swingup")
     except AttributeError as error:

@@ -128,7 +128,7 @@ def test_episodes_are_truncated_after_1000_control_steps(task):
 
 @needs_models
 @pytest.mark.parametrize("task", [task for task in DMC_TASKS if "finger" in task])
-def test_what_the_finger_cannot_reach_is_not_tried(task):
+def test_what_the_finger_cannot_reach_is_not_tried(dm_control, task):
     theirs = oracle.load(task).physics.model
     ours = make_physics(task).dynamics.xla.simulated
     pairs = set(geom_pairs(theirs.ptr)) - set(geom_pairs(ours))
