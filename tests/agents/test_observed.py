@@ -111,7 +111,7 @@ def test_a_run_is_stored_and_continues(tmp_path):
 
 
 def test_the_command_takes_several_cameras():
-    line = "--preset cpu --task inverted_pendulum --obs-mode depth --camera front top"
+    line = "--preset ci --obs-mode depth --camera front top"
     _, config, _ = parse("ppo", line.split())
     assert config.env.camera == ("front", "top")
     assert config.env.obs_mode == "depth"
