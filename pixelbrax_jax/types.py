@@ -349,7 +349,7 @@ class EnvParams(struct.PyTreeNode):
 
     Attributes:
         geoms: the shapes and their colors.
-        rig: the camera rig; a tuple of several.
+        rig: the ``CameraRig``; a tuple of them for several cameras.
         look: light, sky and ground.
         clips: background videos; None if no distractor shows any.
         episode_length: () int32, time limit in control steps.
@@ -357,7 +357,7 @@ class EnvParams(struct.PyTreeNode):
     """
 
     geoms: Geoms
-    rig: CameraRig | tuple[CameraRig, ...]
+    rig: Any
     look: Look
     clips: Clips | None = None
     episode_length: Any = np.int32(1000)

@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from numbers import Integral, Real
-from types import NoneType
 from typing import Annotated, Any, ClassVar, Self, get_type_hints
 
 import numpy as np
@@ -163,17 +162,15 @@ class TrainConfig:
         return replace(self, **settings)
 
 
-_PATH = (str, NoneType)
-
-
 def _check_env(env: EnvConfig) -> None:
     """Reject options without pixels, and options that JSON cannot store."""
     if not isinstance(env, EnvConfig):
         raise TypeError(f"env must be an EnvConfig, got {env!r}.")
     cameras = env.camera if isinstance(env.camera, tuple) else (env.camera,)
-    named = [("camera", camera, str) for camera in cameras]
-    for name, value, kind in (*named, ("look", env.look, str), ("clips", env.clips, _PATH)):
-        if not isinstance(value, kind):
+    named: list[tuple[str, Any]] = [("camera", camera) for camera in cameras]
+    clips = "" if env.clips is None else env.clips
+    for name, value in (*named, ("look", env.look), ("clips", clips)):
+        if not isinstance(value, str):
             raise TypeError(f"{name} of training settings must be a name, got {value!r}.")
     if not all(isinstance(item, str) for item in as_tuple(env.distractors)):
         raise TypeError(f"distractors of training settings must be names, got {env.distractors!r}.")

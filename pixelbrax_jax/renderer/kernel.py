@@ -14,7 +14,7 @@ from jax.experimental.pallas import triton
 from pixelbrax_jax.observations import IMAGES
 from pixelbrax_jax.renderer.fused import Near, View, rays, see, view_of
 from pixelbrax_jax.renderer.intersect import at_least, at_most
-from pixelbrax_jax.renderer.per_pixel import per_pixel
+from pixelbrax_jax.renderer.per_pixel import PerPixel, per_pixel
 from pixelbrax_jax.types import Frame, GeomKind, Scene
 
 BLOCK = 256
@@ -49,7 +49,8 @@ def draw(
     """
     plane: Any = jax.ShapeDtypeStruct((height, width), jnp.float32)
     seg, ground = plane.update(dtype=jnp.int32), plane.update(dtype=bool)
-    inputs: tuple[Any, Any] = (), ()
+    by_pixel: PerPixel | None = None
+    inputs: tuple[list[jax.Array], list[jax.Array]] = [], []
     if "pixels" in images:
         by_pixel = per_pixel(change, Frame(plane, plane, plane, plane, seg, ground))
         if by_pixel is None:
@@ -60,7 +61,7 @@ def draw(
 
     def drawn_pixels(numbers: Any, given: Any, frame: Frame) -> list[jax.Array]:
         planes = {"depth": frame.depth, "segmentation": frame.seg}
-        if "pixels" in images:
+        if by_pixel is not None:
             planes["pixels"] = by_pixel.apply(frame, numbers, given)
         return [planes[name] for name in images]
 

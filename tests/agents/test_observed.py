@@ -11,7 +11,7 @@ import pytest
 
 from pixelbrax_gym.cli.train import parse
 from pixelbrax_jax import PixelEnv, VectorPixelEnv, load_policy
-from pixelbrax_jax.agents import PPO, DrQv2, PPOConfig
+from pixelbrax_jax.agents import DCPG, PPG, PPO, DrQv2, PPOConfig
 from pixelbrax_jax.agents.networks.encoders import scaled
 from pixelbrax_jax.agents.rollout import collect, observations
 from pixelbrax_jax.agents.runner.settings import RunConfig
@@ -71,6 +71,17 @@ def test_rollouts_rebuild_what_was_observed(name):
     rebuilt = observations(rollout.frames, times)
     rebuilt = rebuilt.reshape(envs.num_envs, 8, *rollout.choice.shape[2:])
     np.testing.assert_array_equal(jnp.moveaxis(rebuilt, 0, 1), rollout.choice)
+
+
+@pytest.mark.parametrize("kind", [PPG, DCPG])
+def test_phasic_agents_learn_from_depth_in_their_auxiliary_phase(kind):
+    options, params, _ = CASES["depth of two"]
+    phasic = agent(kind, options)
+    state = phasic.init(jax.random.key(0), params)
+    for _ in range(phasic.auxiliary_every):
+        state, _ = jax.eval_shape(phasic.iterate, state, params)
+    _, metrics = jax.eval_shape(phasic.auxiliary, state)
+    assert metrics
 
 
 def test_a_replay_holds_depths():

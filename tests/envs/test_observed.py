@@ -159,6 +159,17 @@ def test_bad_options_are_named(options, message):
         pb.make("inverted_pendulum", **options)
 
 
+def test_each_environment_may_have_its_own_cameras():
+    env = PixelEnv(Ball(), obs_mode="segmentation", num_cameras=2, **SIZE)
+    eyes = np.stack([ABOVE.eye, ABOVE.eye + np.float32([0.5, 0, 0])])
+    params = TWO.replace(rig=(PARAMS.rig, ABOVE.replace(eye=eyes)))
+    _, timestep = VectorPixelEnv(env, 2).reset(jax.random.key(0), params)
+    keys = VectorPixelEnv.env_keys(jax.random.key(0), 2)
+    for i, eye in enumerate(eyes):
+        own = TWO.replace(rig=(PARAMS.rig, ABOVE.replace(eye=eye)))
+        np.testing.assert_array_equal(timestep.obs[i], env.reset(keys[i], own)[1].obs)
+
+
 def test_params_have_as_many_rigs_as_cameras():
     env = PixelEnv(Ball(), **SIZE)
     with pytest.raises(ValueError, match="num_cameras=1 rigs, got 2"):
