@@ -26,12 +26,12 @@ class Packed(NamedTuple):
     """An ``EnvState`` as few arrays, because each argument of a program costs a fixed time.
 
     Attributes:
-        frames: (N, H, W, 3K) uint8, as in the state.
+        frames: the images, with a leading axis N, as in the state.
         rest: for few environments one (W,) uint32 array with the bits of all other parts; for many
             the parts themselves, with keys as ``jax.random.key_data``.
     """
 
-    frames: jax.Array
+    frames: Any
     rest: tuple[jax.Array, ...]
 
 
@@ -93,7 +93,7 @@ class Programs:
         params: EnvParams,
         seeds: Array | None,
         offsets: Array | None,
-        spare: Array,
+        spare: Any,
     ) -> Stepped:
         """Reset environments where ``mask``; infos describe those where ``reported``, (N,) bool."""
         del spare
@@ -108,7 +108,7 @@ class Programs:
         packed: Packed,
         action: Array,
         params: EnvParams,
-        spare: Array,
+        spare: Any,
         mask: Array | None = None,
     ) -> Stepped:
         """Step where ``mask``, or all; others repeat their observation with ``done`` False."""
@@ -162,7 +162,8 @@ class Programs:
             raise ValueError(
                 f"the state does not have the structure of this environment's state (it has "
                 f"{len(given[0])} arrays, expected {len(wanted[0])}): use a state of an "
-                "environment with the same task, physics backend, distractors and obs_mode."
+                "environment with the same task, physics backend, distractors, number of "
+                "cameras and obs_mode."
             )
         for value, (path, spec) in zip(given[0], wanted[0], strict=True):
             shape, dtype = np.shape(value), getattr(value, "dtype", type(value).__name__)
@@ -213,7 +214,7 @@ def programs_of(vector: VectorPixelEnv, single: bool) -> Programs:
 def pack(state: EnvState) -> Packed:
     """Pack a state with a leading axis N."""
     parts = jax.tree.leaves(state.replace(frames=None))
-    if len(state.frames) > _FEW:
+    if len(state.key) > _FEW:
         return Packed(state.frames, tuple(map(_data, parts)))
     # Without a barrier, XLA would fuse the computation of the parts into the loop that writes them.
     parts = jax.lax.optimization_barrier(parts)
@@ -223,7 +224,7 @@ def pack(state: EnvState) -> Packed:
 def unpack(packed: Packed, like: EnvState) -> EnvState:
     """Invert ``pack`` exactly; ``like`` has the shapes and dtypes of the state."""
     parts, tree = jax.tree.flatten(like.replace(frames=None))
-    if like.frames.shape[0] > _FEW:
+    if like.key.shape[0] > _FEW:
         restored = list(map(_from_data, packed.rest, parts))
     else:
         sizes = [jax.eval_shape(_words, part).size for part in parts]

@@ -6,7 +6,6 @@ import inspect
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import jax
@@ -29,7 +28,7 @@ Keep = Callable[[Stepped], Any]
 """Maps a program's result to the value that an adapter stores with the state."""
 
 # Compiled, so that the host sends nothing.
-_new_frames = jax.jit(partial(jnp.zeros, dtype=jnp.uint8), static_argnums=0)
+_new_frames = jax.jit(jnp.zeros, static_argnums=(0, 1))
 
 _made: deque[tuple[EnvConfig, PixelEnv, EnvParams]] = deque(maxlen=64)
 """The latest environments, which forks of this process can use without JAX."""
@@ -41,7 +40,7 @@ class _Snapshot:
 
     packed: Packed
     ended: Any  # () or (N,) bool, whether episodes have ended
-    spare: jax.Array | None = None  # frames that are not read again
+    spare: Any = None  # frames that are not read again
     shared: bool = False  # whether a copy or the caller may read `packed`
     extra: Any = None  # data of the adapter
 
@@ -279,11 +278,11 @@ class StatefulEnv:
         return outputs
 
     @staticmethod
-    def _spare(snapshot: _Snapshot) -> jax.Array:
+    def _spare(snapshot: _Snapshot) -> Any:
         """Return memory for the next frames."""
         # An interrupted call may have deleted the spare frames.
-        if snapshot.spare is None or snapshot.spare.is_deleted():
-            return _new_frames(snapshot.packed.frames.shape)
+        if snapshot.spare is None or any(x.is_deleted() for x in jax.tree.leaves(snapshot.spare)):
+            return jax.tree.map(lambda x: _new_frames(x.shape, x.dtype), snapshot.packed.frames)
         return snapshot.spare
 
     def _place(self) -> None:

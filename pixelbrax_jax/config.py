@@ -12,6 +12,7 @@ import jax
 from pixelbrax_jax.distractors.base import Distractor
 from pixelbrax_jax.distractors.clips import ClipBank
 from pixelbrax_jax.distractors.presets import as_tuple
+from pixelbrax_jax.observations import IMAGES, check_obs_mode, parts_of
 from pixelbrax_jax.physics.brax.tasks import BraxOptions
 from pixelbrax_jax.physics.mujoco.options import MujocoOptions
 from pixelbrax_jax.plain import from_plain
@@ -19,11 +20,10 @@ from pixelbrax_jax.ranges import Ranges, check_ranges
 from pixelbrax_jax.renderer.base import check_renderer
 from pixelbrax_jax.scene.look import make_look
 from pixelbrax_jax.types import Camera, CameraRig, Look
-from pixelbrax_jax.validation import check_bool, check_choice, check_options, check_positive_int
-
-OBS_MODES = ("pixels", "state", "both")
+from pixelbrax_jax.validation import check_bool, check_options, check_positive_int
 
 Distractors = str | Distractor | Iterable[str | Distractor] | None
+View = str | CameraRig | Camera
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +42,8 @@ class ProgramConfig:
     frame_stack: int = 3
     """Number of frames in one observation."""
     obs_mode: str = "pixels"
-    """Content of an observation: ``pixels``, ``state`` (nothing is rendered) or ``both``."""
+    """Content of an observation: ``pixels``, ``depth``, ``segmentation``, ``state`` (nothing is
+    rendered), several joined by ``+`` such as ``pixels+depth``, or ``both``, pixels and state."""
     action_repeat: int = 1
     """Control steps per environment step. Only the last one is rendered."""
     renderer: str = "auto"
@@ -56,9 +57,14 @@ class ProgramConfig:
     def __post_init__(self) -> None:
         for name in ("height", "width", "frame_stack", "action_repeat"):
             self._store(name, check_positive_int(name, self._static(name)))
-        check_choice("obs_mode", self._static("obs_mode"), OBS_MODES)
+        self._store("obs_mode", check_obs_mode(self._static("obs_mode")))
         check_renderer(self._static("renderer"))
         self._store("distractors", as_tuple(from_plain(self.distractors)))
+
+    @property
+    def images(self) -> tuple[str, ...]:
+        """Names of the images in an observation; none with ``obs_mode="state"``."""
+        return tuple(part for part in parts_of(self.obs_mode) if part in IMAGES)
 
     def _static(self, name: str) -> Any:
         """Return an option, or raise TypeError if it is an array or cannot be hashed."""
@@ -93,8 +99,9 @@ class EnvConfig(BraxOptions, MujocoOptions, ProgramConfig):
     task: str = "ant"
     """Name of the task, one of ``pixelbrax_jax.list_envs()``, or ``module:name``, which first
     imports the module that registers it."""
-    camera: str | CameraRig | Camera = "default"
-    """Viewpoint: a name of ``named_rigs``, a ``CameraRig`` or a ``Camera``."""
+    camera: View | tuple[View, ...] = "default"
+    """Viewpoint: a name of ``named_rigs``, a ``CameraRig`` or a ``Camera``; or a tuple of several,
+    whose images are the channels of each frame, one camera after the other."""
     look: str | Look = "default"
     """Light, sky and ground: ``default``, ``original``, ``dmc`` or a ``Look``. For a task of the DM
     Control Suite ``default`` is ``dmc`` with the lights of its model."""
@@ -124,7 +131,7 @@ class EnvConfig(BraxOptions, MujocoOptions, ProgramConfig):
         self._store("episode_length", episode_length)
         if self.shadows is not None:
             self._store("shadows", check_bool("shadows", self.shadows))
-        self._store("camera", from_plain(self.camera))
+        self._store("camera", _check_camera(from_plain(self.camera)))
         self._store("look", from_plain(self.look))
         make_look(self.look)
         if self.clips is not None and not isinstance(self.clips, (str, PathLike, ClipBank)):
@@ -132,10 +139,27 @@ class EnvConfig(BraxOptions, MujocoOptions, ProgramConfig):
                 f"clips must be a folder, 'procedural' or a bank of load_clips, got {self.clips!r}."
             )
 
+    @property
+    def num_cameras(self) -> int:
+        """Number of cameras."""
+        return len(self.camera) if isinstance(self.camera, tuple) else 1
+
     def suite_options(self) -> dict[str, Any]:
         """Return the options that belong to one suite and differ from their defaults."""
         values = {option.name: getattr(self, option.name) for option in _SUITE_OPTIONS}
         return {o.name: values[o.name] for o in _SUITE_OPTIONS if values[o.name] != o.default}
+
+
+def _check_camera(camera: Any) -> Any:
+    """Return one view, or a tuple of at least two; raise ValueError for none or a repeated name."""
+    if not isinstance(camera, tuple):
+        return camera
+    if not camera:
+        raise ValueError("camera must name at least one viewpoint, got an empty tuple.")
+    for name in camera:
+        if isinstance(name, str) and camera.count(name) > 1:
+            raise ValueError(f"camera={camera!r} has {name!r} twice; give each viewpoint once.")
+    return camera if len(camera) > 1 else camera[0]
 
 
 PROGRAM_OPTIONS = tuple(field.name for field in fields(ProgramConfig))

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 
 from pixelbrax_jax.extras import install_extra
 from pixelbrax_jax.validation import check_choice, suggest
@@ -23,19 +22,21 @@ FOLDER = Path(__file__).parent / "pretrained"
 class Policy:
     """A policy that maps pixels to actions: ``policy(pixels)``.
 
-    ``shape`` is (H, W, 3 K). ``pixelbrax_jax.make(**policy.env_options)`` makes the environment of
-    a pretrained policy; the options are None for a policy from a file.
+    ``shape`` is (H, W, 3 K), and ``dtype`` that of the pixels; depths are float32.
+    ``pixelbrax_jax.make(**policy.env_options)`` makes the environment of a pretrained policy; the
+    options are None for a policy from a file.
     """
 
     program: Callable[[jax.Array], jax.Array]
     shape: tuple[int, ...]
     env_options: dict[str, Any] | None = None
+    dtype: str = "uint8"
 
     def __call__(self, pixels: jax.Array) -> jax.Array:
-        """Map (B, H, W, 3 K) uint8 pixels to (B, A) float32; others raise a ValueError."""
-        if pixels.ndim != 4 or pixels.shape[1:] != self.shape or pixels.dtype != jnp.uint8:
+        """Map (B, H, W, 3 K) pixels to (B, A) float32; others raise a ValueError."""
+        if pixels.ndim != 4 or pixels.shape[1:] != self.shape or pixels.dtype != self.dtype:
             raise ValueError(
-                f"the policy takes (B, {', '.join(map(str, self.shape))}) uint8 pixels, got "
+                f"the policy takes (B, {', '.join(map(str, self.shape))}) {self.dtype} pixels, got "
                 f"{pixels.shape} {pixels.dtype}."
             )
         return self.program(pixels)
@@ -90,4 +91,4 @@ def load_policy(path: str | Path) -> Policy:
         ) from error
     (wanted,) = exported.in_avals
     options = about["env_options"] if about else None
-    return Policy(jax.jit(exported.call), tuple(wanted.shape[1:]), options)
+    return Policy(jax.jit(exported.call), tuple(wanted.shape[1:]), options, str(wanted.dtype))

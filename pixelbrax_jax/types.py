@@ -349,7 +349,7 @@ class EnvParams(struct.PyTreeNode):
 
     Attributes:
         geoms: the shapes and their colors.
-        rig: the camera rig.
+        rig: the ``CameraRig``; a tuple of them for several cameras.
         look: light, sky and ground.
         clips: background videos; None if no distractor shows any.
         episode_length: () int32, time limit in control steps.
@@ -357,7 +357,7 @@ class EnvParams(struct.PyTreeNode):
     """
 
     geoms: Geoms
-    rig: CameraRig
+    rig: Any
     look: Look
     clips: Clips | None = None
     episode_length: Any = np.int32(1000)
@@ -392,12 +392,12 @@ class EnvState(struct.PyTreeNode):
 
     Attributes:
         sim: the simulated part.
-        frames: (H, W, 3K) uint8, the frame stack, oldest first; (0, 0, 0) without pixels.
+        frames: the observation's images; (0, 0, 0) uint8 without any.
         key: typed PRNG key of the environment; never changes.
     """
 
     sim: SimState
-    frames: jax.Array
+    frames: Any
     key: jax.Array
 
     @property
@@ -410,8 +410,10 @@ class Timestep(struct.PyTreeNode):
     """Result of a reset or step.
 
     Attributes:
-        obs: (H, W, 3K) uint8 pixels, oldest frame first; (S,) state; or a dictionary of both with
-            keys ``"pixels"`` and ``"state"``, according to ``obs_mode``.
+        obs: according to ``obs_mode``; a dictionary of several. ``"pixels"`` are (H, W, 3K) uint8,
+            ``"depth"`` (H, W, K) in metres along the viewing axis, at most 100, ``"segmentation"``
+            (H, W, K) int32, rows of ``EnvParams.geoms`` or -1 for the sky; oldest frame first.
+            With C cameras a frame has C times the channels. ``"state"`` is (S,).
         reward: (), 0 after a reset.
         terminated: () bool, the task ended.
         truncated: () bool, the time limit was reached; never together with ``terminated``.

@@ -20,6 +20,7 @@ FOUNDATIONS = {
     "types",
     "spatial",
     "validation",
+    "observations",
     "extras",
     "compilation",
     "flags",
@@ -41,6 +42,7 @@ def _below(*names: str) -> set[str]:
 ALLOWED: dict[str, set[str]] = {
     **{f"pixelbrax_jax.{name}": set() for name in FOUNDATIONS},
     "pixelbrax_jax.spatial": {"pixelbrax_jax.types"},
+    "pixelbrax_jax.observations": {"pixelbrax_jax.validation"},
     "pixelbrax_jax.compilation": {"pixelbrax_jax.flags", "pixelbrax_jax.validation"},
     "pixelbrax_jax.video": {"pixelbrax_jax.extras", "pixelbrax_jax.ffmpeg"},
     "pixelbrax_jax.policy": {"pixelbrax_jax.extras", "pixelbrax_jax.validation"},

@@ -153,15 +153,24 @@ def _names_for_objects() -> ConstructorRegistry:
     from pixelbrax_jax.config import EnvConfig
 
     types, registry = get_type_hints(EnvConfig), ConstructorRegistry()
-    metavars = {types[name]: "NAME" for name in ("camera", "look")} | {
+    metavars = {
+        types["look"]: "NAME",
         types["clips"]: "FOLDER",
         types["dynamics"]: "NAME=LOW:HIGH,...",
     }
 
     @registry.primitive_rule
     def names(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
-        if info.type != types["distractors"] and info.type not in metavars:
+        if info.type not in {types["distractors"], types["camera"], *metavars}:
             return None
+        if info.type == types["camera"]:
+            return PrimitiveConstructorSpec(
+                nargs="*",
+                metavar="NAME ...",
+                instance_from_str=lambda args: args[0] if len(args) == 1 else tuple(args),
+                is_instance=lambda value: isinstance(value, (str, tuple)),
+                str_from_instance=lambda value: [value] if isinstance(value, str) else list(value),
+            )
         if info.type == types["distractors"]:
             return PrimitiveConstructorSpec(
                 nargs="*",

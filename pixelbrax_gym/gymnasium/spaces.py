@@ -8,6 +8,8 @@ import gymnasium
 import numpy as np
 from gymnasium.vector.utils import batch_differing_spaces, iterate
 
+from pixelbrax_jax.observations import MAX_DEPTH
+
 
 class BroadcastBox(gymnasium.spaces.Box):
     """A batched ``Box`` whose bounds are read-only views of one lower and one upper number.
@@ -49,14 +51,14 @@ iterate.register(BroadcastBox, iterate.dispatch(gymnasium.spaces.Box))
 def observation_space(spec: Any, num_envs: int | None = None) -> gymnasium.Space:
     """Return the space of an observation, batched if ``num_envs`` is given.
 
-    Pixels are a uint8 box in [0, 255], state is an unbounded float32 box, both are a ``Dict``.
+    Pixels are a uint8 box in [0, 255], depth a float32 box in [0, 100], segmentation an int32 box
+    from -1, and state an unbounded float32 box; several are a ``Dict``.
     """
     if isinstance(spec, dict):
         return gymnasium.spaces.Dict(
             {name: observation_space(part, num_envs) for name, part in spec.items()}
         )
-    low, high = (0, 255) if spec.dtype == np.uint8 else (-np.inf, np.inf)
-    return _batched(low, high, spec.shape, spec.dtype, num_envs)
+    return _batched(*_bounds(spec), spec.shape, spec.dtype, num_envs)
 
 
 def action_space(action_size: int, num_envs: int | None = None) -> gymnasium.spaces.Box:
@@ -65,15 +67,24 @@ def action_space(action_size: int, num_envs: int | None = None) -> gymnasium.spa
 
 
 def channels_first_space(space: gymnasium.Space) -> gymnasium.Space:
-    """Change pixels in an observation space from (H, W, 3K) to (3K, H, W)."""
+    """Change images in an observation space from (H, W, C) to (C, H, W)."""
     if isinstance(space, gymnasium.spaces.Dict):
         return gymnasium.spaces.Dict(
             {name: channels_first_space(part) for name, part in space.spaces.items()}
         )
-    if space.dtype != np.uint8 or space.shape is None:
+    if not isinstance(space, gymnasium.spaces.Box) or len(space.shape) != 3:
         return space
     height, width, channels = space.shape
-    return gymnasium.spaces.Box(0, 255, (channels, height, width), np.uint8)
+    bounds = space.low.flat[0], space.high.flat[0]
+    return gymnasium.spaces.Box(*bounds, (channels, height, width), space.dtype)
+
+
+def _bounds(spec: Any) -> tuple[float, float]:
+    if spec.dtype == np.uint8:
+        return 0, 255
+    if spec.dtype == np.int32:
+        return -1, np.iinfo(np.int32).max
+    return (0.0, MAX_DEPTH) if len(spec.shape) == 3 else (-np.inf, np.inf)
 
 
 def _batched(

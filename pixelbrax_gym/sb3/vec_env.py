@@ -29,15 +29,16 @@ from pixelbrax_jax.validation import check_bool, check_choice
 
 def check_channels(env: PixelEnv, channels_first: bool) -> None:
     """Reject images whose shortest axis, which Stable-Baselines3 reads as channels, is another."""
-    channels = 3 * env.frame_stack
+    channels = 3 * env.frame_stack * env.num_cameras
     shortest = min(env.height, env.width)
     misread = shortest < channels if channels_first else env.height <= min(env.width, channels)
-    if env.obs_mode != "state" and misread:
+    if "pixels" in env.images and misread:
+        cameras = f", {env.num_cameras} cameras" if env.num_cameras > 1 else ""
         raise ValueError(
-            f"height={env.height}, width={env.width} and frame_stack={env.frame_stack} make images "
-            f"with {channels} channels, but Stable-Baselines3 takes the shortest axis of an image "
-            f"for its channels: use a height and width above {channels} pixels, or stack fewer "
-            "frames."
+            f"height={env.height}, width={env.width}{cameras} and frame_stack={env.frame_stack} "
+            f"make images with {channels} channels, but Stable-Baselines3 takes the shortest axis "
+            f"of an image for its channels: use a height and width above {channels} pixels, or "
+            "stack fewer frames."
         )
 
 
@@ -80,7 +81,7 @@ class SB3VecEnv(VecEnv):
             render_mode: None or ``"rgb_array"``.
             render_height: height of ``render()`` in pixels.
             render_width: width of ``render()`` in pixels.
-            channels_first: whether pixels are (3K, H, W), as a view, instead of (H, W, 3K), which
+            channels_first: whether images are (3K, H, W), as a view, instead of (H, W, 3K), which
                 Stable-Baselines3 transposes itself.
             stagger: whether to spread time limits evenly over the steps, because
                 Stable-Baselines3 evaluates the value function once for each truncated environment.

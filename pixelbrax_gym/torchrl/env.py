@@ -23,15 +23,16 @@ from pixelbrax_gym.interop.fork import check_not_forked
 from pixelbrax_gym.programs import Stepped
 from pixelbrax_gym.resets import SEEDS, as_mask, spread_seeds
 from pixelbrax_gym.stateful import StatefulEnv
-from pixelbrax_gym.torchrl.specs import action_spec, done_spec, observation_spec
+from pixelbrax_gym.torchrl.specs import action_spec, done_spec, entries, observation_spec
 
 
 class TorchRLEnv(EnvBase):
     """``num_envs`` copies of a pixel task, stepped together.
 
-    Batch size (N,). Keys: ``pixels``, (N, H, W, 3K) uint8, oldest frame first; ``observation``,
-    (N, S) float32, with ``obs_mode="state"`` or ``"both"``; ``action``, (N, A) float32 in
-    [-1, 1]; ``reward``, (N, 1) float32; ``done``, ``terminated`` and ``truncated``, (N, 1) bool.
+    Batch size (N,). Keys: ``pixels``, (N, H, W, 3K) uint8, oldest frame first, ``depth`` and
+    ``segmentation`` as ``obs_mode`` asks; ``observation``, (N, S) float32, the state; ``action``,
+    (N, A) float32 in [-1, 1]; ``reward``, (N, 1) float32; ``done``, ``terminated`` and
+    ``truncated``, (N, 1) bool.
 
     The step that ends an episode returns its last observation under ``"next"``. The same program
     resets the environment; ``reset`` then returns the first observation for the rows of its
@@ -96,7 +97,7 @@ class TorchRLEnv(EnvBase):
         self._seeds: list[int | None] | None = None
 
         env, size = stateful.env, (self._num_envs, self.device)
-        self.observation_spec = observation_spec(env.obs_spec, *size)
+        self.observation_spec = observation_spec(env.obs_spec, env.images, *size)
         self.action_spec = action_spec(env.action_size, *size)
         self.reward_spec = Unbounded((self._num_envs, 1), device=self.device, dtype=torch.float32)
         self.done_spec = done_spec(*size)
@@ -227,9 +228,7 @@ class TorchRLEnv(EnvBase):
         return f"{name}({self._task!r}, num_envs={self._num_envs}, device={self.device})"
 
     def _observations(self, obs: Any) -> dict[str, torch.Tensor]:
-        if not isinstance(obs, dict):
-            return {"pixels" if obs.dtype == torch.uint8 else "observation": obs}
-        return {"pixels": obs["pixels"], "observation": obs["state"]}
+        return entries(obs, self._stateful.env.images)
 
     def _flags(self) -> dict[str, torch.Tensor]:
         names = ("done", "terminated", "truncated")

@@ -16,7 +16,7 @@ class _Itself(type(Unbounded)):  # type: ignore[misc]
 
 
 class PixelSpec(UnboundedDiscrete, metaclass=_Itself):
-    """Spec of uint8 pixels without tensors of bounds (``space`` is None).
+    """Spec of images without tensors of bounds (``space`` is None).
 
     It equals an ordinary ``Unbounded`` of the same shape, dtype and device, whose bounds for 4096
     stacks of 84 x 84 frames take 26 s and gigabytes to build.
@@ -29,7 +29,7 @@ class PixelSpec(UnboundedDiscrete, metaclass=_Itself):
         dtype: torch.dtype = torch.uint8,
         **kwargs: Any,
     ) -> None:
-        """Build the spec; transforms may give another dtype."""
+        """Build the spec."""
         kind = "continuous" if dtype.is_floating_point else "discrete"
         TensorSpec.__init__(
             self,
@@ -51,16 +51,26 @@ class PixelSpec(UnboundedDiscrete, metaclass=_Itself):
         return PixelSpec(self.shape, dest, self.dtype)
 
 
-def observation_spec(spec: Any, num_envs: int, device: torch.device) -> Composite:
-    """Return the spec of an observation, with entries ``"pixels"`` and ``"observation"``."""
-    parts = spec if isinstance(spec, dict) else {"any": spec}
+def entries(obs: Any, images: tuple[str, ...]) -> dict[str, Any]:
+    """Return the parts of an observation by TorchRL's names; a single part may be the first image.
+
+    The state is ``"observation"``.
+    """
+    parts = obs if isinstance(obs, dict) else {(*images, "state")[0]: obs}
+    return {"observation" if name == "state" else name: part for name, part in parts.items()}
+
+
+def observation_spec(
+    spec: Any, images: tuple[str, ...], num_envs: int, device: torch.device
+) -> Composite:
+    """Return the spec of an observation, with entries of the names of ``entries``."""
     specs: dict[str, TensorSpec] = {}
-    for part in parts.values():
-        shape = (num_envs, *part.shape)
-        if part.dtype == "uint8":
-            specs["pixels"] = PixelSpec(shape, device)
+    for name, part in entries(spec, images).items():
+        shape, dtype = (num_envs, *part.shape), getattr(torch, part.dtype.name)
+        if name in images:
+            specs[name] = PixelSpec(shape, device, dtype)
         else:
-            specs["observation"] = Unbounded(shape, device=device, dtype=torch.float32)
+            specs[name] = Unbounded(shape, device=device, dtype=dtype)
     return Composite(specs, shape=(num_envs,), device=device)
 
 

@@ -13,9 +13,11 @@ def unpack(packed: jax.Array) -> jax.Array:
 
 
 def push(frames: jax.Array, newest: jax.Array, is_first: jax.Array) -> jax.Array:
-    """Return the frame stack (H, W, 3 K) uint8 after one more frame, (H, W) uint32 packed pixels.
+    """Return the frame stack (H, W, c K) after one more frame, as an image is drawn.
 
-    With ``is_first``, () bool, it becomes K copies of the frame.
+    That is (H, W), or (C, H, W) with C cameras: uint32 packed pixels for a stack of uint8, where c
+    is 3 C; otherwise numbers of the stack's dtype, where c is C. With ``is_first``, () bool, the
+    stack becomes K copies of the frame.
     """
     pushed: jax.Array = jax.lax.platform_dependent(
         frames, newest, is_first, cpu=_concatenate, default=_shift
@@ -25,17 +27,26 @@ def push(frames: jax.Array, newest: jax.Array, is_first: jax.Array) -> jax.Array
 
 def _concatenate(frames: jax.Array, newest: jax.Array, is_first: jax.Array) -> jax.Array:
     """Push by a concatenation of frames, which is fastest on a CPU."""
-    pixels = unpack(newest)
-    copies = jnp.tile(pixels, (1, 1, frames.shape[-1] // 3 - 1))
-    older = jnp.where(is_first, copies, frames[..., 3:])
-    return jnp.concatenate([older, pixels], axis=-1)
+    image = unpack(newest) if frames.dtype == jnp.uint8 else newest[..., None]
+    if image.ndim > 3:
+        image = jnp.concatenate(list(image), axis=-1)
+    channels = image.shape[-1]
+    copies = jnp.tile(image, (1, 1, frames.shape[-1] // channels - 1))
+    older = jnp.where(is_first, copies, frames[..., channels:])
+    return jnp.concatenate([older, image], axis=-1)
 
 
 def _shift(frames: jax.Array, newest: jax.Array, is_first: jax.Array) -> jax.Array:
     """Push by arithmetic on words; a GPU would write a concatenation byte by byte."""
     channel = np.arange(frames.shape[-1])
-    is_new = channel >= len(channel) - 3
-    shifts = np.asarray(8 * (channel % 3), np.uint32)
-    repeated = (newest[..., None] >> shifts).astype(jnp.uint8)
-    shifted = jnp.pad(frames[..., 3:], ((0, 0), (0, 0), (0, 3)))
+    size = 3 if frames.dtype == jnp.uint8 else 1
+    planes = list(newest) if newest.ndim > 2 else [newest]
+    channels = size * len(planes)
+    is_new = channel >= len(channel) - channels
+    repeated = planes[0][..., None]
+    for c, plane in enumerate(planes[1:], 1):
+        repeated = jnp.where(channel // size % len(planes) == c, plane[..., None], repeated)
+    if size > 1:
+        repeated = (repeated >> np.asarray(8 * (channel % 3), np.uint32)).astype(jnp.uint8)
+    shifted = jnp.pad(frames[..., channels:], ((0, 0), (0, 0), (0, channels)))
     return jnp.where(is_first | is_new, repeated, shifted)

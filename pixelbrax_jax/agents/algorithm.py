@@ -14,6 +14,7 @@ from pixelbrax_jax.agents.config import TrainConfig
 from pixelbrax_jax.agents.rollout import Environments, split_obs
 from pixelbrax_jax.agents.train_state import Metrics, Networks, TrainState
 from pixelbrax_jax.flags import under_default_flags
+from pixelbrax_jax.observations import IMAGES, check_obs_mode
 from pixelbrax_jax.types import EnvParams
 
 
@@ -52,16 +53,19 @@ class Algorithm(ABC):
                 f"autoreset_mode of the environments must be 'next_step', got {mode!r}."
             )
         pixels, state = split_obs(envs.env.obs_spec)
-        if pixels is None or len(pixels.shape) != 3 or (config.state_critic and state is None):
-            wanted = "both" if config.state_critic else "pixels"
+        mode = config.env.obs_mode
+        fits = pixels is not None and len(pixels.shape) == 3 and pixels.dtype == IMAGES[mode].dtype
+        if not fits or (config.state_critic and state is None):
+            wanted = check_obs_mode(mode + "+state") if config.state_critic else mode
             raise ValueError(
                 f"obs_mode of the environments must be {wanted!r} with "
                 f"state_critic={config.state_critic}, but their obs_spec is {envs.env.obs_spec}."
             )
         found = {
+            "the number of cameras": (config.env.num_cameras, envs.env.num_cameras),
             "num_envs": (config.num_envs, envs.num_envs),
             "action_repeat": (config.env.action_repeat, envs.env.action_repeat),
-            "frame_stack": (config.env.frame_stack, pixels.shape[-1] // 3),
+            "frame_stack": (config.env.frame_stack, pixels.shape[-1] // config.frame_channels),
             "height": (config.env.height, pixels.shape[0]),
             "width": (config.env.width, pixels.shape[1]),
         }
@@ -85,7 +89,7 @@ class Algorithm(ABC):
 
     @abstractmethod
     def act(self, networks: Networks, pixels: jax.Array, key: jax.Array | None = None) -> jax.Array:
-        """Return (N, A) float32 actions for (N, H, W, 3 K) uint8 pixels.
+        """Return (N, A) float32 actions for (N, H, W, 3 K) uint8 pixels, or float32 depths.
 
         Needs only the networks in ``acting``. A key samples the actions; None returns the best.
         """

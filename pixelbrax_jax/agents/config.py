@@ -6,14 +6,16 @@ import math
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from numbers import Integral, Real
-from types import NoneType
 from typing import Annotated, Any, ClassVar, Self, get_type_hints
+
+import numpy as np
 
 from pixelbrax_jax.agents.networks.encoders import ENCODERS, SMALLEST
 from pixelbrax_jax.config import ENV_OPTIONS, EnvConfig
 from pixelbrax_jax.distractors.presets import as_tuple
 from pixelbrax_jax.envs.making import make
 from pixelbrax_jax.envs.pixel_env import PixelEnv
+from pixelbrax_jax.observations import IMAGES
 from pixelbrax_jax.ranges import Ranges, check_ranges
 from pixelbrax_jax.types import EnvParams
 from pixelbrax_jax.validation import (
@@ -64,7 +66,7 @@ class TrainConfig:
     """Settings of every algorithm; a setting out of range is a ValueError."""
 
     env: EnvConfig = EnvConfig()  # noqa: RUF009 (it is frozen)
-    """Sets the environment's options; camera, look, clips and distractors are names."""
+    """Sets the environment's options; cameras, look, clips and distractors are names."""
 
     test_dynamics: Ranges = ""
     """Option ``dynamics`` of the split ``test`` in evaluations; without it they have that of the
@@ -118,6 +120,17 @@ class TrainConfig:
         raise NotImplementedError(f"{type(self).__name__} lacks steps_per_iteration.")
 
     @property
+    def frame_channels(self) -> int:
+        """Channels of one frame of an observation."""
+        return IMAGES[self.env.obs_mode].channels * self.env.num_cameras
+
+    @property
+    def frame_bytes(self) -> int:
+        """Bytes of one frame of an observation."""
+        size = np.dtype(IMAGES[self.env.obs_mode].dtype).itemsize
+        return self.env.height * self.env.width * self.frame_channels * size
+
+    @property
     def num_iterations(self) -> int:
         """Number of iterations of the run."""
         return -(-self.total_steps // self.steps_per_iteration)
@@ -153,21 +166,24 @@ def _check_env(env: EnvConfig) -> None:
     """Reject options without pixels, and options that JSON cannot store."""
     if not isinstance(env, EnvConfig):
         raise TypeError(f"env must be an EnvConfig, got {env!r}.")
-    for name, kind in (("camera", str), ("look", str), ("clips", (str, NoneType))):
-        if not isinstance(value := getattr(env, name), kind):
+    cameras = env.camera if isinstance(env.camera, tuple) else (env.camera,)
+    named: list[tuple[str, Any]] = [("camera", camera) for camera in cameras]
+    clips = "" if env.clips is None else env.clips
+    for name, value in (*named, ("look", env.look), ("clips", clips)):
+        if not isinstance(value, str):
             raise TypeError(f"{name} of training settings must be a name, got {value!r}.")
     if not all(isinstance(item, str) for item in as_tuple(env.distractors)):
         raise TypeError(f"distractors of training settings must be names, got {env.distractors!r}.")
-    if env.obs_mode != "pixels":
+    if env.obs_mode not in ("pixels", "depth"):
         raise ValueError(
-            f"obs_mode of training settings must be 'pixels', got {env.obs_mode!r}; "
+            f"obs_mode of training settings must be 'pixels' or 'depth', got {env.obs_mode!r}; "
             "state_critic=True shows the simulator's state to a critic."
         )
 
 
 def make_env(config: TrainConfig, **changes: Any) -> tuple[PixelEnv, EnvParams]:
     """Make the environment of the settings; ``changes`` override its ``EnvConfig``."""
-    obs_mode = "both" if config.state_critic else "pixels"
+    obs_mode = config.env.obs_mode + ("+state" if config.state_critic else "")
     return make(config.env, **({"obs_mode": obs_mode} | changes))
 
 

@@ -28,6 +28,7 @@ class Frames(struct.PyTreeNode):
 
     Attributes:
         pixels: (K - 1 + T, N, H, W, 3) uint8 single frames; the first K - 1 precede the rollout.
+            Depths are (..., 1) float32; of C cameras there are C times the channels.
         age: (T, N) int32, earlier frames of the same episode, at most K - 1.
         shift: (N, 2) int32, shift of the observations in pixels down and right.
         state: (T, N, S) float32, the simulator's state; None unless a critic sees it.
@@ -91,8 +92,9 @@ def collect(
     shift_key = jax.random.fold_in(key, num_steps + 1)
     shift = jax.random.randint(shift_key, (num_envs, 2), -random_shift, random_shift + 1)
     first, _ = split_obs(envs.obs(env_state))
-    stack = first.shape[-1] // 3
-    before = jnp.moveaxis(first.reshape(*first.shape[:-1], stack, 3), -2, 0)[:-1]
+    stack = envs.env.frame_stack
+    channels = first.shape[-1] // stack
+    before = jnp.moveaxis(first.reshape(*first.shape[:-1], stack, channels), -2, 0)[:-1]
 
     def choose_at(env_state: EnvState, number: Any) -> tuple[Any, ...]:
         pixels, state = split_obs(envs.obs(env_state))
@@ -112,7 +114,7 @@ def collect(
             timestep.info["episode_return"],
             timestep.info["episode_length"],
         )
-        kept = (pixels[..., -3:], age, state)
+        kept = (pixels[..., -channels:], age, state)
         age = jnp.where(begins, 0, jnp.minimum(age + 1, stack - 1))
         return (env_state, age), (kept, choice, outcome)
 
@@ -126,14 +128,14 @@ def collect(
 
 
 def observations(frames: Frames, times: jax.Array, random_shift: int = 0) -> jax.Array:
-    """Rebuild the (N B, H, W, 3 K) uint8 pixels at (B, N) int32 times, ordered by environment."""
+    """Rebuild the (N B, H, W, 3 K) pixels at (B, N) int32 times, ordered by environment."""
     stack = frames.pixels.shape[0] - frames.age.shape[0] + 1
     age = jnp.take_along_axis(frames.age, times, axis=0)
     back = jnp.minimum(jnp.arange(stack - 1, -1, -1), age[..., None])
     index = times[..., None] + stack - 1 - back
     picked = jax.vmap(lambda pixels, index: pixels[index], in_axes=1)(frames.pixels, index)
     stacked = jnp.moveaxis(picked, 2, -2)
-    stacked = stacked.reshape(*stacked.shape[:-2], 3 * stack)
+    stacked = stacked.reshape(*stacked.shape[:-2], -1)
     if random_shift:
         of_times = jax.vmap(shifted, in_axes=(1, None, None), out_axes=1)
         stacked = of_times(stacked, frames.shift, random_shift)
@@ -147,9 +149,10 @@ def at_times(rows: jax.Array, times: jax.Array) -> jax.Array:
 
 
 def split_obs(obs: Any) -> tuple[Any, Any]:
-    """Split an observation or its spec into pixels and state; a missing part is None."""
+    """Split an observation or its spec into its only image and state; a missing part is None."""
     if isinstance(obs, dict):
-        return obs.get("pixels"), obs.get("state")
+        images = [part for name, part in obs.items() if name != "state"]
+        return images[0] if len(images) == 1 else None, obs.get("state")
     return obs, None
 
 

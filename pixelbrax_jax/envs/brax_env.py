@@ -52,9 +52,19 @@ class BraxEnv(Env):
     """
 
     def __init__(self, env: PixelEnv, params: EnvParams) -> None:
-        """Wrap ``env``, which is not modified; raise TypeError if it is not a ``PixelEnv``."""
+        """Wrap ``env``, which is not modified.
+
+        Raises:
+            TypeError: it is not a ``PixelEnv``.
+            ValueError: its observations have depth or segmentation.
+        """
         if not isinstance(env, PixelEnv):
             raise TypeError(f"env must be a PixelEnv, got {type(env).__name__}.")
+        if env.images not in ((), ("pixels",)):
+            raise ValueError(
+                f"obs_mode={env.obs_mode!r} is not for Brax's trainers, whose images are pixels: "
+                "use 'pixels', 'state' or 'both'."
+            )
         _patch_trainers()
         self.env = env
         self.sys = params.replace(episode_length=jax.device_put(np.int32(_NO_LIMIT)))

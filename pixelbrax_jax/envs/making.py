@@ -58,16 +58,12 @@ def make(task: str | EnvConfig, **options: Any) -> tuple[PixelEnv, EnvParams]:
     physics = registry.make_physics(config.task, **config.suite_options())
     program = {name: getattr(config, name) for name in PROGRAM_OPTIONS}
     program["distractors"] = resolve(config.distractors, config.task)
-    env = PixelEnv(physics, **program)
-    rig = _rig(config, physics)
-    if not rig.link < len(physics.link_names):
-        raise ValueError(
-            f"the camera follows link {rig.link}, but task {config.task!r} has only "
-            f"{len(physics.link_names)} links: {', '.join(physics.link_names)}."
-        )
+    env = PixelEnv(physics, num_cameras=config.num_cameras, **program)
+    cameras = config.camera if isinstance(config.camera, tuple) else (config.camera,)
+    rigs = tuple(_rig(config, camera, physics) for camera in cameras)
     params = EnvParams(
-        geoms=seen_from(physics.geoms, rig),
-        rig=rig,
+        geoms=seen_from(physics.geoms, *rigs),
+        rig=rigs if len(rigs) > 1 else rigs[0],
         look=_look(config, physics),
         episode_length=np.int32(min(filter(None, (config.episode_length, physics.time_limit)))),
         dynamics=_dynamics(config, physics),
@@ -121,16 +117,21 @@ def _corner_rig(physics: Physics) -> CameraRig:
     return rig_from_corner(physics.geoms, xpos, xquat, physics.followed_link)
 
 
-def _rig(config: EnvConfig, physics: Physics) -> CameraRig:
-    rigs = _rigs(config.task, physics)
-    unfit, camera = physics.unfit_cameras, config.camera
+def _rig(config: EnvConfig, camera: Any, physics: Physics) -> CameraRig:
+    rigs, unfit = _rigs(config.task, physics), physics.unfit_cameras
     if isinstance(camera, str) and camera in unfit and camera not in rigs:
         raise ValueError(
             f"camera {camera!r} of task {config.task!r} cannot be a viewpoint: {unfit[camera]}, "
             "but a viewpoint must be a perspective camera with a fixed direction. Allowed: "
             f"{', '.join(sorted(rigs))}, a CameraRig or a Camera."
         )
-    return choose_rig(config.task, camera, rigs)
+    rig = choose_rig(config.task, camera, rigs)
+    if not rig.link < len(physics.link_names):
+        raise ValueError(
+            f"the camera follows link {rig.link}, but task {config.task!r} has only "
+            f"{len(physics.link_names)} links: {', '.join(physics.link_names)}."
+        )
+    return rig
 
 
 def _look(config: EnvConfig, physics: Physics) -> Look:

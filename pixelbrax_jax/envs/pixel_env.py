@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Any
 
@@ -13,14 +13,16 @@ from pixelbrax_jax._platform.frame_stack import push, unpack
 from pixelbrax_jax.config import ProgramConfig
 from pixelbrax_jax.distractors.base import Chain
 from pixelbrax_jax.distractors.presets import as_tuple
+from pixelbrax_jax.envs.arguments import check_action, check_key
 from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.memory import check_fits
+from pixelbrax_jax.observations import IMAGES, MAX_DEPTH, parts_of
 from pixelbrax_jax.physics.base import Physics, check_physics
 from pixelbrax_jax.ranges import sample
 from pixelbrax_jax.renderer.base import draw, render
 from pixelbrax_jax.renderer.choice import why_no_kernel
 from pixelbrax_jax.scene.place import place
-from pixelbrax_jax.types import EnvParams, EnvState, Frame, Scene, SimState, Timestep
+from pixelbrax_jax.types import Camera, EnvParams, EnvState, Frame, Scene, SimState, Timestep
 from pixelbrax_jax.validation import check_positive_int
 
 _RESET_STREAM, _DYNAMICS_STREAM = 0, 2**31
@@ -45,7 +47,8 @@ class PixelEnv(ProgramConfig):
     Attributes:
         physics: the physics with its task; further fields are those of ``ProgramConfig``.
             ``distractors`` may have one object of each kind and no names, and must be empty without
-            pixels.
+            images.
+        num_cameras: number of rigs in ``EnvParams.rig``.
 
     Raises:
         ValueError: a field is out of range; the message says what is allowed.
@@ -54,6 +57,7 @@ class PixelEnv(ProgramConfig):
     """
 
     physics: Physics
+    num_cameras: int = field(default=1, kw_only=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -65,11 +69,26 @@ class PixelEnv(ProgramConfig):
                 f"physics must be hashable, got a {type(self.physics).__name__}: make it a frozen "
                 "dataclass, or do not override its __eq__."
             ) from error
-        chain = Chain(as_tuple(self.distractors) if self.obs_mode != "state" else ())
+        self._store("num_cameras", check_positive_int("num_cameras", self.num_cameras))
+        chain = Chain(as_tuple(self.distractors) if self.images else ())
         self._store("distractors", chain.links)
+        self._check_distractors()
         self.check_memory(1)
-        if self.renderer == "auto" and self.obs_mode != "state":
+        if self.renderer == "auto" and self.images:
             why_no_kernel()  # on a GPU, checks the kernel before a program is traced
+
+    def _check_distractors(self) -> None:
+        for kind in (link.kind for link in self.chain.links):
+            if kind in ("color", "video") and "pixels" not in self.images:
+                raise ValueError(
+                    f"distractor {kind!r} changes only colors, which obs_mode={self.obs_mode!r} "
+                    "does not show: leave it out, or add 'pixels' to obs_mode."
+                )
+            if kind == "camera" and self.num_cameras > 1:
+                raise ValueError(
+                    f"distractor 'camera' moves one camera, but there are {self.num_cameras}: "
+                    "leave it out, or give one camera."
+                )
 
     @cached_property
     def chain(self) -> Chain:
@@ -89,17 +108,37 @@ class PixelEnv(ProgramConfig):
     @property
     def obs_spec(self) -> Any:
         """Shape and dtype of an observation, as ``jax.ShapeDtypeStruct``."""
-        pixels = jax.ShapeDtypeStruct((self.height, self.width, 3 * self.frame_stack), jnp.uint8)
-        state = jax.ShapeDtypeStruct((self.physics.state_size,), jnp.float32)
-        both = {"pixels": pixels, "state": state}
-        return both if self.obs_mode == "both" else both[self.obs_mode]
+        parts: dict[str, Any] = self._stacks
+        if "state" in parts_of(self.obs_mode):
+            state = jax.ShapeDtypeStruct((self.physics.state_size,), jnp.float32)
+            parts = parts | {"state": state}
+        return _bare(parts)
+
+    @property
+    def drawn_spec(self) -> Any:
+        """Shape and dtype of what ``draw_obs`` returns, as ``jax.ShapeDtypeStruct``."""
+        cameras = (self.num_cameras,) if self.num_cameras > 1 else ()
+        shape = (*cameras, self.height, self.width)
+        return _bare({n: jax.ShapeDtypeStruct(shape, IMAGES[n].drawn) for n in self.images})
+
+    @cached_property
+    def _stacks(self) -> dict[str, jax.ShapeDtypeStruct]:
+        """Shape and dtype of each image's frame stack."""
+        frames = self.num_cameras * self.frame_stack
+        return {
+            name: jax.ShapeDtypeStruct(
+                (self.height, self.width, IMAGES[name].channels * frames), IMAGES[name].dtype
+            )
+            for name in self.images
+        }
 
     def check_memory(self, num_envs: int) -> None:
         """Raise MemoryError if observations and states of two steps do not fit into main memory."""
         numbers = 2 * self.physics.state_size + 7 * len(self.physics.link_names)
         what, num_bytes = f"num_envs={num_envs}", 8 * num_envs * numbers
-        if self.obs_mode != "state":
-            num_bytes += 2 * num_envs * self.height * self.width * 3 * self.frame_stack
+        if self.images:
+            stacks = self._stacks.values()
+            num_bytes += 2 * num_envs * sum(x.size * x.dtype.itemsize for x in stacks)
             what += f", height={self.height}, width={self.width}, frame_stack={self.frame_stack}"
         check_fits(what, num_bytes)
 
@@ -196,7 +235,10 @@ class PixelEnv(ProgramConfig):
         height: int | None = None,
         width: int | None = None,
     ) -> Frame:
-        """Render a state with its distractors; height and width default to the observation's."""
+        """Render a state with its distractors; height and width default to the observation's.
+
+        With several cameras, the first one's view.
+        """
         height, width = self._size(height, width)
         frame = render(self._scene(state.sim, params), height, width, self.renderer)
         rows, distractor_state = jnp.arange(height), state.sim.distractor_state
@@ -211,7 +253,10 @@ class PixelEnv(ProgramConfig):
         height: int | None = None,
         width: int | None = None,
     ) -> jax.Array:
-        """Render a state to (height, width, 3) uint8, rounded like an observation."""
+        """Render a state to (height, width, 3) uint8, rounded like an observation.
+
+        With several cameras, the first one's view.
+        """
         height, width = self._size(height, width)
         return unpack(self.draw(state.sim, params, height, width))
 
@@ -284,26 +329,54 @@ class PixelEnv(ProgramConfig):
     def draw(
         self, sim: SimState, params: EnvParams, height: int | None = None, width: int | None = None
     ) -> jax.Array:
-        """Render a state to (height, width) uint32 packed pixels."""
-        height, width = self._size(height, width)
+        """Render a state to (height, width) uint32 packed pixels, of the first camera."""
+        size = self._size(height, width)
+        (pixels,) = self._draw(self._scene(sim, params), sim, params, *size, ("pixels",))
+        return pixels
 
+    def draw_obs(self, sim: SimState, params: EnvParams) -> Any:
+        """Render the images of an observation, as ``drawn_spec`` says."""
+        scene, *others = (self._scene(sim, params, c) for c in range(self.num_cameras))
+
+        def seen_by(camera: Camera) -> tuple[jax.Array, ...]:
+            seen = scene.replace(camera=camera)
+            return self._draw(seen, sim, params, self.height, self.width, self.images)
+
+        if others:
+            cameras = [scene.camera, *(other.camera for other in others)]
+            drawn = jax.vmap(seen_by)(jax.tree.map(lambda *x: jnp.stack(x), *cameras))
+        else:
+            drawn = seen_by(scene.camera)
+        images = dict(zip(self.images, drawn, strict=True))
+        if "depth" in images:
+            images["depth"] = jnp.minimum(images["depth"], MAX_DEPTH)
+        return _bare(images)
+
+    def _draw(
+        self,
+        scene: Scene,
+        sim: SimState,
+        params: EnvParams,
+        height: int,
+        width: int,
+        images: tuple[str, ...],
+    ) -> tuple[jax.Array, ...]:
         def change(frame: Frame, rows: jax.Array) -> Frame:
             return self.chain.change_frame(sim.distractor_state, params, frame, rows, height, width)
 
-        return draw(self._scene(sim, params), height, width, self.renderer, change)
+        return draw(scene, height, width, self.renderer, change, images)
 
-    def blank_frames(self) -> jax.Array:
-        """Return a black frame stack; an empty one without pixels."""
-        shape = (self.height, self.width, 3 * self.frame_stack)
-        return jnp.zeros((0, 0, 0) if self.obs_mode == "state" else shape, jnp.uint8)
+    def blank_frames(self) -> Any:
+        """Return frame stacks of zeros; an empty one without images."""
+        if not self.images:
+            return jnp.zeros((0, 0, 0), jnp.uint8)
+        return _bare({name: jnp.zeros(x.shape, x.dtype) for name, x in self._stacks.items()})
 
-    def push_frame(
-        self, frames: jax.Array, sim: SimState, is_first: jax.Array, params: EnvParams
-    ) -> jax.Array:
-        """Return the frame stack with the image of a state, or K copies of it in a first state."""
-        if self.obs_mode == "state":
+    def push_frame(self, frames: Any, sim: SimState, is_first: jax.Array, params: EnvParams) -> Any:
+        """Return the frame stacks with the images of a state, or K copies in a first state."""
+        if not self.images:
             return frames
-        return push(frames, self.draw(sim, params), is_first)
+        return push_each(frames, self.draw_obs(sim, params), is_first)
 
     def timestep(self, state: EnvState, reward: jax.Array, params: EnvParams) -> Timestep:
         """Return the timestep of a state."""
@@ -324,11 +397,12 @@ class PixelEnv(ProgramConfig):
 
     def obs(self, state: EnvState) -> Any:
         """Return the observation of a state according to ``obs_mode``."""
-        if self.obs_mode == "state":
+        if not self.images:
             return state.sim.physics.obs
-        if self.obs_mode == "pixels":
+        if "state" not in parts_of(self.obs_mode):
             return state.frames
-        return {"pixels": state.frames, "state": state.sim.physics.obs}
+        frames = state.frames if len(self.images) > 1 else {self.images[0]: state.frames}
+        return {**frames, "state": state.sim.physics.obs}
 
     def _size(self, height: int | None, width: int | None) -> tuple[int, int]:
         return (
@@ -336,36 +410,22 @@ class PixelEnv(ProgramConfig):
             self.width if width is None else check_positive_int("width", width),
         )
 
-    def _scene(self, sim: SimState, params: EnvParams) -> Scene:
+    def _scene(self, sim: SimState, params: EnvParams, camera: int = 0) -> Scene:
         params = self.chain.change_params(sim.distractor_state, params)
         physics = sim.physics
-        return place(params.geoms, params.rig, params.look, physics.xpos, physics.xquat)
+        rigs = params.rig if isinstance(params.rig, tuple) else (params.rig,)
+        if len(rigs) != self.num_cameras:
+            raise ValueError(
+                f"params.rig must have num_cameras={self.num_cameras} rigs, got {len(rigs)}."
+            )
+        return place(params.geoms, rigs[camera], params.look, physics.xpos, physics.xquat)
 
 
-def check_action(action: Any, shape: tuple[int, ...]) -> jax.Array:
-    """Return floating-point actions of the given shape as an array.
-
-    Raises:
-        ValueError: they have another shape.
-        TypeError: they are not floating point.
-    """
-    action = jnp.asarray(action)
-    if action.shape != shape:
-        raise ValueError(f"action must have shape {shape}, got {action.shape}.")
-    if not jnp.issubdtype(action.dtype, jnp.floating):
-        raise TypeError(f"action must be floating point in [-1, 1], got {action.dtype}.")
-    return action
+def push_each(frames: Any, newest: Any, is_first: jax.Array) -> Any:
+    """Push the newest image of each frame stack, see ``push``."""
+    return jax.tree.map(lambda stack, image: push(stack, image, is_first), frames, newest)
 
 
-def check_key(key: jax.Array, shape: tuple[int, ...] = ()) -> None:
-    """Raise TypeError unless ``key`` has typed PRNG keys of the given shape."""
-    is_array = isinstance(key, jax.Array)
-    if not (is_array and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)):
-        # Not the type of an array, which is a tracer under jit.
-        got = f"{key.dtype}{list(key.shape)}" if is_array else type(key).__name__
-        raise TypeError(
-            f"key must come from jax.random.key(seed), got {got}; jax.random.wrap_key_data "
-            "converts a key of jax.random.PRNGKey."
-        )
-    if key.shape != shape:
-        raise TypeError(f"key must have shape {shape}, got {key.shape}.")
+def _bare(parts: dict[str, Any]) -> Any:
+    """Return the only entry of a dictionary, or the dictionary of several."""
+    return parts if len(parts) > 1 else next(iter(parts.values()))

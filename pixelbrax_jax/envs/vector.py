@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax._platform.batches import step_rows
-from pixelbrax_jax._platform.frame_stack import push
 from pixelbrax_jax._platform.resets import replace_rows, reset_rows
+from pixelbrax_jax.envs.arguments import check_action, check_key
 from pixelbrax_jax.envs.param_rows import ParamRows, split_params
-from pixelbrax_jax.envs.pixel_env import PixelEnv, check_action, check_key
+from pixelbrax_jax.envs.pixel_env import PixelEnv, push_each
 from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.types import EnvParams, EnvState, SimState, Timestep
 from pixelbrax_jax.validation import check_choice, check_positive_int
@@ -81,7 +81,7 @@ class VectorPixelEnv:
         reset = jax.vmap(rows.of_row(self.env.reset_sim))
         sim = reset(keys, jnp.zeros(self.num_envs, jnp.uint32), rows.own)
         blank = self.env.blank_frames()
-        frames = jnp.broadcast_to(blank, (self.num_envs, *blank.shape))
+        frames = jax.tree.map(lambda x: jnp.broadcast_to(x, (self.num_envs, *x.shape)), blank)
         frames = self._push_frames(frames, sim, rows, jnp.ones(self.num_envs, bool))
         state = EnvState(sim=sim, frames=frames, key=keys)
         return state, self._timestep(state, jnp.zeros(self.num_envs), rows)
@@ -182,11 +182,10 @@ class VectorPixelEnv:
         return timestep
 
     def _push_frames(
-        self, frames: jax.Array, sim: SimState, params: ParamRows, is_first: jax.Array
-    ) -> jax.Array:
+        self, frames: Any, sim: SimState, params: ParamRows, is_first: jax.Array
+    ) -> Any:
         push = jax.vmap(params.of_row(self.env.push_frame))
-        pushed: jax.Array = push(frames, sim, is_first, params.own)
-        return pushed
+        return push(frames, sim, is_first, params.own)
 
     def _reset_rows(
         self, state: EnvState, mask: jax.Array, episode: jax.Array, params: ParamRows
@@ -202,10 +201,14 @@ class VectorPixelEnv:
         """Return the states, reset and rendered where ``mask`` is set; others keep their frames."""
         sim = self._reset_rows(state, mask, episode, params)
         state = state.replace(sim=sim)
-        if self.env.obs_mode == "state":
+        if not self.env.images:
             return state
-        blank = jnp.zeros((self.num_envs, self.env.height, self.env.width), jnp.uint32)
-        newest = replace_rows(params.of_row(self.env.draw), (sim, params.own), mask, blank)
-        first = jax.vmap(push)(state.frames, newest, jnp.ones_like(mask))
-        # Other environments keep their stack, because nothing was rendered for them.
-        return state.replace(frames=jnp.where(mask[:, None, None, None], first, state.frames))
+        blank = jax.tree.map(
+            lambda x: jnp.zeros((self.num_envs, *x.shape), x.dtype), self.env.drawn_spec
+        )
+        newest = replace_rows(params.of_row(self.env.draw_obs), (sim, params.own), mask, blank)
+        first = jax.vmap(push_each)(state.frames, newest, jnp.ones_like(mask))
+        # Other environments keep their stacks, because nothing was rendered for them.
+        where = mask[:, None, None, None]
+        frames = jax.tree.map(lambda new, old: jnp.where(where, new, old), first, state.frames)
+        return state.replace(frames=frames)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pixelbrax_jax.flags import under_default_flags
+from pixelbrax_jax.observations import IMAGES
 from pixelbrax_jax.renderer import choice, fused, reference
 from pixelbrax_jax.types import Frame, Scene
 from pixelbrax_jax.validation import check_choice
@@ -79,11 +80,13 @@ def draw(
     width: int,
     renderer: str,
     change: Callable[[Frame, jax.Array], Frame],
-) -> jax.Array:
-    """Render an image, change it and pack it into (height, width) uint32, only once in a program.
+    images: tuple[str, ...] = ("pixels",),
+) -> tuple[jax.Array, ...]:
+    """Render images of one view, (height, width) each, only once in a program.
 
-    ``change(frame, rows)`` returns rows of the image with other colors, for their indices (R,)
-    int32. Its pixelwise part runs in the kernel.
+    ``pixels`` are packed, uint32; ``change(frame, rows)`` returns rows of the image with other
+    colors, for their indices (R,) int32. Its pixelwise part runs in the kernel. ``depth`` and
+    ``segmentation`` are ``Frame.depth`` and ``Frame.seg``.
 
     Without a barrier XLA fuses the renderer into every reader of its image and runs it again for
     each. A Pallas kernel is never fused. Otherwise the barrier is control flow that XLA keeps: a
@@ -92,44 +95,54 @@ def draw(
     """
     plain = "fused" if renderer == "auto" else renderer
 
-    def draw_rows(first_row: jax.Array, num_rows: int) -> jax.Array:
+    def draw_rows(first_row: jax.Array, num_rows: int) -> tuple[jax.Array, ...]:
         frame = render(scene, height, width, plain, first_row=first_row, num_rows=num_rows)
-        return pack(change(frame, jnp.minimum(first_row + jnp.arange(num_rows), height - 1)))
+        planes = {"depth": frame.depth, "segmentation": frame.seg}
+        if "pixels" in images:
+            rows = jnp.minimum(first_row + jnp.arange(num_rows), height - 1)
+            planes["pixels"] = pack(change(frame, rows))
+        return tuple(planes[name] for name in images)
 
-    def in_bands() -> jax.Array:
+    def in_bands() -> tuple[jax.Array, ...]:
         num_rows = -(-height // _BANDS)
         first_rows = jnp.arange(_BANDS) * num_rows
         bands = jax.lax.map(lambda first_row: draw_rows(first_row, num_rows), first_rows)
-        return bands.reshape(-1, width)[:height]
+        return tuple(band.reshape(-1, width)[:height] for band in bands)
 
-    def in_a_conditional() -> jax.Array:
+    def in_a_conditional() -> tuple[jax.Array, ...]:
         # On a CPU, XLA first clears the result of a loop, and runs what is fused into the writes
         # to it in one thread. A conditional costs nothing. The inner barrier hides from the
         # compiler that it is always taken; otherwise the compiler would remove it.
         zero = jax.lax.optimization_barrier(jnp.int32(0))
-        blank = jnp.zeros(height * width, jnp.uint32)
-        # Flat, as the renderer computes it.
-        image = jax.lax.cond(zero == 0, lambda: draw_rows(zero, height).ravel(), lambda: blank)
-        return image.reshape(height, width)
+        blank = tuple(jnp.zeros(height * width, IMAGES[name].drawn) for name in images)
 
-    def behind_a_barrier() -> jax.Array:
+        def flat() -> tuple[jax.Array, ...]:
+            # As the renderer computes it.
+            return tuple(image.ravel() for image in draw_rows(zero, height))
+
+        drawn = jax.lax.cond(zero == 0, flat, lambda: blank)
+        return tuple(image.reshape(height, width) for image in drawn)
+
+    def behind_a_barrier() -> tuple[jax.Array, ...]:
         # A TPU's compiler keeps the barrier, which needs less memory than a loop over bands.
-        return jax.lax.optimization_barrier(draw_rows(jnp.int32(0), height))
+        drawn: tuple[jax.Array, ...] = jax.lax.optimization_barrier(draw_rows(jnp.int32(0), height))
+        return drawn
 
-    def by_kernel() -> jax.Array:
+    def by_kernel() -> tuple[jax.Array, ...]:
         from pixelbrax_jax.renderer import kernel
 
-        return kernel.draw(
-            scene, height, width, lambda frame: pack(change(frame, jnp.arange(height)))
-        )
+        def packed(frame: Frame) -> jax.Array:
+            return pack(change(frame, jnp.arange(height)))
+
+        return kernel.draw(scene, height, width, packed, images)
 
     if renderer == "pallas":
         return by_kernel()
     forms = {"cpu": in_a_conditional, "tpu": behind_a_barrier}
     if renderer == "auto" and choice.why_no_kernel() is None:
         forms["cuda"] = by_kernel
-    image: jax.Array = jax.lax.platform_dependent(default=in_bands, **forms)
-    return image
+    drawn: tuple[jax.Array, ...] = jax.lax.platform_dependent(default=in_bands, **forms)
+    return drawn
 
 
 def pack(frame: Frame) -> jax.Array:

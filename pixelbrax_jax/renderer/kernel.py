@@ -11,9 +11,10 @@ import numpy as np
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton
 
+from pixelbrax_jax.observations import IMAGES
 from pixelbrax_jax.renderer.fused import Near, View, rays, see, view_of
 from pixelbrax_jax.renderer.intersect import at_least, at_most
-from pixelbrax_jax.renderer.per_pixel import per_pixel
+from pixelbrax_jax.renderer.per_pixel import PerPixel, per_pixel
 from pixelbrax_jax.types import Frame, GeomKind, Scene
 
 BLOCK = 256
@@ -35,20 +36,37 @@ Window = tuple[tuple[Any, Any] | None, tuple[Any, Any]]
 """Least and largest slope along the image's x axis and along y; None for all, else () float32."""
 
 
-def draw(scene: Scene, height: int, width: int, change: Callable[[Frame], jax.Array]) -> jax.Array:
-    """Render and change an image into (height, width) uint32, without a derivative."""
+def draw(
+    scene: Scene,
+    height: int,
+    width: int,
+    change: Callable[[Frame], jax.Array],
+    images: tuple[str, ...] = ("pixels",),
+) -> tuple[jax.Array, ...]:
+    """Render images, (height, width) each, without a derivative; see ``base.draw``.
+
+    ``pixels`` are ``change(frame)``, uint32.
+    """
     plane: Any = jax.ShapeDtypeStruct((height, width), jnp.float32)
     seg, ground = plane.update(dtype=jnp.int32), plane.update(dtype=bool)
-    by_pixel = per_pixel(change, Frame(plane, plane, plane, plane, seg, ground))
-    if by_pixel is None:
-        return change(render(scene, height, width))
+    by_pixel: PerPixel | None = None
+    inputs: tuple[list[jax.Array], list[jax.Array]] = [], []
+    if "pixels" in images:
+        by_pixel = per_pixel(change, Frame(plane, plane, plane, plane, seg, ground))
+        if by_pixel is None:
+            frame = render(scene, height, width)
+            drawn = {"pixels": change(frame), "depth": frame.depth, "segmentation": frame.seg}
+            return tuple(drawn[name] for name in images)
+        inputs = by_pixel.numbers, by_pixel.images
 
-    def changed(numbers: Any, images: Any, frame: Frame) -> list[jax.Array]:
-        return [by_pixel.apply(frame, numbers, images)]
+    def drawn_pixels(numbers: Any, given: Any, frame: Frame) -> list[jax.Array]:
+        planes = {"depth": frame.depth, "segmentation": frame.seg}
+        if by_pixel is not None:
+            planes["pixels"] = by_pixel.apply(frame, numbers, given)
+        return [planes[name] for name in images]
 
-    band, inputs = _Band(height, width, 0, height), (by_pixel.numbers, by_pixel.images)
-    (image,) = _call(changed, view_of(scene, height, _einsum), *inputs, band, [jnp.uint32])
-    return image
+    view, band = view_of(scene, height, _einsum), _Band(height, width, 0, height)
+    return tuple(_call(drawn_pixels, view, *inputs, band, [IMAGES[name].drawn for name in images]))
 
 
 def render(

@@ -72,11 +72,11 @@ def aim(rig: CameraRig, xpos: jax.Array) -> Camera:
     return Camera(pos=eye, xmat=look_at(eye, target, rig.up), fovy=jnp.asarray(rig.fovy))
 
 
-def seen_from(geoms: Geoms, rig: CameraRig) -> Geoms:
-    """Return the geoms with ``Geoms.distant`` set for the position of a rig."""
+def seen_from(geoms: Geoms, *rigs: CameraRig) -> Geoms:
+    """Return the geoms with ``Geoms.distant`` set for the positions of the rigs."""
     with_far_form = [GeomKind(kind).has_far_form for kind in geoms.kind]
     radii = np.asarray(geoms.size)[with_far_form, 0]
-    away = np.linalg.norm(np.asarray(rig.eye))
+    away = max(np.linalg.norm(np.asarray(rig.eye)) for rig in rigs)
     return geoms.replace(distant=bool(len(radii) and away > _DISTANT * radii.min()))
 
 

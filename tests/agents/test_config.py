@@ -118,7 +118,7 @@ def test_what_training_cannot_use_of_an_environment_is_told():
         PPOConfig(env=EnvConfig(camera=camera))
     with pytest.raises(TypeError, match=r"distractors of training settings must be names, got \("):
         PPOConfig(env=EnvConfig(distractors=Video()))
-    with pytest.raises(ValueError, match="obs_mode of training settings must be 'pixels', got"):
+    with pytest.raises(ValueError, match="must be 'pixels' or 'depth', got 'both'"):
         PPOConfig(env=EnvConfig(obs_mode="both"))
     with pytest.raises(TypeError, match="env must be an EnvConfig, got 'ant'"):
         PPOConfig(env="ant")

@@ -60,7 +60,8 @@ class Story:
         )  # fmt: skip
 
     def replay(self, length: int) -> Replay:
-        replay = Replay.empty(NUM_ENVS, SLOTS, 2, 2, 1)
+        frame = jax.ShapeDtypeStruct((2, 2, 3), jnp.uint8)
+        replay = Replay.empty(NUM_ENVS, SLOTS, frame, 1)
         for first in range(0, length, NUM_STEPS):
             replay = replay.add(self.rollout(first))
         return replay

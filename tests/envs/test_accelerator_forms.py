@@ -15,19 +15,38 @@ def lowered_for(platform: str, fn, *args) -> str:
     return jax.jit(fn).trace(*args).lower(lowering_platforms=(platform,)).as_text()
 
 
-@pytest.mark.parametrize("depth", [1, 2, 3])
-def test_frames_are_pushed_alike(depth):
+@pytest.mark.parametrize("cameras", [(), (2,)])
+@pytest.mark.parametrize("stack", [1, 2, 3])
+def test_frames_are_pushed_alike(stack, cameras):
     draw = np.random.default_rng(0)
-    frames = draw.integers(0, 256, (N, 5, 7, 3 * depth), np.uint8)
-    newest = draw.integers(0, 2**24, (N, 5, 7), np.uint32)
+    number = 2 if cameras else 1
+    frames = draw.integers(0, 256, (N, 5, 7, 3 * stack * number), np.uint8)
+    newest = draw.integers(0, 2**24, (N, *cameras, 5, 7), np.uint32)
     is_first = jnp.arange(N) % 2 == 0
     one, other = (
         jax.vmap(push)(frames, newest, is_first)
         for push in (frame_stack._concatenate, frame_stack._shift)
     )
     np.testing.assert_array_equal(one, other)
-    # The newest frame comes last, red first.
-    np.testing.assert_array_equal(other[..., -3], newest & 255)
+    # The newest frame comes last, red first, and the last camera's last.
+    np.testing.assert_array_equal(other[..., -3], newest.reshape(N, -1, 5, 7)[:, -1] & 255)
+
+
+@pytest.mark.parametrize("cameras", [(), (2,)])
+def test_depths_are_pushed_alike(cameras):
+    draw, number = np.random.default_rng(0), 2 if cameras else 1
+    frames = draw.random((N, 5, 7, 3 * number), np.float32)
+    newest = draw.random((N, *cameras, 5, 7), np.float32)
+    is_first = jnp.arange(N) % 2 == 0
+    one, other = (
+        jax.vmap(push)(frames, newest, is_first)
+        for push in (frame_stack._concatenate, frame_stack._shift)
+    )
+    np.testing.assert_array_equal(one, other)
+    image = np.moveaxis(newest.reshape(N, -1, 5, 7), 1, -1)
+    np.testing.assert_array_equal(other[..., -number:], image)
+    np.testing.assert_array_equal(other[1, ..., :-number], frames[1, ..., number:])
+    np.testing.assert_array_equal(other[0, ..., :number], image[0])
 
 
 def test_environments_are_reset_alike():

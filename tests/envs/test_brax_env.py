@@ -91,6 +91,11 @@ def test_sizes_are_those_of_the_observation():
     assert env.unwrapped is env
 
 
+def test_depth_is_not_for_braxs_networks():
+    with pytest.raises(ValueError, match="is not for Brax's trainers, whose images"):
+        make_brax(obs_mode="pixels+depth")
+
+
 def test_a_raw_key_means_the_typed_one():
     env = make_brax(obs_mode="state")
     raw, typed = jax.random.PRNGKey(7), jax.random.key(7)

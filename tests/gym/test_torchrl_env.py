@@ -432,7 +432,7 @@ def test_torchrls_own_gym_environment_takes_ours():
 
 def test_pixel_specs_have_no_tensors():
     spec = torchrl_specs.observation_spec(
-        pixelbrax_jax.make(TASK)[0].obs_spec, 4096, torch.device("cpu")
+        pixelbrax_jax.make(TASK)[0].obs_spec, ("pixels",), 4096, torch.device("cpu")
     )
     assert spec["pixels"].shape == (4096, 84, 84, 9)
     for derived in (spec, spec.clone(), spec.to("cpu"), spec.expand(1, 4096), spec[:7]):

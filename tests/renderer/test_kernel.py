@@ -17,6 +17,7 @@ from pixelbrax_jax.renderer.base import render
 from pixelbrax_jax.renderer.fused import view_of
 from pixelbrax_jax.renderer.kernel import may_see, window_of
 from pixelbrax_jax.tasks import BRAX_TASKS
+from tests.envs.toy import PARAMS, Ball
 from tests.renderer import scenes
 from tests.renderer.test_lamps import LAMP
 from tests.renderer.test_planes import random_strip
@@ -90,6 +91,28 @@ def test_it_draws_what_the_plain_one_draws(task, look):
 )
 def test_it_draws_every_task_and_every_look(task, look):
     assert_same_pictures(task, LOOKS[look])
+
+
+@pytest.mark.parametrize("images", ["pixels+depth+segmentation", "segmentation"])
+def test_it_draws_all_images_of_an_observation(images):
+    """For two cameras, and with a distractor of colors."""
+    params = PARAMS.replace(rig=(PARAMS.rig, PARAMS.rig.replace(eye=np.float32([2, -3, 2]))))
+    colors = (Color(scale=0.3),) if "pixels" in images else ()
+    drawn = []
+    for renderer in ("fused", "pallas"):
+        env = pb.PixelEnv(
+            Ball(), num_cameras=2, height=HEIGHT, width=WIDTH, obs_mode=images,
+            renderer=renderer, distractors=colors,
+        )  # fmt: skip
+        states = poses(env, params)
+        drawn.append(jax.jit(jax.vmap(env.draw_obs, in_axes=(0, None)))(states, params))
+    one, other = ({"segmentation": d} if "+" not in images else d for d in drawn)
+    np.testing.assert_array_equal(one["segmentation"], other["segmentation"])
+    assert one["segmentation"].shape == (NUM_POSES, 2, HEIGHT, WIDTH)
+    if "+" in images:
+        np.testing.assert_allclose(one["depth"], other["depth"], rtol=1e-5)
+        bytes_of = [np.asarray(d["pixels"]).view(np.uint8).astype(int) for d in (one, other)]
+        assert (np.abs(bytes_of[0] - bytes_of[1]) <= 1).mean() >= 0.999
 
 
 @pytest.mark.parametrize("lamps", [0, 2])

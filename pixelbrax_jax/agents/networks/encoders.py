@@ -199,7 +199,12 @@ SMALLEST = {"impala": 1, "nature": 36, "drq": 15, "small": 18, "patch": 24}
 
 
 def scaled(pixels: jax.Array) -> jax.Array:
-    """Scale uint8 pixels to float32 in [0, 1] for an encoder."""
+    """Scale uint8 pixels, or float32 depths in metres, to float32 in [0, 1] for an encoder.
+
+    A depth d becomes ``1 / (1 + d)``, which is near 0 for the sky.
+    """
+    if pixels.dtype == jnp.float32:
+        return 1.0 / (1.0 + pixels)
     return pixels.astype(jnp.float32) / 255.0
 
 

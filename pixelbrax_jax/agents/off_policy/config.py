@@ -178,19 +178,15 @@ class DrQv2Config(TrainConfig):
     @property
     def replay_bytes(self) -> int:
         """Bytes of the frames in the replay."""
-        return self.slots * self.num_envs * self._frame_bytes
+        return self.slots * self.num_envs * self.frame_bytes
 
     def to_fit(self, excess: float) -> str:
         """See ``TrainConfig.to_fit``."""
         largest = self.largest_that_fits(max(0.0, self.replay_bytes - excess))
         return f"{super().to_fit(excess)} Of the replay, {largest}"
 
-    @property
-    def _frame_bytes(self) -> int:
-        return self.env.height * self.env.width * 3
-
     def largest_that_fits(self, num_bytes: float) -> str:
         """Tell the largest ``buffer_size`` whose frames take at most so many bytes."""
         per_iteration = self.num_envs * self.num_steps
-        largest = int(num_bytes // (self._frame_bytes * per_iteration)) * per_iteration
+        largest = int(num_bytes // (self.frame_bytes * per_iteration)) * per_iteration
         return f"the largest that fits is buffer_size={largest}."

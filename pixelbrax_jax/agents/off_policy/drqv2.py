@@ -81,6 +81,8 @@ class DrQv2(Algorithm):
     def init(self, key: jax.Array, env_params: EnvParams) -> OffPolicyState:
         """See ``Algorithm.init``; the replay is empty."""
         config, env = self.config, self.envs.env
+        spec, _ = split_obs(env.obs_spec)
+        frame = jax.ShapeDtypeStruct((*spec.shape[:-1], config.frame_channels), spec.dtype)
         networks = self._init_networks(jax.random.fold_in(key, NETWORKS))
         env_state, _ = self.envs.reset(jax.random.fold_in(key, ENVS), env_params)
         kind = WithReplay if config.checkpoint_replay else OffPolicyState
@@ -91,9 +93,7 @@ class DrQv2(Algorithm):
             key=key,
             iteration=jnp.uint32(0),
             target=networks["critic"],
-            replay=Replay.empty(
-                config.num_envs, config.slots, config.env.height, config.env.width, env.action_size
-            ),
+            replay=Replay.empty(config.num_envs, config.slots, frame, env.action_size),
         )
 
     def _init_networks(self, key: jax.Array) -> Networks:

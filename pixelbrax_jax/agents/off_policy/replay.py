@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -41,7 +41,8 @@ class Replay(struct.PyTreeNode):
     """The latest C steps of each of N environments; step t is in slot t modulo C.
 
     Attributes:
-        frame: (N, C, H, W, 3) uint8, the newest frame of the observation before the step.
+        frame: (N, C, H, W, 3) uint8, the newest frame of the observation before the step, or what
+            ``Frames.pixels`` has.
         action: (N, C, A) float32, clipped to [-1, 1].
         reward: (N, C) float32.
         terminated, truncated: (N, C) bool.
@@ -58,11 +59,11 @@ class Replay(struct.PyTreeNode):
     count: jax.Array = without_envs()
 
     @classmethod
-    def empty(cls, num_envs: int, slots: int, height: int, width: int, action_size: int) -> Replay:
-        """Return a replay without steps."""
+    def empty(cls, num_envs: int, slots: int, frame: Any, action_size: int) -> Replay:
+        """Return a replay without steps; ``frame`` is the ``jax.ShapeDtypeStruct`` of a frame."""
         shape = (num_envs, slots)
         return cls(
-            frame=jnp.zeros((*shape, height, width, 3), jnp.uint8),
+            frame=jnp.zeros((*shape, *frame.shape), frame.dtype),
             action=jnp.zeros((*shape, action_size)),
             reward=jnp.zeros(shape),
             terminated=jnp.zeros(shape, bool),
@@ -142,7 +143,7 @@ class Replay(struct.PyTreeNode):
             age = jnp.cumprod(rows(self.valid, before), -1).sum(-1).reshape(*time.shape, 1)
             back = jnp.minimum(jnp.arange(stack - 1, -1, -1), age)
             frames = jnp.moveaxis(rows(self.frame, time[..., None] - back), 1, -2)
-            return frames.reshape(*frames.shape[:-2], 3 * stack)
+            return frames.reshape(*frames.shape[:-2], -1)
 
         steps = time[..., None] + jnp.arange(n_step)
         terminated, truncated = rows(self.terminated, steps), rows(self.truncated, steps)

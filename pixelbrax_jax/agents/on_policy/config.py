@@ -71,4 +71,4 @@ class OnPolicyConfig(TrainConfig):
     def bytes_per_iteration(self) -> int:
         """Bytes of the frames of one rollout over all environments."""
         frames = self.num_envs * (self.num_steps + self.env.frame_stack - 1)
-        return frames * self.env.height * self.env.width * 3
+        return frames * self.frame_bytes

@@ -16,6 +16,7 @@ from pixelbrax_jax.agents.networks.encoders import dense
 from pixelbrax_jax.agents.on_policy.algorithm import Experience, OnPolicyState
 from pixelbrax_jax.agents.on_policy.losses import Batch, mean, policy_loss, value_loss
 from pixelbrax_jax.agents.on_policy.phasic import Chunk, Phasic, PhasicConfig
+from pixelbrax_jax.agents.rollout import split_obs
 from pixelbrax_jax.agents.train_state import UPDATES, Metrics, Networks, stream_key
 from pixelbrax_jax.validation import check_positive_int
 
@@ -89,8 +90,8 @@ class DCPG(Phasic):
         if config.decoupled:
             networks["target"] = networks["actor"]
         if config.dynamics_coef:
-            env = config.env
-            pixels = jnp.zeros((1, env.height, env.width, 3 * env.frame_stack), jnp.uint8)
+            spec, _ = split_obs(self.envs.env.obs_spec)
+            pixels = jnp.zeros((1, *spec.shape), spec.dtype)
             features = self.agent.actor(networks["actor"], pixels).features
             action = jnp.zeros((1, self.envs.env.action_size))
             dynamics_key = jax.random.fold_in(key, 2)

@@ -108,7 +108,8 @@ def make_split(
     split = HELD_OUT.get(split, split) if plays else split
     dynamics = config.test_dynamics or config.env.dynamics
     try:
-        env, params = make_env(config, obs_mode="pixels", split=split, dynamics=dynamics)
+        mode = config.env.obs_mode
+        env, params = make_env(config, obs_mode=mode, split=split, dynamics=dynamics)
     except (ValueError, FileNotFoundError) as error:
         raise NoSplitError(str(error)) from error
     if not plays:
@@ -126,7 +127,7 @@ def make_split(
 def _make(config: TrainConfig, **changes: Any) -> tuple[PixelEnv, EnvParams]:
     try:
         # Evaluation does not need the simulator's state.
-        return make_env(config, obs_mode="pixels", **changes)
+        return make_env(config, obs_mode=config.env.obs_mode, **changes)
     except FileNotFoundError as error:
         if _source(config) == "procedural":
             raise

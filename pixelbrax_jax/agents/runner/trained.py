@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import jax
-import jax.numpy as jnp
 
 from pixelbrax_jax.agents.algorithm import Algorithm
 from pixelbrax_jax.agents.config import TrainConfig, make_env
@@ -161,7 +160,7 @@ def save_policy(algorithm: Algorithm, networks: Networks, path: str | Path) -> P
     (batch,) = jax.export.symbolic_shape("batch")
     exported = jax.export.export(
         jax.jit(lambda pixels: algorithm.act(acting, pixels)), platforms=("cpu", "cuda", "tpu")
-    )(jax.ShapeDtypeStruct((batch, *spec.shape), jnp.uint8))
+    )(jax.ShapeDtypeStruct((batch, *spec.shape), spec.dtype))
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     # A temporary file is renamed, so a file of this name is always complete.
