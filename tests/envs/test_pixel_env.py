@@ -233,7 +233,7 @@ class TestMake:
                 r"'orginal'\. .*'original'\? Allowed: default, dmc, original",
             ),
             ({"reward_preset": "papers"}, "Did you mean 'paper'"),
-            ({"obs_mode": "image"}, "unknown obs_mode: 'image'; allowed: both, depth, pixels, segm"),
+            ({"obs_mode": "image"}, "unknown obs_mode: 'image'; allowed: both, depth, pixels"),
         ],
     )
     def test_unknown_names_list_what_is_allowed(self, options, message):
