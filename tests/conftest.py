@@ -24,9 +24,11 @@ os.environ["XLA_FLAGS"] = " ".join(
     ]
 )
 
-# Under nohup it is ignored, by the programs that tests start as well.
+# Under nohup and in the background they are ignored, by the programs that tests start as well.
 if hasattr(signal, "SIGHUP"):
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 import jax
 import pytest
