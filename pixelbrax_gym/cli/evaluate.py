@@ -117,6 +117,11 @@ def _compare(agent: Trained, options: Options, report: Callable[[str], None]) ->
             f"--in {where} needs a task of the DM Control Suite, but the task of the run is "
             f"{env.task!r}; allowed: {', '.join(tasks)}."
         )
+    if env.obs_mode != "pixels" or env.num_cameras > 1:
+        raise ValueError(
+            f"--in {where} shows pixels of one camera, but the run has obs_mode={env.obs_mode!r} "
+            f"and camera={env.camera!r}: evaluate it without --in."
+        )
     if options.clips is not None or set(options.split) - {"clean"}:
         raise ValueError(
             f"--in {where} plays split clean alone, because dm_control has no distractors: leave "

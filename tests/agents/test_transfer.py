@@ -173,6 +173,12 @@ def test_dm_controls_picture(monkeypatch, capsys):
     ("options", "line", "message"),
     [
         ({"task": "ant"}, "dm_control", "needs a task of the DM Control Suite, but the task of"),
+        (
+            {"obs_mode": "depth"},
+            "dm_control",
+            "shows pixels of one camera, but the run",
+        ),
+        ({"camera": ("fixed", "top")}, "dm_control_physics", "evaluate it without --in."),
         ({}, "dm_control --split train", "plays split clean alone, because dm_control has no"),
         ({}, "dm_control --clips procedural", "leave out --clips and --split."),
         ({"camera": "front"}, "dm_control", "camera of 'cartpole': 'front'; allowed: fixed,"),
