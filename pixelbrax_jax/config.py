@@ -96,8 +96,9 @@ class EnvConfig(BraxOptions, MujocoOptions, ProgramConfig):
     camera: str | CameraRig | Camera = "default"
     """Viewpoint: a name of ``named_rigs``, a ``CameraRig`` or a ``Camera``."""
     look: str | Look = "default"
-    """Light, sky and ground: ``default``, ``original``, ``dmc`` or a ``Look``. For a task of the DM
-    Control Suite ``default`` is ``dmc`` with the lights of its model."""
+    """Light, sky and ground: ``default``, ``original``, ``dmc``, ``dmc-plain`` or a ``Look``. For a
+    task of MuJoCo the last two have the lights of its model; ``dmc``, the default of the DM Control
+    Suite, also has what only costs time, such as the texture of its sky."""
     shadows: bool | None = None
     """Whether geoms cast shadows. None keeps the choice of the look."""
     episode_length: int = 1000

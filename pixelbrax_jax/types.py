@@ -259,6 +259,8 @@ class Look(struct.PyTreeNode):
         ground_pitch: (), metres, edge of a tile or distance between lines.
         headlight: (), coefficient of diffuse light from the camera; None for none.
         lamps: spot lights.
+        sky_texture: (6, n, n, 3), what a texture adds to the sky's color, which is then clipped to
+            [0, 1]: the faces of a cube map in OpenGL's order, with y up. None for no texture.
     """
 
     ground: str = struct.field(pytree_node=False)
@@ -274,6 +276,7 @@ class Look(struct.PyTreeNode):
     ground_pitch: jax.Array
     headlight: jax.Array | None = None
     lamps: tuple[Lamp, ...] = ()
+    sky_texture: jax.Array | None = None
 
 
 class Scene(struct.PyTreeNode):
@@ -285,6 +288,8 @@ class Scene(struct.PyTreeNode):
         xmat: (G, 3, 3), geom orientations; columns are the geom's axes.
         camera: the viewpoint.
         look: light, sky and ground.
+        sky_xmat: (3, 3), the camera's orientation for the sky's texture, None for that of the
+            camera. A batch with one orientation reads the texture once for all.
     """
 
     geoms: Geoms
@@ -292,6 +297,7 @@ class Scene(struct.PyTreeNode):
     xmat: jax.Array
     camera: Camera
     look: Look
+    sky_xmat: jax.Array | None = None
 
 
 class Frame(struct.PyTreeNode):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 import os
 from dataclasses import replace
 from functools import lru_cache
@@ -68,7 +69,7 @@ def make(task: str | EnvConfig, **options: Any) -> tuple[PixelEnv, EnvParams]:
     params = EnvParams(
         geoms=seen_from(physics.geoms, rig),
         rig=rig,
-        look=_look(config, physics),
+        look=_look(config, physics, float(rig.fovy)),
         episode_length=np.int32(min(filter(None, (config.episode_length, physics.time_limit)))),
         dynamics=_dynamics(config, physics),
     )
@@ -133,11 +134,20 @@ def _rig(config: EnvConfig, physics: Physics) -> CameraRig:
     return choose_rig(config.task, camera, rigs)
 
 
-def _look(config: EnvConfig, physics: Physics) -> Look:
+def _look(config: EnvConfig, physics: Physics, fovy: float) -> Look:
     look = config.look
-    if physics.look is not None and look in ("default", "dmc"):
-        look = physics.look
+    if physics.look is not None and isinstance(look, str):
+        name = physics.default_look if look == "default" else look
+        if name == "dmc":
+            look = _detailed(physics, 2.0 * math.tan(math.radians(fovy) / 2.0) / config.height)
+        elif name == "dmc-plain":
+            look = physics.look
     return make_look(look, shadows=config.shadows)
+
+
+@lru_cache(maxsize=16)
+def _detailed(physics: Physics, pixel: float) -> Look | None:
+    return physics.detailed_look(pixel)
 
 
 def _dynamics(config: EnvConfig, physics: Physics) -> DynamicsRanges | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache, partial
 from typing import Any, NamedTuple
 
@@ -24,6 +24,7 @@ from pixelbrax_jax.renderer.intersect import (
     dot,
     intersect,
 )
+from pixelbrax_jax.renderer.reference import pixel_rays
 from pixelbrax_jax.renderer.shading import SHADOW_BIAS
 from pixelbrax_jax.types import FAR, Frame, GeomKind, Geoms, Look, Scene
 
@@ -67,14 +68,19 @@ def view_of(
         for lamp in look.lamps
     )
     return View(
-        order=tuple(sorted(range(len(geoms.kind)), key=lambda g: geoms.material[g])),
+        order=order_of(geoms),
         pos=einsum("gi,ij->gj", scene.pos - scene.camera.pos, to_camera),
         xmat=einsum("ji,gjk->gik", to_camera, scene.xmat),
         geoms=geoms.replace(pos=None, quat=None, strings=()),
-        look=look.replace(light=light, lamps=lamps),
+        look=look.replace(light=light, lamps=lamps, sky_texture=None),
         pixel=2.0 * jnp.tan(jnp.deg2rad(scene.camera.fovy) / 2.0) / height,
         up=to_camera[2],
     )
+
+
+def order_of(geoms: Geoms) -> tuple[int, ...]:
+    """Return the geom of each rank."""
+    return tuple(sorted(range(len(geoms.kind)), key=lambda g: geoms.material[g]))
 
 
 def rays(view: View, height: int, width: int, row: jax.Array, column: jax.Array) -> Vector:
@@ -85,13 +91,36 @@ def rays(view: View, height: int, width: int, row: jax.Array, column: jax.Array)
     return x * inv_length, y * inv_length, -inv_length
 
 
+def sky_of(
+    scene: Scene, height: int, width: int, first_row: jax.Array | int, num_rows: int
+) -> list[jax.Array]:
+    """Return what the sky's texture adds to each channel of a band's pixels; [] without one.
+
+    It depends on the camera's direction alone: a batch whose cameras do not turn computes it once.
+    """
+    if scene.look.sky_texture is None:
+        return []
+    xmat = scene.camera.xmat if scene.sky_xmat is None else scene.sky_xmat
+    camera = scene.camera.replace(xmat=xmat)
+    rows = first_row + jnp.arange(num_rows)
+    ways = pixel_rays(camera, height, width, rows).reshape(-1, 3)
+    added = shading.sky_texture(scene.look.sky_texture, *ways.T)
+    # The barrier keeps XLA from looking texels up for each image of a batch.
+    added = jax.lax.optimization_barrier(added)
+    return [added[:, c] for c in range(3)]
+
+
 Near = Callable[[int, Callable[[Any], Any], Any], Any]
 """``near(g, update, value)`` returns ``update(value)`` if some pixel of a block may see geom ``g``,
 and may return ``value`` otherwise."""
 
 
-def see(view: View, ray: Vector, near: Near | None = None) -> Frame:
+def see(
+    view: View, ray: Vector, near: Near | None = None, texture: Sequence[jax.Array] = ()
+) -> Frame:
     """Return what pixels with unit rays see; ``near`` may skip geoms that none sees.
+
+    ``texture`` is what the sky's texture adds to their red, green and blue, if it has one.
 
     All parts have the shape of the rays' components. ``seg`` is the rank of the visible geom, and
     the number of geoms for the sky. ``depth`` is exact to a relative ``2**(b - 24)``, with b bits
@@ -189,9 +218,13 @@ def see(view: View, ray: Vector, near: Near | None = None) -> Frame:
         highlight = jnp.where(on_ground, 0.0, highlight)
 
     rise = dot(ray, _vector(view.up))
+
+    def behind(c: int) -> jax.Array:
+        plain = shading.sky(look, rise, c)
+        return between(0.0, plain + texture[c], 1.0) if texture else plain
+
     red, green, blue = (
-        jnp.where(sky, shading.sky(look, rise, c), between(0.0, color[c] * shade + highlight, 1.0))
-        for c in range(3)
+        jnp.where(sky, behind(c), between(0.0, color[c] * shade + highlight, 1.0)) for c in range(3)
     )
     depth = jnp.where(sky, FAR, -t * ray[2])
     return Frame(r=red, g=green, b=blue, depth=depth, seg=winner, ground=on_ground)
@@ -207,7 +240,8 @@ def render(
     index = jnp.arange(num_rows * width, dtype=jnp.int32)
     row = jax.lax.div(index, np.int32(width)) + first_row
     column = jax.lax.rem(index, np.int32(width))
-    frame = see(view, rays(view, height, width, row, column))
+    texture = sky_of(scene, height, width, first_row, num_rows)
+    frame = see(view, rays(view, height, width, row, column), texture=texture)
     frame = frame.replace(seg=jnp.array([*view.order, -1], jnp.int32)[frame.seg])
     return jax.tree.map(lambda plane: plane.reshape(num_rows, width), frame)
 

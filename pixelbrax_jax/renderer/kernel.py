@@ -11,7 +11,7 @@ import numpy as np
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton
 
-from pixelbrax_jax.renderer.fused import Near, View, rays, see, view_of
+from pixelbrax_jax.renderer.fused import Near, View, order_of, rays, see, sky_of, view_of
 from pixelbrax_jax.renderer.intersect import at_least, at_most
 from pixelbrax_jax.renderer.per_pixel import per_pixel
 from pixelbrax_jax.types import Frame, GeomKind, Scene
@@ -47,7 +47,7 @@ def draw(scene: Scene, height: int, width: int, change: Callable[[Frame], jax.Ar
         return [by_pixel.apply(frame, numbers, images)]
 
     band, inputs = _Band(height, width, 0, height), (by_pixel.numbers, by_pixel.images)
-    (image,) = _call(changed, view_of(scene, height, _einsum), *inputs, band, [jnp.uint32])
+    (image,) = _call(changed, scene, *inputs, band, [jnp.uint32])
     return image
 
 
@@ -64,11 +64,10 @@ def render(
         return [frame.r, frame.g, frame.b, frame.depth, frame.seg]
 
     band = _Band(height, width, first_row, height if num_rows is None else num_rows)
-    view = view_of(scene, height, _einsum)
     dtypes = [*[jnp.float32] * 4, jnp.int32]
-    r, g, b, depth, seg = _call(planes, view, (), (), band, dtypes)
+    r, g, b, depth, seg = _call(planes, scene, (), (), band, dtypes)
     ground = jnp.zeros(seg.shape, bool)
-    for geom in filter(view.geoms.is_ground, view.order):
+    for geom in filter(scene.geoms.is_ground, order_of(scene.geoms)):
         ground |= seg == geom
     return Frame(r=r, g=g, b=b, depth=depth, seg=seg, ground=ground)
 
@@ -126,7 +125,7 @@ def _geom(view: View, ranks: jax.Array) -> jax.Array:
 
 def _call(
     compute: Callable[..., list[jax.Array]],
-    view: View,
+    scene: Scene,
     numbers: Sequence[jax.Array],
     images: Sequence[jax.Array],
     band: _Band,
@@ -134,6 +133,9 @@ def _call(
 ) -> list[jax.Array]:
     """Return bands of images, (num_rows, width), from ``compute(numbers, images, frame)``."""
     height, width, first_row, num_rows = band
+    texture = sky_of(scene, height, width, first_row, num_rows)
+    images = [*images, *texture]
+    view = view_of(scene, height, _einsum)
     inputs, inputs_tree = jax.tree.flatten((view, list(numbers), first_row))
     inputs = [jax.lax.stop_gradient(jnp.asarray(x)) for x in inputs]
     packed = [x.ndim <= 1 and x.dtype == jnp.float32 for x in inputs]
@@ -158,8 +160,9 @@ def _call(
         column = jax.lax.rem(index, np.int32(width))
         last = jnp.minimum(start + BLOCK, num_pixels) - 1
         near = _near(view, band._replace(first_row=first_row), start, last)
-        frame = see(view, rays(view, height, width, row, column), near)
-        results = compute(numbers, images, frame.replace(seg=_geom(view, frame.seg)))
+        split = len(images) - len(texture)
+        frame = see(view, rays(view, height, width, row, column), near, images[split:])
+        results = compute(numbers, images[:split], frame.replace(seg=_geom(view, frame.seg)))
         for ref, result in zip(refs[-len(dtypes) :], results, strict=True):
             triton.store(ref.at[:], result, mask=inside)
 

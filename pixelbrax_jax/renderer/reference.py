@@ -68,6 +68,9 @@ def render(
     sky = look.sky[0] + jnp.clip(rise, 0.0, 1.0) * (look.sky[1] - look.sky[0])
     if look.sky.shape[0] == 3:
         sky += jnp.clip(-rise, 0.0, 1.0) * (look.sky[2] - look.sky[0])
+    if look.sky_texture is not None:
+        added = shading.sky_texture(look.sky_texture, *rays.reshape(-1, 3).T)
+        sky = jnp.clip(sky + added.reshape(rays.shape), 0.0, 1.0)
     rgb = jnp.where(hit[..., None], surface, sky)
     return Frame(
         r=rgb[..., 0],

@@ -53,6 +53,39 @@ def sky(look: Look, rise: jax.Array, channel: int) -> jax.Array:
     return color
 
 
+def sky_texture(texture: jax.Array, x: jax.Array, y: jax.Array, z: jax.Array) -> jax.Array:
+    """Return what the sky's texture adds for rays (N,) of any length in the world frame, (N, 3).
+
+    Between texels it is linear, as in OpenGL, but not across the edges of the cube. Faces and their
+    coordinates are those of the OpenGL specification (4.6, table 8.19).
+    """
+    s, t, r = x, z, -y  # the cube's y is up
+    on_s = (jnp.abs(s) >= jnp.abs(t)) & (jnp.abs(s) >= jnp.abs(r))
+    on_t = ~on_s & (jnp.abs(t) >= jnp.abs(r))
+    major = jnp.where(on_s, s, jnp.where(on_t, t, r))
+    sign = jnp.where(major < 0.0, -1.0, 1.0)
+    face = jnp.where(on_s, 0, jnp.where(on_t, 2, 4)) + (major < 0.0)
+    across = jnp.where(on_s, -sign * r, jnp.where(on_t, s, sign * s))
+    down = jnp.where(on_t, sign * r, -t)
+    size = texture.shape[1]
+    inv = 0.5 * size / jnp.abs(major)
+    column, row = (
+        between(0.0, along * inv + 0.5 * (size - 1), size - 1.0) for along in (across, down)
+    )
+    left, top = jnp.floor(column), jnp.floor(row)
+    right_share, bottom_share = (column - left)[:, None], (row - top)[:, None]
+    texels = texture.reshape(-1, 3)
+
+    def row_of_two(row: jax.Array) -> jax.Array:
+        start = (face * size + row.astype(jnp.int32)) * size
+        first = texels[start + left.astype(jnp.int32)]
+        second = texels[start + at_most(left + 1.0, size - 1.0).astype(jnp.int32)]
+        return first + right_share * (second - first)
+
+    above, below = row_of_two(top), row_of_two(at_most(top + 1.0, size - 1.0))
+    return above + bottom_share * (below - above)
+
+
 def _average(
     integral: Callable[[jax.Array], jax.Array], center: jax.Array, width: jax.Array
 ) -> jax.Array:

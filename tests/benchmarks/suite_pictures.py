@@ -1,12 +1,12 @@
 """Compares pictures of the DM Control Suite's models with those of the suite itself.
 
-    MUJOCO_GL=osmesa python -m tests.benchmarks.suite_pictures
+    MUJOCO_GL=egl python -m tests.benchmarks.suite_pictures
 
 draws both with the same states, 84 x 84 pixels and each task's usual camera, and writes
 docs/images/dmc/beside.png, the suite's on the left, and docs/dmc/pictures.json: mean absolute
 differences of color in units of 1/255, of all pixels, of the sky, the ground and all else. It needs
-the package ``dm_control`` and a library of OSMesa (Debian's ``libosmesa6``), a software renderer;
-with another GL, such as ``MUJOCO_GL=egl``, some pixels are others.
+the package ``dm_control`` and a library of EGL (Debian's ``libegl1``); ``MUJOCO_GL=osmesa`` draws
+the same with ``libosmesa6``.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import mujoco
 import numpy as np
 from PIL import Image, ImageDraw
 
+from pixelbrax_jax.physics.mujoco.lighting import detailed
 from pixelbrax_jax.renderer.base import render
 from pixelbrax_jax.scene.place import place
 from pixelbrax_jax.types import Frame
@@ -55,10 +56,12 @@ def pictures(domain: str, task: str, camera: int, movable: tuple[str, ...]) -> d
     physics, rng = environment.physics, np.random.default_rng(1)
     own = suite_models.of(domain, physics.model.ptr, camera, movable)
     scene = own.scene
+    pixel = 2.0 * np.tan(np.deg2rad(scene.rig.fovy) / 2.0) / SIZE
+    look = detailed(own.model, scene.look, float(pixel))
 
     @jax.jit
     def draw(xpos: jax.Array, xquat: jax.Array) -> Frame:
-        return render(place(scene.geoms, scene.rig, scene.look, xpos, xquat), SIZE, SIZE)
+        return render(place(scene.geoms, scene.rig, look, xpos, xquat), SIZE, SIZE)
 
     drawn: dict[str, list] = {"theirs": [], "ours": [], "area": []}
     for state in range(STATES):
@@ -116,7 +119,7 @@ def main() -> None:
         (DOCS / "dmc").mkdir(exist_ok=True)
         (DOCS / "images" / "dmc").mkdir(parents=True, exist_ok=True)
         kept = {
-            "command": "MUJOCO_GL=osmesa python -m tests.benchmarks.suite_pictures",
+            "command": "MUJOCO_GL=egl python -m tests.benchmarks.suite_pictures",
             "mujoco": mujoco.__version__,
             "pixels": SIZE,
             "states": STATES,

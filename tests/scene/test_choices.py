@@ -25,12 +25,12 @@ def test_a_models_own_look_is_the_default_one():
 
     def chosen(look, **options):
         config = EnvConfig("ball", look=look, **options)
-        return making._look(config, Lit())
+        return making._look(config, Lit(), 45.0)
 
-    assert chosen("default") is chosen("dmc") is own
+    assert chosen("default") is chosen("dmc") is chosen("dmc-plain") is own
     assert chosen("original") is make_look("original")
     assert chosen("dmc", shadows=False).ambient == np.float32(0.7)
-    assert making._look(EnvConfig("ball"), Ball()) is make_look("default")
+    assert making._look(EnvConfig("ball"), Ball(), 45.0) is make_look("default")
 
 
 def test_dmcs_look_is_the_suites():

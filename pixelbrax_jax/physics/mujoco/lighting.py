@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
+from pixelbrax_jax.physics.mujoco.sky import sky_colors, sky_texture, texture_pixels
 from pixelbrax_jax.physics.mujoco.viewpoints import follows_tracked
 from pixelbrax_jax.physics.task import Color
 from pixelbrax_jax.spatial import f32
@@ -55,11 +56,19 @@ def read_look(model: mujoco.MjModel) -> Look:
         diffuse=f32(0.0 if sun is None else model.light_diffuse[sun].mean()),
         specular=f32(0.0),
         highlight=f32(0.0 if sun is None else _SPECULAR * model.light_specular[sun].mean()),
-        sky=_sky(model),
+        sky=sky_colors(model),
         ground_rgb=colors,
         ground_pitch=pitch,
         headlight=f32(headlight.diffuse.mean()) if headlight.active else None,
     )
+
+
+def detailed(model: mujoco.MjModel, look: Look, pixel: float) -> Look:
+    """Return a look of ``read_look`` with all that MuJoCo's renderer draws.
+
+    ``pixel`` is the edge of a pixel at distance 1.
+    """
+    return look.replace(sky_texture=sky_texture(model, look.sky, pixel))
 
 
 def read_lamps(model: mujoco.MjModel, com_link: int) -> dict[str, Lamp]:
@@ -114,7 +123,7 @@ def checker(model: mujoco.MjModel, geom: int) -> np.ndarray | None:
     texture = _texture(model, geom)
     if texture < 0 or model.tex_type[texture] != int(mujoco.mjtTexture.mjTEXTURE_2D):
         return None
-    pixels = _pixels(model, texture)
+    pixels = texture_pixels(model, texture)
     # One pixel of each quarter: the first and last have one color, the others another.
     rows, columns = (np.arange(1, 4, 2) * size // 4 for size in pixels.shape[:2])
     (a, b), (c, d) = pixels[np.ix_(rows, columns)]
@@ -134,7 +143,7 @@ def mean_color(model: mujoco.MjModel, geom: int, color: Color) -> Color:
         return color
     headlight = model.vis.headlight
     light = _ambient(model) + (float(headlight.diffuse.mean()) if headlight.active else 0.0)
-    mean = _pixels(model, texture).mean((0, 1)) / 255.0 * color
+    mean = texture_pixels(model, texture).mean((0, 1)) / 255.0 * color
     red, green, blue = mean / max(light, 1.0)
     return float(red), float(green), float(blue)
 
@@ -155,33 +164,3 @@ def _ground(model: mujoco.MjModel) -> tuple[Any, Any]:
                 repeat /= max(float(model.geom_size[geom, 0]), 1e-6)
             return f32(1.0 / repeat), f32(colors)
     return f32(1.0), f32([[0.1, 0.2, 0.3], [0.2, 0.3, 0.4]])
-
-
-def _sky(model: mujoco.MjModel) -> Any:
-    """Return (3, 3), colors at the horizon, above and below that fit the sky's texture best."""
-    skies = np.flatnonzero(model.tex_type == int(mujoco.mjtTexture.mjTEXTURE_SKYBOX))
-    if not len(skies):
-        return f32(np.zeros((3, 3)))
-    pixels = _pixels(model, int(skies[0]))
-    size = pixels.shape[1]
-    if pixels.shape[0] != 6 * size:
-        return f32([pixels.reshape(-1, 3).mean(0) / 255.0] * 3)
-    step = max(size // 50, 1)
-    middle = 2.0 * (np.arange(size) + 0.5) / size - 1.0
-    across, down = np.meshgrid(middle, middle)
-    length = np.sqrt(across**2 + down**2 + 1.0)
-    # Faces are right, left, up, down, front and back, their first rows on top.
-    rises = [-down / length, -down / length, 1.0 / length, -1.0 / length]
-    rises += rises[:2]
-    rise = np.stack([face[::step, ::step] for face in rises]).ravel()
-    colors = pixels.reshape(6, size, size, 3)[:, ::step, ::step].reshape(-1, 3) / 255.0
-    weights = np.stack([1.0 - np.abs(rise), np.maximum(rise, 0.0), np.maximum(-rise, 0.0)], -1)
-    fit, *_ = np.linalg.lstsq(weights, colors, rcond=None)
-    return f32(np.clip(fit, 0.0, 1.0))
-
-
-def _pixels(model: mujoco.MjModel, texture: int) -> np.ndarray:
-    height, width = int(model.tex_height[texture]), int(model.tex_width[texture])
-    channels, first = int(model.tex_nchannel[texture]), int(model.tex_adr[texture])
-    pixels = model.tex_data[first : first + height * width * channels]
-    return pixels.reshape(height, width, channels)[..., :3]
