@@ -12,7 +12,7 @@ import numpy as np
 from flax import struct
 
 from pixelbrax_jax import spatial
-from pixelbrax_jax.renderer import shading
+from pixelbrax_jax.renderer import opengl, shading
 from pixelbrax_jax.renderer.intersect import (
     Axes,
     Fold,
@@ -139,7 +139,7 @@ def see(
         solid, hit = cache(solid), cache(hit)
 
     to_light = None if look.light is None else _vector(look.light)
-    along = _directions(ray, to_light, bool(look.lamps))
+    along = _directions(ray, to_light, bool(look.lamps) or look.opengl)
     # A key is a distance with the rank in its last bits; the smallest one wins.
     bits = np.uint32((1 << count.bit_length()) - 1)
     key = jnp.full(shape, (_INF_BITS & ~bits) | np.uint32(count), jnp.uint32)
@@ -171,51 +171,31 @@ def see(
     points = tuple(t * component for component in ray)
 
     color, on_ground = _surface_colors(view, winner), jnp.zeros(shape, bool)
+    grounds = []
     for g in filter(geoms.is_ground, view.order):
         on_ground |= seen[g]
-        fraction = _ground_fraction(view, g, ray, hit(g).t, solid(g))
+        fraction, place = _ground_fraction(view, g, ray, hit(g).t, solid(g))
+        if geoms.is_bounded(g):
+            grounds.append((seen[g], solid(g), place))
         for c in range(3):
             first, second = look.ground_rgb[0, c], look.ground_rgb[1, c]
             color[c] = jnp.where(seen[g], first + fraction * (second - first), color[c])
 
     def ways(ray: Vector, start: Vector) -> Iterator[tuple[jax.Array, jax.Array]]:
-        """Yield where each geom that casts shadows is seen, and the distance from ``start``."""
         for g in view.order:
             if look.shadows and geoms.kind[g] != GeomKind.PLANE:
                 there = tuple(c - p for c, p in zip(solid(g).center, start, strict=True))
                 yield seen[g], solid(g).hit(ray, there).t
 
-    shade: jax.Array = look.ambient
-    highlight: jax.Array | float = 0.0
-    if look.headlight is not None:
-        shade += look.headlight * at_least(n_z, 0.0)
-        shade = jnp.where(on_ground, at_most(shade, 1.0), shade)
-    if to_light is not None:
-        lit = jnp.ones(shape, bool)
-        for here, way in ways(to_light, points):
-            # A convex geom casts no shadow on its side that faces the light.
-            lit &= ~((way > SHADOW_BIAS) & ~here)
-        gloss = shading.gloss(n_l, n_z, to_light[2], look.shininess)
-        gloss = jnp.where(lit & (n_l > 0.0), gloss, 0.0)
-        diffuse = jnp.where(lit, at_least(n_l, 0.0), 0.0)
-        shade = shade + look.diffuse * diffuse + look.specular * gloss
-        highlight = look.highlight * gloss
-    for lamp in look.lamps:
-        pos = _vector(lamp.pos)
-        beam, inv_distance, strength = shading.beam(lamp, pos, _vector(lamp.axis), points)
-        to_lamp = tuple(-component for component in beam)
-        n_lamp = dot((*n_xy, n_z), to_lamp)
-        strength = jnp.where(n_lamp > 0.0, strength, 0.0)
-        for here, way in ways(beam, pos):
-            blocked = (way > 0.0) & ((way + SHADOW_BIAS) * inv_distance < 1.0)
-            strength = jnp.where(blocked & ~here, 0.0, strength)
-        shine = shading.gloss(n_lamp, n_z, to_lamp[2], look.shininess)
-        shade = shade + strength * lamp.diffuse * n_lamp
-        highlight = highlight + strength * lamp.highlight * shine
-    if look.headlight is not None:
-        # A texture dims the highlight too.
-        shade = shade + jnp.where(on_ground, highlight, 0.0)
-        highlight = jnp.where(on_ground, 0.0, highlight)
+    normal, light = (*n_xy, n_z), _phong_light
+    matte = on_ground
+    if look.opengl:
+        light = _opengl_light
+        for g in view.order:
+            if geoms.textured and geoms.textured[g]:
+                matte |= seen[g]
+    surface = _Surface(ray, points, normal, n_l, on_ground, matte, grounds)
+    shade, highlight = light(look, surface, ways)
 
     rise = dot(ray, _vector(view.up))
 
@@ -318,6 +298,92 @@ def _normal_products(
     ]
 
 
+class _Surface(NamedTuple):
+    """What pixels see: rays, points, normals, their products with the light, ground and textures.
+
+    ``normal`` has x and y only with lamps or ``Look.opengl``. Each bounded ground is where it is
+    seen, its plane, and the places along its x and y.
+    """
+
+    ray: Vector
+    points: Vector
+    normal: Vector
+    n_l: jax.Array
+    on_ground: jax.Array
+    matte: jax.Array
+    grounds: list[tuple[jax.Array, _Solid, Vector]]
+
+
+Ways = Callable[[Vector, Vector], Iterator[tuple[jax.Array, jax.Array]]]
+"""``ways(ray, start)`` yields where each geom that casts shadows is seen, and its distance."""
+
+
+def _phong_light(look: Look, surface: _Surface, ways: Ways) -> tuple[Any, Any]:
+    """Return the factor of colors and what is added to them; see ``Look``."""
+    _, points, normal, n_l, on_ground, *_ = surface
+    shape = n_l.shape
+    n_z, to_light = normal[-1], None if look.light is None else _vector(look.light)
+    shade: jax.Array = look.ambient
+    highlight: jax.Array | float = 0.0
+    if look.headlight is not None:
+        shade += look.headlight * at_least(n_z, 0.0)
+        shade = jnp.where(on_ground, at_most(shade, 1.0), shade)
+    if to_light is not None:
+        lit = jnp.ones(shape, bool)
+        for here, way in ways(to_light, points):
+            # A convex geom casts no shadow on its side that faces the light.
+            lit &= ~((way > SHADOW_BIAS) & ~here)
+        gloss = shading.gloss(n_l, n_z, to_light[2], look.shininess)
+        gloss = jnp.where(lit & (n_l > 0.0), gloss, 0.0)
+        diffuse = jnp.where(lit, at_least(n_l, 0.0), 0.0)
+        shade = shade + look.diffuse * diffuse + look.specular * gloss
+        highlight = look.highlight * gloss
+    for lamp in look.lamps:
+        pos = _vector(lamp.pos)
+        beam, inv_distance, strength = shading.beam(lamp, pos, _vector(lamp.axis), points)
+        to_lamp = tuple(-component for component in beam)
+        n_lamp = dot(normal, to_lamp)
+        strength = jnp.where(n_lamp > 0.0, strength, 0.0)
+        for here, way in ways(beam, pos):
+            blocked = (way > 0.0) & ((way + SHADOW_BIAS) * inv_distance < 1.0)
+            strength = jnp.where(blocked & ~here, 0.0, strength)
+        shine = shading.gloss(n_lamp, n_z, to_lamp[2], look.shininess)
+        shade = shade + strength * lamp.diffuse * n_lamp
+        highlight = highlight + strength * lamp.highlight * shine
+    if look.headlight is not None:
+        # A texture dims the highlight too.
+        shade = shade + jnp.where(on_ground, highlight, 0.0)
+        highlight = jnp.where(on_ground, 0.0, highlight)
+    return shade, highlight
+
+
+def _opengl_light(look: Look, surface: _Surface, ways: Ways) -> tuple[Any, Any]:
+    """Return the same with OpenGL's formulas; see ``opengl.py``."""
+    ray, points, normal, _, on_ground, matte, grounds = surface
+    lights = opengl.lights_of(look, (0.0, 0.0, 1.0))
+    factors = [light(ray, points, normal) for light in lights]
+    textures = [opengl.on_texture(pair) for pair in factors]
+    for here, plane, place in grounds:
+        eye = (0.0, 0.0, 0.0)
+        found = opengl.on_plane(lights, eye, plane.center, plane.axes, plane.size, place)
+        textures = [jnp.where(here, *pair) for pair in zip(found, textures, strict=True)]
+    lit: list[Any] = [True] * len(lights)
+    if look.light is not None:
+        for here, way in ways(_vector(look.light), points):
+            lit[1] &= ~((way > SHADOW_BIAS) & ~here)
+    for k, lamp in enumerate(look.lamps, len(lights) - len(look.lamps)):
+        beam, inv_distance, _ = opengl.beam_of(lamp, points)
+        for here, way in ways(beam, _vector(lamp.pos)):
+            blocked = (way > 0.0) & ((way + SHADOW_BIAS) * inv_distance < 1.0)
+            lit[k] &= ~(blocked & ~here)
+    shade: Any = 0.0
+    highlight: Any = 0.0
+    for (factor, shine), texture, shown in zip(factors, textures, lit, strict=True):
+        shade += jnp.where(shown, jnp.where(on_ground, texture, factor), 0.0)
+        highlight += jnp.where(shown & ~matte, shine, 0.0)
+    return shade, highlight
+
+
 def _surface_colors(view: View, winner: jax.Array) -> list[jax.Array]:
     rgb, materials = view.geoms.rgb, [view.geoms.material[g] for g in view.order]
     color = [jnp.full(winner.shape, rgb[materials[0], c]) for c in range(3)]
@@ -328,16 +394,22 @@ def _surface_colors(view: View, winner: jax.Array) -> list[jax.Array]:
     return color
 
 
-def _ground_fraction(view: View, g: int, ray: Vector, t: jax.Array, plane: _Solid) -> jax.Array:
-    """Return the fraction of the ground's second color for pixels that see plane ``g`` at ``t``."""
+def _ground_fraction(
+    view: View, g: int, ray: Vector, t: jax.Array, plane: _Solid
+) -> tuple[jax.Array, Vector]:
+    """Return the fraction of the ground's second color where pixels see plane ``g`` at ``t``.
+
+    The second result is the place along the plane's x and y, in metres.
+    """
     normal = plane.axes[2]
     slope = 1.0 / at_most(dot(ray, normal), -1e-7)
     inv_pitch = 1.0 / view.look.ground_pitch
     step = -t * ray[2] * view.pixel * inv_pitch
-    coords, widths = [], []
+    place, coords, widths = [], [], []
     for number, (axis, half) in enumerate(zip(plane.axes[:2], plane.size[:2], strict=True)):
         ray_axis = dot(ray, axis)
         along = t * ray_axis - dot(plane.center, axis)
+        place.append(along)
         if view.geoms.is_bounded(g):
             # MuJoCo's textures start at the corner of least x and largest y.
             along = along + half if number == 0 else half - along
@@ -346,4 +418,4 @@ def _ground_fraction(view: View, g: int, ray: Vector, t: jax.Array, plane: _Soli
         right = axis[0] - ray_axis * slope * normal[0]
         above = axis[1] - ray_axis * slope * normal[1]
         widths.append(step * (jnp.abs(right) + jnp.abs(above)))
-    return shading.second_color_fraction(view.look.ground, *coords, *widths)
+    return shading.second_color_fraction(view.look.ground, *coords, *widths), place

@@ -26,9 +26,12 @@ _RGB = int(mujoco.mjtTextureRole.mjTEXROLE_RGB)
 _SPECULAR = 0.5
 """Specular reflection of MuJoCo's default material."""
 
+_EXPONENT = 64
+"""Shininess of MuJoCo's default material, 0.5, in OpenGL's units."""
+
 _SHININESS = 16
-"""A quarter of the default material's 0.5 * 128: that exponent is for the half vector between light
-and viewer, and Phong's mirrored vector turns twice as fast."""
+"""A quarter of that: its exponent is for the half vector between light and viewer, and Phong's
+mirrored vector turns twice as fast."""
 
 
 def read_look(model: mujoco.MjModel) -> Look:
@@ -68,7 +71,14 @@ def detailed(model: mujoco.MjModel, look: Look, pixel: float) -> Look:
 
     ``pixel`` is the edge of a pixel at distance 1.
     """
-    return look.replace(sky_texture=sky_texture(model, look.sky, pixel))
+    headlight = model.vis.headlight
+    shines = bool(headlight.active and headlight.specular.any())
+    return look.replace(
+        opengl=True,
+        shininess=_EXPONENT,
+        headlight_highlight=f32(_SPECULAR * headlight.specular.mean()) if shines else None,
+        sky_texture=sky_texture(model, look.sky, pixel),
+    )
 
 
 def read_lamps(model: mujoco.MjModel, com_link: int) -> dict[str, Lamp]:
@@ -120,7 +130,7 @@ def _ambient(model: mujoco.MjModel) -> float:
 
 def checker(model: mujoco.MjModel, geom: int) -> np.ndarray | None:
     """Return the two colors of a geom's checkered texture, (2, 3) in [0, 1]; None for none."""
-    texture = _texture(model, geom)
+    texture = texture_of(model, geom)
     if texture < 0 or model.tex_type[texture] != int(mujoco.mjtTexture.mjTEXTURE_2D):
         return None
     pixels = texture_pixels(model, texture)
@@ -138,7 +148,7 @@ def mean_color(model: mujoco.MjModel, geom: int, color: Color) -> Color:
     MuJoCo limits the light on a texture to 1. The color is darkened by the excess of ambient light
     and headlight on a surface that faces the camera.
     """
-    texture = _texture(model, geom)
+    texture = texture_of(model, geom)
     if texture < 0:
         return color
     headlight = model.vis.headlight
@@ -148,7 +158,8 @@ def mean_color(model: mujoco.MjModel, geom: int, color: Color) -> Color:
     return float(red), float(green), float(blue)
 
 
-def _texture(model: mujoco.MjModel, geom: int) -> int:
+def texture_of(model: mujoco.MjModel, geom: int) -> int:
+    """Return the index of a geom's texture, -1 for none."""
     material = int(model.geom_matid[geom])
     return int(model.mat_texid[material, _RGB]) if material >= 0 else -1
 

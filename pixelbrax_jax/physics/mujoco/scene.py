@@ -19,7 +19,13 @@ from pixelbrax_jax.physics.mujoco.geometry import (
     resolve_rgba,
     site_shapes,
 )
-from pixelbrax_jax.physics.mujoco.lighting import checker, mean_color, read_lamps, read_look
+from pixelbrax_jax.physics.mujoco.lighting import (
+    checker,
+    mean_color,
+    read_lamps,
+    read_look,
+    texture_of,
+)
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
 from pixelbrax_jax.physics.mujoco.viewpoints import camera_name, read_rigs
 from pixelbrax_jax.physics.mujoco.viewpoints import tracked_body as tracked_body
@@ -108,6 +114,7 @@ def _textured_geoms(
             rgb=shape.rgb if is_own else mean_color(model, shape.row, shape.rgb),
             bounded=bool(is_plane and (shape.size[:2] > 0).any()),
             patterned=is_plane and not is_own and checker(model, shape.row) is not None,
+            textured=not is_own and texture_of(model, shape.row) >= 0,
         )
 
 
