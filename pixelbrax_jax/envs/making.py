@@ -139,7 +139,8 @@ def _look(config: EnvConfig, physics: Physics, fovy: float) -> Look:
     if physics.look is not None and isinstance(look, str):
         name = physics.default_look if look == "default" else look
         if name == "dmc":
-            look = _detailed(physics, 2.0 * math.tan(math.radians(fovy) / 2.0) / config.height)
+            rays = config.height * math.isqrt(config.samples)
+            look = _detailed(physics, 2.0 * math.tan(math.radians(fovy) / 2.0) / rays)
         elif name == "dmc-plain":
             look = physics.look
     return make_look(look, shadows=config.shadows)

@@ -198,7 +198,8 @@ class PixelEnv(ProgramConfig):
     ) -> Frame:
         """Render a state with its distractors; height and width default to the observation's."""
         height, width = self._size(height, width)
-        frame = render(self._scene(state.sim, params), height, width, self.renderer)
+        scene = self._scene(state.sim, params)
+        frame = render(scene, height, width, self.renderer, samples=self.samples)
         rows, distractor_state = jnp.arange(height), state.sim.distractor_state
         return self.chain.change_frame(distractor_state, params, frame, rows, height, width)
 
@@ -290,7 +291,8 @@ class PixelEnv(ProgramConfig):
         def change(frame: Frame, rows: jax.Array) -> Frame:
             return self.chain.change_frame(sim.distractor_state, params, frame, rows, height, width)
 
-        return draw(self._scene(sim, params), height, width, self.renderer, change)
+        scene = self._scene(sim, params)
+        return draw(scene, height, width, self.renderer, change, self.samples)
 
     def blank_frames(self) -> jax.Array:
         """Return a black frame stack; an empty one without pixels."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import partial
 
@@ -15,6 +16,9 @@ from pixelbrax_jax.types import Frame, Scene
 from pixelbrax_jax.validation import check_choice
 
 RENDERERS = ("auto", "fused", "pallas", "reference")
+
+SAMPLES = (1, 4, 9, 16)
+"""Allowed numbers of rays per pixel, the squares of 1 to 4."""
 
 _BANDS = 2
 """Bands of rows that an accelerator renders in a loop. XLA would remove a loop of one."""
@@ -31,6 +35,17 @@ def check_renderer(renderer: object) -> str:
     return name
 
 
+def check_samples(samples: object) -> int:
+    """Return ``samples``; raise an error if it is not one of ``SAMPLES``."""
+    if isinstance(samples, bool) or not isinstance(samples, int | np.integer):
+        raise TypeError(f"samples must be an integer, got {samples!r}.")
+    if samples not in SAMPLES:
+        raise ValueError(
+            f"samples must be 1, 4, 9 or 16 (2 x 2, 3 x 3 or 4 x 4 rays per pixel), got {samples}."
+        )
+    return int(samples)
+
+
 @under_default_flags
 def render(
     scene: Scene,
@@ -40,6 +55,7 @@ def render(
     *,
     first_row: jax.Array | int = 0,
     num_rows: int | None = None,
+    samples: int = 1,
 ) -> Frame:
     """Render an image of the scene.
 
@@ -56,18 +72,28 @@ def render(
         renderer: one of ``RENDERERS``; they give the same image. See ``ProgramConfig``.
         first_row: () int, may be traced: first row of the band to render.
         num_rows: rows of the band; None renders all rows.
+        samples: rays per pixel, one of ``SAMPLES``: those of an image that is larger by its root.
+            Colors are their means; depth, ``seg`` and ``ground`` are those of the ray next to the
+            pixel's center.
 
     Returns:
         The frame, or its band of rows.
 
     Raises:
-        ValueError: a size is below 1, or the renderer is unknown or not supported.
+        ValueError: a size is below 1, ``samples`` is not allowed, or the renderer is unknown or not
+            supported.
     """
     for name, value in (("height", height), ("width", width)):
         if value < 1:
             raise ValueError(f"{name} must be at least 1 pixel, got {value}.")
     rows = height if num_rows is None else num_rows
     first_row = jnp.asarray(first_row, jnp.int32)
+    if (times := math.isqrt(check_samples(samples))) > 1:
+        first, num = first_row * times, rows * times
+        large = render(
+            scene, height * times, width * times, renderer, first_row=first, num_rows=num
+        )
+        return _shrunk(large, times)
     if check_renderer(renderer) == "reference":
         return reference.render(scene, height, width, first_row, rows)
     return _fast(scene, first_row, height, width, rows, renderer)
@@ -79,11 +105,12 @@ def draw(
     width: int,
     renderer: str,
     change: Callable[[Frame, jax.Array], Frame],
+    samples: int = 1,
 ) -> jax.Array:
     """Render an image, change it and pack it into (height, width) uint32, only once in a program.
 
     ``change(frame, rows)`` returns rows of the image with other colors, for their indices (R,)
-    int32. Its pixelwise part runs in the kernel.
+    int32. Its pixelwise part runs in the kernel, if a pixel has one of the ``samples``.
 
     Without a barrier XLA fuses the renderer into every reader of its image and runs it again for
     each. A Pallas kernel is never fused. Otherwise the barrier is control flow that XLA keeps: a
@@ -93,7 +120,9 @@ def draw(
     plain = "fused" if renderer == "auto" else renderer
 
     def draw_rows(first_row: jax.Array, num_rows: int) -> jax.Array:
-        frame = render(scene, height, width, plain, first_row=first_row, num_rows=num_rows)
+        frame = render(
+            scene, height, width, plain, first_row=first_row, num_rows=num_rows, samples=samples
+        )
         return pack(change(frame, jnp.minimum(first_row + jnp.arange(num_rows), height - 1)))
 
     def in_bands() -> jax.Array:
@@ -119,6 +148,9 @@ def draw(
     def by_kernel() -> jax.Array:
         from pixelbrax_jax.renderer import kernel
 
+        if samples > 1:
+            frame = render(scene, height, width, "pallas", samples=samples)
+            return pack(change(frame, jnp.arange(height)))
         return kernel.draw(
             scene, height, width, lambda frame: pack(change(frame, jnp.arange(height)))
         )
@@ -130,6 +162,29 @@ def draw(
         forms["cuda"] = by_kernel
     image: jax.Array = jax.lax.platform_dependent(default=in_bands, **forms)
     return image
+
+
+def _shrunk(frame: Frame, times: int) -> Frame:
+    """Return an image whose pixels are ``times`` by ``times`` pixels of the given one."""
+    # The barrier keeps XLA from rendering again for each channel and sample.
+    frame = jax.lax.optimization_barrier(frame)
+
+    def sample(plane: jax.Array, row: int, column: int) -> jax.Array:
+        return plane[row::times, column::times]
+
+    def mean(plane: jax.Array) -> jax.Array:
+        places = [(row, column) for row in range(times) for column in range(times)]
+        return sum(sample(plane, *place) for place in places) / len(places)
+
+    middle = times // 2
+    return Frame(
+        r=mean(frame.r),
+        g=mean(frame.g),
+        b=mean(frame.b),
+        depth=sample(frame.depth, middle, middle),
+        seg=sample(frame.seg, middle, middle),
+        ground=sample(frame.ground, middle, middle),
+    )
 
 
 def pack(frame: Frame) -> jax.Array:
