@@ -101,6 +101,7 @@ class Geoms(struct.PyTreeNode):
             show their own color. Empty if all planes are ground.
         textured: (G,) static, geoms whose color is the mean of a texture, which OpenGL dims
             highlights with. Empty if none is.
+        mirror: static, index of the plane that reflects, -1 for none; see ``Look.reflectance``.
         distant: static, whether the camera is more than a thousand radii of a sphere or capsule
             away, so that float32 needs the longer formulas of ``renderer.intersect``.
         strings: strings, whose capsules are among the geoms.
@@ -124,6 +125,7 @@ class Geoms(struct.PyTreeNode):
     bounded: tuple[bool, ...] = struct.field(pytree_node=False, default=())
     patterned: tuple[bool, ...] = struct.field(pytree_node=False, default=())
     textured: tuple[bool, ...] = struct.field(pytree_node=False, default=())
+    mirror: int = struct.field(pytree_node=False, default=-1)
     distant: bool = struct.field(pytree_node=False, default=False)
     strings: tuple[String, ...] = ()
     num_planes: tuple[int, ...] = struct.field(pytree_node=False, default=())
@@ -263,6 +265,7 @@ class Look(struct.PyTreeNode):
         headlight: (), coefficient of diffuse light from the camera; None for none.
         headlight_highlight: (), its coefficient of highlights, with ``opengl``; None for none.
         lamps: spot lights.
+        reflectance: (), fraction of the colors that a mirror reflects; None for no reflection.
         opengl: static, whether light is that of MuJoCo's renderer, see ``renderer.opengl``: the
             highlight is the half vector's, ``shininess`` is its exponent, and bounded planes that
             are ground are lit at the vertices of MuJoCo's grid, of half width ``size[2]``.
@@ -285,6 +288,7 @@ class Look(struct.PyTreeNode):
     lamps: tuple[Lamp, ...] = ()
     sky_texture: jax.Array | None = None
     headlight_highlight: jax.Array | None = None
+    reflectance: jax.Array | None = None
     opengl: bool = struct.field(pytree_node=False, default=False)
 
 

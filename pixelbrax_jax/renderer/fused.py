@@ -9,86 +9,31 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 
-from pixelbrax_jax import spatial
 from pixelbrax_jax.renderer import opengl, shading
 from pixelbrax_jax.renderer.intersect import (
-    Axes,
-    Fold,
     Hit,
     Vector,
     at_least,
     at_most,
     between,
     dot,
-    intersect,
 )
+from pixelbrax_jax.renderer.mirror import reflection
 from pixelbrax_jax.renderer.reference import pixel_rays
 from pixelbrax_jax.renderer.shading import SHADOW_BIAS
-from pixelbrax_jax.types import FAR, Frame, GeomKind, Geoms, Look, Scene
+from pixelbrax_jax.renderer.view import (
+    Solid,
+    View,
+    rays,
+    solid_of,
+    surface_colors,
+    vector,
+    view_of,
+)
+from pixelbrax_jax.types import FAR, Frame, GeomKind, Look, Scene
 
 _INF_BITS = np.uint32(0x7F800000)
-
-
-class View(struct.PyTreeNode):
-    """A scene in its camera's frame, with arrays in the scene's order, shapes and units.
-
-    Attributes:
-        order: static, the geom of each rank; geoms of one material have neighboring ranks, so that
-            a material is a range of ranks.
-        pos, xmat: centers and orientations.
-        geoms: sizes and colors, without poses.
-        look: light and lamps in the camera's frame.
-        pixel: () float32, edge of a pixel at distance 1.
-        up: (3,) float32, the world's z axis.
-    """
-
-    order: tuple[int, ...] = struct.field(pytree_node=False)
-    pos: jax.Array
-    xmat: jax.Array
-    geoms: Geoms
-    look: Look
-    pixel: jax.Array
-    up: jax.Array
-
-
-def view_of(
-    scene: Scene, height: int, einsum: Callable[[str, Any, Any], jax.Array] = jnp.einsum
-) -> View:
-    """Return a scene in its camera's frame, for images of ``height`` pixels."""
-    geoms, look = scene.geoms, scene.look
-    to_camera = scene.camera.xmat
-    light = None if look.light is None else einsum("i,ij->j", spatial.unit(look.light), to_camera)
-    lamps = tuple(
-        lamp.replace(
-            pos=einsum("i,ij->j", lamp.pos - scene.camera.pos, to_camera),
-            axis=einsum("i,ij->j", lamp.axis, to_camera),
-        )
-        for lamp in look.lamps
-    )
-    return View(
-        order=order_of(geoms),
-        pos=einsum("gi,ij->gj", scene.pos - scene.camera.pos, to_camera),
-        xmat=einsum("ji,gjk->gik", to_camera, scene.xmat),
-        geoms=geoms.replace(pos=None, quat=None, strings=()),
-        look=look.replace(light=light, lamps=lamps, sky_texture=None),
-        pixel=2.0 * jnp.tan(jnp.deg2rad(scene.camera.fovy) / 2.0) / height,
-        up=to_camera[2],
-    )
-
-
-def order_of(geoms: Geoms) -> tuple[int, ...]:
-    """Return the geom of each rank."""
-    return tuple(sorted(range(len(geoms.kind)), key=lambda g: geoms.material[g]))
-
-
-def rays(view: View, height: int, width: int, row: jax.Array, column: jax.Array) -> Vector:
-    """Return unit rays through the centers of pixels with the given int32 rows and columns."""
-    x = (column.astype(jnp.float32) - 0.5 * (width - 1)) * view.pixel
-    y = (0.5 * (height - 1) - row.astype(jnp.float32)) * view.pixel
-    inv_length = jax.lax.rsqrt(x * x + y * y + 1.0)
-    return x * inv_length, y * inv_length, -inv_length
 
 
 def sky_of(
@@ -128,8 +73,8 @@ def see(
     """
     look, geoms, shape, count = view.look, view.geoms, ray[0].shape, len(view.order)
 
-    def solid(g: int) -> _Solid:
-        return _solid(view, g, in_kernel=near is not None)
+    def solid(g: int) -> Solid:
+        return solid_of(view, g, in_kernel=near is not None)
 
     def hit(g: int) -> Hit:
         return solid(g).hit(ray, solid(g).center)
@@ -138,7 +83,7 @@ def see(
         # Branches cannot share results.
         solid, hit = cache(solid), cache(hit)
 
-    to_light = None if look.light is None else _vector(look.light)
+    to_light = None if look.light is None else vector(look.light)
     along = _directions(ray, to_light, bool(look.lamps) or look.opengl)
     # A key is a distance with the rank in its last bits; the smallest one wins.
     bits = np.uint32((1 << count.bit_length()) - 1)
@@ -170,7 +115,7 @@ def see(
     sky = winner == count
     points = tuple(t * component for component in ray)
 
-    color, on_ground = _surface_colors(view, winner), jnp.zeros(shape, bool)
+    color, on_ground = surface_colors(view, winner), jnp.zeros(shape, bool)
     grounds = []
     for g in filter(geoms.is_ground, view.order):
         on_ground |= seen[g]
@@ -194,18 +139,24 @@ def see(
         for g in view.order:
             if geoms.textured and geoms.textured[g]:
                 matte |= seen[g]
-    surface = _Surface(ray, points, normal, n_l, on_ground, matte, grounds)
+    surface = _Surface(ray, points, normal, to_light, n_l, on_ground, matte, grounds)
     shade, highlight = light(look, surface, ways)
 
-    rise = dot(ray, _vector(view.up))
+    rise = dot(ray, vector(view.up))
+    reflected: list[jax.Array] = []
+    if view.mirrored is not None:
+        here, found = seen[geoms.mirror], reflection(view, ray, t, in_kernel=near is not None)
+        reflected = [jnp.where(here, channel, 0.0) for channel in found]
+
+    def front(c: int) -> jax.Array:
+        own = color[c] * shade + highlight
+        return between(0.0, own + reflected[c] if reflected else own, 1.0)
 
     def behind(c: int) -> jax.Array:
         plain = shading.sky(look, rise, c)
         return between(0.0, plain + texture[c], 1.0) if texture else plain
 
-    red, green, blue = (
-        jnp.where(sky, behind(c), between(0.0, color[c] * shade + highlight, 1.0)) for c in range(3)
-    )
+    red, green, blue = (jnp.where(sky, behind(c), front(c)) for c in range(3))
     depth = jnp.where(sky, FAR, -t * ray[2])
     return Frame(r=red, g=green, b=blue, depth=depth, seg=winner, ground=on_ground)
 
@@ -224,58 +175,6 @@ def render(
     frame = see(view, rays(view, height, width, row, column), texture=texture)
     frame = frame.replace(seg=jnp.array([*view.order, -1], jnp.int32)[frame.seg])
     return jax.tree.map(lambda plane: plane.reshape(num_rows, width), frame)
-
-
-class _Solid(NamedTuple):
-    center: Vector
-    axes: Axes
-    size: Any
-    hit: Callable[[Vector, Vector], Hit]
-    """Where rays enter it, with its center at another place."""
-
-
-def _solid(view: View, g: int, in_kernel: bool) -> _Solid:
-    geoms = view.geoms
-    x, y, z = (tuple(view.xmat[g, k, axis] for k in range(3)) for axis in range(3))
-    size: Any = tuple(geoms.size[g, k] for k in range(3))
-    if geoms.kind[g] == GeomKind.MESH:
-        size = _planes(geoms, g, in_kernel)
-    hit = partial(
-        intersect,
-        geoms.kind[g],
-        axes=(x, y, z),
-        size=size,
-        bounded=geoms.is_bounded(g),
-        distant=geoms.distant,
-    )
-    return _Solid(tuple(view.pos[g, k] for k in range(3)), (x, y, z), size, hit)
-
-
-def _planes(geoms: Geoms, g: int, in_kernel: bool) -> Fold:
-    first, end = geoms.rows_of_planes(g)
-    planes: Any = geoms.planes
-
-    def in_a_loop(prepare: Callable, update: Callable, value: Any) -> Any:
-        # Hundreds of planes in a row would take minutes to compile.
-        def one(row: jax.Array, value: Any) -> Any:
-            return update(value, prepare(tuple(planes[row, k] for k in range(4))))
-
-        return jax.lax.fori_loop(np.int32(first), np.int32(end), one, value)
-
-    def in_a_row(prepare: Callable, update: Callable, value: Any) -> Any:
-        # A loop would keep images of all values. The barrier keeps what differs by plane alone out
-        # of the loop over pixels.
-        columns = prepare(tuple(planes[first:end, k] for k in range(4)))
-        columns = jax.lax.optimization_barrier(columns)
-        for row in range(end - first):
-            value = update(value, tuple(column[row] for column in columns))
-        return value
-
-    return in_a_loop if in_kernel else in_a_row
-
-
-def _vector(array: Any) -> Vector:
-    return array[0], array[1], array[2]
 
 
 def _directions(ray: Vector, to_light: Vector | None, lamps: bool) -> list[tuple[Vector, Any]]:
@@ -308,10 +207,11 @@ class _Surface(NamedTuple):
     ray: Vector
     points: Vector
     normal: Vector
+    to_light: Vector | None
     n_l: jax.Array
     on_ground: jax.Array
     matte: jax.Array
-    grounds: list[tuple[jax.Array, _Solid, Vector]]
+    grounds: list[tuple[jax.Array, Solid, Vector]]
 
 
 Ways = Callable[[Vector, Vector], Iterator[tuple[jax.Array, jax.Array]]]
@@ -320,9 +220,8 @@ Ways = Callable[[Vector, Vector], Iterator[tuple[jax.Array, jax.Array]]]
 
 def _phong_light(look: Look, surface: _Surface, ways: Ways) -> tuple[Any, Any]:
     """Return the factor of colors and what is added to them; see ``Look``."""
-    _, points, normal, n_l, on_ground, *_ = surface
-    shape = n_l.shape
-    n_z, to_light = normal[-1], None if look.light is None else _vector(look.light)
+    _, points, normal, to_light, n_l, on_ground, *_ = surface
+    n_z, shape = normal[-1], n_l.shape
     shade: jax.Array = look.ambient
     highlight: jax.Array | float = 0.0
     if look.headlight is not None:
@@ -339,8 +238,8 @@ def _phong_light(look: Look, surface: _Surface, ways: Ways) -> tuple[Any, Any]:
         shade = shade + look.diffuse * diffuse + look.specular * gloss
         highlight = look.highlight * gloss
     for lamp in look.lamps:
-        pos = _vector(lamp.pos)
-        beam, inv_distance, strength = shading.beam(lamp, pos, _vector(lamp.axis), points)
+        pos = vector(lamp.pos)
+        beam, inv_distance, strength = shading.beam(lamp, pos, vector(lamp.axis), points)
         to_lamp = tuple(-component for component in beam)
         n_lamp = dot(normal, to_lamp)
         strength = jnp.where(n_lamp > 0.0, strength, 0.0)
@@ -359,7 +258,7 @@ def _phong_light(look: Look, surface: _Surface, ways: Ways) -> tuple[Any, Any]:
 
 def _opengl_light(look: Look, surface: _Surface, ways: Ways) -> tuple[Any, Any]:
     """Return the same with OpenGL's formulas; see ``opengl.py``."""
-    ray, points, normal, _, on_ground, matte, grounds = surface
+    ray, points, normal, to_light, _, on_ground, matte, grounds = surface
     lights = opengl.lights_of(look, (0.0, 0.0, 1.0))
     factors = [light(ray, points, normal) for light in lights]
     textures = [opengl.on_texture(pair) for pair in factors]
@@ -368,12 +267,12 @@ def _opengl_light(look: Look, surface: _Surface, ways: Ways) -> tuple[Any, Any]:
         found = opengl.on_plane(lights, eye, plane.center, plane.axes, plane.size, place)
         textures = [jnp.where(here, *pair) for pair in zip(found, textures, strict=True)]
     lit: list[Any] = [True] * len(lights)
-    if look.light is not None:
-        for here, way in ways(_vector(look.light), points):
+    if to_light is not None:
+        for here, way in ways(to_light, points):
             lit[1] &= ~((way > SHADOW_BIAS) & ~here)
     for k, lamp in enumerate(look.lamps, len(lights) - len(look.lamps)):
         beam, inv_distance, _ = opengl.beam_of(lamp, points)
-        for here, way in ways(beam, _vector(lamp.pos)):
+        for here, way in ways(beam, vector(lamp.pos)):
             blocked = (way > 0.0) & ((way + SHADOW_BIAS) * inv_distance < 1.0)
             lit[k] &= ~(blocked & ~here)
     shade: Any = 0.0
@@ -384,18 +283,8 @@ def _opengl_light(look: Look, surface: _Surface, ways: Ways) -> tuple[Any, Any]:
     return shade, highlight
 
 
-def _surface_colors(view: View, winner: jax.Array) -> list[jax.Array]:
-    rgb, materials = view.geoms.rgb, [view.geoms.material[g] for g in view.order]
-    color = [jnp.full(winner.shape, rgb[materials[0], c]) for c in range(3)]
-    for rank in range(1, len(materials)):
-        if materials[rank] != materials[rank - 1]:
-            for c in range(3):
-                color[c] = jnp.where(winner >= rank, rgb[materials[rank], c], color[c])
-    return color
-
-
 def _ground_fraction(
-    view: View, g: int, ray: Vector, t: jax.Array, plane: _Solid
+    view: View, g: int, ray: Vector, t: jax.Array, plane: Solid
 ) -> tuple[jax.Array, Vector]:
     """Return the fraction of the ground's second color where pixels see plane ``g`` at ``t``.
 

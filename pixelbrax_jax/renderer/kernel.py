@@ -11,9 +11,10 @@ import numpy as np
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton
 
-from pixelbrax_jax.renderer.fused import Near, View, order_of, rays, see, sky_of, view_of
+from pixelbrax_jax.renderer.fused import Near, see, sky_of
 from pixelbrax_jax.renderer.intersect import at_least, at_most
 from pixelbrax_jax.renderer.per_pixel import per_pixel
+from pixelbrax_jax.renderer.view import View, order_of, rays, view_of
 from pixelbrax_jax.types import Frame, GeomKind, Scene
 
 BLOCK = 256

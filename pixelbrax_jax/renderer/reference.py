@@ -40,9 +40,13 @@ def render(
     if look.opengl:
         shade, highlight = _opengl_light(scene, rays, points, normal, nearest, on_ground)
     else:
-        shade, highlight = _phong_light(scene, points, normal, nearest, on_ground)
+        shade, highlight = _phong_light(scene, points, normal, nearest, on_ground, back)
     shade, highlight = (jnp.broadcast_to(x, hit.shape)[..., None] for x in (shade, highlight))
-    surface = jnp.clip(color * shade + highlight, 0.0, 1.0)
+    surface = color * shade + highlight
+    if look.reflectance is not None and geoms.mirror >= 0:
+        here = (hit & (nearest == geoms.mirror))[..., None]
+        surface += jnp.where(here, _reflection(scene, rays, t), 0.0)
+    surface = jnp.clip(surface, 0.0, 1.0)
     rise = rays[..., 2:]
     sky = look.sky[0] + jnp.clip(rise, 0.0, 1.0) * (look.sky[1] - look.sky[0])
     if look.sky.shape[0] == 3:
@@ -62,10 +66,15 @@ def render(
 
 
 def _phong_light(
-    scene: Scene, points: jax.Array, normal: jax.Array, nearest: jax.Array, on_ground: jax.Array
+    scene: Scene,
+    points: jax.Array,
+    normal: jax.Array,
+    nearest: jax.Array,
+    on_ground: jax.Array,
+    back: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
     """Return the factor of colors and what is added to them, (H, W) or (); see ``Look``."""
-    look, back = scene.look, scene.camera.xmat[:, 2]
+    look = scene.look
     n_z = normal @ back
     shade, highlight = look.ambient, jnp.zeros(())
     if look.headlight is not None:
@@ -142,6 +151,37 @@ def _in_shadow(scene: Scene, light: int, points: jax.Array, nearest: jax.Array) 
     ray = spatial.unit(away)
     until = jnp.sum(away * ray, -1) - shading.SHADOW_BIAS
     return _shaded(scene, lamp.pos, ray, until, nearest)
+
+
+def _reflection(scene: Scene, rays: jax.Array, until: jax.Array) -> jax.Array:
+    """Return the color that pixels get from a mirror at distance ``until``, (H, W, 3).
+
+    The mirror is passed by rays of a mirrored camera; see ``mirror.py``.
+    """
+    geoms, look, camera = scene.geoms, scene.look, scene.camera
+    base, axis = scene.pos[geoms.mirror], scene.xmat[geoms.mirror][:, 2]
+    eye = camera.pos - 2.0 * ((camera.pos - base) @ axis) * axis
+    rays = rays - 2.0 * (rays @ axis)[..., None] * axis
+    others = [g for g in range(len(geoms.kind)) if g != geoms.mirror and not geoms.is_ground(g)]
+    found = jnp.zeros(rays.shape)
+    nearest = jnp.full(until.shape, jnp.inf)
+    look = look if look.light is None else look.replace(light=spatial.unit(look.light))
+    lights = opengl.lights_of(look, tuple(camera.xmat[:, 2]))
+    for g in others:
+        t, normal = _cast(scene, g, eye, rays)
+        first = (t > until) & (t < nearest)
+        points = eye + jnp.where(first, t, 1.0)[..., None] * rays
+        ray, point, n = (tuple(jnp.moveaxis(x, -1, 0)) for x in (rays, points, normal))
+        factors = [light(ray, point, n) for light in lights]
+        shade, highlight = (sum(part) for part in zip(*factors, strict=True))
+        if geoms.textured and geoms.textured[g]:
+            highlight = 0.0
+        shade, highlight = (jnp.broadcast_to(x, t.shape)[..., None] for x in (shade, highlight))
+        color = look.reflectance * jnp.asarray(geoms.rgb)[geoms.material[g]]
+        seen = jnp.clip(color * shade + highlight, 0.0, 1.0)
+        found = jnp.where(first[..., None], seen, found)
+        nearest = jnp.where(first, t, nearest)
+    return found
 
 
 def pixel_rays(camera: Camera, height: int, width: int, rows: jax.Array) -> jax.Array:

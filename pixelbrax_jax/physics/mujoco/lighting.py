@@ -21,6 +21,7 @@ from pixelbrax_jax.types import Lamp, Look
 _DIRECTIONAL = int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
 _POINT = int(mujoco.mjtLightType.mjLIGHT_POINT)
 _TRACKCOM = int(mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM)
+_PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
 _RGB = int(mujoco.mjtTextureRole.mjTEXROLE_RGB)
 
 _SPECULAR = 0.5
@@ -72,13 +73,24 @@ def detailed(model: mujoco.MjModel, look: Look, pixel: float) -> Look:
     ``pixel`` is the edge of a pixel at distance 1.
     """
     headlight = model.vis.headlight
+    mirror = mirror_of(model)
     shines = bool(headlight.active and headlight.specular.any())
     return look.replace(
         opengl=True,
         shininess=_EXPONENT,
         headlight_highlight=f32(_SPECULAR * headlight.specular.mean()) if shines else None,
+        reflectance=f32(model.mat_reflectance[model.geom_matid[mirror]]) if mirror >= 0 else None,
         sky_texture=sky_texture(model, look.sky, pixel),
     )
+
+
+def mirror_of(model: mujoco.MjModel) -> int:
+    """Return the index of the plane that reflects in MuJoCo's renderer, the first; -1 for none."""
+    for geom in np.flatnonzero(model.geom_type == _PLANE):
+        material = int(model.geom_matid[geom])
+        if material >= 0 and model.mat_reflectance[material] > 0:
+            return int(geom)
+    return -1
 
 
 def read_lamps(model: mujoco.MjModel, com_link: int) -> dict[str, Lamp]:
