@@ -20,6 +20,10 @@ from pixelbrax_jax.types import Lamp, Look
 _MOST_CELLS = 198
 """Cells of a plane along an axis, without those at its ends (``mjMAXPLANEGRID - 2``)."""
 
+_BLUR = 1.3
+"""Pixels in the edge of the square whose mean is nearest to what OpenGL's mipmaps show of a
+checker, measured with MuJoCo's floors."""
+
 _TINY = 1e-6
 
 Light = Callable[[Vector, Vector, Vector], tuple[Any, Any]]
@@ -80,6 +84,16 @@ def _gloss(look: Look, ray: Vector, normal: Vector, to_light: Vector) -> Any:
     inv_length = jax.lax.rsqrt(at_least(2.0 - 2.0 * dot(ray, to_light), _TINY))
     cosine = at_least((n_l - dot(normal, ray)) * inv_length, 0.0)
     return jnp.where(n_l > 0.0, cosine**look.shininess, 0.0)
+
+
+def footprint(right: Vector, above: Vector) -> Any:
+    """Return the width of the square of a texture that OpenGL shows in a pixel.
+
+    The arguments are a texture's coordinates (2) of one pixel to the right and of one above. The
+    level of a mipmap follows from the longer one alone.
+    """
+    squares = [x * x + y * y for x, y in (right, above)]
+    return _BLUR * jnp.sqrt(at_least(at_least(squares[0], squares[1]), _TINY**2))
 
 
 def on_texture(factors: tuple[Any, Any]) -> Any:

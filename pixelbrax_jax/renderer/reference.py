@@ -357,10 +357,14 @@ def _ground_color(scene: Scene, g: int, rays: jax.Array, height: int) -> jax.Arr
     down = jnp.minimum(d[..., 2], -1e-7)
     s = -o[2] / down
     footprint = jnp.zeros((*s.shape, 2))
+    steps = []
     for axis in (camera.xmat[:, 0], camera.xmat[:, 1]):
         turn = (axis * pixel) @ xmat
         moved = s[..., None] * (turn[:2] - d[..., :2] * (turn[2] / down)[..., None])
         footprint += jnp.abs(moved)
+        steps.append((moved[..., 0], moved[..., 1]))
+    if look.opengl:
+        footprint = jnp.broadcast_to(opengl.footprint(*steps)[..., None], footprint.shape)
     coords = o[:2] + s[..., None] * d[..., :2]
     if scene.geoms.is_bounded(g):
         # MuJoCo's textures start at the corner of least x and largest y.

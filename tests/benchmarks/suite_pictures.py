@@ -4,15 +4,16 @@
 
 draws both with the same states, 84 x 84 pixels and each task's usual camera, and writes
 docs/images/dmc/beside.png, the suite's on the left, and docs/dmc/pictures.json: mean absolute
-differences of color in units of 1/255, of all pixels, of the sky, the ground and all else. It needs
-the package ``dm_control`` and a library of EGL (Debian's ``libegl1``); ``MUJOCO_GL=osmesa`` draws
-the same with ``libosmesa6``.
+differences of color in units of 1/255, of all pixels, of the sky, the ground and all else, with one
+ray per pixel and with four. It needs the package ``dm_control`` and a library of EGL (Debian's
+``libegl1``); ``MUJOCO_GL=osmesa`` draws the same with ``libosmesa6``.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -46,8 +47,8 @@ def pictures(domain: str, task: str, camera: int, movable: tuple[str, ...]) -> d
     """Draw states of an episode of random actions.
 
     Returns:
-        Lists of ``theirs`` and ``ours``, (84, 84, 3) uint8, and of ``area``, (84, 84) int: 0 sky,
-        1 ground, 2 else.
+        Lists of ``theirs``, ``ours`` and ``smooth`` with four samples, (84, 84, 3) uint8, and of
+        ``area``, (84, 84) int: 0 sky, 1 ground, 2 else.
     """
     from dm_control import suite
 
@@ -56,22 +57,24 @@ def pictures(domain: str, task: str, camera: int, movable: tuple[str, ...]) -> d
     physics, rng = environment.physics, np.random.default_rng(1)
     own = suite_models.of(domain, physics.model.ptr, camera, movable)
     scene = own.scene
-    pixel = 2.0 * np.tan(np.deg2rad(scene.rig.fovy) / 2.0) / SIZE
-    look = detailed(own.model, scene.look, float(pixel))
+    slope = 2.0 * float(np.tan(np.deg2rad(scene.rig.fovy) / 2.0))
 
-    @jax.jit
-    def draw(xpos: jax.Array, xquat: jax.Array) -> Frame:
-        return render(place(scene.geoms, scene.rig, look, xpos, xquat), SIZE, SIZE)
+    @partial(jax.jit, static_argnums=2)
+    def draw(xpos: jax.Array, xquat: jax.Array, times: int) -> Frame:
+        look = detailed(own.model, scene.look, slope / (SIZE * times))
+        placed = place(scene.geoms, scene.rig, look, xpos, xquat)
+        return render(placed, SIZE, SIZE, samples=times**2)
 
-    drawn: dict[str, list] = {"theirs": [], "ours": [], "area": []}
+    drawn: dict[str, list] = {"theirs": [], "ours": [], "smooth": [], "area": []}
     for state in range(STATES):
         if state:
             for _ in range(20):
                 environment.step(rng.uniform(-1, 1, environment.action_spec().shape))
         mujoco.mj_forward(physics.model.ptr, physics.data.ptr)
-        frame = draw(*own.links(physics.data.ptr))
-        image = np.stack([frame.r, frame.g, frame.b], axis=-1)
-        drawn["ours"].append(np.floor(image * 255 + 0.5).astype(np.uint8))
+        for name, times in (("smooth", 2), ("ours", 1)):
+            frame = draw(*own.links(physics.data.ptr), times)
+            image = np.stack([frame.r, frame.g, frame.b], axis=-1)
+            drawn[name].append(np.floor(image * 255 + 0.5).astype(np.uint8))
         drawn["theirs"].append(physics.render(SIZE, SIZE, camera_id=camera))
         seen, ground = np.asarray(frame.seg) >= 0, np.asarray(frame.ground)
         drawn["area"].append(np.where(ground, 1, np.where(seen, 2, 0)))
@@ -79,9 +82,9 @@ def pictures(domain: str, task: str, camera: int, movable: tuple[str, ...]) -> d
     return drawn
 
 
-def differences(drawn: dict[str, list]) -> dict[str, float | None]:
+def differences(drawn: dict[str, list], side: str = "ours") -> dict[str, float | None]:
     """Return mean absolute differences by area, in units of 1/255; None where there is none."""
-    ours, theirs = (np.stack(drawn[side]).astype(int) for side in ("ours", "theirs"))
+    ours, theirs = (np.stack(drawn[images]).astype(int) for images in (side, "theirs"))
     difference, area = np.abs(ours - theirs).mean(axis=-1), np.stack(drawn["area"])
     masks = {"all": area >= 0, "sky": area == 0, "ground": area == 1, "else": area == 2}
     return {
@@ -109,10 +112,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("cases", nargs="*", default=list(CASES), metavar="case")
     chosen = parser.parse_args().cases
-    report, pairs = {}, {}
+    report, smooth, pairs = {}, {}, {}
     for name in chosen:
         drawn = pictures(*CASES[name])
-        report[name] = differences(drawn)
+        report[name], smooth[name] = differences(drawn), differences(drawn, "smooth")
+        print(f"{name:24} {report[name]} with four samples {smooth[name]}", flush=True)
         gap = np.full((SIZE, 2, 3), 255, np.uint8)
         pairs[name] = np.concatenate([drawn["theirs"][1], gap, drawn["ours"][1]], axis=1)
     if set(chosen) == set(CASES):
@@ -124,6 +128,7 @@ def main() -> None:
             "pixels": SIZE,
             "states": STATES,
             "mean_absolute_difference_of_255": report,
+            "with_four_samples": smooth,
         }
         text = json.dumps(kept, indent=2) + "\n"
         (DOCS / "dmc" / "pictures.json").write_text(text, "utf-8")
