@@ -28,7 +28,7 @@ _PLATFORMS = {"cpu": "cpu", "gpu": "gpu", "cuda": "gpu", "rocm": "gpu", "tpu": "
 
 _MOST_INTERSECTIONS = 50
 """Largest number of intersections per pixel (geoms and planes of meshes, times rays: one to the
-camera, one to its mirror image and one to each lamp) that XLA's newer emitters still compile to one fast loop."""
+camera and one to each lamp) that XLA's newer emitters still compile to one fast loop."""
 
 
 def compiler_options(env: Any = None, platform: str | None = None) -> dict[str, Any]:
@@ -112,7 +112,6 @@ def _options(physics: Any, platform: str | None = None) -> dict[str, Any]:
         if physics is not None:
             chosen |= physics.compiler_options
             rays = 1 + len(physics.look.lamps if physics.look else ())
-            rays += physics.default_look == "dmc" and physics.geoms.mirror >= 0
             shapes = len(physics.geoms.kind) + sum(physics.geoms.num_planes)
             if shapes * rays > _MOST_INTERSECTIONS:
                 # The newer ones split long loops and compute shared values again in each part:

@@ -77,9 +77,8 @@ def test_scenes_of_many_geoms_have_the_older_emitters(monkeypatch):
     for geoms, lamps, expected in ((50, 0, None), (51, 0, False), (25, 1, None), (26, 1, False)):
         physics = SimpleNamespace(
             compiler_options={},
-            geoms=SimpleNamespace(kind=(GeomKind.SPHERE,) * geoms, num_planes=(), mirror=-1),
+            geoms=SimpleNamespace(kind=(GeomKind.SPHERE,) * geoms, num_planes=()),
             look=SimpleNamespace(lamps=(None,) * lamps),
-            default_look="dmc",
         )
         options = compilation._options(physics)
         assert options.get("xla_cpu_use_fusion_emitters") is expected

@@ -140,7 +140,8 @@ def _look(config: EnvConfig, physics: Physics, fovy: float) -> Look:
         name = physics.default_look if look == "default" else look
         if name == "dmc":
             rays = config.height * math.isqrt(config.samples)
-            look = _detailed(physics, 2.0 * math.tan(math.radians(fovy) / 2.0) / rays)
+            pixel = 2.0 * math.tan(math.radians(fovy) / 2.0) / rays
+            look = _detailed(physics, pixel) or look
         elif name == "dmc-plain":
             look = physics.look
     return make_look(look, shadows=config.shadows)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pixelbrax_jax.flags import under_default_flags
-from pixelbrax_jax.renderer import choice, fused, reference
+from pixelbrax_jax.renderer import choice, fused, reference, shading
 from pixelbrax_jax.types import Frame, Scene
 from pixelbrax_jax.validation import check_choice
 
@@ -73,8 +73,8 @@ def render(
         first_row: () int, may be traced: first row of the band to render.
         num_rows: rows of the band; None renders all rows.
         samples: rays per pixel, one of ``SAMPLES``: those of an image that is larger by its root.
-            Colors are their means; depth, ``seg`` and ``ground`` are those of the ray next to the
-            pixel's center.
+            Colors are their means, each rounded to 10 bits; depth, ``seg`` and ``ground`` are those
+            of the ray next to the pixel's center.
 
     Returns:
         The frame, or its band of rows.
@@ -166,21 +166,20 @@ def draw(
 
 def _shrunk(frame: Frame, times: int) -> Frame:
     """Return an image whose pixels are ``times`` by ``times`` pixels of the given one."""
-    # The barrier keeps XLA from rendering again for each channel and sample.
-    frame = jax.lax.optimization_barrier(frame)
 
     def sample(plane: jax.Array, row: int, column: int) -> jax.Array:
         return plane[row::times, column::times]
 
-    def mean(plane: jax.Array) -> jax.Array:
-        places = [(row, column) for row in range(times) for column in range(times)]
-        return sum(sample(plane, *place) for place in places) / len(places)
-
+    places = [(row, column) for row in range(times) for column in range(times)]
+    colors = [
+        sum([sample(plane, *place) for place in places], jnp.zeros(())) / len(places)
+        for plane in shading.computed_apart([frame.r, frame.g, frame.b])
+    ]
     middle = times // 2
     return Frame(
-        r=mean(frame.r),
-        g=mean(frame.g),
-        b=mean(frame.b),
+        r=colors[0],
+        g=colors[1],
+        b=colors[2],
         depth=sample(frame.depth, middle, middle),
         seg=sample(frame.seg, middle, middle),
         ground=sample(frame.ground, middle, middle),

@@ -145,8 +145,11 @@ def see(
     rise = dot(ray, vector(view.up))
     reflected: list[jax.Array] = []
     if view.mirrored is not None:
-        here, found = seen[geoms.mirror], reflection(view, ray, t, in_kernel=near is not None)
-        reflected = [jnp.where(here, channel, 0.0) for channel in found]
+        way = hit(geoms.mirror).t
+        found = reflection(view, ray, way, in_kernel=near is not None)
+        if near is None:
+            found = shading.computed_apart(found)
+        reflected = [jnp.where(seen[geoms.mirror], channel, 0.0) for channel in found]
 
     def front(c: int) -> jax.Array:
         own = color[c] * shade + highlight

@@ -73,7 +73,7 @@ def beam_of(lamp: Lamp, point: Vector) -> tuple[Vector, Any, Any]:
     away = [p - lamp.pos[k] for k, p in enumerate(point)]
     inv_distance = jax.lax.rsqrt(at_least(dot(away, away), _TINY))
     beam = tuple(component * inv_distance for component in away)
-    along = dot(beam, lamp.axis)
+    along = dot(beam, (lamp.axis[0], lamp.axis[1], lamp.axis[2]))
     strength = jnp.where(along >= lamp.cos_cutoff, at_least(along, 0.0) ** lamp.exponent, 0.0)
     return beam, inv_distance, strength
 

@@ -159,6 +159,7 @@ def _reflection(scene: Scene, rays: jax.Array, until: jax.Array) -> jax.Array:
     The mirror is passed by rays of a mirrored camera; see ``mirror.py``.
     """
     geoms, look, camera = scene.geoms, scene.look, scene.camera
+    reflectance = jnp.asarray(look.reflectance)
     base, axis = scene.pos[geoms.mirror], scene.xmat[geoms.mirror][:, 2]
     eye = camera.pos - 2.0 * ((camera.pos - base) @ axis) * axis
     rays = rays - 2.0 * (rays @ axis)[..., None] * axis
@@ -177,7 +178,7 @@ def _reflection(scene: Scene, rays: jax.Array, until: jax.Array) -> jax.Array:
         if geoms.textured and geoms.textured[g]:
             highlight = 0.0
         shade, highlight = (jnp.broadcast_to(x, t.shape)[..., None] for x in (shade, highlight))
-        color = look.reflectance * jnp.asarray(geoms.rgb)[geoms.material[g]]
+        color = reflectance * jnp.asarray(geoms.rgb)[geoms.material[g]]
         seen = jnp.clip(color * shade + highlight, 0.0, 1.0)
         found = jnp.where(first[..., None], seen, found)
         nearest = jnp.where(first, t, nearest)

@@ -44,6 +44,23 @@ def beam(lamp: Lamp, pos: Vector, axis: Vector, points: Vector) -> tuple[Vector,
     return ray, inv_distance, strength
 
 
+@jax.custom_jvp
+def computed_apart(channels: list[jax.Array]) -> list[jax.Array]:
+    """Return three colors in [0, 1], rounded to 10 bits, from an array that XLA computes by itself.
+
+    A loop over pixels that is too long compiles slowly, and XLA then computes values in it again;
+    so it does for each of several results. The derivative does not round.
+    """
+    levels = [(channel * 1023.0 + 0.5).astype(jnp.uint32) for channel in channels]
+    word = jax.lax.optimization_barrier(levels[0] | levels[1] << 10 | levels[2] << 20)
+    return [((word >> 10 * c) & 1023).astype(jnp.float32) / 1023.0 for c in range(3)]
+
+
+@computed_apart.defjvp
+def _computed_apart_jvp(primals: tuple, tangents: tuple) -> tuple[list, list]:
+    return computed_apart(*primals), tangents[0]
+
+
 def sky(look: Look, rise: jax.Array, channel: int) -> jax.Array:
     """Return one channel of the sky's color for the z component of unit rays in the world frame."""
     horizon, above, *below = (look.sky[row, channel] for row in range(look.sky.shape[0]))

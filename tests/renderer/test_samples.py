@@ -27,7 +27,7 @@ def test_colors_are_means_of_a_larger_image(renderer, times):
     small = render(SCENE, HEIGHT, WIDTH, renderer, samples=times**2)
     large = render(SCENE, HEIGHT * times, WIDTH * times, renderer)
     means = rgb(large).reshape(HEIGHT, times, WIDTH, times, 3).mean((1, 3))
-    np.testing.assert_allclose(rgb(small), means, atol=1e-6)
+    np.testing.assert_allclose(rgb(small), means, atol=6e-4)  # 10 bits
     middle = np.s_[times // 2 :: times, times // 2 :: times]
     for name in ("depth", "seg", "ground"):
         np.testing.assert_array_equal(getattr(small, name), getattr(large, name)[middle])
@@ -39,7 +39,7 @@ def test_colors_are_means_of_a_larger_image(renderer, times):
 def test_bands_and_packed_images_have_samples_too():
     whole = render(SCENE, HEIGHT, WIDTH, "fused", samples=4)
     band = render(SCENE, HEIGHT, WIDTH, "fused", first_row=3, num_rows=2, samples=4)
-    np.testing.assert_allclose(band.r, whole.r[3:5], atol=1e-6)
+    np.testing.assert_allclose(band.r, whole.r[3:5], atol=1e-3)
     packed = draw(SCENE, HEIGHT, WIDTH, "fused", lambda frame, rows: frame, 4)
     levels = [np.asarray(image).view(np.uint8).astype(int) for image in (packed, pack(whole))]
     assert np.abs(levels[0] - levels[1]).max() <= 1

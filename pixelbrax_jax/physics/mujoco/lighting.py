@@ -67,11 +67,12 @@ def read_look(model: mujoco.MjModel) -> Look:
     )
 
 
-def detailed(model: mujoco.MjModel, look: Look, pixel: float) -> Look:
+def detailed(model: mujoco.MjModel, look: Look | None, pixel: float) -> Look:
     """Return a look of ``read_look`` with all that MuJoCo's renderer draws.
 
     ``pixel`` is the edge of a pixel at distance 1.
     """
+    look = read_look(model) if look is None else look
     headlight = model.vis.headlight
     mirror = mirror_of(model)
     shines = bool(headlight.active and headlight.specular.any())
@@ -80,7 +81,7 @@ def detailed(model: mujoco.MjModel, look: Look, pixel: float) -> Look:
         shininess=_EXPONENT,
         headlight_highlight=f32(_SPECULAR * headlight.specular.mean()) if shines else None,
         reflectance=f32(model.mat_reflectance[model.geom_matid[mirror]]) if mirror >= 0 else None,
-        sky_texture=sky_texture(model, look.sky, pixel),
+        sky_texture=sky_texture(model, np.asarray(look.sky), pixel),
     )
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
@@ -10,7 +12,7 @@ from pixelbrax_jax.spatial import f32
 _SKYBOX = int(mujoco.mjtTexture.mjTEXTURE_SKYBOX)
 
 
-def sky_colors(model: mujoco.MjModel) -> np.ndarray:
+def sky_colors(model: mujoco.MjModel) -> Any:
     """Return (3, 3), colors at the horizon, above and below that fit the sky's texture best."""
     texture = _texture(model)
     if texture < 0:
