@@ -135,7 +135,7 @@ def see(
     normal, light = (*n_xy, n_z), _phong_light
     matte = on_ground
     if look.opengl:
-        light = _opengl_light
+        light = partial(_opengl_light, in_kernel=near is not None)
         for g in view.order:
             if geoms.textured and geoms.textured[g]:
                 matte |= seen[g]
@@ -259,7 +259,7 @@ def _phong_light(look: Look, surface: _Surface, ways: Ways) -> tuple[Any, Any]:
     return shade, highlight
 
 
-def _opengl_light(look: Look, surface: _Surface, ways: Ways) -> tuple[Any, Any]:
+def _opengl_light(look: Look, surface: _Surface, ways: Ways, *, in_kernel: bool) -> tuple[Any, Any]:
     """Return the same with OpenGL's formulas; see ``opengl.py``."""
     ray, points, normal, to_light, _, on_ground, matte, grounds = surface
     lights = opengl.lights_of(look, (0.0, 0.0, 1.0))
@@ -268,6 +268,8 @@ def _opengl_light(look: Look, surface: _Surface, ways: Ways) -> tuple[Any, Any]:
     for here, plane, place in grounds:
         eye = (0.0, 0.0, 0.0)
         found = opengl.on_plane(lights, eye, plane.center, plane.axes, plane.size, place)
+        if not in_kernel:
+            found = shading.computed_apart(found)
         textures = [jnp.where(here, *pair) for pair in zip(found, textures, strict=True)]
     lit: list[Any] = [True] * len(lights)
     if to_light is not None:

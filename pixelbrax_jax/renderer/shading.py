@@ -46,14 +46,23 @@ def beam(lamp: Lamp, pos: Vector, axis: Vector, points: Vector) -> tuple[Vector,
 
 @jax.custom_jvp
 def computed_apart(channels: list[jax.Array]) -> list[jax.Array]:
-    """Return three colors in [0, 1], rounded to 10 bits, from an array that XLA computes by itself.
+    """Return values in [0, 1], rounded to 10 bits, from arrays that XLA computes in other loops.
 
     A loop over pixels that is too long compiles slowly, and XLA then computes values in it again;
-    so it does for each of several results. The derivative does not round.
+    so it does for each of several results. Three values share a word. The derivative does not
+    round.
     """
     levels = [(channel * 1023.0 + 0.5).astype(jnp.uint32) for channel in channels]
-    word = jax.lax.optimization_barrier(levels[0] | levels[1] << 10 | levels[2] << 20)
-    return [((word >> 10 * c) & 1023).astype(jnp.float32) / 1023.0 for c in range(3)]
+    words = []
+    for first in range(0, len(levels), 3):
+        word = levels[first]
+        for k, level in enumerate(levels[first + 1 : first + 3], 1):
+            word |= level << 10 * k
+        words.append(jax.lax.optimization_barrier(word))
+    return [
+        ((words[k // 3] >> 10 * (k % 3)) & 1023).astype(jnp.float32) / 1023.0
+        for k in range(len(levels))
+    ]
 
 
 @computed_apart.defjvp
