@@ -74,7 +74,7 @@ def render(
         num_rows: rows of the band; None renders all rows.
         samples: rays per pixel, one of ``SAMPLES``: those of an image that is larger by its root.
             Colors are their means, each rounded to 10 bits; depth, ``seg`` and ``ground`` are those
-            of the ray next to the pixel's center.
+            of the ray through the pixel's center.
 
     Returns:
         The frame, or its band of rows.
@@ -89,11 +89,9 @@ def render(
     rows = height if num_rows is None else num_rows
     first_row = jnp.asarray(first_row, jnp.int32)
     if (times := math.isqrt(check_samples(samples))) > 1:
-        first, num = first_row * times, rows * times
-        large = render(
-            scene, height * times, width * times, renderer, first_row=first, num_rows=num
-        )
-        return _shrunk(large, times)
+        frame = render(scene, height, width, renderer, first_row=first_row, num_rows=num_rows)
+        r, g, b = _means(scene, first_row, height, width, rows, renderer, times)
+        return frame.replace(r=r, g=g, b=b)
     if check_renderer(renderer) == "reference":
         return reference.render(scene, height, width, first_row, rows)
     return _fast(scene, first_row, height, width, rows, renderer)
@@ -164,26 +162,53 @@ def draw(
     return image
 
 
-def _shrunk(frame: Frame, times: int) -> Frame:
-    """Return an image whose pixels are ``times`` by ``times`` pixels of the given one."""
+@partial(jax.custom_jvp, nondiff_argnums=(2, 3, 4, 5, 6))
+def _means(
+    scene: Scene,
+    first_row: jax.Array,
+    height: int,
+    width: int,
+    num_rows: int,
+    renderer: str,
+    times: int,
+) -> list[jax.Array]:
+    """Return red, green and blue of a band of rows, means over ``times`` by ``times`` rays."""
 
-    def sample(plane: jax.Array, row: int, column: int) -> jax.Array:
-        return plane[row::times, column::times]
+    def large() -> list[jax.Array]:
+        rows, size = num_rows * times, (height * times, width * times)
+        frame = render(scene, *size, renderer, first_row=first_row * times, num_rows=rows)
+        return [frame.r, frame.g, frame.b]
 
+    return [_shrunk(plane, times) for plane in shading.computed_apart(large)]
+
+
+@_means.defjvp
+@under_default_flags
+def _means_jvp(
+    height: int,
+    width: int,
+    num_rows: int,
+    renderer: str,
+    times: int,
+    primals: tuple,
+    tangents: tuple,
+) -> tuple[list[jax.Array], list[jax.Array]]:
+    scene, first_row = primals
+
+    def colors(scene: Scene) -> list[jax.Array]:
+        size = (height * times, width * times)
+        frame = reference.render(scene, *size, first_row * times, num_rows * times)
+        return [_shrunk(plane, times) for plane in (frame.r, frame.g, frame.b)]
+
+    _, tangent = jax.jvp(colors, (scene,), tangents[:1])
+    return _means(scene, first_row, height, width, num_rows, renderer, times), tangent
+
+
+def _shrunk(plane: jax.Array, times: int) -> jax.Array:
+    """Return the means of blocks of ``times`` by ``times`` pixels."""
     places = [(row, column) for row in range(times) for column in range(times)]
-    colors = [
-        sum([sample(plane, *place) for place in places], jnp.zeros(())) / len(places)
-        for plane in shading.computed_apart([frame.r, frame.g, frame.b])
-    ]
-    middle = times // 2
-    return Frame(
-        r=colors[0],
-        g=colors[1],
-        b=colors[2],
-        depth=sample(frame.depth, middle, middle),
-        seg=sample(frame.seg, middle, middle),
-        ground=sample(frame.ground, middle, middle),
-    )
+    total = sum([plane[row::times, column::times] for row, column in places], jnp.zeros(()))
+    return total / len(places)
 
 
 def pack(frame: Frame) -> jax.Array:

@@ -146,9 +146,8 @@ def see(
     reflected: list[jax.Array] = []
     if view.mirrored is not None:
         way = hit(geoms.mirror).t
-        found = reflection(view, ray, way, in_kernel=near is not None)
-        if near is None:
-            found = shading.computed_apart(found)
+        image = partial(reflection, view, ray, way, in_kernel=near is not None)
+        found = shading.computed_apart(image) if near is None else image()
         reflected = [jnp.where(seen[geoms.mirror], channel, 0.0) for channel in found]
 
     def front(c: int) -> jax.Array:
@@ -267,9 +266,8 @@ def _opengl_light(look: Look, surface: _Surface, ways: Ways, *, in_kernel: bool)
     textures = [opengl.on_texture(pair) for pair in factors]
     for here, plane, place in grounds:
         eye = (0.0, 0.0, 0.0)
-        found = opengl.on_plane(lights, eye, plane.center, plane.axes, plane.size, place)
-        if not in_kernel:
-            found = shading.computed_apart(found)
+        image = partial(opengl.on_plane, lights, eye, plane.center, plane.axes, plane.size, place)
+        found = image() if in_kernel else shading.computed_apart(image)
         textures = [jnp.where(here, *pair) for pair in zip(found, textures, strict=True)]
     lit: list[Any] = [True] * len(lights)
     if to_light is not None:

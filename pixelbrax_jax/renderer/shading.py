@@ -44,30 +44,38 @@ def beam(lamp: Lamp, pos: Vector, axis: Vector, points: Vector) -> tuple[Vector,
     return ray, inv_distance, strength
 
 
-@jax.custom_jvp
-def computed_apart(channels: list[jax.Array]) -> list[jax.Array]:
-    """Return values in [0, 1], rounded to 10 bits, from arrays that XLA computes in other loops.
+def computed_apart(compute: Callable[[], list[jax.Array]]) -> list[jax.Array]:
+    """Return values in [0, 1], rounded to 10 bits, that XLA computes in other loops than the rest.
 
     A loop over pixels that is too long compiles slowly, and XLA then computes values in it again;
-    so it does for each of several results. Three values share a word. The derivative does not
-    round.
+    so it does for each of several results. Hence three values share a word. On a CPU, XLA fuses
+    across barriers but not across conditionals. There is no derivative.
     """
-    levels = [(channel * 1023.0 + 0.5).astype(jnp.uint32) for channel in channels]
-    words = []
-    for first in range(0, len(levels), 3):
-        word = levels[first]
-        for k, level in enumerate(levels[first + 1 : first + 3], 1):
-            word |= level << 10 * k
-        words.append(jax.lax.optimization_barrier(word))
+    number = len(jax.eval_shape(compute))
+
+    def words() -> list[jax.Array]:
+        levels = [(value * 1023.0 + 0.5).astype(jnp.uint32) for value in compute()]
+        packed = []
+        for first in range(0, number, 3):
+            word = levels[first]
+            for k, level in enumerate(levels[first + 1 : first + 3], 1):
+                word |= level << 10 * k
+            packed.append(word)
+        return packed
+
+    def in_a_conditional() -> list[jax.Array]:
+        zero = jax.lax.optimization_barrier(jnp.int32(0))
+        blank = [jnp.zeros(word.shape, word.dtype) for word in jax.eval_shape(words)]
+        taken: list[jax.Array] = jax.lax.cond(zero == 0, words, lambda: blank)
+        return taken
+
+    def behind_a_barrier() -> list[jax.Array]:
+        return list(jax.lax.optimization_barrier(words()))
+
+    found = jax.lax.platform_dependent(cpu=in_a_conditional, default=behind_a_barrier)
     return [
-        ((words[k // 3] >> 10 * (k % 3)) & 1023).astype(jnp.float32) / 1023.0
-        for k in range(len(levels))
+        ((found[k // 3] >> 10 * (k % 3)) & 1023).astype(jnp.float32) / 1023.0 for k in range(number)
     ]
-
-
-@computed_apart.defjvp
-def _computed_apart_jvp(primals: tuple, tangents: tuple) -> tuple[list, list]:
-    return computed_apart(*primals), tangents[0]
 
 
 def sky(look: Look, rise: jax.Array, channel: int) -> jax.Array:
