@@ -4,8 +4,8 @@
 
 draws both with the same states, 84 x 84 pixels and each task's usual camera, and writes
 docs/images/dmc/beside.png, the suite's on the left, and docs/dmc/pictures.json: mean absolute
-differences of color in units of 1/255, of all pixels, of the sky, the ground and all else, with one
-ray per pixel and with four. It needs the package ``dm_control`` and a library of EGL (Debian's
+differences of color in units of 1/255, of all pixels, of the sky, the ground and all else, with the
+rays per pixel of ``--samples``. It needs the package ``dm_control`` and a library of EGL (Debian's
 ``libegl1``); ``MUJOCO_GL=osmesa`` draws the same with ``libosmesa6``.
 """
 
@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from functools import partial
+import math
 from pathlib import Path
 
 import jax
@@ -43,12 +43,14 @@ CASES = {
 """What is shown: domain, task, camera, and what moves by an edit of the model."""
 
 
-def pictures(domain: str, task: str, camera: int, movable: tuple[str, ...]) -> dict[str, list]:
+def pictures(
+    domain: str, task: str, camera: int, movable: tuple[str, ...], samples: int = 1
+) -> dict[str, list]:
     """Draw states of an episode of random actions.
 
     Returns:
-        Lists of ``theirs``, ``ours`` and ``smooth`` with four samples, (84, 84, 3) uint8, and of
-        ``area``, (84, 84) int: 0 sky, 1 ground, 2 else.
+        Lists of ``theirs`` and ``ours``, (84, 84, 3) uint8, and of ``area``, (84, 84) int: 0 sky,
+        1 ground, 2 else.
     """
     from dm_control import suite
 
@@ -57,24 +59,23 @@ def pictures(domain: str, task: str, camera: int, movable: tuple[str, ...]) -> d
     physics, rng = environment.physics, np.random.default_rng(1)
     own = suite_models.of(domain, physics.model.ptr, camera, movable)
     scene = own.scene
-    slope = 2.0 * float(np.tan(np.deg2rad(scene.rig.fovy) / 2.0))
+    pixel = 2.0 * float(np.tan(np.deg2rad(scene.rig.fovy) / 2.0)) / (SIZE * math.isqrt(samples))
+    look = detailed(own.model, scene.look, pixel)
 
-    @partial(jax.jit, static_argnums=2)
-    def draw(xpos: jax.Array, xquat: jax.Array, times: int) -> Frame:
-        look = detailed(own.model, scene.look, slope / (SIZE * times))
+    @jax.jit
+    def draw(xpos: jax.Array, xquat: jax.Array) -> Frame:
         placed = place(scene.geoms, scene.rig, look, xpos, xquat)
-        return render(placed, SIZE, SIZE, samples=times**2)
+        return render(placed, SIZE, SIZE, samples=samples)
 
-    drawn: dict[str, list] = {"theirs": [], "ours": [], "smooth": [], "area": []}
+    drawn: dict[str, list] = {"theirs": [], "ours": [], "area": []}
     for state in range(STATES):
         if state:
             for _ in range(20):
                 environment.step(rng.uniform(-1, 1, environment.action_spec().shape))
         mujoco.mj_forward(physics.model.ptr, physics.data.ptr)
-        for name, times in (("smooth", 2), ("ours", 1)):
-            frame = draw(*own.links(physics.data.ptr), times)
-            image = np.stack([frame.r, frame.g, frame.b], axis=-1)
-            drawn[name].append(np.floor(image * 255 + 0.5).astype(np.uint8))
+        frame = draw(*own.links(physics.data.ptr))
+        image = np.stack([frame.r, frame.g, frame.b], axis=-1)
+        drawn["ours"].append(np.floor(image * 255 + 0.5).astype(np.uint8))
         drawn["theirs"].append(physics.render(SIZE, SIZE, camera_id=camera))
         seen, ground = np.asarray(frame.seg) >= 0, np.asarray(frame.ground)
         drawn["area"].append(np.where(ground, 1, np.where(seen, 2, 0)))
@@ -82,9 +83,9 @@ def pictures(domain: str, task: str, camera: int, movable: tuple[str, ...]) -> d
     return drawn
 
 
-def differences(drawn: dict[str, list], side: str = "ours") -> dict[str, float | None]:
+def differences(drawn: dict[str, list]) -> dict[str, float | None]:
     """Return mean absolute differences by area, in units of 1/255; None where there is none."""
-    ours, theirs = (np.stack(drawn[images]).astype(int) for images in (side, "theirs"))
+    ours, theirs = (np.stack(drawn[side]).astype(int) for side in ("ours", "theirs"))
     difference, area = np.abs(ours - theirs).mean(axis=-1), np.stack(drawn["area"])
     masks = {"all": area >= 0, "sky": area == 0, "ground": area == 1, "else": area == 2}
     return {
@@ -111,12 +112,14 @@ def main() -> None:
     """Compare some models, or all; files are written for all."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("cases", nargs="*", default=list(CASES), metavar="case")
-    chosen = parser.parse_args().cases
-    report, smooth, pairs = {}, {}, {}
+    parser.add_argument("--samples", type=int, default=1, help="rays per pixel")
+    options = parser.parse_args()
+    chosen = options.cases
+    report, pairs = {}, {}
     for name in chosen:
-        drawn = pictures(*CASES[name])
-        report[name], smooth[name] = differences(drawn), differences(drawn, "smooth")
-        print(f"{name:24} {report[name]} with four samples {smooth[name]}", flush=True)
+        drawn = pictures(*CASES[name], options.samples)
+        report[name] = differences(drawn)
+        print(f"{name:24} {report[name]}", flush=True)
         gap = np.full((SIZE, 2, 3), 255, np.uint8)
         pairs[name] = np.concatenate([drawn["theirs"][1], gap, drawn["ours"][1]], axis=1)
     if set(chosen) == set(CASES):
@@ -127,8 +130,8 @@ def main() -> None:
             "mujoco": mujoco.__version__,
             "pixels": SIZE,
             "states": STATES,
+            "samples": options.samples,
             "mean_absolute_difference_of_255": report,
-            "with_four_samples": smooth,
         }
         text = json.dumps(kept, indent=2) + "\n"
         (DOCS / "dmc" / "pictures.json").write_text(text, "utf-8")
