@@ -297,7 +297,7 @@ def _ground_fraction(
     slope = 1.0 / at_most(dot(ray, normal), -1e-7)
     inv_pitch = 1.0 / view.look.ground_pitch
     step = -t * ray[2] * view.pixel * inv_pitch
-    place, coords, widths, rights, aboves = [], [], [], [], []
+    place, coords, widths, across, upward = [], [], [], [], []
     for number, (axis, half) in enumerate(zip(plane.axes[:2], plane.size[:2], strict=True)):
         ray_axis = dot(ray, axis)
         along = t * ray_axis - dot(plane.center, axis)
@@ -310,8 +310,8 @@ def _ground_fraction(
         right = axis[0] - ray_axis * slope * normal[0]
         above = axis[1] - ray_axis * slope * normal[1]
         widths.append(step * (jnp.abs(right) + jnp.abs(above)))
-        rights.append(right)
-        aboves.append(above)
+        across.append(right)
+        upward.append(above)
     if view.look.opengl:
-        widths = [step * opengl.footprint(rights, aboves)] * 2
+        widths = [step * opengl.footprint(across, upward)] * 2
     return shading.second_color_fraction(view.look.ground, *coords, *widths), place
