@@ -17,7 +17,7 @@ from pixelbrax_jax.physics.brax.tasks import BraxOptions
 from pixelbrax_jax.physics.mujoco.options import MujocoOptions
 from pixelbrax_jax.plain import from_plain
 from pixelbrax_jax.ranges import Ranges, check_ranges
-from pixelbrax_jax.renderer.base import check_renderer
+from pixelbrax_jax.renderer.base import check_renderer, check_samples
 from pixelbrax_jax.scene.look import make_look
 from pixelbrax_jax.types import Camera, CameraRig, Look
 from pixelbrax_jax.validation import check_bool, check_options, check_positive_int
@@ -50,6 +50,9 @@ class ProgramConfig:
     """``auto`` chooses the fastest renderer for the device, ``fused`` runs on all devices,
     ``pallas`` is a kernel for NVIDIA GPUs (``auto`` takes it there if it passes a check), and
     ``reference`` is the slow renderer that the others are tested against."""
+    samples: int = 1
+    """Rays per pixel, whose colors are averaged: 1, 4, 9 or 16. More smooth edges, and take as many
+    times as long to render."""
     distractors: Distractors = ()
     """Changes of the image: a distractor, the name of a preset, or several of them. A dictionary of
     ``plain.to_plain`` may stand for a distractor."""
@@ -59,6 +62,7 @@ class ProgramConfig:
             self._store(name, check_positive_int(name, self._static(name)))
         self._store("obs_mode", check_obs_mode(self._static("obs_mode")))
         check_renderer(self._static("renderer"))
+        self._store("samples", check_samples(self._static("samples")))
         self._store("distractors", as_tuple(from_plain(self.distractors)))
 
     @property
@@ -103,8 +107,9 @@ class EnvConfig(BraxOptions, MujocoOptions, ProgramConfig):
     """Viewpoint: a name of ``named_rigs``, a ``CameraRig`` or a ``Camera``; or a tuple of several,
     whose images are the channels of each frame, one camera after the other."""
     look: str | Look = "default"
-    """Light, sky and ground: ``default``, ``original``, ``dmc`` or a ``Look``. For a task of the DM
-    Control Suite ``default`` is ``dmc`` with the lights of its model."""
+    """Light, sky and ground: ``default``, ``original``, ``dmc``, ``dmc-plain`` or a ``Look``. For a
+    task of MuJoCo the last two have the lights of its model; ``dmc``, the default of the DM Control
+    Suite, also has what only costs time, such as the texture of its sky."""
     shadows: bool | None = None
     """Whether geoms cast shadows. None keeps the choice of the look."""
     episode_length: int = 1000

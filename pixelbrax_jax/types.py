@@ -99,6 +99,9 @@ class Geoms(struct.PyTreeNode):
             no end. Empty if all planes are infinite.
         patterned: (G,) static, planes that are ground and show the look's pattern; other planes
             show their own color. Empty if all planes are ground.
+        textured: (G,) static, geoms whose color is the mean of a texture, which OpenGL dims
+            highlights with. Empty if none is.
+        mirror: static, index of the plane that reflects, -1 for none; see ``Look.reflectance``.
         distant: static, whether the camera is more than a thousand radii of a sphere or capsule
             away, so that float32 needs the longer formulas of ``renderer.intersect``.
         strings: strings, whose capsules are among the geoms.
@@ -121,6 +124,8 @@ class Geoms(struct.PyTreeNode):
     rgb: jax.Array
     bounded: tuple[bool, ...] = struct.field(pytree_node=False, default=())
     patterned: tuple[bool, ...] = struct.field(pytree_node=False, default=())
+    textured: tuple[bool, ...] = struct.field(pytree_node=False, default=())
+    mirror: int = struct.field(pytree_node=False, default=-1)
     distant: bool = struct.field(pytree_node=False, default=False)
     strings: tuple[String, ...] = ()
     num_planes: tuple[int, ...] = struct.field(pytree_node=False, default=())
@@ -258,7 +263,14 @@ class Look(struct.PyTreeNode):
         ground_rgb: (2, 3), colors of the two checker tiles, or of tile and line.
         ground_pitch: (), metres, edge of a tile or distance between lines.
         headlight: (), coefficient of diffuse light from the camera; None for none.
+        headlight_highlight: (), its coefficient of highlights, with ``opengl``; None for none.
         lamps: spot lights.
+        reflectance: (), fraction of the colors that a mirror reflects; None for no reflection.
+        opengl: static, whether light is that of MuJoCo's renderer, see ``renderer.opengl``: the
+            highlight is the half vector's, ``shininess`` is its exponent, and bounded planes that
+            are ground are lit at the vertices of MuJoCo's grid, of half width ``size[2]``.
+        sky_texture: (6, n, n, 3), what a texture adds to the sky's color, which is then clipped to
+            [0, 1]: the faces of a cube map in OpenGL's order, with y up. None for no texture.
     """
 
     ground: str = struct.field(pytree_node=False)
@@ -274,6 +286,10 @@ class Look(struct.PyTreeNode):
     ground_pitch: jax.Array
     headlight: jax.Array | None = None
     lamps: tuple[Lamp, ...] = ()
+    sky_texture: jax.Array | None = None
+    headlight_highlight: jax.Array | None = None
+    reflectance: jax.Array | None = None
+    opengl: bool = struct.field(pytree_node=False, default=False)
 
 
 class Scene(struct.PyTreeNode):
@@ -285,6 +301,8 @@ class Scene(struct.PyTreeNode):
         xmat: (G, 3, 3), geom orientations; columns are the geom's axes.
         camera: the viewpoint.
         look: light, sky and ground.
+        sky_xmat: (3, 3), the camera's orientation for the sky's texture, None for that of the
+            camera. A batch with one orientation reads the texture once for all.
     """
 
     geoms: Geoms
@@ -292,6 +310,7 @@ class Scene(struct.PyTreeNode):
     xmat: jax.Array
     camera: Camera
     look: Look
+    sky_xmat: jax.Array | None = None
 
 
 class Frame(struct.PyTreeNode):

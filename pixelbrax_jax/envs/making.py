@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 import os
 from dataclasses import replace
 from functools import lru_cache
@@ -64,7 +65,8 @@ def make(task: str | EnvConfig, **options: Any) -> tuple[PixelEnv, EnvParams]:
     params = EnvParams(
         geoms=seen_from(physics.geoms, *rigs),
         rig=rigs if len(rigs) > 1 else rigs[0],
-        look=_look(config, physics),
+        # Textures are averaged for the pixels of the first camera.
+        look=_look(config, physics, float(rigs[0].fovy)),
         episode_length=np.int32(min(filter(None, (config.episode_length, physics.time_limit)))),
         dynamics=_dynamics(config, physics),
     )
@@ -134,11 +136,22 @@ def _rig(config: EnvConfig, camera: Any, physics: Physics) -> CameraRig:
     return rig
 
 
-def _look(config: EnvConfig, physics: Physics) -> Look:
+def _look(config: EnvConfig, physics: Physics, fovy: float) -> Look:
     look = config.look
-    if physics.look is not None and look in ("default", "dmc"):
-        look = physics.look
+    if physics.look is not None and isinstance(look, str):
+        name = physics.default_look if look == "default" else look
+        if name == "dmc":
+            rays = config.height * math.isqrt(config.samples)
+            pixel = 2.0 * math.tan(math.radians(fovy) / 2.0) / rays
+            look = _detailed(physics, pixel) or look
+        elif name == "dmc-plain":
+            look = physics.look
     return make_look(look, shadows=config.shadows)
+
+
+@lru_cache(maxsize=16)
+def _detailed(physics: Physics, pixel: float) -> Look | None:
+    return physics.detailed_look(pixel)
 
 
 def _dynamics(config: EnvConfig, physics: Physics) -> DynamicsRanges | None:

@@ -240,7 +240,8 @@ class PixelEnv(ProgramConfig):
         With several cameras, the first one's view.
         """
         height, width = self._size(height, width)
-        frame = render(self._scene(state.sim, params), height, width, self.renderer)
+        scene = self._scene(state.sim, params)
+        frame = render(scene, height, width, self.renderer, samples=self.samples)
         rows, distractor_state = jnp.arange(height), state.sim.distractor_state
         return self.chain.change_frame(distractor_state, params, frame, rows, height, width)
 
@@ -364,7 +365,7 @@ class PixelEnv(ProgramConfig):
         def change(frame: Frame, rows: jax.Array) -> Frame:
             return self.chain.change_frame(sim.distractor_state, params, frame, rows, height, width)
 
-        return draw(scene, height, width, self.renderer, change, images)
+        return draw(scene, height, width, self.renderer, change, images, self.samples)
 
     def blank_frames(self) -> Any:
         """Return frame stacks of zeros; an empty one without images."""

@@ -65,7 +65,9 @@ class Physics(abc.ABC):
         followed_link: the link that a camera follows by default.
         hull_errors: metres by name of a mesh geom: largest distance of the drawn shape from the
             convex hull of the mesh.
-        look: lights, sky and ground of the model, used as looks ``default`` and ``dmc``.
+        look: lights, sky and ground of the model, used as look ``dmc-plain``; see
+            ``detailed_look``.
+        default_look: which look ``default`` means if the model has one, ``dmc`` or ``dmc-plain``.
         batch_last: whether a CPU is faster with the environments as last axis of a batch.
         compiler_options: XLA options for fast programs on a CPU.
     """
@@ -83,6 +85,7 @@ class Physics(abc.ABC):
     followed_link: int = 0
     hull_errors: Mapping[str, float] = MappingProxyType({})
     look: Look | None = None
+    default_look: str = "dmc"
     batch_last: bool = True
     compiler_options: Mapping[str, Any] = MappingProxyType({})
 
@@ -105,6 +108,14 @@ class Physics(abc.ABC):
             ``terminated`` and ``non_finite`` true. A step after a termination continues the
             dynamics.
         """
+
+    def detailed_look(self, pixel: float) -> Look | None:
+        """Return ``look`` with what only look ``dmc`` shows, such as the sky's texture.
+
+        ``pixel`` is the edge of a pixel at distance 1, which textures are averaged for.
+        """
+        del pixel
+        return self.look
 
     def from_qpos(
         self, q: jax.Array, qd: jax.Array | None = None, *, key: jax.Array | None = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import partial
 
@@ -11,11 +12,14 @@ import numpy as np
 
 from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.observations import IMAGES
-from pixelbrax_jax.renderer import choice, fused, reference
+from pixelbrax_jax.renderer import choice, fused, reference, shading
 from pixelbrax_jax.types import Frame, Scene
 from pixelbrax_jax.validation import check_choice
 
 RENDERERS = ("auto", "fused", "pallas", "reference")
+
+SAMPLES = (1, 4, 9, 16)
+"""Allowed numbers of rays per pixel, the squares of 1 to 4."""
 
 _BANDS = 2
 """Bands of rows that an accelerator renders in a loop. XLA would remove a loop of one."""
@@ -32,6 +36,17 @@ def check_renderer(renderer: object) -> str:
     return name
 
 
+def check_samples(samples: object) -> int:
+    """Return ``samples``; raise an error if it is not one of ``SAMPLES``."""
+    if isinstance(samples, bool) or not isinstance(samples, int | np.integer):
+        raise TypeError(f"samples must be an integer, got {samples!r}.")
+    if samples not in SAMPLES:
+        raise ValueError(
+            f"samples must be 1, 4, 9 or 16 (2 x 2, 3 x 3 or 4 x 4 rays per pixel), got {samples}."
+        )
+    return int(samples)
+
+
 @under_default_flags
 def render(
     scene: Scene,
@@ -41,6 +56,7 @@ def render(
     *,
     first_row: jax.Array | int = 0,
     num_rows: int | None = None,
+    samples: int = 1,
 ) -> Frame:
     """Render an image of the scene.
 
@@ -57,18 +73,26 @@ def render(
         renderer: one of ``RENDERERS``; they give the same image. See ``ProgramConfig``.
         first_row: () int, may be traced: first row of the band to render.
         num_rows: rows of the band; None renders all rows.
+        samples: rays per pixel, one of ``SAMPLES``: those of an image that is larger by its root.
+            Colors are their means, each rounded to 10 bits; depth, ``seg`` and ``ground`` are those
+            of the ray through the pixel's center.
 
     Returns:
         The frame, or its band of rows.
 
     Raises:
-        ValueError: a size is below 1, or the renderer is unknown or not supported.
+        ValueError: a size is below 1, ``samples`` is not allowed, or the renderer is unknown or not
+            supported.
     """
     for name, value in (("height", height), ("width", width)):
         if value < 1:
             raise ValueError(f"{name} must be at least 1 pixel, got {value}.")
     rows = height if num_rows is None else num_rows
     first_row = jnp.asarray(first_row, jnp.int32)
+    if (times := math.isqrt(check_samples(samples))) > 1:
+        frame = render(scene, height, width, renderer, first_row=first_row, num_rows=num_rows)
+        r, g, b = _means(scene, first_row, height, width, rows, renderer, times)
+        return frame.replace(r=r, g=g, b=b)
     if check_renderer(renderer) == "reference":
         return reference.render(scene, height, width, first_row, rows)
     return _fast(scene, first_row, height, width, rows, renderer)
@@ -81,12 +105,13 @@ def draw(
     renderer: str,
     change: Callable[[Frame, jax.Array], Frame],
     images: tuple[str, ...] = ("pixels",),
+    samples: int = 1,
 ) -> tuple[jax.Array, ...]:
     """Render images of one view, (height, width) each, only once in a program.
 
     ``pixels`` are packed, uint32; ``change(frame, rows)`` returns rows of the image with other
-    colors, for their indices (R,) int32. Its pixelwise part runs in the kernel. ``depth`` and
-    ``segmentation`` are ``Frame.depth`` and ``Frame.seg``.
+    colors, for their indices (R,) int32. Its pixelwise part runs in the kernel, if a pixel has one
+    of the ``samples``. ``depth`` and ``segmentation`` are ``Frame.depth`` and ``Frame.seg``.
 
     Without a barrier XLA fuses the renderer into every reader of its image and runs it again for
     each. A Pallas kernel is never fused. Otherwise the barrier is control flow that XLA keeps: a
@@ -95,13 +120,20 @@ def draw(
     """
     plain = "fused" if renderer == "auto" else renderer
 
-    def draw_rows(first_row: jax.Array, num_rows: int) -> tuple[jax.Array, ...]:
-        frame = render(scene, height, width, plain, first_row=first_row, num_rows=num_rows)
+    # Without colors no samples are needed.
+    samples = samples if "pixels" in images else 1
+
+    def planes_of(frame: Frame, rows: jax.Array) -> tuple[jax.Array, ...]:
         planes = {"depth": frame.depth, "segmentation": frame.seg}
         if "pixels" in images:
-            rows = jnp.minimum(first_row + jnp.arange(num_rows), height - 1)
             planes["pixels"] = pack(change(frame, rows))
         return tuple(planes[name] for name in images)
+
+    def draw_rows(first_row: jax.Array, num_rows: int) -> tuple[jax.Array, ...]:
+        frame = render(
+            scene, height, width, plain, first_row=first_row, num_rows=num_rows, samples=samples
+        )
+        return planes_of(frame, jnp.minimum(first_row + jnp.arange(num_rows), height - 1))
 
     def in_bands() -> tuple[jax.Array, ...]:
         num_rows = -(-height // _BANDS)
@@ -131,10 +163,10 @@ def draw(
     def by_kernel() -> tuple[jax.Array, ...]:
         from pixelbrax_jax.renderer import kernel
 
-        def packed(frame: Frame) -> jax.Array:
-            return pack(change(frame, jnp.arange(height)))
-
-        return kernel.draw(scene, height, width, packed, images)
+        rows = jnp.arange(height)
+        if samples > 1:
+            return planes_of(render(scene, height, width, "pallas", samples=samples), rows)
+        return kernel.draw(scene, height, width, lambda frame: pack(change(frame, rows)), images)
 
     if renderer == "pallas":
         return by_kernel()
@@ -143,6 +175,55 @@ def draw(
         forms["cuda"] = by_kernel
     drawn: tuple[jax.Array, ...] = jax.lax.platform_dependent(default=in_bands, **forms)
     return drawn
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(2, 3, 4, 5, 6))
+def _means(
+    scene: Scene,
+    first_row: jax.Array,
+    height: int,
+    width: int,
+    num_rows: int,
+    renderer: str,
+    times: int,
+) -> list[jax.Array]:
+    """Return red, green and blue of a band of rows, means over ``times`` by ``times`` rays."""
+
+    def large() -> list[jax.Array]:
+        rows, size = num_rows * times, (height * times, width * times)
+        frame = render(scene, *size, renderer, first_row=first_row * times, num_rows=rows)
+        return [frame.r, frame.g, frame.b]
+
+    return [_shrunk(plane, times) for plane in shading.computed_apart(large)]
+
+
+@_means.defjvp
+@under_default_flags
+def _means_jvp(
+    height: int,
+    width: int,
+    num_rows: int,
+    renderer: str,
+    times: int,
+    primals: tuple,
+    tangents: tuple,
+) -> tuple[list[jax.Array], list[jax.Array]]:
+    scene, first_row = primals
+
+    def colors(scene: Scene) -> list[jax.Array]:
+        size = (height * times, width * times)
+        frame = reference.render(scene, *size, first_row * times, num_rows * times)
+        return [_shrunk(plane, times) for plane in (frame.r, frame.g, frame.b)]
+
+    _, tangent = jax.jvp(colors, (scene,), tangents[:1])
+    return _means(scene, first_row, height, width, num_rows, renderer, times), tangent
+
+
+def _shrunk(plane: jax.Array, times: int) -> jax.Array:
+    """Return the means of blocks of ``times`` by ``times`` pixels."""
+    places = [(row, column) for row in range(times) for column in range(times)]
+    total = sum([plane[row::times, column::times] for row, column in places], jnp.zeros(()))
+    return total / len(places)
 
 
 def pack(frame: Frame) -> jax.Array:

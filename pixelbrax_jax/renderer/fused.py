@@ -2,87 +2,57 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache, partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 
-from pixelbrax_jax import spatial
-from pixelbrax_jax.renderer import shading
+from pixelbrax_jax.renderer import opengl, shading
 from pixelbrax_jax.renderer.intersect import (
-    Axes,
-    Fold,
     Hit,
     Vector,
     at_least,
     at_most,
     between,
     dot,
-    intersect,
 )
+from pixelbrax_jax.renderer.mirror import reflection
+from pixelbrax_jax.renderer.reference import pixel_rays
 from pixelbrax_jax.renderer.shading import SHADOW_BIAS
-from pixelbrax_jax.types import FAR, Frame, GeomKind, Geoms, Look, Scene
+from pixelbrax_jax.renderer.view import (
+    Solid,
+    View,
+    rays,
+    solid_of,
+    surface_colors,
+    vector,
+    view_of,
+)
+from pixelbrax_jax.types import FAR, Frame, GeomKind, Look, Scene
 
 _INF_BITS = np.uint32(0x7F800000)
 
 
-class View(struct.PyTreeNode):
-    """A scene in its camera's frame, with arrays in the scene's order, shapes and units.
+def sky_of(
+    scene: Scene, height: int, width: int, first_row: jax.Array | int, num_rows: int
+) -> list[jax.Array]:
+    """Return what the sky's texture adds to each channel of a band's pixels; [] without one.
 
-    Attributes:
-        order: static, the geom of each rank; geoms of one material have neighboring ranks, so that
-            a material is a range of ranks.
-        pos, xmat: centers and orientations.
-        geoms: sizes and colors, without poses.
-        look: light and lamps in the camera's frame.
-        pixel: () float32, edge of a pixel at distance 1.
-        up: (3,) float32, the world's z axis.
+    It depends on the camera's direction alone: a batch whose cameras do not turn computes it once.
     """
-
-    order: tuple[int, ...] = struct.field(pytree_node=False)
-    pos: jax.Array
-    xmat: jax.Array
-    geoms: Geoms
-    look: Look
-    pixel: jax.Array
-    up: jax.Array
-
-
-def view_of(
-    scene: Scene, height: int, einsum: Callable[[str, Any, Any], jax.Array] = jnp.einsum
-) -> View:
-    """Return a scene in its camera's frame, for images of ``height`` pixels."""
-    geoms, look = scene.geoms, scene.look
-    to_camera = scene.camera.xmat
-    light = None if look.light is None else einsum("i,ij->j", spatial.unit(look.light), to_camera)
-    lamps = tuple(
-        lamp.replace(
-            pos=einsum("i,ij->j", lamp.pos - scene.camera.pos, to_camera),
-            axis=einsum("i,ij->j", lamp.axis, to_camera),
-        )
-        for lamp in look.lamps
-    )
-    return View(
-        order=tuple(sorted(range(len(geoms.kind)), key=lambda g: geoms.material[g])),
-        pos=einsum("gi,ij->gj", scene.pos - scene.camera.pos, to_camera),
-        xmat=einsum("ji,gjk->gik", to_camera, scene.xmat),
-        geoms=geoms.replace(pos=None, quat=None, strings=()),
-        look=look.replace(light=light, lamps=lamps),
-        pixel=2.0 * jnp.tan(jnp.deg2rad(scene.camera.fovy) / 2.0) / height,
-        up=to_camera[2],
-    )
-
-
-def rays(view: View, height: int, width: int, row: jax.Array, column: jax.Array) -> Vector:
-    """Return unit rays through the centers of pixels with the given int32 rows and columns."""
-    x = (column.astype(jnp.float32) - 0.5 * (width - 1)) * view.pixel
-    y = (0.5 * (height - 1) - row.astype(jnp.float32)) * view.pixel
-    inv_length = jax.lax.rsqrt(x * x + y * y + 1.0)
-    return x * inv_length, y * inv_length, -inv_length
+    if scene.look.sky_texture is None:
+        return []
+    xmat = scene.camera.xmat if scene.sky_xmat is None else scene.sky_xmat
+    camera = scene.camera.replace(xmat=xmat)
+    rows = first_row + jnp.arange(num_rows)
+    ways = pixel_rays(camera, height, width, rows).reshape(-1, 3)
+    added = shading.sky_texture(scene.look.sky_texture, *ways.T)
+    # The barrier keeps XLA from looking texels up for each image of a batch.
+    added = jax.lax.optimization_barrier(added)
+    return [added[:, c] for c in range(3)]
 
 
 Near = Callable[[int, Callable[[Any], Any], Any], Any]
@@ -90,8 +60,12 @@ Near = Callable[[int, Callable[[Any], Any], Any], Any]
 and may return ``value`` otherwise."""
 
 
-def see(view: View, ray: Vector, near: Near | None = None) -> Frame:
+def see(
+    view: View, ray: Vector, near: Near | None = None, texture: Sequence[jax.Array] = ()
+) -> Frame:
     """Return what pixels with unit rays see; ``near`` may skip geoms that none sees.
+
+    ``texture`` is what the sky's texture adds to their red, green and blue, if it has one.
 
     All parts have the shape of the rays' components. ``seg`` is the rank of the visible geom, and
     the number of geoms for the sky. ``depth`` is exact to a relative ``2**(b - 24)``, with b bits
@@ -99,8 +73,8 @@ def see(view: View, ray: Vector, near: Near | None = None) -> Frame:
     """
     look, geoms, shape, count = view.look, view.geoms, ray[0].shape, len(view.order)
 
-    def solid(g: int) -> _Solid:
-        return _solid(view, g, in_kernel=near is not None)
+    def solid(g: int) -> Solid:
+        return solid_of(view, g, in_kernel=near is not None)
 
     def hit(g: int) -> Hit:
         return solid(g).hit(ray, solid(g).center)
@@ -109,8 +83,8 @@ def see(view: View, ray: Vector, near: Near | None = None) -> Frame:
         # Branches cannot share results.
         solid, hit = cache(solid), cache(hit)
 
-    to_light = None if look.light is None else _vector(look.light)
-    along = _directions(ray, to_light, bool(look.lamps))
+    to_light = None if look.light is None else vector(look.light)
+    along = _directions(ray, to_light, bool(look.lamps) or look.opengl)
     # A key is a distance with the rank in its last bits; the smallest one wins.
     bits = np.uint32((1 << count.bit_length()) - 1)
     key = jnp.full(shape, (_INF_BITS & ~bits) | np.uint32(count), jnp.uint32)
@@ -141,58 +115,50 @@ def see(view: View, ray: Vector, near: Near | None = None) -> Frame:
     sky = winner == count
     points = tuple(t * component for component in ray)
 
-    color, on_ground = _surface_colors(view, winner), jnp.zeros(shape, bool)
+    color, on_ground = surface_colors(view, winner), jnp.zeros(shape, bool)
+    grounds = []
     for g in filter(geoms.is_ground, view.order):
         on_ground |= seen[g]
-        fraction = _ground_fraction(view, g, ray, hit(g).t, solid(g))
+        fraction, place = _ground_fraction(view, g, ray, hit(g).t, solid(g))
+        if geoms.is_bounded(g):
+            grounds.append((seen[g], solid(g), place))
         for c in range(3):
             first, second = look.ground_rgb[0, c], look.ground_rgb[1, c]
             color[c] = jnp.where(seen[g], first + fraction * (second - first), color[c])
 
     def ways(ray: Vector, start: Vector) -> Iterator[tuple[jax.Array, jax.Array]]:
-        """Yield where each geom that casts shadows is seen, and the distance from ``start``."""
         for g in view.order:
             if look.shadows and geoms.kind[g] != GeomKind.PLANE:
                 there = tuple(c - p for c, p in zip(solid(g).center, start, strict=True))
                 yield seen[g], solid(g).hit(ray, there).t
 
-    shade: jax.Array = look.ambient
-    highlight: jax.Array | float = 0.0
-    if look.headlight is not None:
-        shade += look.headlight * at_least(n_z, 0.0)
-        shade = jnp.where(on_ground, at_most(shade, 1.0), shade)
-    if to_light is not None:
-        lit = jnp.ones(shape, bool)
-        for here, way in ways(to_light, points):
-            # A convex geom casts no shadow on its side that faces the light.
-            lit &= ~((way > SHADOW_BIAS) & ~here)
-        gloss = shading.gloss(n_l, n_z, to_light[2], look.shininess)
-        gloss = jnp.where(lit & (n_l > 0.0), gloss, 0.0)
-        diffuse = jnp.where(lit, at_least(n_l, 0.0), 0.0)
-        shade = shade + look.diffuse * diffuse + look.specular * gloss
-        highlight = look.highlight * gloss
-    for lamp in look.lamps:
-        pos = _vector(lamp.pos)
-        beam, inv_distance, strength = shading.beam(lamp, pos, _vector(lamp.axis), points)
-        to_lamp = tuple(-component for component in beam)
-        n_lamp = dot((*n_xy, n_z), to_lamp)
-        strength = jnp.where(n_lamp > 0.0, strength, 0.0)
-        for here, way in ways(beam, pos):
-            blocked = (way > 0.0) & ((way + SHADOW_BIAS) * inv_distance < 1.0)
-            strength = jnp.where(blocked & ~here, 0.0, strength)
-        shine = shading.gloss(n_lamp, n_z, to_lamp[2], look.shininess)
-        shade = shade + strength * lamp.diffuse * n_lamp
-        highlight = highlight + strength * lamp.highlight * shine
-    if look.headlight is not None:
-        # A texture dims the highlight too.
-        shade = shade + jnp.where(on_ground, highlight, 0.0)
-        highlight = jnp.where(on_ground, 0.0, highlight)
+    normal, light = (*n_xy, n_z), _phong_light
+    matte = on_ground
+    if look.opengl:
+        light = partial(_opengl_light, in_kernel=near is not None)
+        for g in view.order:
+            if geoms.textured and geoms.textured[g]:
+                matte |= seen[g]
+    surface = _Surface(ray, points, normal, to_light, n_l, on_ground, matte, grounds)
+    shade, highlight = light(look, surface, ways)
 
-    rise = dot(ray, _vector(view.up))
-    red, green, blue = (
-        jnp.where(sky, shading.sky(look, rise, c), between(0.0, color[c] * shade + highlight, 1.0))
-        for c in range(3)
-    )
+    rise = dot(ray, vector(view.up))
+    reflected: list[jax.Array] = []
+    if view.mirrored is not None:
+        way = hit(geoms.mirror).t
+        image = partial(reflection, view, ray, way, in_kernel=near is not None)
+        found = shading.computed_apart(image) if near is None else image()
+        reflected = [jnp.where(seen[geoms.mirror], channel, 0.0) for channel in found]
+
+    def front(c: int) -> jax.Array:
+        own = color[c] * shade + highlight
+        return between(0.0, own + reflected[c] if reflected else own, 1.0)
+
+    def behind(c: int) -> jax.Array:
+        plain = shading.sky(look, rise, c)
+        return between(0.0, plain + texture[c], 1.0) if texture else plain
+
+    red, green, blue = (jnp.where(sky, behind(c), front(c)) for c in range(3))
     depth = jnp.where(sky, FAR, -t * ray[2])
     return Frame(r=red, g=green, b=blue, depth=depth, seg=winner, ground=on_ground)
 
@@ -207,61 +173,10 @@ def render(
     index = jnp.arange(num_rows * width, dtype=jnp.int32)
     row = jax.lax.div(index, np.int32(width)) + first_row
     column = jax.lax.rem(index, np.int32(width))
-    frame = see(view, rays(view, height, width, row, column))
+    texture = sky_of(scene, height, width, first_row, num_rows)
+    frame = see(view, rays(view, height, width, row, column), texture=texture)
     frame = frame.replace(seg=jnp.array([*view.order, -1], jnp.int32)[frame.seg])
     return jax.tree.map(lambda plane: plane.reshape(num_rows, width), frame)
-
-
-class _Solid(NamedTuple):
-    center: Vector
-    axes: Axes
-    size: Any
-    hit: Callable[[Vector, Vector], Hit]
-    """Where rays enter it, with its center at another place."""
-
-
-def _solid(view: View, g: int, in_kernel: bool) -> _Solid:
-    geoms = view.geoms
-    x, y, z = (tuple(view.xmat[g, k, axis] for k in range(3)) for axis in range(3))
-    size: Any = tuple(geoms.size[g, k] for k in range(3))
-    if geoms.kind[g] == GeomKind.MESH:
-        size = _planes(geoms, g, in_kernel)
-    hit = partial(
-        intersect,
-        geoms.kind[g],
-        axes=(x, y, z),
-        size=size,
-        bounded=geoms.is_bounded(g),
-        distant=geoms.distant,
-    )
-    return _Solid(tuple(view.pos[g, k] for k in range(3)), (x, y, z), size, hit)
-
-
-def _planes(geoms: Geoms, g: int, in_kernel: bool) -> Fold:
-    first, end = geoms.rows_of_planes(g)
-    planes: Any = geoms.planes
-
-    def in_a_loop(prepare: Callable, update: Callable, value: Any) -> Any:
-        # Hundreds of planes in a row would take minutes to compile.
-        def one(row: jax.Array, value: Any) -> Any:
-            return update(value, prepare(tuple(planes[row, k] for k in range(4))))
-
-        return jax.lax.fori_loop(np.int32(first), np.int32(end), one, value)
-
-    def in_a_row(prepare: Callable, update: Callable, value: Any) -> Any:
-        # A loop would keep images of all values. The barrier keeps what differs by plane alone out
-        # of the loop over pixels.
-        columns = prepare(tuple(planes[first:end, k] for k in range(4)))
-        columns = jax.lax.optimization_barrier(columns)
-        for row in range(end - first):
-            value = update(value, tuple(column[row] for column in columns))
-        return value
-
-    return in_a_loop if in_kernel else in_a_row
-
-
-def _vector(array: Any) -> Vector:
-    return array[0], array[1], array[2]
 
 
 def _directions(ray: Vector, to_light: Vector | None, lamps: bool) -> list[tuple[Vector, Any]]:
@@ -284,26 +199,109 @@ def _normal_products(
     ]
 
 
-def _surface_colors(view: View, winner: jax.Array) -> list[jax.Array]:
-    rgb, materials = view.geoms.rgb, [view.geoms.material[g] for g in view.order]
-    color = [jnp.full(winner.shape, rgb[materials[0], c]) for c in range(3)]
-    for rank in range(1, len(materials)):
-        if materials[rank] != materials[rank - 1]:
-            for c in range(3):
-                color[c] = jnp.where(winner >= rank, rgb[materials[rank], c], color[c])
-    return color
+class _Surface(NamedTuple):
+    """What pixels see: rays, points, normals, their products with the light, ground and textures.
+
+    ``normal`` has x and y only with lamps or ``Look.opengl``. Each bounded ground is where it is
+    seen, its plane, and the places along its x and y.
+    """
+
+    ray: Vector
+    points: Vector
+    normal: Vector
+    to_light: Vector | None
+    n_l: jax.Array
+    on_ground: jax.Array
+    matte: jax.Array
+    grounds: list[tuple[jax.Array, Solid, Vector]]
 
 
-def _ground_fraction(view: View, g: int, ray: Vector, t: jax.Array, plane: _Solid) -> jax.Array:
-    """Return the fraction of the ground's second color for pixels that see plane ``g`` at ``t``."""
+Ways = Callable[[Vector, Vector], Iterator[tuple[jax.Array, jax.Array]]]
+"""``ways(ray, start)`` yields where each geom that casts shadows is seen, and its distance."""
+
+
+def _phong_light(look: Look, surface: _Surface, ways: Ways) -> tuple[Any, Any]:
+    """Return the factor of colors and what is added to them; see ``Look``."""
+    _, points, normal, to_light, n_l, on_ground, *_ = surface
+    n_z, shape = normal[-1], n_l.shape
+    shade: jax.Array = look.ambient
+    highlight: jax.Array | float = 0.0
+    if look.headlight is not None:
+        shade += look.headlight * at_least(n_z, 0.0)
+        shade = jnp.where(on_ground, at_most(shade, 1.0), shade)
+    if to_light is not None:
+        lit = jnp.ones(shape, bool)
+        for here, way in ways(to_light, points):
+            # A convex geom casts no shadow on its side that faces the light.
+            lit &= ~((way > SHADOW_BIAS) & ~here)
+        gloss = shading.gloss(n_l, n_z, to_light[2], look.shininess)
+        gloss = jnp.where(lit & (n_l > 0.0), gloss, 0.0)
+        diffuse = jnp.where(lit, at_least(n_l, 0.0), 0.0)
+        shade = shade + look.diffuse * diffuse + look.specular * gloss
+        highlight = look.highlight * gloss
+    for lamp in look.lamps:
+        pos = vector(lamp.pos)
+        beam, inv_distance, strength = shading.beam(lamp, pos, vector(lamp.axis), points)
+        to_lamp = tuple(-component for component in beam)
+        n_lamp = dot(normal, to_lamp)
+        strength = jnp.where(n_lamp > 0.0, strength, 0.0)
+        for here, way in ways(beam, pos):
+            blocked = (way > 0.0) & ((way + SHADOW_BIAS) * inv_distance < 1.0)
+            strength = jnp.where(blocked & ~here, 0.0, strength)
+        shine = shading.gloss(n_lamp, n_z, to_lamp[2], look.shininess)
+        shade = shade + strength * lamp.diffuse * n_lamp
+        highlight = highlight + strength * lamp.highlight * shine
+    if look.headlight is not None:
+        # A texture dims the highlight too.
+        shade = shade + jnp.where(on_ground, highlight, 0.0)
+        highlight = jnp.where(on_ground, 0.0, highlight)
+    return shade, highlight
+
+
+def _opengl_light(look: Look, surface: _Surface, ways: Ways, *, in_kernel: bool) -> tuple[Any, Any]:
+    """Return the same with OpenGL's formulas; see ``opengl.py``."""
+    ray, points, normal, to_light, _, on_ground, matte, grounds = surface
+    lights = opengl.lights_of(look, (0.0, 0.0, 1.0))
+    factors = [light(ray, points, normal) for light in lights]
+    textures = [opengl.on_texture(pair) for pair in factors]
+    for here, plane, place in grounds:
+        eye = (0.0, 0.0, 0.0)
+        image = partial(opengl.on_plane, lights, eye, plane.center, plane.axes, plane.size, place)
+        found = image() if in_kernel else shading.computed_apart(image)
+        textures = [jnp.where(here, *pair) for pair in zip(found, textures, strict=True)]
+    lit: list[Any] = [True] * len(lights)
+    if to_light is not None:
+        for here, way in ways(to_light, points):
+            lit[1] &= ~((way > SHADOW_BIAS) & ~here)
+    for k, lamp in enumerate(look.lamps, len(lights) - len(look.lamps)):
+        beam, inv_distance, _ = opengl.beam_of(lamp, points)
+        for here, way in ways(beam, vector(lamp.pos)):
+            blocked = (way > 0.0) & ((way + SHADOW_BIAS) * inv_distance < 1.0)
+            lit[k] &= ~(blocked & ~here)
+    shade: Any = 0.0
+    highlight: Any = 0.0
+    for (factor, shine), texture, shown in zip(factors, textures, lit, strict=True):
+        shade += jnp.where(shown, jnp.where(on_ground, texture, factor), 0.0)
+        highlight += jnp.where(shown & ~matte, shine, 0.0)
+    return shade, highlight
+
+
+def _ground_fraction(
+    view: View, g: int, ray: Vector, t: jax.Array, plane: Solid
+) -> tuple[jax.Array, Vector]:
+    """Return the fraction of the ground's second color where pixels see plane ``g`` at ``t``.
+
+    The second result is the place along the plane's x and y, in metres.
+    """
     normal = plane.axes[2]
     slope = 1.0 / at_most(dot(ray, normal), -1e-7)
     inv_pitch = 1.0 / view.look.ground_pitch
     step = -t * ray[2] * view.pixel * inv_pitch
-    coords, widths = [], []
+    place, coords, widths, across, upward = [], [], [], [], []
     for number, (axis, half) in enumerate(zip(plane.axes[:2], plane.size[:2], strict=True)):
         ray_axis = dot(ray, axis)
         along = t * ray_axis - dot(plane.center, axis)
+        place.append(along)
         if view.geoms.is_bounded(g):
             # MuJoCo's textures start at the corner of least x and largest y.
             along = along + half if number == 0 else half - along
@@ -312,4 +310,8 @@ def _ground_fraction(view: View, g: int, ray: Vector, t: jax.Array, plane: _Soli
         right = axis[0] - ray_axis * slope * normal[0]
         above = axis[1] - ray_axis * slope * normal[1]
         widths.append(step * (jnp.abs(right) + jnp.abs(above)))
-    return shading.second_color_fraction(view.look.ground, *coords, *widths)
+        across.append(right)
+        upward.append(above)
+    if view.look.opengl:
+        widths = [step * opengl.footprint(across, upward)] * 2
+    return shading.second_color_fraction(view.look.ground, *coords, *widths), place

@@ -12,9 +12,10 @@ from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton
 
 from pixelbrax_jax.observations import IMAGES
-from pixelbrax_jax.renderer.fused import Near, View, rays, see, view_of
+from pixelbrax_jax.renderer.fused import Near, see, sky_of
 from pixelbrax_jax.renderer.intersect import at_least, at_most
 from pixelbrax_jax.renderer.per_pixel import PerPixel, per_pixel
+from pixelbrax_jax.renderer.view import View, order_of, rays, view_of
 from pixelbrax_jax.types import Frame, GeomKind, Scene
 
 BLOCK = 256
@@ -65,8 +66,8 @@ def draw(
             planes["pixels"] = by_pixel.apply(frame, numbers, given)
         return [planes[name] for name in images]
 
-    view, band = view_of(scene, height, _einsum), _Band(height, width, 0, height)
-    return tuple(_call(drawn_pixels, view, *inputs, band, [IMAGES[name].drawn for name in images]))
+    band = _Band(height, width, 0, height)
+    return tuple(_call(drawn_pixels, scene, *inputs, band, [IMAGES[name].drawn for name in images]))
 
 
 def render(
@@ -82,11 +83,10 @@ def render(
         return [frame.r, frame.g, frame.b, frame.depth, frame.seg]
 
     band = _Band(height, width, first_row, height if num_rows is None else num_rows)
-    view = view_of(scene, height, _einsum)
     dtypes = [*[jnp.float32] * 4, jnp.int32]
-    r, g, b, depth, seg = _call(planes, view, (), (), band, dtypes)
+    r, g, b, depth, seg = _call(planes, scene, (), (), band, dtypes)
     ground = jnp.zeros(seg.shape, bool)
-    for geom in filter(view.geoms.is_ground, view.order):
+    for geom in filter(scene.geoms.is_ground, order_of(scene.geoms)):
         ground |= seg == geom
     return Frame(r=r, g=g, b=b, depth=depth, seg=seg, ground=ground)
 
@@ -144,7 +144,7 @@ def _geom(view: View, ranks: jax.Array) -> jax.Array:
 
 def _call(
     compute: Callable[..., list[jax.Array]],
-    view: View,
+    scene: Scene,
     numbers: Sequence[jax.Array],
     images: Sequence[jax.Array],
     band: _Band,
@@ -152,6 +152,9 @@ def _call(
 ) -> list[jax.Array]:
     """Return bands of images, (num_rows, width), from ``compute(numbers, images, frame)``."""
     height, width, first_row, num_rows = band
+    texture = sky_of(scene, height, width, first_row, num_rows)
+    images = [*images, *texture]
+    view = view_of(scene, height, _einsum)
     inputs, inputs_tree = jax.tree.flatten((view, list(numbers), first_row))
     inputs = [jax.lax.stop_gradient(jnp.asarray(x)) for x in inputs]
     packed = [x.ndim <= 1 and x.dtype == jnp.float32 for x in inputs]
@@ -176,8 +179,9 @@ def _call(
         column = jax.lax.rem(index, np.int32(width))
         last = jnp.minimum(start + BLOCK, num_pixels) - 1
         near = _near(view, band._replace(first_row=first_row), start, last)
-        frame = see(view, rays(view, height, width, row, column), near)
-        results = compute(numbers, images, frame.replace(seg=_geom(view, frame.seg)))
+        split = len(images) - len(texture)
+        frame = see(view, rays(view, height, width, row, column), near, images[split:])
+        results = compute(numbers, images[:split], frame.replace(seg=_geom(view, frame.seg)))
         for ref, result in zip(refs[-len(dtypes) :], results, strict=True):
             triton.store(ref.at[:], result, mask=inside)
 

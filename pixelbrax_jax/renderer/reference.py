@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax import spatial
-from pixelbrax_jax.renderer import shading
+from pixelbrax_jax.renderer import opengl, shading
 from pixelbrax_jax.types import FAR, Camera, Frame, GeomKind, Lamp, Scene
 
 
@@ -37,6 +37,44 @@ def render(
         color = jnp.where((nearest == g)[..., None], tiles, color)
 
     back = camera.xmat[:, 2]
+    if look.opengl:
+        shade, highlight = _opengl_light(scene, rays, points, normal, nearest, on_ground)
+    else:
+        shade, highlight = _phong_light(scene, points, normal, nearest, on_ground, back)
+    shade, highlight = (jnp.broadcast_to(x, hit.shape)[..., None] for x in (shade, highlight))
+    surface = color * shade + highlight
+    if look.reflectance is not None and geoms.mirror >= 0:
+        here = (hit & (nearest == geoms.mirror))[..., None]
+        surface += jnp.where(here, _reflection(scene, rays, t), 0.0)
+    surface = jnp.clip(surface, 0.0, 1.0)
+    rise = rays[..., 2:]
+    sky = look.sky[0] + jnp.clip(rise, 0.0, 1.0) * (look.sky[1] - look.sky[0])
+    if look.sky.shape[0] == 3:
+        sky += jnp.clip(-rise, 0.0, 1.0) * (look.sky[2] - look.sky[0])
+    if look.sky_texture is not None:
+        added = shading.sky_texture(look.sky_texture, *rays.reshape(-1, 3).T)
+        sky = jnp.clip(sky + added.reshape(rays.shape), 0.0, 1.0)
+    rgb = jnp.where(hit[..., None], surface, sky)
+    return Frame(
+        r=rgb[..., 0],
+        g=rgb[..., 1],
+        b=rgb[..., 2],
+        depth=jnp.where(hit, -t * (rays @ back), FAR),
+        seg=jnp.where(hit, nearest, -1).astype(jnp.int32),
+        ground=on_ground,
+    )
+
+
+def _phong_light(
+    scene: Scene,
+    points: jax.Array,
+    normal: jax.Array,
+    nearest: jax.Array,
+    on_ground: jax.Array,
+    back: jax.Array,
+) -> tuple[jax.Array, jax.Array]:
+    """Return the factor of colors and what is added to them, (H, W) or (); see ``Look``."""
+    look = scene.look
     n_z = normal @ back
     shade, highlight = look.ambient, jnp.zeros(())
     if look.headlight is not None:
@@ -62,21 +100,89 @@ def render(
             jnp.where(on_ground, shade + highlight, shade),
             jnp.where(on_ground, 0.0, highlight),
         )
-    shade, highlight = (jnp.broadcast_to(x, hit.shape)[..., None] for x in (shade, highlight))
-    surface = jnp.clip(color * shade + highlight, 0.0, 1.0)
-    rise = rays[..., 2:]
-    sky = look.sky[0] + jnp.clip(rise, 0.0, 1.0) * (look.sky[1] - look.sky[0])
-    if look.sky.shape[0] == 3:
-        sky += jnp.clip(-rise, 0.0, 1.0) * (look.sky[2] - look.sky[0])
-    rgb = jnp.where(hit[..., None], surface, sky)
-    return Frame(
-        r=rgb[..., 0],
-        g=rgb[..., 1],
-        b=rgb[..., 2],
-        depth=jnp.where(hit, -t * (rays @ back), FAR),
-        seg=jnp.where(hit, nearest, -1).astype(jnp.int32),
-        ground=on_ground,
-    )
+    return shade, highlight
+
+
+def _opengl_light(
+    scene: Scene,
+    rays: jax.Array,
+    points: jax.Array,
+    normal: jax.Array,
+    nearest: jax.Array,
+    on_ground: jax.Array,
+) -> tuple[jax.Array, jax.Array]:
+    """Return the same with OpenGL's formulas; see ``opengl.py``."""
+    geoms, look, camera = scene.geoms, scene.look, scene.camera
+    unlit = look if look.light is None else look.replace(light=spatial.unit(look.light))
+    lights = opengl.lights_of(unlit, tuple(camera.xmat[:, 2]))
+    ray, point, n = (tuple(jnp.moveaxis(x, -1, 0)) for x in (rays, points, normal))
+    factors = [light(ray, point, n) for light in lights]
+    textures = [opengl.on_texture(pair) for pair in factors]
+    for g in range(len(geoms.kind)):
+        if geoms.is_ground(g) and geoms.is_bounded(g):
+            pos, axes = scene.pos[g], scene.xmat[g]
+            place = tuple(jnp.moveaxis((points - pos) @ axes, -1, 0)[:2])
+            size, center = tuple(geoms.size[g]), tuple(pos)
+            found = opengl.on_plane(lights, tuple(camera.pos), center, tuple(axes.T), size, place)
+            textures = [
+                jnp.where(nearest == g, *pair) for pair in zip(found, textures, strict=True)
+            ]
+    matte = on_ground
+    if geoms.textured:
+        matte |= jnp.array(geoms.textured)[nearest]
+    shade, highlight = jnp.zeros(nearest.shape), jnp.zeros(nearest.shape)
+    for k, ((factor, shine), texture) in enumerate(zip(factors, textures, strict=True)):
+        lit = jnp.ones(nearest.shape, bool)
+        if k and look.shadows:
+            lit = ~_in_shadow(scene, k, points, nearest)
+        shade += jnp.where(lit, jnp.where(on_ground, texture, factor), 0.0)
+        highlight += jnp.where(lit & ~matte, shine, 0.0)
+    return shade, highlight
+
+
+def _in_shadow(scene: Scene, light: int, points: jax.Array, nearest: jax.Array) -> jax.Array:
+    """Return where a light of ``opengl.lights_of`` but the first is blocked."""
+    look = scene.look
+    if look.light is not None and light == 1:
+        to_light = jnp.broadcast_to(spatial.unit(look.light), points.shape)
+        return _shaded(scene, points, to_light, jnp.inf, nearest)
+    lamp = look.lamps[light - 1 - (look.light is not None)]
+    away = points - lamp.pos
+    ray = spatial.unit(away)
+    until = jnp.sum(away * ray, -1) - shading.SHADOW_BIAS
+    return _shaded(scene, lamp.pos, ray, until, nearest)
+
+
+def _reflection(scene: Scene, rays: jax.Array, until: jax.Array) -> jax.Array:
+    """Return the color that pixels get from a mirror at distance ``until``, (H, W, 3).
+
+    The mirror is passed by rays of a mirrored camera; see ``mirror.py``.
+    """
+    geoms, look, camera = scene.geoms, scene.look, scene.camera
+    reflectance = jnp.asarray(look.reflectance)
+    base, axis = scene.pos[geoms.mirror], scene.xmat[geoms.mirror][:, 2]
+    eye = camera.pos - 2.0 * ((camera.pos - base) @ axis) * axis
+    rays = rays - 2.0 * (rays @ axis)[..., None] * axis
+    others = [g for g in range(len(geoms.kind)) if g != geoms.mirror and not geoms.is_ground(g)]
+    found = jnp.zeros(rays.shape)
+    nearest = jnp.full(until.shape, jnp.inf)
+    look = look if look.light is None else look.replace(light=spatial.unit(look.light))
+    lights = opengl.lights_of(look, tuple(camera.xmat[:, 2]))
+    for g in others:
+        t, normal = _cast(scene, g, eye, rays)
+        first = (t > until) & (t < nearest)
+        points = eye + jnp.where(first, t, 1.0)[..., None] * rays
+        ray, point, n = (tuple(jnp.moveaxis(x, -1, 0)) for x in (rays, points, normal))
+        factors = [light(ray, point, n) for light in lights]
+        shade, highlight = (sum(part) for part in zip(*factors, strict=True))
+        if geoms.textured and geoms.textured[g]:
+            highlight = 0.0
+        shade, highlight = (jnp.broadcast_to(x, t.shape)[..., None] for x in (shade, highlight))
+        color = reflectance * jnp.asarray(geoms.rgb)[geoms.material[g]]
+        seen = jnp.clip(color * shade + highlight, 0.0, 1.0)
+        found = jnp.where(first[..., None], seen, found)
+        nearest = jnp.where(first, t, nearest)
+    return found
 
 
 def pixel_rays(camera: Camera, height: int, width: int, rows: jax.Array) -> jax.Array:
@@ -252,10 +358,14 @@ def _ground_color(scene: Scene, g: int, rays: jax.Array, height: int) -> jax.Arr
     down = jnp.minimum(d[..., 2], -1e-7)
     s = -o[2] / down
     footprint = jnp.zeros((*s.shape, 2))
+    steps = []
     for axis in (camera.xmat[:, 0], camera.xmat[:, 1]):
         turn = (axis * pixel) @ xmat
         moved = s[..., None] * (turn[:2] - d[..., :2] * (turn[2] / down)[..., None])
         footprint += jnp.abs(moved)
+        steps.append((moved[..., 0], moved[..., 1]))
+    if look.opengl:
+        footprint = jnp.broadcast_to(opengl.footprint(*steps)[..., None], footprint.shape)
     coords = o[:2] + s[..., None] * d[..., :2]
     if scene.geoms.is_bounded(g):
         # MuJoCo's textures start at the corner of least x and largest y.

@@ -44,6 +44,40 @@ def beam(lamp: Lamp, pos: Vector, axis: Vector, points: Vector) -> tuple[Vector,
     return ray, inv_distance, strength
 
 
+def computed_apart(compute: Callable[[], list[jax.Array]]) -> list[jax.Array]:
+    """Return values in [0, 1], rounded to 10 bits, that XLA computes in other loops than the rest.
+
+    A loop over pixels that is too long compiles slowly, and XLA then computes values in it again;
+    so it does for each of several results. Hence three values share a word. On a CPU, XLA fuses
+    across barriers but not across conditionals. There is no derivative.
+    """
+    number = len(jax.eval_shape(compute))
+
+    def words() -> list[jax.Array]:
+        levels = [(value * 1023.0 + 0.5).astype(jnp.uint32) for value in compute()]
+        packed = []
+        for first in range(0, number, 3):
+            word = levels[first]
+            for k, level in enumerate(levels[first + 1 : first + 3], 1):
+                word |= level << 10 * k
+            packed.append(word)
+        return packed
+
+    def in_a_conditional() -> list[jax.Array]:
+        zero = jax.lax.optimization_barrier(jnp.int32(0))
+        blank = [jnp.zeros(word.shape, word.dtype) for word in jax.eval_shape(words)]
+        taken: list[jax.Array] = jax.lax.cond(zero == 0, words, lambda: blank)
+        return taken
+
+    def behind_a_barrier() -> list[jax.Array]:
+        return list(jax.lax.optimization_barrier(words()))
+
+    found = jax.lax.platform_dependent(cpu=in_a_conditional, default=behind_a_barrier)
+    return [
+        ((found[k // 3] >> 10 * (k % 3)) & 1023).astype(jnp.float32) / 1023.0 for k in range(number)
+    ]
+
+
 def sky(look: Look, rise: jax.Array, channel: int) -> jax.Array:
     """Return one channel of the sky's color for the z component of unit rays in the world frame."""
     horizon, above, *below = (look.sky[row, channel] for row in range(look.sky.shape[0]))
@@ -51,6 +85,39 @@ def sky(look: Look, rise: jax.Array, channel: int) -> jax.Array:
     if below:
         color += between(0.0, -rise, 1.0) * (below[0] - horizon)
     return color
+
+
+def sky_texture(texture: jax.Array, x: jax.Array, y: jax.Array, z: jax.Array) -> jax.Array:
+    """Return what the sky's texture adds for rays (N,) of any length in the world frame, (N, 3).
+
+    Between texels it is linear, as in OpenGL, but not across the edges of the cube. Faces and their
+    coordinates are those of the OpenGL specification (4.6, table 8.19).
+    """
+    s, t, r = x, z, -y  # the cube's y is up
+    on_s = (jnp.abs(s) >= jnp.abs(t)) & (jnp.abs(s) >= jnp.abs(r))
+    on_t = ~on_s & (jnp.abs(t) >= jnp.abs(r))
+    major = jnp.where(on_s, s, jnp.where(on_t, t, r))
+    sign = jnp.where(major < 0.0, -1.0, 1.0)
+    face = jnp.where(on_s, 0, jnp.where(on_t, 2, 4)) + (major < 0.0)
+    across = jnp.where(on_s, -sign * r, jnp.where(on_t, s, sign * s))
+    down = jnp.where(on_t, sign * r, -t)
+    size = texture.shape[1]
+    inv = 0.5 * size / jnp.abs(major)
+    column, row = (
+        between(0.0, along * inv + 0.5 * (size - 1), size - 1.0) for along in (across, down)
+    )
+    left, top = jnp.floor(column), jnp.floor(row)
+    right_share, bottom_share = (column - left)[:, None], (row - top)[:, None]
+    texels = texture.reshape(-1, 3)
+
+    def row_of_two(row: jax.Array) -> jax.Array:
+        start = (face * size + row.astype(jnp.int32)) * size
+        first = texels[start + left.astype(jnp.int32)]
+        second = texels[start + at_most(left + 1.0, size - 1.0).astype(jnp.int32)]
+        return first + right_share * (second - first)
+
+    above, below = row_of_two(top), row_of_two(at_most(top + 1.0, size - 1.0))
+    return above + bottom_share * (below - above)
 
 
 def _average(

@@ -1,4 +1,4 @@
-"""Looks: PixelBrax's ``default``, the paper's ``original``, and DM Control's ``dmc``."""
+"""Looks: PixelBrax's ``default``, the paper's ``original``, DM Control's ``dmc``, a plainer one."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ LOOKS: dict[str, Look] = {
         ground_pitch=f32(2000 / 2048),
     ),
     # Headlight, checker and sky of the DM Control Suite (common/visual.xml, materials.xml,
-    # skybox.xml), and its models' light from above. Tasks of the suite have a variant of this look
-    # with the lights of their models.
+    # skybox.xml), and its models' light from above. MuJoCo's tasks have a variant of this look
+    # with the lights of their models and, but for `dmc-plain`, all that MuJoCo's renderer draws.
     "dmc": Look(
         ground="checker",
         shadows=True,
@@ -56,6 +56,7 @@ LOOKS: dict[str, Look] = {
         headlight=f32(0.8),
     ),
 }
+LOOKS["dmc-plain"] = LOOKS["dmc"]
 
 
 def make_look(look: str | Look = "default", *, shadows: bool | None = None) -> Look:

@@ -9,6 +9,7 @@ import numpy as np
 from pixelbrax_jax import spatial
 from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.scene.cameras import aim
+from pixelbrax_jax.spatial import look_at
 from pixelbrax_jax.types import CameraRig, Geoms, Look, Scene, String
 
 _NEWTON_STEPS = 8
@@ -46,7 +47,9 @@ def place(geoms: Geoms, rig: CameraRig, look: Look, xpos: jax.Array, xquat: jax.
         for lamp in look.lamps
     )
     look = look.replace(lamps=lamps)
-    return Scene(geoms=geoms, pos=pos, xmat=xmat, camera=aim(rig, xpos), look=look)
+    # A rig never turns, so this does not depend on the links.
+    turned = None if look.sky_texture is None else look_at(rig.eye, rig.target, rig.up)
+    return Scene(geoms, pos, xmat, aim(rig, xpos), look, sky_xmat=turned)
 
 
 def _pieces(string: String, ends: jax.Array, num: int) -> tuple[jax.Array, jax.Array, jax.Array]:

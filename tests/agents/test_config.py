@@ -45,7 +45,7 @@ CHOICES = ("encoder", "policy", "normalize_advantage", "layout", "critic")
 UNCHECKED = {
     # Options of the environment, checked with those of every other one.
     "task", "backend", "engine", "reward_preset", "distractors", "clips", "camera", "look",
-    "shadows", "split", "obs_mode", "renderer", "dynamics", "test_dynamics",
+    "shadows", "samples", "split", "obs_mode", "renderer", "dynamics", "test_dynamics",
     # Truth values.
     "state_critic", "anneal", "normalize_reward", "clip_value", "decoupled",
     "checkpoint_replay", "layer_norm", "bfloat16",

@@ -1,18 +1,19 @@
 """Compares pictures of the DM Control Suite's models with those of the suite itself.
 
-    MUJOCO_GL=osmesa python -m tests.benchmarks.suite_pictures
+    MUJOCO_GL=egl python -m tests.benchmarks.suite_pictures
 
 draws both with the same states, 84 x 84 pixels and each task's usual camera, and writes
 docs/images/dmc/beside.png, the suite's on the left, and docs/dmc/pictures.json: mean absolute
-differences of color in units of 1/255, of all pixels, of the sky, the ground and all else. It needs
-the package ``dm_control`` and a library of OSMesa (Debian's ``libosmesa6``), a software renderer;
-with another GL, such as ``MUJOCO_GL=egl``, some pixels are others.
+differences of color in units of 1/255, of all pixels, of the sky, the ground and all else, with the
+rays per pixel of ``--samples``. It needs the package ``dm_control`` and a library of EGL (Debian's
+``libegl1``); ``MUJOCO_GL=osmesa`` draws the same with ``libosmesa6``.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 from pathlib import Path
 
 import jax
@@ -20,6 +21,7 @@ import mujoco
 import numpy as np
 from PIL import Image, ImageDraw
 
+from pixelbrax_jax.physics.mujoco.lighting import detailed
 from pixelbrax_jax.renderer.base import render
 from pixelbrax_jax.scene.place import place
 from pixelbrax_jax.types import Frame
@@ -41,7 +43,9 @@ CASES = {
 """What is shown: domain, task, camera, and what moves by an edit of the model."""
 
 
-def pictures(domain: str, task: str, camera: int, movable: tuple[str, ...]) -> dict[str, list]:
+def pictures(
+    domain: str, task: str, camera: int, movable: tuple[str, ...], samples: int = 1
+) -> dict[str, list]:
     """Draw states of an episode of random actions.
 
     Returns:
@@ -55,10 +59,13 @@ def pictures(domain: str, task: str, camera: int, movable: tuple[str, ...]) -> d
     physics, rng = environment.physics, np.random.default_rng(1)
     own = suite_models.of(domain, physics.model.ptr, camera, movable)
     scene = own.scene
+    pixel = 2.0 * float(np.tan(np.deg2rad(scene.rig.fovy) / 2.0)) / (SIZE * math.isqrt(samples))
+    look = detailed(own.model, scene.look, pixel)
 
     @jax.jit
     def draw(xpos: jax.Array, xquat: jax.Array) -> Frame:
-        return render(place(scene.geoms, scene.rig, scene.look, xpos, xquat), SIZE, SIZE)
+        placed = place(scene.geoms, scene.rig, look, xpos, xquat)
+        return render(placed, SIZE, SIZE, samples=samples)
 
     drawn: dict[str, list] = {"theirs": [], "ours": [], "area": []}
     for state in range(STATES):
@@ -105,21 +112,25 @@ def main() -> None:
     """Compare some models, or all; files are written for all."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("cases", nargs="*", default=list(CASES), metavar="case")
-    chosen = parser.parse_args().cases
+    parser.add_argument("--samples", type=int, default=1, help="rays per pixel")
+    options = parser.parse_args()
+    chosen = options.cases
     report, pairs = {}, {}
     for name in chosen:
-        drawn = pictures(*CASES[name])
+        drawn = pictures(*CASES[name], options.samples)
         report[name] = differences(drawn)
+        print(f"{name:24} {report[name]}", flush=True)
         gap = np.full((SIZE, 2, 3), 255, np.uint8)
         pairs[name] = np.concatenate([drawn["theirs"][1], gap, drawn["ours"][1]], axis=1)
     if set(chosen) == set(CASES):
         (DOCS / "dmc").mkdir(exist_ok=True)
         (DOCS / "images" / "dmc").mkdir(parents=True, exist_ok=True)
         kept = {
-            "command": "MUJOCO_GL=osmesa python -m tests.benchmarks.suite_pictures",
+            "command": "MUJOCO_GL=egl python -m tests.benchmarks.suite_pictures",
             "mujoco": mujoco.__version__,
             "pixels": SIZE,
             "states": STATES,
+            "samples": options.samples,
             "mean_absolute_difference_of_255": report,
         }
         text = json.dumps(kept, indent=2) + "\n"

@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from pixelbrax_jax.physics.mujoco.lighting import detailed
 from pixelbrax_jax.physics.mujoco.scene import read_scene, tracked_body
 from pixelbrax_jax.types import GeomKind
 
@@ -178,3 +179,25 @@ def test_what_cannot_be_drawn_is_named():
     </tendon></mujoco>"""
     with pytest.raises(ValueError, match=r"tendon 'rope' runs over geoms .* alpha 0 or group 3"):
         read_scene(mujoco.MjModel.from_xml_string(over_a_geom))
+
+
+def test_what_only_the_detailed_look_shows():
+    model = mujoco.MjModel.from_xml_string(MODEL)
+    plain = read_scene(model)
+    assert plain.geoms.mirror == -1
+    geoms = plain.geoms
+    assert [geoms.name[g] for g in np.flatnonzero(geoms.textured)] == ["ground", "wall"]
+    model.mat_reflectance[model.material("floor").id] = 0.3
+    model.mat_reflectance[model.material("skin").id] = 0.4  # no plane
+    model.vis.headlight.specular[:] = 0.2
+    scene = read_scene(model)
+    assert scene.geoms.mirror == row(scene.geoms, "ground")
+    assert scene.look.reflectance is None
+    assert scene.look.sky_texture is None
+    look = detailed(model, scene.look, 0.04)
+    assert look.reflectance == np.float32(0.3)
+    # Half of it, as the default material's specular is 0.5.
+    assert look.headlight_highlight == np.float32(0.1)
+    assert look.sky_texture.shape == (6, 50, 50, 3)
+    assert (look.opengl, look.shininess) == (True, 64)
+    assert look.lamps == scene.look.lamps

@@ -14,8 +14,8 @@ import pixelbrax_jax as pb
 from pixelbrax_jax import GeomKind, make_look
 from pixelbrax_jax.distractors import Color, Distractor
 from pixelbrax_jax.renderer.base import render
-from pixelbrax_jax.renderer.fused import view_of
 from pixelbrax_jax.renderer.kernel import may_see, window_of
+from pixelbrax_jax.renderer.view import view_of
 from pixelbrax_jax.tasks import BRAX_TASKS
 from tests.envs.toy import PARAMS, Ball
 from tests.renderer import scenes

@@ -25,12 +25,33 @@ def test_a_models_own_look_is_the_default_one():
 
     def chosen(look, **options):
         config = EnvConfig("ball", look=look, **options)
-        return making._look(config, Lit())
+        return making._look(config, Lit(), 45.0)
 
-    assert chosen("default") is chosen("dmc") is own
+    assert chosen("default") is chosen("dmc") is chosen("dmc-plain") is own
     assert chosen("original") is make_look("original")
     assert chosen("dmc", shadows=False).ambient == np.float32(0.7)
-    assert making._look(EnvConfig("ball"), Ball()) is make_look("default")
+    assert making._look(EnvConfig("ball"), Ball(), 45.0) is make_look("default")
+
+
+@pytest.mark.parametrize("default", ["dmc", "dmc-plain"])
+def test_a_model_has_a_plain_look_and_a_detailed_one(default):
+    """The detailed one is for the rays of the picture."""
+    pixels = []
+
+    class Lit(Ball):
+        look = make_look("dmc").replace(ambient=np.float32(0.7))
+        default_look = default
+
+        def detailed_look(self, pixel):
+            pixels.append(pixel)
+            return self.look.replace(opengl=True)
+
+    for name, detailed in (("dmc", True), ("dmc-plain", False), ("default", default == "dmc")):
+        config = EnvConfig("ball", look=name, height=50, samples=4)
+        look = making._look(config, Lit(), 90.0)
+        assert look.ambient == np.float32(0.7)
+        assert look.opengl == detailed
+    assert pixels == [pytest.approx(2.0 / 100)]
 
 
 def test_dmcs_look_is_the_suites():

@@ -37,6 +37,7 @@ class Shape(NamedTuple):
     material: str = ""
     bounded: bool = False
     patterned: bool = False
+    textured: bool = False
     row: int = -1
     planes: np.ndarray | None = None
     error: float = 0.0
@@ -68,6 +69,7 @@ def as_geoms(shapes: Sequence[Shape]) -> Geoms:
         rgb=stack(rgb for _, rgb in rows),
         bounded=tuple(shape.bounded for shape in shapes),
         patterned=tuple(shape.patterned for shape in shapes),
+        textured=tuple(shape.textured for shape in shapes),
         num_planes=counts if planes else (),
         planes=jnp.asarray(np.concatenate(planes)) if planes else None,
         material_name=tuple(materials.values()) if any(materials.values()) else (),

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
+from pixelbrax_jax.physics.mujoco.sky import sky_colors, sky_texture, texture_pixels
 from pixelbrax_jax.physics.mujoco.viewpoints import follows_tracked
 from pixelbrax_jax.physics.task import Color
 from pixelbrax_jax.spatial import f32
@@ -20,14 +21,18 @@ from pixelbrax_jax.types import Lamp, Look
 _DIRECTIONAL = int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
 _POINT = int(mujoco.mjtLightType.mjLIGHT_POINT)
 _TRACKCOM = int(mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM)
+_PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
 _RGB = int(mujoco.mjtTextureRole.mjTEXROLE_RGB)
 
 _SPECULAR = 0.5
 """Specular reflection of MuJoCo's default material."""
 
+_EXPONENT = 64
+"""Shininess of MuJoCo's default material, 0.5, in OpenGL's units."""
+
 _SHININESS = 16
-"""A quarter of the default material's 0.5 * 128: that exponent is for the half vector between light
-and viewer, and Phong's mirrored vector turns twice as fast."""
+"""A quarter of that: its exponent is for the half vector between light and viewer, and Phong's
+mirrored vector turns twice as fast."""
 
 
 def read_look(model: mujoco.MjModel) -> Look:
@@ -55,11 +60,38 @@ def read_look(model: mujoco.MjModel) -> Look:
         diffuse=f32(0.0 if sun is None else model.light_diffuse[sun].mean()),
         specular=f32(0.0),
         highlight=f32(0.0 if sun is None else _SPECULAR * model.light_specular[sun].mean()),
-        sky=_sky(model),
+        sky=sky_colors(model),
         ground_rgb=colors,
         ground_pitch=pitch,
         headlight=f32(headlight.diffuse.mean()) if headlight.active else None,
     )
+
+
+def detailed(model: mujoco.MjModel, look: Look | None, pixel: float) -> Look:
+    """Return a look of ``read_look`` with all that MuJoCo's renderer draws.
+
+    ``pixel`` is the edge of a pixel at distance 1.
+    """
+    look = read_look(model) if look is None else look
+    headlight = model.vis.headlight
+    mirror = mirror_of(model)
+    shines = bool(headlight.active and headlight.specular.any())
+    return look.replace(
+        opengl=True,
+        shininess=_EXPONENT,
+        headlight_highlight=f32(_SPECULAR * headlight.specular.mean()) if shines else None,
+        reflectance=f32(model.mat_reflectance[model.geom_matid[mirror]]) if mirror >= 0 else None,
+        sky_texture=sky_texture(model, np.asarray(look.sky), pixel),
+    )
+
+
+def mirror_of(model: mujoco.MjModel) -> int:
+    """Return the index of the plane that reflects in MuJoCo's renderer, the first; -1 for none."""
+    for geom in np.flatnonzero(model.geom_type == _PLANE):
+        material = int(model.geom_matid[geom])
+        if material >= 0 and model.mat_reflectance[material] > 0:
+            return int(geom)
+    return -1
 
 
 def read_lamps(model: mujoco.MjModel, com_link: int) -> dict[str, Lamp]:
@@ -111,10 +143,10 @@ def _ambient(model: mujoco.MjModel) -> float:
 
 def checker(model: mujoco.MjModel, geom: int) -> np.ndarray | None:
     """Return the two colors of a geom's checkered texture, (2, 3) in [0, 1]; None for none."""
-    texture = _texture(model, geom)
+    texture = texture_of(model, geom)
     if texture < 0 or model.tex_type[texture] != int(mujoco.mjtTexture.mjTEXTURE_2D):
         return None
-    pixels = _pixels(model, texture)
+    pixels = texture_pixels(model, texture)
     # One pixel of each quarter: the first and last have one color, the others another.
     rows, columns = (np.arange(1, 4, 2) * size // 4 for size in pixels.shape[:2])
     (a, b), (c, d) = pixels[np.ix_(rows, columns)]
@@ -129,17 +161,18 @@ def mean_color(model: mujoco.MjModel, geom: int, color: Color) -> Color:
     MuJoCo limits the light on a texture to 1. The color is darkened by the excess of ambient light
     and headlight on a surface that faces the camera.
     """
-    texture = _texture(model, geom)
+    texture = texture_of(model, geom)
     if texture < 0:
         return color
     headlight = model.vis.headlight
     light = _ambient(model) + (float(headlight.diffuse.mean()) if headlight.active else 0.0)
-    mean = _pixels(model, texture).mean((0, 1)) / 255.0 * color
+    mean = texture_pixels(model, texture).mean((0, 1)) / 255.0 * color
     red, green, blue = mean / max(light, 1.0)
     return float(red), float(green), float(blue)
 
 
-def _texture(model: mujoco.MjModel, geom: int) -> int:
+def texture_of(model: mujoco.MjModel, geom: int) -> int:
+    """Return the index of a geom's texture, -1 for none."""
     material = int(model.geom_matid[geom])
     return int(model.mat_texid[material, _RGB]) if material >= 0 else -1
 
@@ -155,33 +188,3 @@ def _ground(model: mujoco.MjModel) -> tuple[Any, Any]:
                 repeat /= max(float(model.geom_size[geom, 0]), 1e-6)
             return f32(1.0 / repeat), f32(colors)
     return f32(1.0), f32([[0.1, 0.2, 0.3], [0.2, 0.3, 0.4]])
-
-
-def _sky(model: mujoco.MjModel) -> Any:
-    """Return (3, 3), colors at the horizon, above and below that fit the sky's texture best."""
-    skies = np.flatnonzero(model.tex_type == int(mujoco.mjtTexture.mjTEXTURE_SKYBOX))
-    if not len(skies):
-        return f32(np.zeros((3, 3)))
-    pixels = _pixels(model, int(skies[0]))
-    size = pixels.shape[1]
-    if pixels.shape[0] != 6 * size:
-        return f32([pixels.reshape(-1, 3).mean(0) / 255.0] * 3)
-    step = max(size // 50, 1)
-    middle = 2.0 * (np.arange(size) + 0.5) / size - 1.0
-    across, down = np.meshgrid(middle, middle)
-    length = np.sqrt(across**2 + down**2 + 1.0)
-    # Faces are right, left, up, down, front and back, their first rows on top.
-    rises = [-down / length, -down / length, 1.0 / length, -1.0 / length]
-    rises += rises[:2]
-    rise = np.stack([face[::step, ::step] for face in rises]).ravel()
-    colors = pixels.reshape(6, size, size, 3)[:, ::step, ::step].reshape(-1, 3) / 255.0
-    weights = np.stack([1.0 - np.abs(rise), np.maximum(rise, 0.0), np.maximum(-rise, 0.0)], -1)
-    fit, *_ = np.linalg.lstsq(weights, colors, rcond=None)
-    return f32(np.clip(fit, 0.0, 1.0))
-
-
-def _pixels(model: mujoco.MjModel, texture: int) -> np.ndarray:
-    height, width = int(model.tex_height[texture]), int(model.tex_width[texture])
-    channels, first = int(model.tex_nchannel[texture]), int(model.tex_adr[texture])
-    pixels = model.tex_data[first : first + height * width * channels]
-    return pixels.reshape(height, width, channels)[..., :3]

@@ -15,6 +15,7 @@ from pixelbrax_jax.physics.divergence import GuardedPhysics
 from pixelbrax_jax.physics.mujoco.dynamics import Dynamics, Readings, State
 from pixelbrax_jax.physics.mujoco.formulas import Formulas, Snapshot, Start
 from pixelbrax_jax.physics.mujoco.geometry import VISIBLE_GROUPS
+from pixelbrax_jax.physics.mujoco.lighting import detailed
 from pixelbrax_jax.physics.mujoco.native import compile_model, with_poses, without_textures
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
 from pixelbrax_jax.physics.mujoco.poses import (
@@ -26,7 +27,7 @@ from pixelbrax_jax.physics.mujoco.poses import (
 from pixelbrax_jax.physics.mujoco.scene import COM_LINK, read_scene
 from pixelbrax_jax.physics.mujoco.viewpoints import unfit_cameras
 from pixelbrax_jax.physics.task import Color
-from pixelbrax_jax.types import CameraRig, PhysicsState
+from pixelbrax_jax.types import CameraRig, Look, PhysicsState
 
 _UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 
@@ -40,6 +41,7 @@ class MujocoPhysics(GuardedPhysics):
 
     backend = "mujoco"
     varies = True
+    default_look = "dmc-plain"
     # XLA's CPU library YNNPACK is slower than XLA's own loops for the small sums and products of
     # these models.
     compiler_options = MappingProxyType({"xla_cpu_experimental_ynn_fusion_type": ""})
@@ -56,6 +58,7 @@ class MujocoPhysics(GuardedPhysics):
         colors: Mapping[str, Color] | None = None,
         geom_groups: Collection[int] = VISIBLE_GROUPS,
         identity: Hashable,
+        default_look: str = "dmc-plain",
     ):
         """Compile the model, edited for the task, and read its scene; compile no program.
 
@@ -74,6 +77,7 @@ class MujocoPhysics(GuardedPhysics):
             geom_groups=geom_groups,
         )
         self.geoms, self.look = scene.geoms, scene.look
+        self.default_look = default_look
         self.hull_errors = scene.hull_errors
         default = scene.rigs.get("default") or scene.rig or next(iter(rigs.values()), None)
         self.rigs = {**scene.rigs, **rigs} | ({"default": default} if default else {})
@@ -104,6 +108,10 @@ class MujocoPhysics(GuardedPhysics):
         self._control_range = low, high
         first = jax.eval_shape(self.reset, jax.random.key(0))
         self.state_size = int(first.obs.shape[0])
+
+    def detailed_look(self, pixel: float) -> Look:
+        """Return the look with all that MuJoCo's renderer draws; see ``Physics``."""
+        return detailed(self._model, self.look, pixel)
 
     def control(self, action: jax.Array) -> jax.Array:
         """Map an action (A,) from [-1, 1] to the range of each control that has one."""

@@ -16,11 +16,12 @@ from pixelbrax_jax.physics.mujoco.compatibility import (
     loading_silenced,
 )
 from pixelbrax_jax.physics.mujoco.geometry import VISIBLE_GROUPS
+from pixelbrax_jax.physics.mujoco.lighting import detailed
 from pixelbrax_jax.physics.mujoco.poses import body_names, with_center_of_mass
 from pixelbrax_jax.physics.mujoco.scene import read_scene
 from pixelbrax_jax.physics.mujoco.viewpoints import followed_body, unfit_cameras
 from pixelbrax_jax.physics.task import Color
-from pixelbrax_jax.types import PhysicsState
+from pixelbrax_jax.types import Look, PhysicsState
 
 with import_silenced():
     from mujoco import mjx
@@ -31,6 +32,7 @@ class PlaygroundPhysics(GuardedPhysics):
     """A task of MuJoCo Playground, made by ``playground_physics``."""
 
     backend = "mjx"
+    default_look = "dmc-plain"
 
     @default_flags()
     def __init__(
@@ -74,6 +76,10 @@ class PlaygroundPhysics(GuardedPhysics):
         self._dtypes = jax.tree.map(lambda leaf: leaf.dtype, first)
         obs = jax.eval_shape(_flat, first.obs)
         self.state_size = int(obs.shape[0])
+
+    def detailed_look(self, pixel: float) -> Look:
+        """Return the look with all that MuJoCo's renderer draws; see ``Physics``."""
+        return detailed(self._env.mj_model, self.look, pixel)
 
     def _reset(self, key: jax.Array) -> PhysicsState:
         return self._state(self._env.reset(jax.random.key_data(key)))

@@ -19,7 +19,14 @@ from pixelbrax_jax.physics.mujoco.geometry import (
     resolve_rgba,
     site_shapes,
 )
-from pixelbrax_jax.physics.mujoco.lighting import checker, mean_color, read_lamps, read_look
+from pixelbrax_jax.physics.mujoco.lighting import (
+    checker,
+    mean_color,
+    mirror_of,
+    read_lamps,
+    read_look,
+    texture_of,
+)
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
 from pixelbrax_jax.physics.mujoco.viewpoints import camera_name, read_rigs
 from pixelbrax_jax.physics.mujoco.viewpoints import tracked_body as tracked_body
@@ -80,7 +87,7 @@ def read_scene(
     links = [COM_LINK] if tracked_body(model) >= 0 else []
     com_link = model.nbody - 1 if links else -1
     target = model.nbody - 1 + len(links)
-    geoms_seen = _textured_geoms(model, colors or {}, geom_groups)
+    geoms_seen = list(_textured_geoms(model, colors or {}, geom_groups))
     shapes, lamps = [*geoms_seen, *site_shapes(model, geom_groups)], read_lamps(model, com_link)
     moving = [i for i, s in enumerate(shapes) if s.name.removeprefix("site/") in movable]
     if moving:
@@ -91,7 +98,10 @@ def read_scene(
         for name in set(movable) & set(lamps):
             lamps[name] = lamps[name].replace(link=target, pos=lamps[name].pos - anchor)
     pieces, strings = _strings(model, len(shapes))
-    geoms = as_geoms([*shapes, *pieces]).replace(strings=tuple(strings))
+    mirrors = [i for i, shape in enumerate(geoms_seen) if shape.row == mirror_of(model)]
+    geoms = as_geoms([*shapes, *pieces]).replace(
+        strings=tuple(strings), mirror=mirrors[0] if mirrors else -1
+    )
     rigs = read_rigs(model, com_link)
     look = read_look(model).replace(lamps=tuple(lamps.values()))
     rig = None if camera is None or not model.ncam else rigs[camera_name(model, camera)]
@@ -108,6 +118,7 @@ def _textured_geoms(
             rgb=shape.rgb if is_own else mean_color(model, shape.row, shape.rgb),
             bounded=bool(is_plane and (shape.size[:2] > 0).any()),
             patterned=is_plane and not is_own and checker(model, shape.row) is not None,
+            textured=not is_own and texture_of(model, shape.row) >= 0,
         )
 
 
