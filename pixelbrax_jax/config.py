@@ -108,8 +108,8 @@ class EnvConfig(BraxOptions, MujocoOptions, ProgramConfig):
     whose images are the channels of each frame, one camera after the other."""
     look: str | Look = "default"
     """Light, sky and ground: ``default``, ``original``, ``dmc``, ``dmc-plain`` or a ``Look``. For a
-    task of MuJoCo the last two have the lights of its model; ``dmc``, the default of the DM Control
-    Suite, also has what only costs time, such as the texture of its sky."""
+    task of MuJoCo ``default`` is ``dmc-plain`` with the lights of its model; ``dmc`` is the picture
+    of MuJoCo's renderer, with the texture of the sky and reflections, and takes longer."""
     shadows: bool | None = None
     """Whether geoms cast shadows. None keeps the choice of the look."""
     episode_length: int = 1000

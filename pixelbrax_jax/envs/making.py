@@ -139,12 +139,11 @@ def _rig(config: EnvConfig, camera: Any, physics: Physics) -> CameraRig:
 def _look(config: EnvConfig, physics: Physics, fovy: float) -> Look:
     look = config.look
     if physics.look is not None and isinstance(look, str):
-        name = physics.default_look if look == "default" else look
-        if name == "dmc":
+        if look == "dmc":
             rays = config.height * math.isqrt(config.samples)
             pixel = 2.0 * math.tan(math.radians(fovy) / 2.0) / rays
             look = _detailed(physics, pixel) or look
-        elif name == "dmc-plain":
+        elif look in ("default", "dmc-plain"):
             look = physics.look
     return make_look(look, shadows=config.shadows)
 

@@ -65,9 +65,8 @@ class Physics(abc.ABC):
         followed_link: the link that a camera follows by default.
         hull_errors: metres by name of a mesh geom: largest distance of the drawn shape from the
             convex hull of the mesh.
-        look: lights, sky and ground of the model, used as look ``dmc-plain``; see
+        look: lights, sky and ground of the model, used as looks ``default`` and ``dmc-plain``; see
             ``detailed_look``.
-        default_look: which look ``default`` means if the model has one, ``dmc`` or ``dmc-plain``.
         batch_last: whether a CPU is faster with the environments as last axis of a batch.
         compiler_options: XLA options for fast programs on a CPU.
     """
@@ -85,7 +84,6 @@ class Physics(abc.ABC):
     followed_link: int = 0
     hull_errors: Mapping[str, float] = MappingProxyType({})
     look: Look | None = None
-    default_look: str = "dmc"
     batch_last: bool = True
     compiler_options: Mapping[str, Any] = MappingProxyType({})
 

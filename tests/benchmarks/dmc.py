@@ -43,7 +43,7 @@ def main() -> None:
 
     import pixelbrax_gym  # noqa: F401  # registers the ids
 
-    envs = gymnasium.make_vec(name, num_envs=num_envs, output="numpy", look="dmc-plain")
+    envs = gymnasium.make_vec(name, num_envs=num_envs, output="numpy")
     envs.reset(seed=0)
     low, high = envs.action_space.low, envs.action_space.high
     draw = np.random.default_rng(0)

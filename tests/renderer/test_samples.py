@@ -39,7 +39,7 @@ def test_bands_and_packed_images_have_samples_too():
     whole = render(SCENE, HEIGHT, WIDTH, "fused", samples=4)
     band = render(SCENE, HEIGHT, WIDTH, "fused", first_row=3, num_rows=2, samples=4)
     np.testing.assert_allclose(band.r, whole.r[3:5], atol=1e-3)
-    packed = draw(SCENE, HEIGHT, WIDTH, "fused", lambda frame, rows: frame, 4)
+    (packed,) = draw(SCENE, HEIGHT, WIDTH, "fused", lambda frame, rows: frame, samples=4)
     levels = [np.asarray(image).view(np.uint8).astype(int) for image in (packed, pack(whole))]
     assert np.abs(levels[0] - levels[1]).max() <= 1
 

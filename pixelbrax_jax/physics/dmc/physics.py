@@ -24,4 +24,4 @@ def _load(task: str, engine: str) -> MujocoPhysics:
     formulas = FORMULAS[task]
     spec = load_spec(TASKS[task].domain, **formulas.options)
     identity = Recipe(_load, (task, engine))
-    return MujocoPhysics(formulas, spec, engine=engine, identity=identity, default_look="dmc")
+    return MujocoPhysics(formulas, spec, engine=engine, identity=identity)

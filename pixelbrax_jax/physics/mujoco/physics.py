@@ -41,7 +41,6 @@ class MujocoPhysics(GuardedPhysics):
 
     backend = "mujoco"
     varies = True
-    default_look = "dmc-plain"
     # XLA's CPU library YNNPACK is slower than XLA's own loops for the small sums and products of
     # these models.
     compiler_options = MappingProxyType({"xla_cpu_experimental_ynn_fusion_type": ""})
@@ -58,7 +57,6 @@ class MujocoPhysics(GuardedPhysics):
         colors: Mapping[str, Color] | None = None,
         geom_groups: Collection[int] = VISIBLE_GROUPS,
         identity: Hashable,
-        default_look: str = "dmc-plain",
     ):
         """Compile the model, edited for the task, and read its scene; compile no program.
 
@@ -77,7 +75,6 @@ class MujocoPhysics(GuardedPhysics):
             geom_groups=geom_groups,
         )
         self.geoms, self.look = scene.geoms, scene.look
-        self.default_look = default_look
         self.hull_errors = scene.hull_errors
         default = scene.rigs.get("default") or scene.rig or next(iter(rigs.values()), None)
         self.rigs = {**scene.rigs, **rigs} | ({"default": default} if default else {})

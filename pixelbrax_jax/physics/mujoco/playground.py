@@ -32,7 +32,6 @@ class PlaygroundPhysics(GuardedPhysics):
     """A task of MuJoCo Playground, made by ``playground_physics``."""
 
     backend = "mjx"
-    default_look = "dmc-plain"
 
     @default_flags()
     def __init__(
