@@ -1,7 +1,7 @@
 """Draw the golden images; ``python -m tests.golden.images`` rewrites those that are kept.
 
 One PNG for each of Brax's tasks: a row for each look, a column for each camera. One PNG for each
-model of the DM Control Suite and of Gymnasium: its task's own camera and look.
+model of the DM Control Suite and of Gymnasium: its task's own camera, of DM Control in both looks.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from pixelbrax_jax.scene.place import place
 from pixelbrax_jax.tasks import BRAX_TASKS, DMC_TASKS, GYM_TASKS
 
 FOLDER = Path(__file__).parent
-LOOKS = {"brax": ("default", "original"), "models": ("default",)}
-SIZE = {"brax": 48, "models": 84}
+LOOKS = {"brax": ("default", "original"), "dmc": ("default", "dmc"), "gym": ("default",)}
+SIZE = {"brax": 48, "dmc": 84, "gym": 84}
 """Pixels of an image, each way."""
 TARGET = (0.1, -0.05, 0.1)
 """Metres, where the target is in tasks that have one."""
@@ -41,10 +41,10 @@ def draw(task: str) -> np.ndarray:
     Returns:
         (size looks, size cameras, 3) uint8.
     """
-    suite = "brax" if task in BRAX_TASKS else "models"
+    suite = "brax" if task in BRAX_TASKS else "dmc" if task in DMC_TASKS else "gym"
     env, params = pb.make(task, obs_mode="state")
     rigs = list(pb.named_rigs(task).values()) if suite == "brax" else [params.rig]
-    looks = [params.look if look == "default" else pb.make_look(look) for look in LOOKS[suite]]
+    looks = [pb.make(task, obs_mode="state", look=look)[1].look for look in LOOKS[suite]]
     xpos, xquat = pose(env.physics)
     size = SIZE[suite]
 
