@@ -8,6 +8,7 @@ import pytest
 from pixelbrax_jax.physics.dmc.formulas import rising, small_control, tolerance
 from pixelbrax_jax.tasks import BRAX_TASKS, DMC_TASKS, GYM_TASKS, TASKS
 from tests.benchmarks import task_pages
+from tests.benchmarks.formula_texts import Text
 
 SUITES = {"brax": BRAX_TASKS, "dmc": DMC_TASKS, "gymnasium": GYM_TASKS}
 DESCRIBED = {"brax": task_pages.brax, "dmc": task_pages.dmc, "gymnasium": task_pages.gym}
@@ -25,9 +26,7 @@ def test_every_task_says_what_it_rewards_and_observes(suite):
     for task in described:
         name = task.row.name
         assert task.reward.sentence(), f"{name}: its reward has no formula in words"
-        said = (
-            f"{name}: entries of its observation that have words, see tests/benchmarks/task_pages"
-        )
+        said = f"{name}: words for each entry, see tests/benchmarks/formula_texts.py"
         assert task_pages.num_observed(task) == task.physics.state_size, said
 
 
@@ -60,9 +59,7 @@ def test_a_text_is_filled_and_its_entries_are_counted():
         * ``2 * size`` more, {size / 4!.2f}
         """
 
-    text = task_pages.Text.of(
-        observe, {"places": [("x", "m"), ("y", "m"), ("turn", "rad")], "size": 3}
-    )
+    text = Text.of(observe, {"places": [("x", "m"), ("y", "m"), ("turn", "rad")], "size": 3})
     assert list(text.entries()) == [
         (3, "`x`, `y` (m), `turn` (rad), as they are"),
         (6, "more, 0.75"),

@@ -1,16 +1,12 @@
 """Pages of docs/tasks: rewards, observations, time steps, actions and cameras of every task.
 
-Names, numbers and units come from the models and the code. What the numbers mean stands beside the
-formulas: in the docstrings of a MuJoCo task's functions, and in the rows of Brax's tasks. Such a
-text may have ``{expressions}`` of the function's module, its keywords and ``model``. An entry of an
-observation is ``* ``expression`` text``; the expression gives labels, or a number of entries.
+Names, numbers and units come from the models and the code, and what they mean from texts beside the
+formulas, see ``formula_texts``.
 """
 
 from __future__ import annotations
 
-import inspect
 import json
-import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache, partial
@@ -30,147 +26,11 @@ from pixelbrax_jax.physics.mujoco.formulas import never
 from pixelbrax_jax.registry import make_physics
 from pixelbrax_jax.tasks import BRAX_TASKS, DMC_TASKS, GYM_TASKS
 from pixelbrax_jax.types import CameraRig
+from tests.benchmarks.formula_texts import Labels, Text
 
 DOCS = Path(__file__).parents[2] / "docs"
 
-Label = tuple[str, str]
-"""Name and unit of an entry."""
-
-_ENTRY = re.compile(r"^\s*\* ``(.+?)``[ ;,:]*(.*)$")
-_JOINTS, _SENSORS = mujoco.mjtJoint, mujoco.mjtSensor
-_UNITS = {
-    "TOUCH": "N",
-    "FORCE": "N",
-    "TORQUE": "N m",
-    "ACCELEROMETER": "m/s²",
-    "VELOCIMETER": "m/s",
-    "GYRO": "rad/s",
-    "FRAMEPOS": "m",
-    "SUBTREELINVEL": "m/s",
-}
-
-
-@dataclass(frozen=True)
-class Labels:
-    """Names and units of what a task's formulas read, by the names that they use."""
-
-    model: mujoco.MjModel
-
-    @property
-    def qpos(self) -> list[Label]:
-        found: list[Label] = []
-        for i in range(self.model.njnt):
-            name, kind = self._joint(i), int(self.model.jnt_type[i])
-            if kind == _JOINTS.mjJNT_FREE:
-                found += [(f"{name}.{axis}", "m") for axis in "xyz"]
-            if kind in (_JOINTS.mjJNT_FREE, _JOINTS.mjJNT_BALL):
-                found += [(f"{name}.q{axis}", "quaternion") for axis in "wxyz"]
-            else:
-                found.append((name, "m" if kind == _JOINTS.mjJNT_SLIDE else "rad"))
-        return found
-
-    @property
-    def qvel(self) -> list[Label]:
-        found: list[Label] = []
-        for i in range(self.model.njnt):
-            name, kind = self._joint(i), int(self.model.jnt_type[i])
-            if kind == _JOINTS.mjJNT_FREE:
-                found += [(f"{name}.v{axis}", "m/s") for axis in "xyz"]
-            if kind in (_JOINTS.mjJNT_FREE, _JOINTS.mjJNT_BALL):
-                found += [(f"{name}.w{axis}", "rad/s") for axis in "xyz"]
-            else:
-                found.append((name, "m/s" if kind == _JOINTS.mjJNT_SLIDE else "rad/s"))
-        return found
-
-    @property
-    def act(self) -> list[Label]:
-        return [(self.model.actuator(i).name, "activation") for i in range(self.model.na)]
-
-    def joint_pos(self, *names: str) -> list[Label]:
-        return [self.qpos[self.model.joint(name).qposadr[0]] for name in names]
-
-    def joint_vel(self, *names: str) -> list[Label]:
-        return [self.qvel[self.model.joint(name).dofadr[0]] for name in names]
-
-    def sensor(self, *names: str) -> list[Label]:
-        found: list[Label] = []
-        for name in names:
-            sensor = self.model.sensor(name)
-            kind = _SENSORS(int(sensor.type[0])).name.removeprefix("mjSENS_")
-            joint = self.model.joint(int(sensor.objid[0])) if kind.startswith("JOINT") else None
-            if joint is not None:
-                slides = int(joint.type[0]) == _JOINTS.mjJNT_SLIDE
-                unit = ("m" if slides else "rad") + ("/s" if kind == "JOINTVEL" else "")
-            else:
-                unit = _UNITS[kind]
-            axes = [f"{name}.{axis}" for axis in "xyz"] if sensor.dim[0] == 3 else [name]
-            found += [(axis, unit) for axis in axes]
-        return found
-
-    def sensors_of(self, *kinds: str) -> list[Label]:
-        wanted = [int(getattr(_SENSORS, f"mjSENS_{kind}")) for kind in kinds]
-        rows = [i for i, kind in enumerate(self.model.sensor_type) if int(kind) in wanted]
-        return self.sensor(*(self.model.sensor(i).name for i in rows))
-
-    def _joint(self, i: int) -> str:
-        body = self.model.body(int(self.model.jnt_bodyid[i])).name
-        return self.model.joint(i).name or f"{body}/{i - self.model.body(body).jntadr[0]}"
-
-    def names(self) -> dict[str, Any]:
-        """What an expression may use."""
-        public = (name for name in dir(self) if not name.startswith("_") and name != "names")
-        return {name: getattr(self, name) for name in public}
-
-
-@dataclass(frozen=True)
-class Text:
-    """What a formula says of itself: its docstring, or a row's text, with its names."""
-
-    text: str
-    names: Mapping[str, Any]
-    keywords: Mapping[str, Any]
-
-    @classmethod
-    def of(cls, formula: Callable[..., Any], names: Mapping[str, Any]) -> Text:
-        keywords: dict[str, Any] = {}
-        while isinstance(formula, partial):
-            keywords, formula = formula.keywords | keywords, formula.func
-        text = inspect.cleandoc(formula.__doc__ or "")
-        return cls(text, formula.__globals__ | keywords | names, keywords)
-
-    def sentence(self) -> str:
-        """All of it, without the verb, its expressions evaluated."""
-        text = re.sub(r"^Return (whether )?", "", " ".join(self.text.split()))
-        return self._filled(text).replace("``", "`").rstrip(".")
-
-    def entries(self) -> Iterator[tuple[int, str]]:
-        """Numbers and meanings of the entries of an observation, in order."""
-        for line in self.text.splitlines():
-            if not (found := _ENTRY.match(line)):
-                continue
-            value = eval(found[1], dict(self.names))
-            text = self._filled(found[2]).replace("``", "`")
-            if callable(value):
-                yield from Text.of(value, self.names).entries()
-            elif isinstance(value, int):
-                yield value, text
-            else:
-                yield len(value), ", ".join(filter(None, (listed(value), text)))
-
-    def _filled(self, text: str) -> str:
-        def fill(found: re.Match[str]) -> str:
-            code, _, form = found[1].partition("!")
-            return format(eval(code, dict(self.names)), form)
-
-        return re.sub(r"\{([^}]+)\}", fill, text)
-
-
-def listed(labels: list[Label]) -> str:
-    """Names with their units, those of one unit together."""
-    parts = []
-    for unit, group in groupby(labels, key=lambda label: label[1]):
-        parts.append(", ".join(f"`{name}`" for name, _ in group) + f" ({unit})")
-    return ", ".join(parts)
+_JOINTS = mujoco.mjtJoint
 
 
 @dataclass(frozen=True)
@@ -214,42 +74,50 @@ def _range(low: float, high: float, unit: str = "") -> str:
     return f"{bounds} {unit}".strip()
 
 
+def _effect(
+    model: mujoco.MjModel, i: int, bounds: tuple[float, float], gear: float
+) -> tuple[tuple[str, str], str]:
+    """What an actuator does and how far, and its joint, tendon or site."""
+    at, trn = int(model.actuator_trnid[i, 0]), mujoco.mjtTrn(int(model.actuator_trntype[i]))
+    by_joint = trn in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+    if by_joint:
+        target, is_slide = Labels(model).joint(at), model.jnt_type[at] == _JOINTS.mjJNT_SLIDE
+    else:
+        is_tendon = trn == mujoco.mjtTrn.mjTRN_TENDON
+        target, is_slide = (model.tendon(at) if is_tendon else model.site(at)).name, True
+    _, stiffness, damping = model.actuator_biasprm[i, :3]
+    if stiffness:
+        effect, unit = "position", ("m" if is_slide else "rad") if by_joint else ""
+    elif damping:
+        effect, unit = "velocity", ("m/s" if is_slide else "rad/s") if by_joint else ""
+    else:
+        effect, unit = ("force", "N") if is_slide else ("torque", "N m")
+        scale = model.actuator_gainprm[i, 0] * gear
+        bounds = bounds[0] * scale, bounds[1] * scale
+    filtered = ", filtered" if model.actuator_dyntype[i] else ""
+    return (effect, _range(*bounds, unit) + filtered), target
+
+
 def actuators(task: Described) -> str:
     """What actions do, those that do the same together."""
     model, env = task.model, getattr(task.physics, "_source", None)
-    ranges = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, [[-1, 1]])
-    gears, scaled = model.actuator_gear[:, 0], True
+    limited = model.actuator_ctrllimited[:, None].astype(bool)
+    ranges = np.where(limited, model.actuator_ctrlrange, [[-1.0, 1.0]])
+    gears = model.actuator_gear[:, 0]
     if env is not None:
         gears = np.asarray(env.unwrapped.sys.actuator.gear)
-        scaled = task.row.paper_unscaled
-    effects = []
-    for i in range(model.nu):
-        joint = model.actuator_trnid[i, 0]
-        by_joint = model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT
-        target = Labels(model)._joint(joint) if by_joint else model.tendon(int(joint)).name
-        slides = by_joint and model.jnt_type[joint] == _JOINTS.mjJNT_SLIDE
-        low, high = ranges[i] if scaled else (max(-1, ranges[i, 0]), min(1, ranges[i, 1]))
-        _, stiffness, damping = model.actuator_biasprm[i, :3]
-        gain = model.actuator_gainprm[i, 0]
-        if stiffness:
-            kind, reach = (
-                "position",
-                _range(low, high, "" if not by_joint else "m" if slides else "rad"),
-            )
-        elif damping:
-            kind, reach = "velocity", _range(low, high, "m/s" if slides else "rad/s")
-        else:
-            unit = ("N" if slides else "N m") if by_joint else "on the tendon"
-            kind = "force" if slides or not by_joint else "torque"
-            reach = _range(low * gain * gears[i], high * gain * gears[i], unit)
-        effects.append(((kind, reach, bool(model.actuator_dyntype[i])), target))
+        if not task.row.paper_unscaled:
+            ranges = np.clip(ranges, -1.0, 1.0)
+    effects = [
+        _effect(model, i, (float(low), float(high)), float(gears[i]))
+        for i, (low, high) in enumerate(ranges)
+    ]
     parts = []
-    for (kind, reach, filtered), group in groupby(effects, key=lambda effect: effect[0]):
-        names = ", ".join(f"`{target}`" for _, target in group)
-        parts.append(f"{kind} {names} {reach}" + (", filtered" if filtered else ""))
-    control = " or ".join(dict.fromkeys(_range(*ends) for ends in ranges)) if scaled else "±1"
+    for (effect, reach), group in groupby(effects, key=lambda effect: effect[0]):
+        parts.append(f"{effect} {', '.join(f'`{target}`' for _, target in group)} {reach}")
+    control = " or ".join(dict.fromkeys(_range(*bounds) for bounds in ranges))
     mapped = "" if control == "±1" else f", mapped to controls u ({control})"
-    return f"{model.nu} in [-1, 1]{mapped}: " + "; ".join(parts)
+    return f"{model.nu} in [-1, 1]{mapped}: {'; '.join(parts)}"
 
 
 def cameras(task: Described) -> str:

@@ -58,7 +58,7 @@ class BraxTask(Task):
         paper_reward: name of that preset's reward in ``loading``, None for Brax's.
         reward: Brax's formula, with the action a, or the control u that an action is mapped to.
         ends: when an episode ends before the time limit; empty for never.
-        observation: entries of the state, see ``tests/benchmarks/task_pages.py``.
+        observation: entries of the state, see ``tests/benchmarks/formula_texts.py``.
     """
 
     default_backend: str
