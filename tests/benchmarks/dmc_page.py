@@ -1,10 +1,11 @@
-"""Tables, figures and learning curves of docs/dmc.md, from the results in docs/dmc."""
+"""Tables, figures and learning curves about the DM Control Suite, from the results in docs/dmc."""
 
 from __future__ import annotations
 
 import json
 from contextlib import suppress
-from functools import cache
+from functools import cache, partial
+from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
 
@@ -60,14 +61,51 @@ def learned() -> str:
 
 
 def tasks() -> str:
-    """All tasks, in Markdown."""
-    lines = [[f"`{r.gymnasium_id}`", f"`{r.name}`", r.summary] for r in DMC_TASKS.values()]
-    return table(("Gymnasium id", "in JAX", "goal"), lines)
+    """All tasks by domain, in Markdown."""
+    lines = []
+    for domain, rows in groupby(DMC_TASKS.values(), key=lambda row: row.domain):
+        page = f"tasks/dmc.md#{domain.replace('_', '-')}"
+        names = ", ".join(f"`{row.name}`" for row in rows)
+        lines.append([f"[{domain.replace('_', ' ')}]({page})", names])
+    return table(("domain", "in JAX"), lines)
+
+
+@cache
+def kept_physics() -> dict[str, dict]:
+    """How far each task is from dm_control's."""
+    kept: dict[str, dict] = json.loads((FOLDER / "physics.json").read_text("utf-8"))["tasks"]
+    return kept
+
+
+def same_state() -> str:
+    """The largest difference in the same state."""
+    tasks = kept_physics().values()
+    parts = ("reward", "observation")
+    return f"{max(task['same_state'][part] for task in tasks for part in parts):.0e}"
+
+
+def states() -> str:
+    """How many states were stepped; none of their velocities is off."""
+    tasks = kept_physics().values()
+    assert not any(task["control_step"]["velocities_off"] for task in tasks)
+    return f"{sum(task['states'] for task in tasks):,}"
+
+
+def part() -> str:
+    """After how many control steps the first episode parts."""
+    return f"{min(n for task in kept_physics().values() if (n := task['episode']['apart']))}"
+
+
+def first_frames(which: str) -> str:
+    """Seconds to the first frame, over all tasks."""
+    ours = [row for row in rows() if row["measure"] == "dmc.pixels" and row["status"] == "ok"]
+    seconds = [row["values"]["first_frame"][which] for row in ours]
+    return f"{min(seconds):.0f} to {max(seconds):.0f}"
 
 
 def physics() -> str:
     """How far each domain is from dm_control's, the worst of its tasks, in Markdown."""
-    kept = json.loads((FOLDER / "physics.json").read_text("utf-8"))["tasks"]
+    kept = kept_physics()
     domains: dict[str, list[dict]] = {}
     for name, row in DMC_TASKS.items():
         domains.setdefault(row.domain, []).append(kept[name])
@@ -132,7 +170,19 @@ def end(name: str) -> str:
     return f"{final(run)['return']:.0f}"
 
 
-FIGURES = {"speed": speed, "physics": physics, "learned": learned, "tasks": tasks}
+FIGURES = {
+    "learned": learned,
+    "tasks": tasks,
+    "least": lambda: named(next(iter(ratios()))),
+    "most": lambda: named(next(reversed(ratios()))),
+    "cheetah": lambda: number(speeds("dmc_cheetah_run")[0]),
+    "first-frame": partial(first_frames, "without"),
+    "first-frame-kept": partial(first_frames, "with"),
+    "same-state": same_state,
+    "states": states,
+    "part": part,
+}
+ALL = {"speed": speed, "physics": physics}
 README = {
     "cheetah": lambda: number(speeds("dmc_cheetah_run")[0]),
     "cheetah-ratio": lambda: f"{ratios()['dmc_cheetah_run']:.0f}",

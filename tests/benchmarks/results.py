@@ -1,4 +1,4 @@
-"""Tables, figures and plots of docs/results.md, from the runs that `experiments.py` kept."""
+"""Tables, figures and plots of what agents learn, from the runs that `experiments.py` kept."""
 
 from __future__ import annotations
 
@@ -150,6 +150,21 @@ def clean_table(runs: dict[str, list[dict]]) -> str:
     return markdown_table(heads, lines)
 
 
+def short_table(runs: dict[str, list[dict]]) -> str:
+    """What the preset's own runs reach, and what is earned without learning, in Markdown."""
+    algorithms = ("ppo", "ppg", "dcpg")
+    heads = ("task", *(name.upper() for name in algorithms), "random policy", "no action")
+    lines, tasks, without = [], by_task(runs), read("untrained.json")
+    for key, of_task in tasks.items():
+        task = key.rsplit("-", 1)[0]
+        own = [of_task[name] for x in algorithms if (name := f"{x}-{task}") in of_task]
+        if len(own) == len(algorithms):
+            ends = [without[key][kind] for kind in ("random", "none")]
+            earned = [f"{end['return']:,.0f} ± {end['standard_error']:,.0f}" for end in ends]
+            lines.append([title(key, list(tasks)), *map(reached, own), *earned])
+    return markdown_table(heads, lines)
+
+
 def baselines_table(runs: dict[str, list[dict]]) -> str:
     """What is earned without learning, and by another agent from the state, in Markdown."""
     heads = ("task", "random policy", "no action", "Brax's PPO, from the state", "million steps")
@@ -284,9 +299,7 @@ def elsewhere(name: str) -> str:
 
 
 FIGURES: Figures = {
-    "clean": lambda: clean_table(seeds_of()),
-    "baselines": lambda: baselines_table(seeds_of()),
-    "distracted": lambda: distracted_table(seeds_of()),
+    "short": lambda: short_table(seeds_of()),
     "pretrained": pretrained_table,
     **{task: partial(mean_end, f"ppo-{task}") for task in TASKS},
     **{f"{task}-length": partial(mean_length, f"ppo-{task}") for task in ("walker2d", "humanoid")},
@@ -299,8 +312,13 @@ FIGURES: Figures = {
     "held-out-errors": lambda: span(error_of_ratio(run) for seeds in with_clips() for run in seeds),
     "under-video": partial(elsewhere, "halfcheetah under paper-video"),
     "under-color": partial(elsewhere, "halfcheetah under paper-color"),
-    "by-brax": partial(elsewhere, "walker2d by Brax's reward"),
 }
+RUNS: Figures = {
+    "clean": lambda: clean_table(seeds_of()),
+    "baselines": lambda: baselines_table(seeds_of()),
+    "distracted": lambda: distracted_table(seeds_of()),
+}
+TRIED: Figures = {"by-brax": partial(elsewhere, "walker2d by Brax's reward")}
 
 
 def plot() -> None:

@@ -56,6 +56,9 @@ class BraxTask(Task):
         paper_unscaled: whether that preset passes actions unchanged to costs and actuators, where
             Brax first maps them from [-1, 1] to the control range. Actuators still clip to it.
         paper_reward: name of that preset's reward in ``loading``, None for Brax's.
+        reward: Brax's formula, with the action a, or the control u that an action is mapped to.
+        ends: when an episode ends before the time limit; empty for never.
+        observation: entries of the state, see ``tests/benchmarks/formula_texts.py``.
     """
 
     default_backend: str
@@ -67,6 +70,9 @@ class BraxTask(Task):
     paper_options: Mapping[str, float] = field(default_factory=dict)
     paper_unscaled: bool = False
     paper_reward: str | None = None
+    reward: str = ""
+    ends: str = ""
+    observation: tuple[str, ...] = ()
 
 
 # Okabe and Ito's palette (Color Universal Design, 2008) can be distinguished with any color vision.
@@ -74,6 +80,20 @@ _SKY_BLUE = (0.337, 0.706, 0.914)
 _YELLOW = (0.941, 0.894, 0.259)
 _VERMILLION = (0.835, 0.369, 0.0)
 _RED = (1.0, 0.0, 0.0)
+
+_HUMANOID_STATE = (
+    "``qpos[2:]``",
+    "``qvel``",
+    "``10 * (model.nbody - 1)`` of each link: inertia about the center of mass, and mass",
+    "``6 * (model.nbody - 1)`` of each link: velocity times its part of the mass (m/s), and "
+    "angular velocity (rad/s)",
+    "``model.nv`` of each degree of freedom: torque of its actuator, N m",
+)
+_WALKER_STATE = (
+    "``1`` height of the torso, m",
+    "``qpos[2:]``",
+    "``qvel`` clipped to [-10, 10]",
+)
 
 # Viewpoints of the original renderer (arXiv 2502.00021). Its field of view is horizontal, which for
 # square images equals the vertical one.
@@ -100,6 +120,9 @@ TASKS = by_name(
             # Brax's reset noise puts feet below the ground, and the positional backend then throws
             # the ant into the air: a quarter of the episodes ends within four steps.
             backends=("generalized", "mjx", "spring"),
+            reward="``v + 1 - 0.5 * sum(a ** 2)``; v: velocity of the torso along x, m/s",
+            ends="when the torso's height is outside [0.2, 1] m",
+            observation=("``qpos[2:]``", "``qvel``"),
         ),
         BraxTask(
             "halfcheetah",
@@ -107,6 +130,8 @@ TASKS = by_name(
             "A planar two-legged body runs along x; never ends early.",
             "spring",
             _PLANAR,
+            reward="``v - 0.1 * sum(a ** 2)``; v: velocity of the torso along x, m/s",
+            observation=("``qpos[1:]``", "``qvel``"),
         ),
         BraxTask(
             "hopper",
@@ -114,6 +139,10 @@ TASKS = by_name(
             "A planar one-legged body hops along x; ends when it falls.",
             "positional",
             _PLANAR,
+            reward="``v + 1 - 0.001 * sum(a ** 2)``; v: velocity of the torso along x, m/s",
+            ends="when the torso's height is at most 0.7 m, its angle beyond 0.2 rad, or another "
+            "position or velocity reaches 100",
+            observation=_WALKER_STATE,
         ),
         BraxTask(
             "humanoid",
@@ -122,6 +151,10 @@ TASKS = by_name(
             "spring",
             _HUMANOID,
             paper_unscaled=True,
+            reward="``1.25 * v + 5 - 0.1 * sum(u ** 2)``; v: velocity of the center of mass along "
+            "x, m/s",
+            ends="when the torso's height is outside [1, 2] m",
+            observation=_HUMANOID_STATE,
         ),
         BraxTask(
             "humanoidstandup",
@@ -131,6 +164,8 @@ TASKS = by_name(
             _HUMANOID,
             camera=_LYING,
             paper_unscaled=True,
+            reward="``z / {physics.dt!g} + 1 - 0.01 * sum(u ** 2)``; z: height of the torso, m",
+            observation=_HUMANOID_STATE,
         ),
         BraxTask(
             "inverted_double_pendulum",
@@ -139,6 +174,15 @@ TASKS = by_name(
             "generalized",
             None,
             camera=Viewpoint((0.0, -3.0, 0.6), (0.0, 0.0, 0.6), 55.0),
+            reward="``10 - 0.01 * x ** 2 - (z - 2) ** 2 - 0.001 * w1 ** 2 - 0.005 * w2 ** 2``, "
+            "without the 10 at the end; x, z: the tip, m; w1, w2: velocities of the hinges, rad/s",
+            ends="when the tip's height is at most 1 m",
+            observation=(
+                "``qpos[:1]``",
+                "``2`` sines of both hinges",
+                "``2`` cosines of both hinges",
+                "``qvel`` clipped to [-10, 10]",
+            ),
         ),
         BraxTask(
             "inverted_pendulum",
@@ -147,6 +191,9 @@ TASKS = by_name(
             "generalized",
             _CART,
             paper_unscaled=True,
+            reward="1 a control step, also at the end",
+            ends="when the pole's angle is beyond 0.2 rad",
+            observation=("``qpos``", "``qvel``"),
         ),
         # The paper's pusher also has another object; its physics are not reproduced.
         BraxTask(
@@ -158,6 +205,13 @@ TASKS = by_name(
             # The goal disc has no name in Brax's model, so it is capsule/20.
             colors={"object_geom": _SKY_BLUE, "capsule/20": _VERMILLION},
             paper_unscaled=True,
+            reward="``-0.5 * near - away - 0.1 * sum(u ** 2)``; near: metres from the object to "
+            "the wrist, away: from the object to the goal, both before the step",
+            observation=(
+                "``qpos[:7]``",
+                "``qvel[:7]``",
+                "``9`` centers of mass of wrist, object and goal, m",
+            ),
         ),
         BraxTask(
             "reacher",
@@ -168,6 +222,14 @@ TASKS = by_name(
             colors={"fingertip": _YELLOW, "target": _RED},
             # At 84 pixels their 9 and 10 mm are two pixels.
             drawn_radius={"fingertip": 0.015, "target": 0.018},
+            reward="``-d - sum(a ** 2)``; d: metres from the fingertip to the target",
+            observation=(
+                "``2`` cosines of both hinges",
+                "``2`` sines of both hinges",
+                "``qpos[2:]``",
+                "``2`` velocity of the fingertip: x and y, m/s",
+                "``3`` from the target to the fingertip, m",
+            ),
         ),
         BraxTask(
             "swimmer",
@@ -178,6 +240,8 @@ TASKS = by_name(
             # Brax rejects the swimmer on other backends.
             backends=("generalized",),
             paper_reward="distance_swum",
+            reward="``v - 0.0001 * sum(a ** 2)``; v: velocity of the first link along x, m/s",
+            observation=("``qpos[2:]``", "``qvel``"),
         ),
         BraxTask(
             "walker2d",
@@ -186,6 +250,9 @@ TASKS = by_name(
             "spring",
             _PLANAR,
             paper_options={"forward_reward_weight": 10.0},
+            reward="``v + 1 - 0.001 * sum(a ** 2)``; v: velocity of the torso along x, m/s",
+            ends="when the torso's height leaves (0.8, 2) m, or its angle (-1, 1) rad",
+            observation=_WALKER_STATE,
         ),
     ]
 )

@@ -77,20 +77,44 @@ def _left(seen: Snapshot, body: str) -> jax.Array:
 
 
 def _without_place(seen: Snapshot, *, skipped: int) -> jax.Array:
-    """Return joint positions without the first ones, and velocities."""
+    """Return joint positions without the first ones, and velocities.
+
+    * ``qpos[skipped:]``
+    * ``qvel``
+    """
     return joined(seen.state.qpos[skipped:], seen.state.qvel)
 
 
 def _with_clipped_speed(seen: Snapshot) -> jax.Array:
+    """Return joint positions without x, and velocities.
+
+    * ``qpos[1:]``
+    * ``qvel`` clipped to [-10, 10]
+    """
     return joined(seen.state.qpos[1:], jnp.clip(seen.state.qvel, -10, 10))
 
 
 def _observe_ant(seen: Snapshot) -> jax.Array:
+    """Return joint positions without x and y, velocities, and forces.
+
+    * ``qpos[2:]``
+    * ``qvel``
+    * ``6 * (model.nbody - 1)`` of each body: external torque and force, clipped to [-1, 1]
+    """
     forces = jnp.clip(seen.data.fields["cfrc_ext"], -1, 1)
     return joined(_without_place(seen, skipped=2), forces[1:])
 
 
 def _observe_humanoid(seen: Snapshot) -> jax.Array:
+    """Return joint positions without x and y, velocities, inertia and forces.
+
+    * ``qpos[2:]``
+    * ``qvel``
+    * ``10 * (model.nbody - 1)`` of each body: inertia about the center of mass, and mass
+    * ``6 * (model.nbody - 1)`` of each body: angular (rad/s) and linear velocity (m/s)
+    * ``model.nv - 6`` of each hinge: torque of its actuator, N m
+    * ``6 * (model.nbody - 1)`` of each body: external torque (N m) and force (N)
+    """
     fields = seen.data.fields
     bodies = fields["cinert"][1:], fields["cvel"][1:]
     return joined(
@@ -102,6 +126,14 @@ def _observe_humanoid(seen: Snapshot) -> jax.Array:
 
 
 def _observe_double_pendulum(seen: Snapshot) -> jax.Array:
+    """Return the cart's position, the poles' angles, velocities, and a force.
+
+    * ``qpos[:1]``
+    * ``2`` sines of both hinges
+    * ``2`` cosines of both hinges
+    * ``qvel`` clipped to [-10, 10]
+    * ``1`` constraint force on the cart (N), clipped to [-10, 10]
+    """
     state, force = seen.state, seen.data.fields["qfrc_constraint"][:1]
     angles = state.qpos[1:]
     return joined(
@@ -114,6 +146,14 @@ def _observe_double_pendulum(seen: Snapshot) -> jax.Array:
 
 
 def _observe_reacher(seen: Snapshot) -> jax.Array:
+    """Return the arm's angles and velocities, the target, and the vector from it.
+
+    * ``2`` cosines of both hinges
+    * ``2`` sines of both hinges
+    * ``qpos[2:]``
+    * ``qvel[:2]``
+    * ``2`` from the target to the fingertip: x and y, m
+    """
     state = seen.state
     angles = state.qpos[:2]
     away = (_left(seen, "fingertip") - _left(seen, "target"))[:2]
@@ -121,6 +161,12 @@ def _observe_reacher(seen: Snapshot) -> jax.Array:
 
 
 def _observe_pusher(seen: Snapshot) -> jax.Array:
+    """Return the arm's joints, and where its tip, the cylinder and the goal are.
+
+    * ``qpos[:7]``
+    * ``qvel[:7]``
+    * ``9`` positions of the arm's tip, the cylinder and the goal, m
+    """
     places = (_left(seen, name) for name in ("tips_arm", "object", "goal"))
     return joined(seen.state.qpos[:7], seen.state.qvel[:7], *places)
 
@@ -160,15 +206,22 @@ def _center_of_mass(seen: Snapshot) -> jax.Array:
 
 
 def _reward_runner(seen: Snapshot, *, substeps: int, effort: float) -> jax.Array:
+    """Return ``v - {effort!g} * sum(u ** 2)``; v: velocity along x, m/s; u: the controls."""
     return _speed(seen, substeps) - _effort(seen, effort)
 
 
 def _ant_fell(seen: Snapshot) -> jax.Array:
+    """Return whether the torso's height is outside [0.2, 1] m."""
     z = seen.state.qpos[2]
     return ~((z >= 0.2) & (z <= 1.0))
 
 
 def _reward_ant(seen: Snapshot) -> jax.Array:
+    """Return ``v + 1 - 0.5 * sum(u ** 2) - 0.0005 * sum(c ** 2)``, without the 1 at the end.
+
+    v: velocity of the torso along x, m/s; u: the controls; c: external torques and forces on the
+    bodies, clipped to [-1, 1].
+    """
     forces = jnp.clip(seen.data.fields["cfrc_ext"], -1, 1)
     forward = _lagging_speed(seen, _torso, 5)
     healthy = jnp.where(_ant_fell(seen), 0.0, 1.0)
@@ -176,17 +229,23 @@ def _reward_ant(seen: Snapshot) -> jax.Array:
 
 
 def _hopper_fell(seen: Snapshot) -> jax.Array:
+    """Return whether the height is at most 0.7 m, or the angle beyond 0.2 rad.
+
+    It also ends when another entry of the state reaches 100.
+    """
     _, z, angle = seen.state.qpos[:3]
     rest = joined(seen.state.qpos, seen.state.qvel)[2:]
     return ~(jnp.all(_within(rest, -100, 100)) & (z > 0.7) & _within(angle, -0.2, 0.2))
 
 
 def _walker_fell(seen: Snapshot) -> jax.Array:
+    """Return whether the height leaves (0.8, 2) m, or the angle (-1, 1) rad."""
     _, z, angle = seen.state.qpos[:3]
     return ~(_within(z, 0.8, 2.0) & _within(angle, -1.0, 1.0))
 
 
 def _humanoid_fell(seen: Snapshot) -> jax.Array:
+    """Return whether the torso's height leaves (1, 2) m."""
     return ~_within(seen.state.qpos[2], 1.0, 2.0)
 
 
@@ -195,18 +254,34 @@ def _impact(seen: Snapshot, weight: float) -> jax.Array:
 
 
 def _reward_humanoid(seen: Snapshot) -> jax.Array:
+    """Return ``1.25 * v + 5 - 0.1 * sum(u ** 2) - min(5e-7 * sum(c ** 2), 10)``.
+
+    v: velocity of the center of mass along x, m/s; u: the controls; c: external torques and forces
+    on the bodies. The 5 is missing at the episode's end.
+    """
     forward = 1.25 * _lagging_speed(seen, _center_of_mass, 5)
     healthy = jnp.where(_humanoid_fell(seen), 0.0, 5.0)
     return forward + healthy - _effort(seen, 0.1) - _impact(seen, 5e-7)
 
 
 def _reward_standup(seen: Snapshot) -> jax.Array:
+    """Return the height over a physics step's duration, less costs.
+
+    ``z / {model.opt.timestep!g} + 1 - 0.1 * sum(u ** 2) - min(5e-7 * sum(c ** 2), 10)``; z: height
+    of the torso, m; u: the controls; c: external torques and forces on the bodies.
+    """
     height = seen.state.qpos[2] / seen.model.opt.timestep
     return height - _effort(seen, 0.1) - _impact(seen, 5e-7) + 1
 
 
 def _pole_fell(seen: Snapshot) -> jax.Array:
+    """Return whether the pole's angle is beyond 0.2 rad."""
     return jnp.abs(seen.state.qpos[1]) > 0.2
+
+
+def _reward_pendulum(seen: Snapshot) -> jax.Array:
+    """Return 1, and 0 at the episode's end."""
+    return jnp.where(_pole_fell(seen), 0.0, 1.0)
 
 
 def _tip(seen: Snapshot) -> tuple[jax.Array, jax.Array]:
@@ -215,10 +290,16 @@ def _tip(seen: Snapshot) -> tuple[jax.Array, jax.Array]:
 
 
 def _poles_fell(seen: Snapshot) -> jax.Array:
+    """Return whether the tip's height is at most 1 m."""
     return _tip(seen)[1] <= 1
 
 
 def _reward_double_pendulum(seen: Snapshot) -> jax.Array:
+    """Return 10, less costs of the tip's place and of velocities.
+
+    ``10 - 0.01 * x ** 2 - (z - 2) ** 2 - 0.001 * w1 ** 2 - 0.005 * w2 ** 2``, without the 10 at its
+    end; x, z: the tip, m; w1, w2: velocities of the hinges, rad/s.
+    """
     x, z = _tip(seen)
     first, second = seen.state.qvel[1:3]
     alive = jnp.where(_poles_fell(seen), 0.0, 10.0)
@@ -226,11 +307,17 @@ def _reward_double_pendulum(seen: Snapshot) -> jax.Array:
 
 
 def _reward_reacher(seen: Snapshot) -> jax.Array:
+    """Return ``-d - sum(u ** 2)``; d: metres to the target; u: the controls."""
     away = _left(seen, "fingertip") - _left(seen, "target")
     return -jnp.linalg.norm(away) - _effort(seen, 1.0)
 
 
 def _reward_pusher(seen: Snapshot) -> jax.Array:
+    """Return ``-0.5 * near - away - 0.1 * sum(u ** 2)``.
+
+    near: metres from the cylinder to the arm's tip; away: metres from the cylinder to the goal;
+    u: the controls.
+    """
     near = jnp.linalg.norm(_left(seen, "object") - _left(seen, "tips_arm"))
     away = jnp.linalg.norm(_left(seen, "object") - _left(seen, "goal"))
     return -0.5 * near - away - _effort(seen, 0.1)
@@ -238,11 +325,19 @@ def _reward_pusher(seen: Snapshot) -> jax.Array:
 
 def _stander(fell: Callable[[Snapshot], jax.Array]) -> Formulas:
     """Make the task of a body that runs and ends when it falls."""
-    run = partial(_reward_runner, substeps=4, effort=1e-3)
+
+    def reward(seen: Snapshot) -> jax.Array:
+        """Return ``v + 1 - 0.001 * sum(u ** 2)``, without the 1 at the episode's end.
+
+        v: velocity along x, m/s; u: the controls.
+        """
+        run = _reward_runner(seen, substeps=4, effort=1e-3)
+        return run + jnp.where(fell(seen), 0.0, 1.0)
+
     return Formulas(
         partial(_near_default, noise=5e-3),
         _with_clipped_speed,
-        lambda seen: run(seen) + jnp.where(fell(seen), 0.0, 1.0),
+        reward,
         fell,
         substeps=4,
     )
@@ -292,7 +387,7 @@ FORMULAS = {
     "gym_inverted_pendulum": Formulas(
         partial(_near_default, noise=0.01),
         observe_joints,
-        lambda seen: jnp.where(_pole_fell(seen), 0.0, 1.0),
+        _reward_pendulum,
         _pole_fell,
         substeps=2,
     ),

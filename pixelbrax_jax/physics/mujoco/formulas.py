@@ -123,7 +123,11 @@ def joined(*parts: jax.Array | float) -> jax.Array:
 
 
 def observe_joints(seen: Snapshot) -> jax.Array:
-    """Return all joint positions and velocities."""
+    """Return all joint positions and velocities.
+
+    * ``qpos``
+    * ``qvel``
+    """
     return joined(seen.state.qpos, seen.state.qvel)
 
 

@@ -58,6 +58,7 @@ def _start_cup(dynamics: Dynamics, key: jax.Array) -> Start:
 
 
 def _reward_cup(seen: Snapshot) -> jax.Array:
+    """Return 1 while the ball is inside the target in the cup, else 0."""
     offset = jnp.abs(seen.site_pos("target") - seen.xpos("ball"))
     size = seen.model.site("target").size - seen.model.geom("ball").size[0]
     return jnp.where((offset[0] < size[0]) & (offset[2] < size[2]), 1.0, 0.0)
@@ -80,6 +81,13 @@ def _from_hinge(seen: Snapshot, place: jax.Array) -> jax.Array:
 
 
 def _observe_spin(seen: Snapshot) -> jax.Array:
+    """Return positions, velocities and touch.
+
+    * ``sensor("proximal", "distal")``
+    * ``2`` from the spinner's hinge to its tip: x and z, m
+    * ``sensor("proximal_velocity", "distal_velocity", "hinge_velocity")``
+    * ``sensor("touchtop", "touchbottom")`` as log(1 + x)
+    """
     return joined(
         seen.sensor("proximal", "distal"),
         _from_hinge(seen, seen.sensor("tip")),
@@ -95,14 +103,25 @@ def _distance(seen: Snapshot) -> jax.Array:
 
 
 def _observe_turn(seen: Snapshot) -> jax.Array:
+    """Return the same, and where the target is.
+
+    * ``_observe_spin``
+    * ``2`` from the spinner's hinge to the target: x and z, m
+    * ``1`` from the tip to the target's edge, m; negative inside
+    """
     return joined(_observe_spin(seen), _from_hinge(seen, seen.state.target), _distance(seen))
 
 
 def _reward_spin(seen: Snapshot) -> jax.Array:
+    """Return 1 while the spinner turns at {-_FINGER_SPEED!g} rad/s or less, else 0."""
     return jnp.where(seen.sensor("hinge_velocity")[0] <= -_FINGER_SPEED, 1.0, 0.0)
 
 
 def _reward_turn(seen: Snapshot) -> jax.Array:
+    """Return 1 while the tip is inside the target, else 0.
+
+    Inside: at most {model.site("target").size[0]!g} m from its center.
+    """
     return jnp.where(_distance(seen) <= 0, 1.0, 0.0)
 
 
@@ -177,6 +196,16 @@ def _in_plane(seen: Snapshot, body: str) -> jax.Array:
 
 
 def _observe_manipulator(seen: Snapshot) -> jax.Array:
+    """Return the arm, touch, and where hand, ball and target are.
+
+    * ``2 * len(_ARM)`` sine and cosine of each position of {", ".join(_ARM)}
+    * ``joint_vel(*_ARM)``
+    * ``sensor(*_TOUCH)`` as log(1 + x)
+    * ``4`` the hand: x and z (m), w and y of its quaternion
+    * ``4`` the ball: the same
+    * ``joint_vel(*_BALL)``
+    * ``4`` the target: x and z (m), w and y of its quaternion
+    """
     arm = seen.joint_pos(*_ARM)
     return joined(
         jnp.stack([jnp.sin(arm), jnp.cos(arm)], axis=-1),
@@ -190,6 +219,10 @@ def _observe_manipulator(seen: Snapshot) -> jax.Array:
 
 
 def _reward_manipulator(seen: Snapshot) -> jax.Array:
+    """Return ``tolerance(d, [0, {_NEAR!g}], margin={2 * _NEAR!g})``.
+
+    d: metres from the ball to the target.
+    """
     apart = jnp.linalg.norm(seen.site_pos("ball") - seen.site_pos(_TARGET))
     return tolerance(apart, (0.0, _NEAR), margin=2 * _NEAR)
 

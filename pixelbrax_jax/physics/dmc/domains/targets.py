@@ -57,19 +57,38 @@ def _fish_to_target(seen: Snapshot) -> jax.Array:
 
 
 def _observe_fish_upright(seen: Snapshot) -> jax.Array:
+    """Return joint positions, how upright it is, and velocities.
+
+    * ``joint_pos(*_FISH_JOINTS)``
+    * ``1`` z of the torso's z axis: 1 is upright
+    * ``qvel``
+    """
     return joined(seen.joint_pos(*_FISH_JOINTS), _fish_upright(seen), seen.state.qvel)
 
 
 def _observe_fish_swim(seen: Snapshot) -> jax.Array:
+    """Return the same with the vector to the target.
+
+    * ``joint_pos(*_FISH_JOINTS)``
+    * ``1`` z of the torso's z axis: 1 is upright
+    * ``3`` from the mouth to the target in the mouth's frame, m
+    * ``qvel``
+    """
     joints = seen.joint_pos(*_FISH_JOINTS)
     return joined(joints, _fish_upright(seen), _fish_to_target(seen), seen.state.qvel)
 
 
 def _reward_fish_upright(seen: Snapshot) -> jax.Array:
+    """Return ``tolerance(z, [1, 1], margin=1)``; z: z of the torso's z axis."""
     return tolerance(_fish_upright(seen), (1.0, 1.0), margin=1.0)
 
 
 def _reward_fish_swim(seen: Snapshot) -> jax.Array:
+    """Return ``(7 * tolerance(d, [0, r], margin=2 * r) + (1 + z) / 2) / 8``.
+
+    d: metres from the mouth to the target; r: their radii together,
+    {model.geom("mouth").size[0] + model.geom("target").size[0]!g} m; z: z of the torso's z axis.
+    """
     reach = sum(float(seen.model.geom(name).size[0]) for name in ("mouth", "target"))
     near = tolerance(jnp.linalg.norm(_fish_to_target(seen)), (0.0, reach), margin=2 * reach)
     return (7 * near + 0.5 * (_fish_upright(seen) + 1)) / 8
@@ -80,6 +99,11 @@ def _hide_target(model: mujoco.MjModel) -> None:
 
 
 def _reward_point_mass(seen: Snapshot) -> jax.Array:
+    """Return ``tolerance(d, [0, r], margin=r) * (4 + small(u)) / 5``.
+
+    d: metres from the point to the target; r: the target's radius,
+    {model.geom("target").size[0]!g} m; u: the controls.
+    """
     distance = jnp.linalg.norm(seen.geom_pos("target") - seen.geom_pos("pointmass"))
     radius = float(seen.model.geom("target").size[0])
     near = tolerance(distance, (0.0, radius), margin=radius)
@@ -103,10 +127,21 @@ def _reacher_to_target(seen: Snapshot) -> jax.Array:
 
 
 def _observe_reacher(seen: Snapshot) -> jax.Array:
+    """Return joint positions, the vector to the target, and velocities.
+
+    * ``qpos``
+    * ``2`` from the finger to the target: x and y, m
+    * ``qvel``
+    """
     return joined(seen.state.qpos, _reacher_to_target(seen), seen.state.qvel)
 
 
 def _reward_reacher(seen: Snapshot) -> jax.Array:
+    """Return 1 while the finger touches the target, else 0.
+
+    Touches: their centers are at most the sum of their radii apart,
+    {model.geom("target").size[0] + model.geom("finger").size[0]!g} m.
+    """
     reach = sum(float(seen.model.geom(name).size[0]) for name in ("target", "finger"))
     return tolerance(jnp.linalg.norm(_reacher_to_target(seen)), (0.0, reach))
 
@@ -130,13 +165,23 @@ def _swimmer_to_target(seen: Snapshot) -> jax.Array:
 
 
 def _observe_swimmer(seen: Snapshot) -> jax.Array:
-    """Return joint positions, vector to the target, and each body's velocities in its frame."""
+    """Return joint positions, the vector to the target, and velocities of the bodies.
+
+    * ``qpos[3:]``
+    * ``2`` from the nose to the target in the head's frame: x and y, m
+    * ``3 * (model.nbody - 1)`` of each body: x and y of its velocity (m/s), z of its turn (rad/s)
+    """
     names = [seen.model.sensor(i).name for i in range(seen.model.nsensor)]
     readings = seen.sensor(*names)[_SWIMMER_BODY_SENSORS:].reshape(-1, 6)
     return joined(seen.state.qpos[3:], _swimmer_to_target(seen), readings[:, jnp.array([0, 1, 5])])
 
 
 def _reward_swimmer(seen: Snapshot) -> jax.Array:
+    """Return 1 while the nose is inside the target, and less with the distance from its edge.
+
+    Outside: ``1 / (1 + (3 * d / {5 * model.geom("target").size[0]!g}) ** 2)``; d: metres from the
+    nose to the target's edge, {model.geom("target").size[0]!g} m from its center.
+    """
     radius = float(seen.model.geom("target").size[0])
     distance = jnp.linalg.norm(_swimmer_to_target(seen))
     return tolerance(distance, (0.0, radius), margin=5 * radius, sigmoid="long_tail")

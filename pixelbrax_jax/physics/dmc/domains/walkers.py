@@ -57,16 +57,30 @@ def _start_cheetah(dynamics: Dynamics, key: jax.Array) -> Start:
 
 
 def _observe_cheetah(seen: Snapshot) -> jax.Array:
-    """Return joint positions without x, and velocities."""
+    """Return joint positions without x, and velocities.
+
+    * ``qpos[1:]``
+    * ``qvel``
+    """
     return joined(seen.state.qpos[1:], seen.state.qvel)
 
 
 def _reward_cheetah(seen: Snapshot) -> jax.Array:
+    """Return ``rising(v, {_CHEETAH_SPEED!g}, margin={_CHEETAH_SPEED!g})``.
+
+    v: velocity of the center of mass along x, m/s.
+    """
     speed = seen.sensor("torso_subtreelinvel")[0]
     return rising(speed, _CHEETAH_SPEED, margin=_CHEETAH_SPEED)
 
 
 def _observe_hopper(seen: Snapshot) -> jax.Array:
+    """Return joint positions without x, velocities and touch.
+
+    * ``qpos[1:]``
+    * ``qvel``
+    * ``sensor("touch_toe", "touch_heel")`` as log(1 + x)
+    """
     touch = jnp.log1p(seen.sensor("touch_toe", "touch_heel"))
     return joined(seen.state.qpos[1:], seen.state.qvel, touch)
 
@@ -77,17 +91,36 @@ def _standing_hopper(seen: Snapshot) -> jax.Array:
 
 
 def _reward_hopper_stand(seen: Snapshot) -> jax.Array:
+    """Return ``tolerance(h, [{_HOPPER_HEIGHT!g}, 2]) * (4 + small(u)) / 5``.
+
+    h: metres from the foot's center of mass up to the torso's; u: the controls.
+    """
     small = small_control(seen.state.ctrl)
     return _standing_hopper(seen) * (jnp.mean(small) + 4) / 5
 
 
 def _reward_hopper_hop(seen: Snapshot) -> jax.Array:
+    """Return how well it stands, times how fast it hops.
+
+    ``tolerance(h, [{_HOPPER_HEIGHT!g}, 2]) * rising(v, {_HOPPER_SPEED!g},
+    margin={_HOPPER_SPEED / 2!g}, value=0.5)``; h: metres from the foot's center of mass up to the
+    torso's; v: velocity of the center of mass along x, m/s.
+    """
     speed = seen.sensor("torso_subtreelinvel")[0]
     standing = _standing_hopper(seen)
     return standing * rising(speed, _HOPPER_SPEED, _HOPPER_SPEED / 2, value_at_margin=0.5)
 
 
 def _observe_humanoid(seen: Snapshot) -> jax.Array:
+    """Return the pose in the torso's frame, and velocities.
+
+    * ``qpos[7:]``
+    * ``1`` height of the head, m
+    * ``12`` left hand, left foot, right hand, right foot from the torso, in the torso's frame, m
+    * ``3`` z of the torso's axes x, y and z
+    * ``sensor("torso_subtreelinvel")``
+    * ``qvel``
+    """
     torso, frame = seen.xpos("torso"), seen.xmat("torso")
     limbs = ("left_hand", "left_foot", "right_hand", "right_foot")
     extremities = [(seen.xpos(limb) - torso) @ frame for limb in limbs]
@@ -102,6 +135,14 @@ def _observe_humanoid(seen: Snapshot) -> jax.Array:
 
 
 def _reward_humanoid(seen: Snapshot, *, speed: float) -> jax.Array:
+    """Return how well it stands, times how well it moves.
+
+    Stands: ``tolerance(h, [{_HUMANOID_HEIGHT!g}, inf], margin={_HUMANOID_HEIGHT / 4!g}) * rising(z,
+    0.9, margin=1.9) * (4 + small(u)) / 5``; h: height of the head, m; z: z of the torso's z axis;
+    u: the controls. Moves: ``(5 * rising(v, speed, margin=speed) + 1) / 6``; v: horizontal speed of
+    the center of mass, m/s. For speed 0, moves: the mean of ``tolerance(v, [0, 0], margin=2)`` over
+    its velocities along x and y.
+    """
     height = seen.xpos("head")[2]
     standing = tolerance(height, (_HUMANOID_HEIGHT, jnp.inf), margin=_HUMANOID_HEIGHT / 4)
     upright = rising(seen.xmat("torso")[2, 2], 0.9, margin=1.9)
@@ -127,6 +168,16 @@ def _start_quadruped(dynamics: Dynamics, key: jax.Array) -> Start:
 
 
 def _observe_quadruped(seen: Snapshot) -> jax.Array:
+    """Return joints, activations, and the torso's velocity, rotation and sensors.
+
+    * ``qpos[7:]``
+    * ``qvel[6:]``
+    * ``act``
+    * ``sensor("velocimeter")``
+    * ``1`` z of the torso's z axis: 1 is upright
+    * ``sensors_of("GYRO", "ACCELEROMETER")``
+    * ``sensors_of("FORCE", "TORQUE")`` as asinh(x)
+    """
     model, kinds = seen.model, mujoco.mjtSensor
     hinges = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE)
     names = [model.joint(int(hinge)).name for hinge in hinges]
@@ -142,16 +193,33 @@ def _observe_quadruped(seen: Snapshot) -> jax.Array:
 
 
 def _reward_quadruped(seen: Snapshot, *, speed: float) -> jax.Array:
+    """Return ``rising(z, 1, margin=2) * rising(v, speed, margin=speed, value=0.5)``.
+
+    z: z of the torso's z axis; v: the torso's velocity along its own x axis, m/s.
+    """
     upright = rising(seen.xmat("torso")[2, 2], 1.0, margin=2.0)
     return upright * rising(seen.sensor("velocimeter")[0], speed, speed, value_at_margin=0.5)
 
 
 def _observe_walker(seen: Snapshot) -> jax.Array:
+    """Return rotations, the torso's height, and velocities.
+
+    * ``2 * (model.nbody - 1)`` of each body: x of its axes x and z
+    * ``1`` height of the torso, m
+    * ``qvel``
+    """
     axes = quat_to_mat(seen.data.xquat[1:])[:, 0][:, jnp.array([0, 2])]
     return joined(axes, seen.xpos("torso")[2], seen.state.qvel)
 
 
 def _reward_walker(seen: Snapshot, *, speed: float) -> jax.Array:
+    """Return how well it stands, times how well it moves.
+
+    Stands: ``(3 * tolerance(h, [{_WALKER_HEIGHT!g}, inf], margin={_WALKER_HEIGHT / 2!g}) +
+    (1 + z) / 2) / 4``; h: height of the torso, m; z: z of its z axis. Moves: 1 for speed 0, else
+    ``(5 * rising(v, speed, margin=speed / 2, value=0.5) + 1) / 6``; v: velocity of the center of
+    mass along x, m/s.
+    """
     height = seen.xpos("torso")[2]
     standing = tolerance(height, (_WALKER_HEIGHT, jnp.inf), margin=_WALKER_HEIGHT / 2)
     stand = (3 * standing + (1 + seen.xmat("torso")[2, 2]) / 2) / 4
