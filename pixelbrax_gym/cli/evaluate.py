@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 class AgentOptions:
     """Options that select a trained agent."""
 
-    folder: Annotated[Positional[str | None], arg(metavar="FOLDER")] = None
-    """Output folder of the training run."""
     pretrained: str | None = None
     """Loads a policy of the package instead, by its task, such as halfcheetah."""
     steps: int | None = None
@@ -43,11 +41,19 @@ class AgentOptions:
 class Options(AgentOptions):
     """Plays whole episodes with a checkpoint and writes a line of JSON for each split.
 
-    Actions are the policy's means. Every call plays the same episodes.
+    Actions are the policy's means. Every call plays the same episodes. With --suite it plays the
+    levels of a suite with all runs, which are the seeds of one agent, and writes their table.
     """
 
-    episodes: int = 32
-    """Number of episodes of each split."""
+    runs: Annotated[Positional[tuple[str, ...]], arg(metavar="RUN")] = ()
+    """Output folder of the training run; with --suite one or several."""
+    episodes: int | None = None
+    """Number of episodes of each split or level; default: 32, or the suite's number."""
+    suite: Literal["axes", "dcs", "dmcgb", "dmcgb2", "paper", "subtle"] | None = None
+    """Plays the levels of a suite instead of splits, and writes a table in Markdown."""
+    output_dir: str | None = None
+    """Folder for the suite's returns.json, table.csv and levels.png. Levels whose returns it has
+    are not played again."""
     split: tuple[Literal["clean", "train", "test"], ...] = ()
     """Splits to evaluate; default: clean, with distractors also train, and test if it has clips
     that training does not show."""
@@ -62,16 +68,27 @@ class Options(AgentOptions):
 def run(arguments: Sequence[str]) -> int:
     """Run the command."""
     options = parse("evaluate", Options, arguments)
-    agent = load(options)
+    if options.suite is not None:
+        from pixelbrax_gym.cli._suite import run_suite
+
+        return run_suite(options)
+    if options.output_dir is not None:
+        raise ValueError("--output-dir needs --suite.")
+    if len(options.runs) > 1:
+        raise ValueError(f"give one run, or --suite for several; got {', '.join(options.runs)}.")
+    agent = load(options, next(iter(options.runs), None))
     from pixelbrax_jax.agents.runner.evaluate import Evaluator
     from pixelbrax_jax.agents.runner.settings import place_of
     from pixelbrax_jax.agents.runner.splits import make_splits
     from pixelbrax_jax.agents.runner.trained import with_clips
 
-    report, episodes = partial(say, "evaluate"), options.episodes
+    report, episodes = (
+        partial(say, "evaluate"),
+        32 if options.episodes is None else options.episodes,
+    )
     check_positive_int("episodes", episodes)
     if options.where is not None:
-        _write(_compare(agent, options, report))
+        _write(_compare(agent, options, episodes, report))
         return 0
     config, shown = with_clips(agent, options.clips)
     if options.clips and not shown:
@@ -86,31 +103,38 @@ def run(arguments: Sequence[str]) -> int:
     return 0
 
 
-def load(options: AgentOptions) -> Trained:
-    """Load the agent that the options select; raise a CommandError if its checkpoint is missing."""
+def load(options: AgentOptions, folder: str | None) -> Trained:
+    """Load the agent of a run's folder, or the pretrained one, that the options select.
+
+    Raises:
+        CommandError: its checkpoint is missing.
+        ValueError: both or none are given, or options do not fit.
+    """
     with needs_extra("train"):
         from pixelbrax_jax.agents.runner.checkpoint import CheckpointError
         from pixelbrax_jax.agents.runner.trained import load_pretrained, load_trained
     steps, best, run = options.steps, options.best, options.run_index
-    if options.folder is not None and options.pretrained is None:
+    if folder is not None and options.pretrained is None:
         try:
-            return load_trained(options.folder, steps=steps, best=best, run=run)
+            return load_trained(folder, steps=steps, best=best, run=run)
         except CheckpointError as error:
             raise CommandError(str(error)) from error
-    if options.folder is not None or options.pretrained is None:
+    if folder is not None or options.pretrained is None:
         raise ValueError("give either the folder of a run or --pretrained with a name.")
     if steps is not None or best or run:
         raise ValueError("--steps, --best and --run need the folder of a run, not --pretrained.")
     return load_pretrained(options.pretrained)
 
 
-def _compare(agent: Trained, options: Options, report: Callable[[str], None]) -> dict[str, Any]:
+def _compare(
+    agent: Trained, options: Options, episodes: int, report: Callable[[str], None]
+) -> dict[str, Any]:
     """Play the same episodes here and in dm_control; return the row."""
     from pixelbrax_jax.agents.runner.evaluate import Evaluator, paired
     from pixelbrax_jax.agents.runner.splits import make_split
     from pixelbrax_jax.agents.runner.transfer import play_in
 
-    config, episodes, where = agent.algorithm.config, options.episodes, options.where
+    config, where = agent.algorithm.config, options.where
     env = config.env
     if env.task not in (tasks := SUITES["dmc"].tasks):
         raise ValueError(
