@@ -95,7 +95,7 @@ def scores_of(config: EnvConfig, suite: str, levels: Levels) -> Scores:
     for name in _LEFT_OUT:
         del options[name]
     bank = levels.bank
-    shown = None if bank is None else {"digest": bank.digest, "names": list(bank.names)}
+    shown = None if bank is None else f"{len(bank.names)} clips, {bank.digest[:16]}"
     options |= {"episodes": levels.episodes, "clips": shown}
     return Scores(suite, config.task, options)
 

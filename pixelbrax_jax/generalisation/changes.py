@@ -20,8 +20,8 @@ NUM_VIEWS = 100
 """Number of directions of the camera in DMC-GB2; episode i and episode i + 100 have the same."""
 
 _ROTATION_STRIDE, _SHIFT_STRIDE = 61, 47
-"""Episode i takes direction (stride i) mod 100. Both visit all; the first few are spread evenly, and
-so are the pairs of both."""
+"""Episode i takes direction (stride i) mod 100. Both visit all, the first few are spread evenly,
+and so are the pairs of both."""
 
 
 class Change:
