@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import sys
+from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from pixelbrax_gym.cli import needs_extra, say
-from pixelbrax_gym.cli.evaluate import Options, load
+from pixelbrax_gym.cli._agents import AgentOptions, load
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
+
+    import numpy as np
 
     from pixelbrax_gym.generalisation.scores import Player
     from pixelbrax_jax.agents.runner.trained import Trained
@@ -23,55 +22,51 @@ _MAY_DIFFER = ("clips", "memory_budget_gb", "split")
 """Settings in which the seeds of one agent may differ."""
 
 
-def run_suite(options: Options) -> int:
-    """Play the levels of ``options.suite`` with all runs, and write their table."""
-    assert options.suite is not None
-    for name, value in (("split", options.split), ("in", options.where)):
-        if value:
-            raise ValueError(f"--suite plays its own levels; leave out --{name}.")
+def evaluate(
+    options: AgentOptions,
+    runs: Sequence[str],
+    suite: str,
+    episodes: int | None,
+    output_dir: str | None,
+) -> str:
+    """Play the levels of a suite with all runs; return their table in Markdown."""
     if options.run_index:
         raise ValueError("--suite plays all runs of a folder; leave out --run.")
-    agents = _load(options)
+    agents = _load(options, runs)
     with needs_extra("train"):
         from pixelbrax_gym.generalisation.evaluation import scores_of
-        from pixelbrax_gym.generalisation.scores import SHEET, play
-        from pixelbrax_jax.generalisation.frames import write_sheet
+        from pixelbrax_gym.generalisation.scores import RETURNS, ROWS, SHEET, play
         from pixelbrax_jax.generalisation.making import make_levels
         from pixelbrax_jax.generalisation.suites import SUITES
 
     report = partial(say, "evaluate")
     config = next(iter(agents.values())).algorithm.config.env
-    episodes = options.episodes
-    if episodes is None:
-        episodes = SUITES[options.suite].episodes
-    levels = make_levels(config, options.suite, episodes, options.clips, report)
+    episodes = SUITES[suite].episodes if episodes is None else episodes
+    levels = make_levels(config, suite, episodes, options.clips, report)
     _check_new_clips(agents, levels)
     report(f"{len(levels.levels)} levels in {levels.num_programs} programs")
-    scores = scores_of(config, options.suite, levels)
+    scores = scores_of(config, suite, levels)
     players = {name: _player(agent, episodes) for name, agent in agents.items()}
-    play(levels, players, scores, options.output_dir, report)
-    if options.output_dir is not None:
-        path = Path(options.output_dir) / SHEET
-        write_sheet(levels, path)
-        report(f"wrote {path.parent}/returns.json, table.csv and {SHEET}")
-    sys.stdout.write(scores.markdown() + "\n")
-    return 0
+    play(levels, players, scores, output_dir, report)
+    if output_dir is not None:
+        report(f"wrote {RETURNS}, {ROWS} and {SHEET} in {output_dir}")
+    return scores.markdown()
 
 
-def _load(options: Options) -> Mapping[str, Trained]:
+def _load(options: AgentOptions, runs: Sequence[str]) -> Mapping[str, Trained]:
     """Load all runs by name; raise a ValueError unless they are seeds of one agent."""
     if options.pretrained is not None:
-        return {options.pretrained: load(options, next(iter(options.runs), None))}
-    if not options.runs:
+        return {options.pretrained: load(options, next(iter(runs), None))}
+    if not runs:
         raise ValueError("--suite needs the folders of one or several runs, or --pretrained.")
     from pixelbrax_jax.agents.config import describe
     from pixelbrax_jax.agents.runner.trained import num_runs
 
     agents: dict[str, Trained] = {}
-    for folder in options.runs:
+    for folder in runs:
         first = load(options, folder)
         for index in range(num_runs(folder)):
-            agent = first if index == 0 else load(_at(options, index), folder)
+            agent = first if index == 0 else load(replace(options, run_index=index), folder)
             name = f"{folder}, seed {agent.seed}, {agent.steps} steps"
             if name in agents:
                 raise ValueError(f"run {folder} is given twice.")
@@ -88,12 +83,6 @@ def _load(options: Options) -> Mapping[str, Trained]:
                     "evaluate them in separate calls."
                 )
     return agents
-
-
-def _at(options: Options, index: int) -> Options:
-    from dataclasses import replace
-
-    return replace(options, run_index=index)
 
 
 def _name(agent: Trained) -> str:

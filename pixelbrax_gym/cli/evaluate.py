@@ -12,29 +12,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from pixelbrax_gym.cli import CommandError, needs_extra, parse, say
+from pixelbrax_gym.cli import CommandError, parse, say
+from pixelbrax_gym.cli._agents import AgentOptions, load
+from pixelbrax_gym.cli._suite import evaluate
 from pixelbrax_jax.tasks import SUITES
 from pixelbrax_jax.validation import check_positive_int
 
 if TYPE_CHECKING:
     from pixelbrax_jax.agents.runner.trained import Trained
-
-
-@dataclass(frozen=True)
-class AgentOptions:
-    """Options that select a trained agent."""
-
-    pretrained: str | None = None
-    """Loads a policy of the package instead, by its task, such as halfcheetah."""
-    steps: int | None = None
-    """Loads the checkpoint of this many steps; default: the latest."""
-    clips: str | None = None
-    """Folder of the clips; default: the folder used in training. Split train needs the same
-    clips."""
-    best: bool = False
-    """Loads the best checkpoint."""
-    run_index: Annotated[int, arg(name="run")] = 0
-    """Index of the run among those of --seeds, from 0."""
 
 
 @dataclass(frozen=True)
@@ -69,9 +54,12 @@ def run(arguments: Sequence[str]) -> int:
     """Run the command."""
     options = parse("evaluate", Options, arguments)
     if options.suite is not None:
-        from pixelbrax_gym.cli._suite import run_suite
-
-        return run_suite(options)
+        for name, value in (("split", options.split), ("in", options.where)):
+            if value:
+                raise ValueError(f"--suite plays its own levels; leave out --{name}.")
+        episodes, folder = options.episodes, options.output_dir
+        sys.stdout.write(evaluate(options, options.runs, options.suite, episodes, folder) + "\n")
+        return 0
     if options.output_dir is not None:
         raise ValueError("--output-dir needs --suite.")
     if len(options.runs) > 1:
@@ -82,10 +70,8 @@ def run(arguments: Sequence[str]) -> int:
     from pixelbrax_jax.agents.runner.splits import make_splits
     from pixelbrax_jax.agents.runner.trained import with_clips
 
-    report, episodes = (
-        partial(say, "evaluate"),
-        32 if options.episodes is None else options.episodes,
-    )
+    report = partial(say, "evaluate")
+    episodes = 32 if options.episodes is None else options.episodes
     check_positive_int("episodes", episodes)
     if options.where is not None:
         _write(_compare(agent, options, episodes, report))
@@ -101,29 +87,6 @@ def run(arguments: Sequence[str]) -> int:
             row["clips"] = place_of(str(config.env.clips or "procedural"))
         _write(row | result.scalars)
     return 0
-
-
-def load(options: AgentOptions, folder: str | None) -> Trained:
-    """Load the agent of a run's folder, or the pretrained one, that the options select.
-
-    Raises:
-        CommandError: its checkpoint is missing.
-        ValueError: both or none are given, or options do not fit.
-    """
-    with needs_extra("train"):
-        from pixelbrax_jax.agents.runner.checkpoint import CheckpointError
-        from pixelbrax_jax.agents.runner.trained import load_pretrained, load_trained
-    steps, best, run = options.steps, options.best, options.run_index
-    if folder is not None and options.pretrained is None:
-        try:
-            return load_trained(folder, steps=steps, best=best, run=run)
-        except CheckpointError as error:
-            raise CommandError(str(error)) from error
-    if folder is not None or options.pretrained is None:
-        raise ValueError("give either the folder of a run or --pretrained with a name.")
-    if steps is not None or best or run:
-        raise ValueError("--steps, --best and --run need the folder of a run, not --pretrained.")
-    return load_pretrained(options.pretrained)
 
 
 def _compare(

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tyro.conf import Positional, arg
 
 from pixelbrax_gym.cli import parse
-from pixelbrax_gym.cli.evaluate import AgentOptions, load
+from pixelbrax_gym.cli._agents import AgentOptions, load
 from pixelbrax_jax.validation import check_choice, check_positive_int
 from pixelbrax_jax.video import write_frames
 

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from os import PathLike
-from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from pixelbrax_gym.generalisation.scores import SHEET, Player, Scores, play
+from pixelbrax_gym.generalisation.scores import Player, Scores, play
 from pixelbrax_gym.gymnasium.vector_env import GymnasiumVectorEnv
 from pixelbrax_jax import EnvConfig, VectorPixelEnv
 from pixelbrax_jax.config import ENV_OPTIONS, env_config
 from pixelbrax_jax.flags import default_flags
-from pixelbrax_jax.generalisation.frames import write_sheet
 from pixelbrax_jax.generalisation.making import LevelEnv, Levels, make_levels
 from pixelbrax_jax.generalisation.suites import EPISODES, SUITES
 from pixelbrax_jax.plain import to_plain
@@ -63,6 +61,7 @@ def evaluate_suite(
             shape, or the folder has returns of other options.
         FileNotFoundError: clips are missing; the message says where to get them.
         TypeError: an option is unknown or the suite's own, or a policy cannot be called.
+        ImportError: ``output_dir`` is given and Pillow is missing.
     """
     policies = policy if isinstance(policy, Mapping) else {"policy": policy}
     for name, one in policies.items():
@@ -83,10 +82,7 @@ def evaluate_suite(
         return lambda level: envs.play(level, one)
 
     players = {name: player(one) for name, one in policies.items()}
-    play(levels, players, scores, output_dir, report)
-    if output_dir is not None:
-        write_sheet(levels, Path(output_dir) / SHEET)
-    return scores
+    return play(levels, players, scores, output_dir, report)
 
 
 def scores_of(config: EnvConfig, suite: str, levels: Levels) -> Scores:

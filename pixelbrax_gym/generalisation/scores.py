@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from pixelbrax_gym.bench.tables import table
+from pixelbrax_jax.generalisation.frames import write_sheet
 from pixelbrax_jax.generalisation.intervals import interquartile_mean
 from pixelbrax_jax.generalisation.making import LevelEnv, Levels
 
@@ -131,13 +132,19 @@ def play(
     folder: str | Path | None = None,
     report: Callable[[str], object] = lambda _: None,
 ) -> Scores:
-    """Play all levels with all runs, write the files after each, and return the runs' scores.
+    """Play all levels with all runs and return the runs' scores.
 
-    ``scores`` has the options and no returns. Levels that the folder's file has are not played
-    again. Errors are those of ``read``.
+    ``scores`` has the options and no returns. The folder gets the contact sheet first and the
+    returns after each level; levels whose returns it has are not played again. Errors are those of
+    ``read``, and an ImportError without Pillow.
     """
     folder = None if folder is None else Path(folder)
-    known = read(scores, folder) if folder is not None else {}
+    known = {}
+    if folder is not None:
+        known = read(scores, folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        if not (folder / SHEET).exists():
+            write_sheet(levels, folder / SHEET)
     for level in levels.levels:
         name = level.level.name
         for run, player in players.items():
@@ -189,7 +196,6 @@ def _json(scores: Scores, returns: Mapping[str, Any]) -> str:
 
 def _write(path: Path, text: str) -> None:
     """Write a file and rename it, so that it is complete after an interruption."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(path.name + ".part")
     part.write_text(text, "utf-8")
     part.replace(path)
