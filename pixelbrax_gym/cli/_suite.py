@@ -10,7 +10,7 @@ from pixelbrax_gym.cli import needs_extra, say
 from pixelbrax_gym.cli._agents import AgentOptions, load
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     import numpy as np
 
@@ -43,7 +43,7 @@ def evaluate(
     config = next(iter(agents.values())).algorithm.config.env
     episodes = SUITES[suite].episodes if episodes is None else episodes
     levels = make_levels(config, suite, episodes, options.clips, report)
-    _check_new_clips(agents, levels)
+    _check_new_clips(agents, levels, report)
     report(f"{len(levels.levels)} levels in {levels.num_programs} programs")
     scores = scores_of(config, suite, levels)
     players = {name: _player(agent, episodes) for name, agent in agents.items()}
@@ -99,7 +99,9 @@ def _player(agent: Trained, episodes: int) -> Player:
     return play
 
 
-def _check_new_clips(agents: Mapping[str, Trained], levels: Levels) -> None:
+def _check_new_clips(
+    agents: Mapping[str, Trained], levels: Levels, report: Callable[[str], object]
+) -> None:
     """Raise a ValueError if a level of held-out clips shows clips of the training."""
     if levels.bank is None:
         return
@@ -107,14 +109,18 @@ def _check_new_clips(agents: Mapping[str, Trained], levels: Levels) -> None:
     from pixelbrax_jax.agents.runner.splits import plays_clips
     from pixelbrax_jax.agents.runner.trained import with_clips
 
-    digests = None
+    digests: list[str] = []
     for name, agent in agents.items():
-        if not plays_clips(agent.algorithm.config):
+        config = agent.algorithm.config
+        if not plays_clips(config):
             continue
-        shown = set(with_clips(agent, None)[1] or ())
+        _, shown = with_clips(agent, config.env.clips or "procedural")
+        if shown is None:
+            report(f"{name} has no digest of its clips; assuming that no level shows them")
+            continue
         digests = digests or clip_digests(levels.bank.to_device())
         for split, clips in levels.splits.items():
-            shared = sum(digests[clip] in shown for clip in clips)
+            shared = sum(digests[clip] in set(shown) for clip in clips)
             if shared and split != "train":
                 raise ValueError(
                     f"{name} was trained with {shared} of the {len(clips)} clips of split "

@@ -24,6 +24,9 @@ RETURNS, ROWS, SHEET = "returns.json", "table.csv", "levels.png"
 MEAN = "mean of the levels"
 """Name of the last row."""
 
+Returns = dict[str, dict[str, list[float]]]
+"""The returns of episodes by run and level."""
+
 Player = Callable[[LevelEnv], np.ndarray]
 """Plays the episodes of a level; returns their (E,) returns."""
 
@@ -68,7 +71,7 @@ class Scores:
     suite: str
     task: str
     options: dict[str, Any]
-    returns: dict[str, dict[str, list[float]]] = field(default_factory=dict)
+    returns: Returns = field(default_factory=dict)
 
     def rows(self) -> list[Row]:
         """Return a row for each level that all runs have, and one for all but the first level."""
@@ -139,7 +142,7 @@ def play(
     ``read``, and an ImportError without Pillow.
     """
     folder = None if folder is None else Path(folder)
-    known = {}
+    known: Returns = {}
     if folder is not None:
         known = read(scores, folder)
         folder.mkdir(parents=True, exist_ok=True)
@@ -164,7 +167,7 @@ def play(
     return scores
 
 
-def read(scores: Scores, folder: Path) -> dict[str, dict[str, list[float]]]:
+def read(scores: Scores, folder: Path) -> Returns:
     """Read the returns in a folder's file, none if there is no file.
 
     Raises:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 
 from pixelbrax_jax.distractors.base import Distractor
@@ -115,9 +115,15 @@ def _dmcgb(task: str) -> tuple[Level, ...]:
 
 def _distracting(task: str, scale: float) -> tuple[Distractor, ...]:
     """Return the Distracting Control Suite's dynamic distractors at another scale."""
+    videos = [link for link in preset("dcs-easy", task) if isinstance(link, Video)]
+    color = Color("geom", "walk", scale, "uniform")
+    return MovingCamera(scale), *_of_all_clips(videos), color
+
+
+def _of_all_clips(links: Iterable[Distractor]) -> tuple[Distractor, ...]:
+    """Return distractors whose videos show any clip; a level has the number of clips."""
     return tuple(
-        replace(link, num_clips=None) if isinstance(link, Video) else replace(link, scale=scale)
-        for link in preset("dcs-easy", task)
+        replace(link, num_clips=None) if isinstance(link, Video) else link for link in links
     )
 
 
@@ -159,10 +165,7 @@ def _dcs(task: str) -> tuple[Level, ...]:
     def levels() -> Iterator[Level]:
         for difficulty, num_clips in NUM_CLIPS.items():
             for suffix in ("", "-static"):
-                links = tuple(
-                    replace(link, num_clips=None) if isinstance(link, Video) else link
-                    for link in preset(f"dcs-{difficulty}{suffix}", task)
-                )
+                links = _of_all_clips(preset(f"dcs-{difficulty}{suffix}", task))
                 for split in ("train", "test"):
                     name = f"{difficulty}{suffix or '-dynamic'}-{split}"
                     yield Level(name, links, (split,), num_clips)
