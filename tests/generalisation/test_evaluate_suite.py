@@ -148,7 +148,7 @@ def test_several_policies_are_seeds():
         ({}, {}, ValueError, "at least one policy"),
         (of_numpy, {"distractors": "color"}, TypeError, "distractors is decided by the levels"),
         (of_numpy, {"obs_mode": "state"}, ValueError, "obs_mode='state' shows none"),
-        (of_numpy, {"hight": 3}, TypeError, "unexpected keyword argument 'hight'"),
+        (of_numpy, {"heigth": 3}, TypeError, "unexpected keyword argument 'heigth'"),
         (of_numpy, {"episodes": 0}, ValueError, "episodes must be a positive integer"),
     ],
 )
