@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
+from typing import get_args, get_type_hints
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -12,8 +12,10 @@ from PIL import Image
 
 from pixelbrax_gym import evaluate_suite
 from pixelbrax_gym.cli import _suite, main
+from pixelbrax_gym.cli.evaluate import Options
 from pixelbrax_jax.agents import PPOConfig
 from pixelbrax_jax.agents.runner.trained import Pretrained, Trained
+from pixelbrax_jax.generalisation.suites import SUITES
 from tests.generalisation.conftest import TASK, TINY
 
 LEVELS = ["clean", "turned", "painted"]
@@ -190,4 +192,8 @@ def test_options_of_a_suite_need_one(capsys):
         assert message in capsys.readouterr().err
     with pytest.raises(SystemExit):
         main(["evaluate", "a", "--suite", "dmcgb3"])
-    assert jax.device_count()
+
+
+def test_the_command_has_all_suites():
+    literal, _ = get_args(get_type_hints(Options)["suite"])
+    assert {*get_args(literal), "tiny"} == set(SUITES)
