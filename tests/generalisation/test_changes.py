@@ -61,7 +61,7 @@ def test_the_camera_turns_by_a_hundred_even_angles(degrees):
     angles = np.linspace(-degrees, degrees, 100, endpoint=False)
     assert same_set(orientations(rig), [BEFORE @ about("z", angle) for angle in angles])
     assert np.array_equal(rig.eye, np.tile(TILTED.rig.eye, (100, 1)))
-    np.testing.assert_allclose(rig.target, np.tile(TILTED.rig.target, (100, 1)), atol=1e-6)
+    np.testing.assert_allclose(rig.target, np.tile(TILTED.rig.target, (100, 1)), atol=1e-5)
 
 
 def test_the_camera_shifts_along_a_rectangle():
@@ -112,8 +112,8 @@ def test_lights_turn_by_an_angle():
 
 def test_light_is_darker_or_brighter():
     look = rows(LightIntensity(0.4), 60).look
-    factors = np.asarray(look.diffuse) / TILTED.look.diffuse
-    assert set(np.round(factors, 4)) == {0.6, 1.4}
+    factors = np.asarray(look.diffuse, float) / TILTED.look.diffuse
+    assert set(np.round(factors, 4).tolist()) == {0.6, 1.4}
     np.testing.assert_allclose(look.ambient / TILTED.look.ambient, factors, rtol=1e-6)
 
 
@@ -129,6 +129,6 @@ def test_the_body_alone_has_other_colors():
 
 def test_a_radius_is_that_of_the_image_alone():
     size = np.asarray(rows(Radius(0.25, ("ball",)), 2).geoms.size)
-    assert np.array_equal(size[0], [[0, 0, 1], [0.075, 0, 0]])
+    np.testing.assert_allclose(size[0], [[0, 0, 1], [0.075, 0, 0]], rtol=1e-6)
     with pytest.raises(ValueError, match="the task has no geom pole; it has ground, ball"):
         Radius(0.5, ("pole",)).change(TILTED, jax.random.key(0), 0)
