@@ -114,8 +114,8 @@ class _Envs:
         over, returns = np.zeros(num, bool), np.zeros(num)
         while not over.all():
             actions = policy(obs)
-            if tuple(getattr(actions, "shape", np.shape(actions))) != shape:
-                got = tuple(getattr(actions, "shape", np.shape(actions)))
+            got = tuple(actions.shape) if hasattr(actions, "shape") else np.shape(actions)
+            if got != shape:
                 raise ValueError(
                     f"the policy must return actions of shape {shape}, a row for each of the "
                     f"{num} episodes, got {got}."

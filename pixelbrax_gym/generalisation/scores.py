@@ -21,8 +21,8 @@ from pixelbrax_jax.generalisation.making import LevelEnv, Levels
 RETURNS, ROWS, SHEET = "returns.json", "table.csv", "levels.png"
 """Files in the output folder."""
 
-MEAN = "mean of the levels"
-"""Name of the last row."""
+ALL = "all but clean"
+"""Name of the last row, of all levels but the first."""
 
 Returns = dict[str, dict[str, list[float]]]
 """The returns of episodes by run and level."""
@@ -39,7 +39,8 @@ class Row:
         level: name of the level; the last row has all but clean.
         runs: number of runs R, the seeds.
         episodes: number of episodes E of each run and level.
-        mean: mean return; of several runs the interquartile mean over their mean returns.
+        mean: mean return; of several runs the interquartile mean over their mean returns, in the
+            last row over those of all levels.
         low: lower end of its 95 % stratified bootstrap interval; NaN for one run.
         high: upper end.
         standard_error: of a run's mean over its episodes, averaged over runs; NaN for one episode
@@ -86,7 +87,7 @@ class Scores:
             rows.append(self._row(name, returns.mean(axis=1)[None], float(errors.mean()), rows))
         if len(names) > 2:
             means = np.stack([arrays[name].mean(axis=1) for name in names[1:]])
-            rows.append(self._row(MEAN, means, math.nan, rows))
+            rows.append(self._row(ALL, means, math.nan, rows))
         return rows
 
     def _row(self, name: str, scores: np.ndarray, error: float, rows: Sequence[Row]) -> Row:
@@ -146,7 +147,7 @@ def play(
     if folder is not None:
         known = read(scores, folder)
         folder.mkdir(parents=True, exist_ok=True)
-        if not (folder / SHEET).exists():
+        if not (known and (folder / SHEET).exists()):
             write_sheet(levels, folder / SHEET)
     for level in levels.levels:
         name = level.level.name

@@ -9,7 +9,7 @@ import math
 import numpy as np
 import pytest
 
-from pixelbrax_gym.generalisation.scores import MEAN, Scores
+from pixelbrax_gym.generalisation.scores import ALL, Scores
 from pixelbrax_jax.generalisation.intervals import interquartile_mean
 
 LEVELS = ("clean", "easy", "hard")
@@ -55,7 +55,7 @@ def test_rows_of_one_run():
     found = scores(1)
     returns = found.returns["run 0"]
     rows = {row.level: row for row in found.rows()}
-    assert list(rows) == [*LEVELS, MEAN]
+    assert list(rows) == [*LEVELS, ALL]
     for name in LEVELS:
         mean = sum(returns[name]) / 4
         spread = math.sqrt(sum((x - mean) ** 2 for x in returns[name]) / 3)
@@ -63,7 +63,7 @@ def test_rows_of_one_run():
         assert rows[name].standard_error == pytest.approx(spread / 2)
         assert rows[name].ratio == pytest.approx(mean / rows["clean"].mean)
         assert math.isnan(rows[name].low)
-    assert rows[MEAN].mean == pytest.approx((rows["easy"].mean + rows["hard"].mean) / 2)
+    assert rows[ALL].mean == pytest.approx((rows["easy"].mean + rows["hard"].mean) / 2)
     head, _, clean, *_ = found.markdown().splitlines()
     assert [cell.strip() for cell in head.split("|")[1:-1]] == [
         "level",
@@ -83,8 +83,8 @@ def test_rows_of_several_runs():
         assert (rows[name].mean, rows[name].low, rows[name].high) == expected
         errors = [np.std(run[name], ddof=1) / 2 for run in found.returns.values()]
         assert rows[name].standard_error == pytest.approx(np.mean(errors))
-    assert rows[MEAN].mean == pytest.approx(middle_mean(means["easy"] + means["hard"]))
-    assert rows[MEAN].runs == 5
+    assert rows[ALL].mean == pytest.approx(middle_mean(means["easy"] + means["hard"]))
+    assert rows[ALL].runs == 5
     text = found.markdown()
     assert "| return (IQM) | 95 % interval" in text
     lines = list(csv.DictReader(io.StringIO(found.csv())))
