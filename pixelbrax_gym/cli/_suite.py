@@ -114,7 +114,7 @@ def _check_new_clips(
         config = agent.algorithm.config
         if not plays_clips(config):
             continue
-        _, shown = with_clips(agent, config.env.clips or "procedural")
+        _, shown = with_clips(agent, str(config.env.clips or "procedural"))
         if shown is None:
             report(f"{name} has no digest of its clips; assuming that no level shows them")
             continue

@@ -8,6 +8,7 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -133,7 +134,7 @@ def play(
     levels: Levels,
     players: Mapping[str, Player],
     scores: Scores,
-    folder: str | Path | None = None,
+    folder: str | PathLike[str] | None = None,
     report: Callable[[str], object] = lambda _: None,
 ) -> Scores:
     """Play all levels with all runs and return the runs' scores.
@@ -142,13 +143,13 @@ def play(
     returns after each level; levels whose returns it has are not played again. Errors are those of
     ``read``, and an ImportError without Pillow.
     """
-    folder = None if folder is None else Path(folder)
+    path = None if folder is None else Path(folder)
     known: Returns = {}
-    if folder is not None:
-        known = read(scores, folder)
-        folder.mkdir(parents=True, exist_ok=True)
-        if not (known and (folder / SHEET).exists()):
-            write_sheet(levels, folder / SHEET)
+    if path is not None:
+        known = read(scores, path)
+        path.mkdir(parents=True, exist_ok=True)
+        if not (known and (path / SHEET).exists()):
+            write_sheet(levels, path / SHEET)
     for level in levels.levels:
         name = level.level.name
         for run, player in players.items():
@@ -157,14 +158,14 @@ def play(
             if is_new:
                 returns = np.asarray(player(level), np.float64)
                 of_run[name] = returns.tolist()
-                if folder is not None:
-                    _write(folder / RETURNS, _json(scores, known))
+                if path is not None:
+                    _write(path / RETURNS, _json(scores, known))
             mean = float(np.mean(of_run[name]))
             report(f"{name}, {run}: return {mean:.1f}{'' if is_new else ', from the file'}")
     order = [level.level.name for level in levels.levels]
     scores.returns = {run: {name: known[run][name] for name in order} for run in players}
-    if folder is not None:
-        _write(folder / ROWS, scores.csv())
+    if path is not None:
+        _write(path / ROWS, scores.csv())
     return scores
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
+from functools import partial, reduce
 from os import PathLike
 from typing import Any
 
@@ -244,18 +244,18 @@ def _first_split(
     clips: str | PathLike[str], names: Sequence[str], config: EnvConfig
 ) -> tuple[str, ClipBank]:
     """Return the first of some splits that is there, and its clips."""
-    size = {"height": config.height, "width": config.width}
+    read = partial(load_clips, height=config.height, width=config.width)
     if str(clips) == "procedural":
         split = next(name for name in names if name in SPLITS)
-        return split, load_clips("procedural", split, **size)
+        return split, read("procedural", split)
     folder = whole_path(clips)
     for name in names:
         if (folder / name).is_dir() and not (folder / "JPEGImages").is_dir():
-            return name, load_clips(folder / name, "all", **size)
+            return name, read(folder / name, "all")
     errors = []
     for name in names:
         try:
-            return name, load_clips(folder, name, **size)
+            return name, read(folder, name)
         except (ValueError, FileNotFoundError) as error:
             errors.append(str(error))
     raise FileNotFoundError(f"{errors[-1]} Wanted: {' or '.join(names)}. {_WHERE}.")

@@ -138,11 +138,8 @@ def _dmcgb2(task: str) -> tuple[Level, ...]:
     levels = [CLEAN]
     for name in ("easy", "hard"):
         hard = name == "hard"
-        by = 1.0 if hard else 1.5
         rotation = Rotation(180.0 if hard else 90.0)
-        shift = Shift(
-            *(tuple(angle / by for angle in axis) for axis in (hard_shift.y, hard_shift.x))
-        )
+        shift = hard_shift if hard else _divided(hard_shift, 1.5)
         palette = preset(f"color-{name}", task)
         levels += [
             Level(f"color-{name}", palette),

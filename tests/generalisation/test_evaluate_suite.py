@@ -39,7 +39,8 @@ def evaluate(policy, **more):
 
 
 def agent(policy=of_jax, seed=0, **settings):
-    config = PPOConfig().replace(task=TASK, encoder="small", **TINY | settings)
+    options = {"task": TASK, "encoder": "small"} | TINY | settings
+    config = PPOConfig().replace(**options)
     return Trained(Pretrained(config, policy), {}, 16, seed)
 
 
