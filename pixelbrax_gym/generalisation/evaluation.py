@@ -142,5 +142,5 @@ class _Envs:
 
 
 def _numpy(array: Any) -> np.ndarray:
-    """Copy an array of NumPy, JAX or torch to NumPy."""
-    return np.array(array.cpu() if hasattr(array, "cpu") else array)
+    """Return an array of NumPy, JAX or torch in host memory."""
+    return np.asarray(array.cpu().numpy() if hasattr(array, "cpu") else array)

@@ -93,7 +93,8 @@ def test_episodes_are_those_of_the_command(runs, capsys, tmp_path):
     assert list(ours) == list(theirs)
     for name, returns in theirs.items():
         np.testing.assert_allclose(ours[name], returns, rtol=1e-6)
-    assert Image.open(tmp_path / "levels.png").size == (3 * 182, 196)
+    with Image.open(tmp_path / "levels.png") as sheet:
+        assert sheet.size == (3 * 182, 196)
     # Nothing is played again, and another seed is added.
     runs["b"] = [agent(lambda obs: 0.5 * of_jax(obs), seed=2)]
     assert command("a", "b", *where) == 0
