@@ -18,6 +18,7 @@ from pixelbrax_jax.generalisation.changes import Radius, Rotation, Shift
 from pixelbrax_jax.generalisation.making import make_levels
 from pixelbrax_jax.generalisation.suites import EPISODES, SUITES, levels_of
 from pixelbrax_jax.tasks import SUITES as TASK_SUITES
+from tests.agents.test_splits import write_clips
 from tests.generalisation.conftest import TASK, TINY
 
 CONFIG = EnvConfig(task=TASK, **TINY)
@@ -145,6 +146,22 @@ def test_clips_come_in_order_from_the_held_out_split():
     # Intensity 0.025 has two clips, of training.
     shown = set(by_name["distracting-0.025"].params.clips.first[:, 0].tolist())
     assert shown == set(made.bank.first[list(made.splits["train"])[:2]].tolist())
+
+
+def test_one_folder_has_the_clips_of_both_benchmarks(tmp_path, monkeypatch):
+    monkeypatch.setenv("PIXELBRAX_CACHE", str(tmp_path / "cache"))
+    data = tmp_path / "data"
+    write_clips(data / "video_easy", "abc")
+    write_clips(data / "video_hard", "de")
+    write_clips(data / "DAVIS" / "JPEGImages" / "480p", "fg")
+    lists = data / "DAVIS" / "ImageSets" / "2017"
+    lists.mkdir(parents=True)
+    (lists / "train.txt").write_text("g\nf\n")
+    made, by_name = levels("dmcgb", episodes=4, clips=data)
+    shown = {name: [made.bank.names[i] for i in clips] for name, clips in made.splits.items()}
+    assert shown == {"video_easy": ["a", "b", "c"], "video_hard": ["d", "e"], "train": ["g", "f"]}
+    assert by_name["video-easy"].params.clips.first[:, 0].tolist() == [0, 2, 4, 0]
+    assert by_name["video-hard"].params.clips.first[:, 0].tolist() == [6, 8, 6, 8]
 
 
 def test_an_episode_shows_its_clip_from_the_first_frame():
