@@ -24,6 +24,10 @@ _ROTATION_STRIDE, _SHIFT_STRIDE = 61, 47
 and so are the pairs of both."""
 
 
+_LIGHT = ("ambient", "diffuse", "specular", "highlight", "headlight", "headlight_highlight")
+"""Coefficients of a look's light."""
+
+
 class Change:
     """A change of parameters, a frozen dataclass of plain numbers."""
 
@@ -112,11 +116,7 @@ class LightIntensity(Change):
         """Return the parameters with darker or brighter light."""
         factor = jnp.where(jax.random.bernoulli(key), 1.0 + self.amount, 1.0 - self.amount)
         look = params.look
-        names = [
-            name
-            for name in ("ambient", "diffuse", "specular", "highlight", "headlight")
-            if getattr(look, name) is not None
-        ]
+        names = [name for name in _LIGHT if getattr(look, name, None) is not None]
         scaled: dict[str, Any] = {name: getattr(look, name) * factor for name in names}
         lamps = tuple(
             lamp.replace(diffuse=lamp.diffuse * factor, highlight=lamp.highlight * factor)

@@ -127,7 +127,7 @@ def make_levels(
                 f"level {level.name!r} of suite {suite!r} cannot be made for task "
                 f"{config.task!r}: {error}"
             ) from error
-    params = _share([base.replace(clips=None) for _, base in made], drawn)
+    params = _share([base.replace(clips=None) for _, base in made], drawn, episodes)
     ready = []
     for level, (env, base), of_level in zip(levels, made, params, strict=True):
         if base.clips is not None:
@@ -150,12 +150,13 @@ def _make(config: EnvConfig, level: Level, bank: ClipBank | None) -> tuple[Pixel
 
 
 def _draw(changes: Sequence[Change | Distractor], base: EnvParams, keys: jax.Array) -> EnvParams:
-    """Return parameters whose arrays all have a row for each episode."""
+    """Return parameters in which changed arrays have a row for each episode."""
     chosen = [
         change for change in changes if isinstance(change, Change) or changes_params_alone(change)
     ]
+    before, tree = jax.tree.flatten(base)
 
-    def of_episode(key: jax.Array, episode: jax.Array) -> EnvParams:
+    def of_episode(key: jax.Array, episode: jax.Array) -> list[Any]:
         def step(params: EnvParams, change: Change | Distractor) -> EnvParams:
             if isinstance(change, Distractor):
                 own = Chain.key(key, change, 0)
@@ -163,34 +164,44 @@ def _draw(changes: Sequence[Change | Distractor], base: EnvParams, keys: jax.Arr
                 own = jax.random.fold_in(key, chosen.index(change))
             return apply(change, params, own, episode)
 
-        return reduce(step, chosen, base)
+        after = jax.tree.leaves(reduce(step, chosen, base))
+        return [None if new is old else new for new, old in zip(after, before, strict=True)]
 
-    rows: EnvParams = jax.vmap(of_episode)(keys, jnp.arange(len(keys)))
-    size = np.asarray(rows.geoms.size).min(0)
-    if (size < np.asarray(base.geoms.size)).any():
+    drawn = jax.vmap(of_episode)(keys, jnp.arange(len(keys)))
+    leaves = [old if new is None else new for new, old in zip(drawn, before, strict=True)]
+    rows: EnvParams = jax.tree.unflatten(tree, leaves)
+    if np.ndim(rows.geoms.size) > np.ndim(base.geoms.size):
+        smallest = base.geoms.replace(size=np.asarray(rows.geoms.size).min(0))
         cameras = base.rig if isinstance(base.rig, tuple) else (base.rig,)
-        distant = seen_from(base.geoms.replace(size=size), *cameras).distant
+        distant = seen_from(smallest, *cameras).distant
         rows = rows.replace(geoms=rows.geoms.replace(distant=distant))
     return rows
 
 
-def _share(bases: Sequence[EnvParams], drawn: Sequence[EnvParams]) -> list[EnvParams]:
-    """Keep rows of those arrays alone that some level changes, the same arrays in all levels."""
+def _share(
+    bases: Sequence[EnvParams], drawn: Sequence[EnvParams], episodes: int
+) -> list[EnvParams]:
+    """Give the same arrays rows in all levels: those that some level changes."""
     before = [jax.tree.leaves(base) for base in bases]
     after = [jax.tree.leaves(rows) for rows in drawn]
     changed = [
         any(
-            (np.asarray(rows[i]) != np.asarray(base[i])[None]).any()
+            np.ndim(rows[i]) > np.ndim(base[i]) and bool(np.any(rows[i] != base[i]))
             for base, rows in zip(before, after, strict=True)
         )
         for i in range(len(before[0]))
     ]
-    shared = [
-        [row if own else base for base, row, own in zip(*leaves, changed, strict=True)]
-        for leaves in zip(before, after, strict=True)
-    ]
-    trees = [jax.tree.structure(rows) for rows in drawn]
-    return [jax.tree.unflatten(tree, leaves) for tree, leaves in zip(trees, shared, strict=True)]
+
+    def shared(base: Any, row: Any, own: bool) -> Any:
+        if not own or np.ndim(row) > np.ndim(base):
+            return row if own else base
+        return np.repeat(np.asarray(base)[None], episodes, axis=0)
+
+    found = []
+    for rows, old, new in zip(drawn, before, after, strict=True):
+        leaves = [shared(*parts) for parts in zip(old, new, changed, strict=True)]
+        found.append(jax.tree.unflatten(jax.tree.structure(rows), leaves))
+    return found
 
 
 def _show(clips: Any, shown: Sequence[int], in_order: bool, keys: jax.Array) -> Any:
