@@ -94,8 +94,8 @@ def make_levels(
     """Make the levels of a suite for a task with these options.
 
     Distractors, clips, split and dynamics of ``config`` are left out. Episode i of every level
-    starts from the same state, that of the key ``fold_in(key(EPISODES), i)``. What a level draws
-    for it is drawn with a key that no training has.
+    starts from the same state, that of the key ``fold_in(key(EPISODES), i)``. Parameters that a
+    level draws for it have a key that no training has.
 
     Args:
         config: the task and how it is seen.
