@@ -11,6 +11,7 @@ import gymnasium as gym
 from pixelbrax_jax.tasks import TASKS
 
 if TYPE_CHECKING:
+    from pixelbrax_gym.generalisation.evaluation import evaluate_suite as evaluate_suite
     from pixelbrax_gym.gymnasium.check import check_vector_env as check_vector_env
     from pixelbrax_gym.gymnasium.env import GymnasiumEnv as GymnasiumEnv
     from pixelbrax_gym.gymnasium.vector_env import GymnasiumVectorEnv as GymnasiumVectorEnv
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from pixelbrax_gym.torchrl.env import TorchRLEnv as TorchRLEnv
 
 # Names that need an extra are missing, so that a star import works without it.
-__all__ = ["GymnasiumEnv", "GymnasiumVectorEnv", "check_vector_env", "register"]
+__all__ = ["GymnasiumEnv", "GymnasiumVectorEnv", "check_vector_env", "evaluate_suite", "register"]
 
 _LAZY = {
     "GymnasiumEnv": "pixelbrax_gym.gymnasium.env",
@@ -28,6 +29,7 @@ _LAZY = {
     "TorchPolicy": "pixelbrax_gym.policy",
     "TorchRLEnv": "pixelbrax_gym.torchrl.env",
     "check_vector_env": "pixelbrax_gym.gymnasium.check",
+    "evaluate_suite": "pixelbrax_gym.generalisation.evaluation",
 }
 
 _ENV = "pixelbrax_gym.gymnasium.env:GymnasiumEnv"

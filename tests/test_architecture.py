@@ -56,22 +56,31 @@ ALLOWED: dict[str, set[str]] = {
     "pixelbrax_jax._platform": set(),
     "pixelbrax_jax.registry": _below("tasks", "physics"),
     "pixelbrax_jax.envs": _below("config", "ranges", "registry", *LAYERS),
+    "pixelbrax_jax.generalisation": _below("config", "envs", "registry", *LAYERS),
     # The package itself, which names what is public.
     "pixelbrax_jax": _below("config", "envs", "registry", "policy", *LAYERS),
     "pixelbrax_jax.agents": {
         "pixelbrax_jax",
-        *_below("config", "envs", "policy", "ranges", "registry", "distractors"),
+        *_below(
+            "config",
+            "envs",
+            "generalisation",
+            "policy",
+            "ranges",
+            "registry",
+            "distractors",
+        ),
     },
     "pixelbrax_gym": {
         "pixelbrax_jax",
-        *_below("config", "plain", "registry", "tasks", "policy", "renderer"),
+        *_below("config", "generalisation", "plain", "registry", "tasks", "policy", "renderer"),
     }
     - {"pixelbrax_jax._platform"},
     # The command line joins everything, and nothing imports it.
     "pixelbrax_gym.cli": {
         "pixelbrax_gym",
         "pixelbrax_jax",
-        *_below("config", "tasks", "policy", "physics", "distractors", "agents"),
+        *_below("config", "generalisation", "tasks", "policy", "physics", "distractors", "agents"),
     },
 }
 """Package -> the packages that it may import besides itself."""

@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from pixelbrax_gym.cli import CommandError, needs_extra, parse, say
+from pixelbrax_gym.cli import CommandError, parse, say
+from pixelbrax_gym.cli._agents import AgentOptions, load
+from pixelbrax_gym.cli._suite import evaluate
 from pixelbrax_jax.tasks import SUITES
 from pixelbrax_jax.validation import check_positive_int
 
@@ -21,33 +23,22 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class AgentOptions:
-    """Options that select a trained agent."""
-
-    folder: Annotated[Positional[str | None], arg(metavar="FOLDER")] = None
-    """Output folder of the training run."""
-    pretrained: str | None = None
-    """Loads a policy of the package instead, by its task, such as halfcheetah."""
-    steps: int | None = None
-    """Loads the checkpoint of this many steps; default: the latest."""
-    clips: str | None = None
-    """Folder of the clips; default: the folder used in training. Split train needs the same
-    clips."""
-    best: bool = False
-    """Loads the best checkpoint."""
-    run_index: Annotated[int, arg(name="run")] = 0
-    """Index of the run among those of --seeds, from 0."""
-
-
-@dataclass(frozen=True)
 class Options(AgentOptions):
     """Plays whole episodes with a checkpoint and writes a line of JSON for each split.
 
-    Actions are the policy's means. Every call plays the same episodes.
+    Actions are the policy's means. Every call plays the same episodes. With --suite it plays the
+    levels of a suite with all runs, which are the seeds of one agent, and writes their table.
     """
 
-    episodes: int = 32
-    """Number of episodes of each split."""
+    runs: Annotated[Positional[tuple[str, ...]], arg(metavar="RUN")] = ()
+    """Output folder of the training run; with --suite one or several."""
+    episodes: int | None = None
+    """Number of episodes of each split or level; default: 32, or the suite's number."""
+    suite: Literal["axes", "dcs", "dmcgb", "dmcgb2", "paper", "subtle"] | None = None
+    """Plays the levels of a suite instead of splits, and writes a table in Markdown."""
+    output_dir: str | None = None
+    """Folder for the suite's returns.json, table.csv and levels.png. Levels whose returns it has
+    are not played again."""
     split: tuple[Literal["clean", "train", "test"], ...] = ()
     """Splits to evaluate; default: clean, with distractors also train, and test if it has clips
     that training does not show."""
@@ -62,16 +53,28 @@ class Options(AgentOptions):
 def run(arguments: Sequence[str]) -> int:
     """Run the command."""
     options = parse("evaluate", Options, arguments)
-    agent = load(options)
+    if options.suite is not None:
+        for name, value in (("split", options.split), ("in", options.where)):
+            if value:
+                raise ValueError(f"--suite plays its own levels; leave out --{name}.")
+        episodes, folder = options.episodes, options.output_dir
+        sys.stdout.write(evaluate(options, options.runs, options.suite, episodes, folder) + "\n")
+        return 0
+    if options.output_dir is not None:
+        raise ValueError("--output-dir needs --suite.")
+    if len(options.runs) > 1:
+        raise ValueError(f"give one run, or --suite for several; got {', '.join(options.runs)}.")
+    agent = load(options, next(iter(options.runs), None))
     from pixelbrax_jax.agents.runner.evaluate import Evaluator
     from pixelbrax_jax.agents.runner.settings import place_of
     from pixelbrax_jax.agents.runner.splits import make_splits
     from pixelbrax_jax.agents.runner.trained import with_clips
 
-    report, episodes = partial(say, "evaluate"), options.episodes
+    report = partial(say, "evaluate")
+    episodes = 32 if options.episodes is None else options.episodes
     check_positive_int("episodes", episodes)
     if options.where is not None:
-        _write(_compare(agent, options, report))
+        _write(_compare(agent, options, episodes, report))
         return 0
     config, shown = with_clips(agent, options.clips)
     if options.clips and not shown:
@@ -86,31 +89,15 @@ def run(arguments: Sequence[str]) -> int:
     return 0
 
 
-def load(options: AgentOptions) -> Trained:
-    """Load the agent that the options select; raise a CommandError if its checkpoint is missing."""
-    with needs_extra("train"):
-        from pixelbrax_jax.agents.runner.checkpoint import CheckpointError
-        from pixelbrax_jax.agents.runner.trained import load_pretrained, load_trained
-    steps, best, run = options.steps, options.best, options.run_index
-    if options.folder is not None and options.pretrained is None:
-        try:
-            return load_trained(options.folder, steps=steps, best=best, run=run)
-        except CheckpointError as error:
-            raise CommandError(str(error)) from error
-    if options.folder is not None or options.pretrained is None:
-        raise ValueError("give either the folder of a run or --pretrained with a name.")
-    if steps is not None or best or run:
-        raise ValueError("--steps, --best and --run need the folder of a run, not --pretrained.")
-    return load_pretrained(options.pretrained)
-
-
-def _compare(agent: Trained, options: Options, report: Callable[[str], None]) -> dict[str, Any]:
+def _compare(
+    agent: Trained, options: Options, episodes: int, report: Callable[[str], None]
+) -> dict[str, Any]:
     """Play the same episodes here and in dm_control; return the row."""
     from pixelbrax_jax.agents.runner.evaluate import Evaluator, paired
     from pixelbrax_jax.agents.runner.splits import make_split
     from pixelbrax_jax.agents.runner.transfer import play_in
 
-    config, episodes, where = agent.algorithm.config, options.episodes, options.where
+    config, where = agent.algorithm.config, options.where
     env = config.env
     if env.task not in (tasks := SUITES["dmc"].tasks):
         raise ValueError(

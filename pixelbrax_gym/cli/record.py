@@ -7,10 +7,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+from tyro.conf import Positional, arg
 
 from pixelbrax_gym.cli import parse
-from pixelbrax_gym.cli.evaluate import AgentOptions, load
+from pixelbrax_gym.cli._agents import AgentOptions, load
 from pixelbrax_jax.validation import check_choice, check_positive_int
 from pixelbrax_jax.video import write_frames
 
@@ -24,6 +26,8 @@ if TYPE_CHECKING:
 class Options(AgentOptions):
     """Plays several episodes with a checkpoint side by side and writes a video."""
 
+    folder: Annotated[Positional[str | None], arg(metavar="FOLDER")] = None
+    """Output folder of the training run."""
     output: str | None = None
     """Path of the .mp4 or .gif; default: videos/<steps>_<split>.mp4 in the folder."""
     split: str | None = None
@@ -41,7 +45,7 @@ class Options(AgentOptions):
 def run(arguments: Sequence[str]) -> int:
     """Run the command."""
     options = parse("record", Options, arguments)
-    agent = load(options)
+    agent = load(options, options.folder)
     from pixelbrax_jax.agents.runner.splits import SPLITS, make_split, splits_of
     from pixelbrax_jax.agents.runner.trained import with_clips
 

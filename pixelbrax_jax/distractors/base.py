@@ -83,14 +83,14 @@ class Chain:
 
     def reset(self, key: jax.Array, params: EnvParams) -> tuple[Any, ...]:
         """Sample states at the first frame of the episode with this key."""
-        return tuple(link.reset(self._key(key, link, 0), params) for link in self.links)
+        return tuple(link.reset(self.key(key, link, 0), params) for link in self.links)
 
     def advance(
         self, states: tuple[Any, ...], key: jax.Array, frame: jax.Array, params: EnvParams
     ) -> tuple[Any, ...]:
         """Return states at frame ``frame``, at least 1, of the episode with this key."""
         return tuple(
-            link.advance(state, self._key(key, link, frame), frame, params)
+            link.advance(state, self.key(key, link, frame), frame, params)
             for link, state in zip(self.links, states, strict=True)
         )
 
@@ -128,7 +128,8 @@ class Chain:
         return info
 
     @staticmethod
-    def _key(key: jax.Array, link: Distractor, frame: jax.Array | int) -> jax.Array:
+    def key(key: jax.Array, link: Distractor, frame: jax.Array | int) -> jax.Array:
+        """Return a distractor's key at a frame of the episode with this key."""
         return jax.random.fold_in(jax.random.fold_in(key, link.stream), frame)
 
 

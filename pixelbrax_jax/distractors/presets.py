@@ -11,7 +11,7 @@ from pixelbrax_jax.distractors.video import Video
 from pixelbrax_jax.validation import check_choice
 
 _SCALES = {"easy": 0.1, "medium": 0.2, "hard": 0.3}
-_NUM_CLIPS = {"easy": 4, "medium": 8, "hard": None}
+NUM_CLIPS = {"easy": 4, "medium": 8, "hard": None}
 
 _GROUND_ALPHA = {
     "reacher": 0.0,
@@ -72,7 +72,7 @@ def preset(name: str, task: str) -> tuple[Distractor, ...]:
         Video(
             ground_alpha=_ground_alpha(task),
             dynamics="pingpong" if dynamic else "static",
-            num_clips=_NUM_CLIPS[level],
+            num_clips=NUM_CLIPS[level],
         ),
         Color(
             mode="geom",

@@ -137,7 +137,7 @@ LINE = ["evaluate", "runs/x", "--episodes", "2", "--in"]
 def is_loaded(monkeypatch: pytest.MonkeyPatch, policy: Any = waver, **options: Any) -> None:
     config = PPOConfig().replace(**OPTIONS | {"episode_length": 30, "action_repeat": 4} | options)
     agent = Trained(Pretrained(config, policy), {}, 16)
-    monkeypatch.setattr(evaluate, "load", lambda _: agent)
+    monkeypatch.setattr(evaluate, "load", lambda *_: agent)
 
 
 def test_our_picture_of_dm_controls_physics_is_the_same(monkeypatch, capsys):

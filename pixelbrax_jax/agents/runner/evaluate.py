@@ -15,10 +15,9 @@ from pixelbrax_jax.agents.train_state import Networks
 from pixelbrax_jax.compilation import jit
 from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.envs.vector import VectorPixelEnv
+from pixelbrax_jax.generalisation.intervals import interquartile_mean
+from pixelbrax_jax.generalisation.suites import EPISODES
 from pixelbrax_jax.types import EnvParams, EnvState
-
-EPISODES = 1_000_003
-"""Seed of the evaluated episodes, whatever the seed of the training."""
 
 
 @dataclass(frozen=True)
@@ -126,21 +125,3 @@ def paired(here: Result, there: Result) -> dict[str, float]:
         compared["difference_standard_error"] = error
         compared |= {"difference_low": mean - reach, "difference_high": mean + reach}
     return compared
-
-
-def interquartile_mean(scores: np.ndarray) -> tuple[float, float, float]:
-    """Compute the interquartile mean of (R,) scores, and its 95 % bootstrap interval over runs.
-
-    Recommended for few runs by Agarwal et al., arXiv 2108.13264.
-
-    Raises:
-        ValueError: there are fewer than 2 scores.
-    """
-    from scipy import stats
-
-    scores = np.asarray(scores, np.float64)
-    if scores.ndim != 1 or len(scores) < 2:
-        raise ValueError(f"scores must be at least 2 numbers, got shape {scores.shape}.")
-    resampled = np.random.default_rng(0).choice(scores, (10_000, len(scores)))
-    low, high = np.quantile(stats.trim_mean(resampled, 0.25, axis=1), [0.025, 0.975])
-    return float(stats.trim_mean(scores, 0.25)), float(low), float(high)

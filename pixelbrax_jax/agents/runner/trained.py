@@ -110,6 +110,12 @@ def load_trained(
     return Trained(algorithm, networks, about["steps"], seed, about.get("clips"))
 
 
+def num_runs(folder: str | Path) -> int:
+    """Return the number of runs in the latest checkpoint of an output folder."""
+    seeds: int = read_about(Path(folder) / "checkpoints")["config"].get("seeds", 1)
+    return seeds
+
+
 def with_clips(agent: Trained, clips: str | None) -> tuple[TrainConfig, Sequence[str] | None]:
     """Return an agent's settings with other ``clips``, and digests of its training's clips.
 

@@ -9,13 +9,14 @@ from typing import Any, Protocol
 import jax
 import numpy as np
 
-from pixelbrax_jax.agents.runner.evaluate import EPISODES, Result
+from pixelbrax_jax.agents.runner.evaluate import Result
 from pixelbrax_jax.agents.runner.progress import Report, silent
 from pixelbrax_jax.agents.runner.trained import Player
 from pixelbrax_jax.agents.train_state import Networks
 from pixelbrax_jax.compilation import jit
 from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.envs.vector import VectorPixelEnv
+from pixelbrax_jax.generalisation.suites import EPISODES
 from pixelbrax_jax.types import EnvParams, EnvState, PhysicsState, Timestep
 
 

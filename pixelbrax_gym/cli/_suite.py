@@ -1,0 +1,128 @@
+"""Play a suite of levels with trained agents."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING
+
+from pixelbrax_gym.cli import needs_extra, say
+from pixelbrax_gym.cli._agents import AgentOptions, load
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    import numpy as np
+
+    from pixelbrax_gym.generalisation.scores import Player
+    from pixelbrax_jax.agents.runner.trained import Trained
+    from pixelbrax_jax.generalisation.making import LevelEnv, Levels
+
+_MAY_DIFFER = ("clips", "memory_budget_gb", "split")
+"""Settings in which the seeds of one agent may differ."""
+
+
+def evaluate(
+    options: AgentOptions,
+    runs: Sequence[str],
+    suite: str,
+    episodes: int | None,
+    output_dir: str | None,
+) -> str:
+    """Play the levels of a suite with all runs; return their table in Markdown."""
+    if options.run_index:
+        raise ValueError("--suite plays all runs of a folder; leave out --run.")
+    agents = _load(options, runs)
+    with needs_extra("train"):
+        from pixelbrax_gym.generalisation.evaluation import scores_of
+        from pixelbrax_gym.generalisation.scores import RETURNS, ROWS, SHEET, play
+        from pixelbrax_jax.generalisation.making import make_levels
+        from pixelbrax_jax.generalisation.suites import SUITES
+
+    report = partial(say, "evaluate")
+    config = next(iter(agents.values())).algorithm.config.env
+    episodes = SUITES[suite].episodes if episodes is None else episodes
+    levels = make_levels(config, suite, episodes, options.clips, report)
+    _check_new_clips(agents, levels, report)
+    report(f"{len(levels.levels)} levels in {levels.num_programs} programs")
+    scores = scores_of(config, suite, levels)
+    players = {name: _player(agent, episodes) for name, agent in agents.items()}
+    play(levels, players, scores, output_dir, report)
+    if output_dir is not None:
+        report(f"wrote {RETURNS}, {ROWS} and {SHEET} in {output_dir}")
+    return scores.markdown()
+
+
+def _load(options: AgentOptions, runs: Sequence[str]) -> Mapping[str, Trained]:
+    """Load all runs by name; raise a ValueError unless they are seeds of one agent."""
+    if options.pretrained is not None:
+        return {options.pretrained: load(options, next(iter(runs), None))}
+    if not runs:
+        raise ValueError("--suite needs the folders of one or several runs, or --pretrained.")
+    from pixelbrax_jax.agents.config import describe
+    from pixelbrax_jax.agents.runner.trained import num_runs
+
+    agents: dict[str, Trained] = {}
+    for folder in runs:
+        first = load(options, folder)
+        for index in range(num_runs(folder)):
+            agent = first if index == 0 else load(replace(options, run_index=index), folder)
+            name = f"{folder}, seed {agent.seed}, {agent.steps} steps"
+            if name in agents:
+                raise ValueError(f"run {folder} is given twice.")
+            agents[name] = agent
+    (first_name, first), *others = agents.items()
+    for name, agent in others:
+        here = {"algorithm": _name(first), **describe(first.algorithm.config)}
+        there = {"algorithm": _name(agent), **describe(agent.algorithm.config)}
+        for setting in [*here, *there]:
+            if setting not in _MAY_DIFFER and here.get(setting) != there.get(setting):
+                raise ValueError(
+                    f"runs of one call are seeds of one agent, but {setting} is "
+                    f"{here.get(setting)!r} in {first_name} and {there.get(setting)!r} in {name}; "
+                    "evaluate them in separate calls."
+                )
+    return agents
+
+
+def _name(agent: Trained) -> str:
+    return type(agent.algorithm).__name__
+
+
+def _player(agent: Trained, episodes: int) -> Player:
+    from pixelbrax_jax.agents.runner.evaluate import Evaluator
+
+    def play(level: LevelEnv) -> np.ndarray:
+        evaluator = Evaluator(agent.algorithm, level.env, level.params, num_episodes=episodes)
+        return evaluator(agent.networks).returns
+
+    return play
+
+
+def _check_new_clips(
+    agents: Mapping[str, Trained], levels: Levels, report: Callable[[str], object]
+) -> None:
+    """Raise a ValueError if a level of held-out clips shows clips of the training."""
+    if levels.bank is None:
+        return
+    from pixelbrax_jax.agents.runner.settings import clip_digests
+    from pixelbrax_jax.agents.runner.splits import plays_clips
+    from pixelbrax_jax.agents.runner.trained import with_clips
+
+    digests: list[str] = []
+    for name, agent in agents.items():
+        config = agent.algorithm.config
+        if not plays_clips(config):
+            continue
+        _, shown = with_clips(agent, str(config.env.clips or "procedural"))
+        if shown is None:
+            report(f"{name} has no digest of its clips; assuming that no level shows them")
+            continue
+        digests = digests or clip_digests(levels.bank.to_device())
+        for split, clips in levels.splits.items():
+            shared = sum(digests[clip] in set(shown) for clip in clips)
+            if shared and split != "train":
+                raise ValueError(
+                    f"{name} was trained with {shared} of the {len(clips)} clips of split "
+                    f"{split!r} of {levels.bank.source}; choose other clips with --clips."
+                )

@@ -1,0 +1,1 @@
+"""Play suites of test levels and tabulate the returns."""

@@ -1,0 +1,146 @@
+"""Play a suite of levels with any policy through the Gymnasium vector environment."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from os import PathLike
+from typing import Any
+
+import jax
+import numpy as np
+
+from pixelbrax_gym.generalisation.scores import Player, Scores, play
+from pixelbrax_gym.gymnasium.vector_env import GymnasiumVectorEnv
+from pixelbrax_jax import EnvConfig, VectorPixelEnv
+from pixelbrax_jax.config import ENV_OPTIONS, env_config
+from pixelbrax_jax.flags import default_flags
+from pixelbrax_jax.generalisation.making import LevelEnv, Levels, make_levels
+from pixelbrax_jax.generalisation.suites import EPISODES, SUITES
+from pixelbrax_jax.plain import to_plain
+from pixelbrax_jax.validation import check_choice
+
+Policy = Callable[[Any], Any]
+
+_LEFT_OUT = ("task", "clips", "split", "distractors", "dynamics")
+"""Options that a suite decides."""
+
+
+def evaluate_suite(
+    policy: Policy | Mapping[str, Policy],
+    task: str,
+    suite: str,
+    *,
+    episodes: int | None = None,
+    clips: str | PathLike[str] | None = None,
+    output: str = "numpy",
+    output_dir: str | PathLike[str] | None = None,
+    report: Callable[[str], object] = lambda _: None,
+    **options: Any,
+) -> Scores:
+    """Play every level of a suite with a policy; ``print(scores.markdown())`` shows the table.
+
+    ``policy(obs)`` gets the observations of all episodes of a level at once, (E, H, W, 3 K) uint8
+    pixels unless ``obs_mode`` says otherwise, and returns (E, A) actions in [-1, 1], floating
+    point. The episodes are those of ``pixelbrax evaluate --suite``, the same in every call.
+
+    Args:
+        policy: the policy; or several by name, which are the seeds of one agent.
+        task: one of ``pixelbrax_jax.list_envs()``.
+        suite: ``dmcgb``, ``dmcgb2``, ``dcs``, ``paper``, ``subtle`` or ``axes``.
+        episodes: number E of episodes of each level; None for the suite's.
+        clips: folder of the videos, or ``"procedural"``, for suites that show any.
+        output: type of the observations, ``"numpy"``, ``"torch"`` or ``"jax"``.
+        output_dir: folder for ``returns.json``, with the return of every episode, ``table.csv`` and
+            ``levels.png``. Levels that the file has are not played again; it knows policies by
+            name alone.
+        report: takes a line after each level.
+        **options: other options of ``pixelbrax_jax.make``, such as ``action_repeat``.
+
+    Raises:
+        ValueError: the suite is unknown or has no levels for the task, the policy returns another
+            shape, or the folder has returns of other options.
+        FileNotFoundError: clips are missing; the message says where to get them.
+        TypeError: an option is unknown or the suite's own, or a policy cannot be called.
+        ImportError: ``output_dir`` is given and Pillow is missing.
+    """
+    policies = policy if isinstance(policy, Mapping) else {"policy": policy}
+    for name, one in policies.items():
+        if not callable(one):
+            raise TypeError(f"policy {name!r} must be a function of observations, got {one!r}.")
+    if not policies:
+        raise ValueError("policy must have at least one policy, got an empty mapping.")
+    check_choice("suite", suite, SUITES)
+    if own := [name for name in _LEFT_OUT if name in options]:
+        raise TypeError(f"{own[0]} is decided by the levels of a suite; leave it out.")
+    config = env_config(task, options, ("episodes", "clips", "output", "output_dir", "report"))
+    episodes = SUITES[suite].episodes if episodes is None else episodes
+    levels = make_levels(config, suite, episodes, clips, report)
+    scores = scores_of(config, suite, levels)
+    envs = _Envs(config, levels, output)
+
+    def player(one: Policy) -> Player:
+        return lambda level: envs.play(level, one)
+
+    players = {name: player(one) for name, one in policies.items()}
+    return play(levels, players, scores, output_dir, report)
+
+
+def scores_of(config: EnvConfig, suite: str, levels: Levels) -> Scores:
+    """Return scores without returns, with all that decides them but the policy."""
+    options = {name: to_plain(getattr(config, name)) for name in ENV_OPTIONS}
+    for name in _LEFT_OUT:
+        del options[name]
+    bank = levels.bank
+    shown = None if bank is None else f"{len(bank.names)} clips, {bank.digest[:16]}"
+    options |= {"episodes": levels.episodes, "clips": shown}
+    return Scores(suite, config.task, options)
+
+
+class _Envs:
+    """Vector environments of a suite's levels; levels with one program share one."""
+
+    def __init__(self, config: EnvConfig, levels: Levels, output: str) -> None:
+        self._config, self._levels, self._output = config, levels, output
+        self._made: dict[Any, GymnasiumVectorEnv] = {}
+
+    def play(self, one: LevelEnv, policy: Policy) -> np.ndarray:
+        """Play the episodes of a level; return their (E,) returns."""
+        envs, num = self._envs(one), self._levels.episodes
+        with default_flags():
+            key = jax.random.key(EPISODES)
+        state, _ = VectorPixelEnv(one.env, num).reset(key, one.params)
+        obs, _ = envs.reset(options={"state": state})
+        shape = (num, one.env.action_size)
+        over, returns = np.zeros(num, bool), np.zeros(num)
+        while not over.all():
+            actions = policy(obs)
+            got = tuple(actions.shape) if hasattr(actions, "shape") else np.shape(actions)
+            if got != shape:
+                raise ValueError(
+                    f"the policy must return actions of shape {shape}, a row for each of the "
+                    f"{num} episodes, got {got}."
+                )
+            obs, _, terminated, truncated, infos = envs.step(actions)
+            # Later episodes of an environment are ignored.
+            returns = np.where(over, returns, _numpy(infos["episode_return"]))
+            over |= _numpy(terminated) | _numpy(truncated)
+        return returns
+
+    def _envs(self, one: LevelEnv) -> GymnasiumVectorEnv:
+        envs = self._made.get(one.env)
+        if envs is None:
+            options = {name: getattr(self._config, name) for name in ENV_OPTIONS if name != "task"}
+            options |= {"distractors": one.env.distractors, "split": "train", "dynamics": ""}
+            options["clips"] = self._levels.bank if one.level.clips else None
+            envs = GymnasiumVectorEnv(
+                self._config.task, self._levels.episodes, output=self._output, **options
+            )
+            self._made[one.env] = envs
+        # Levels differ in the parameters that a vector environment passes to its programs.
+        envs._stateful.params = one.params
+        return envs
+
+
+def _numpy(array: Any) -> np.ndarray:
+    """Return an array of NumPy, JAX or torch in host memory."""
+    return np.asarray(array.cpu().numpy() if hasattr(array, "cpu") else array)

@@ -1,0 +1,206 @@
+"""Returns of a suite's episodes: their files, and their table."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pixelbrax_gym.bench.tables import table
+from pixelbrax_jax.generalisation.frames import write_sheet
+from pixelbrax_jax.generalisation.intervals import interquartile_mean
+from pixelbrax_jax.generalisation.making import LevelEnv, Levels
+
+RETURNS, ROWS, SHEET = "returns.json", "table.csv", "levels.png"
+"""Files in the output folder."""
+
+ALL = "all but clean"
+"""Name of the last row, of all levels but the first."""
+
+Returns = dict[str, dict[str, list[float]]]
+"""The returns of episodes by run and level."""
+
+Player = Callable[[LevelEnv], np.ndarray]
+"""Plays the episodes of a level; returns their (E,) returns."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A line of the table.
+
+    Attributes:
+        level: name of the level; the last row has all but clean.
+        runs: number of runs R, the seeds.
+        episodes: number of episodes E of each run and level.
+        mean: mean return; of several runs the interquartile mean over their mean returns, in the
+            last row over those of all levels.
+        low: lower end of its 95 % stratified bootstrap interval; NaN for one run.
+        high: upper end.
+        standard_error: of a run's mean over its episodes, averaged over runs; NaN for one episode
+            and for the last row.
+        ratio: ``mean`` over that of the level clean; NaN if that is not positive.
+    """
+
+    level: str
+    runs: int
+    episodes: int
+    mean: float
+    low: float
+    high: float
+    standard_error: float
+    ratio: float
+
+
+@dataclass
+class Scores:
+    """The returns of a suite's episodes.
+
+    Attributes:
+        suite: name of the suite.
+        task: name of the task.
+        options: all else that decides the returns, as JSON has it.
+        returns: (E,) returns by run and level.
+    """
+
+    suite: str
+    task: str
+    options: dict[str, Any]
+    returns: Returns = field(default_factory=dict)
+
+    def rows(self) -> list[Row]:
+        """Return a row for each level that all runs have, and one for all but the first level."""
+        runs = list(self.returns.values())
+        names = [name for name in runs[0] if all(name in run for run in runs)] if runs else []
+        arrays = {name: np.array([run[name] for run in runs], np.float64) for name in names}
+        rows: list[Row] = []
+        for name, returns in arrays.items():
+            errors = np.full(len(runs), math.nan)
+            if returns.shape[1] > 1:
+                errors = returns.std(axis=1, ddof=1) / math.sqrt(returns.shape[1])
+            rows.append(self._row(name, returns.mean(axis=1)[None], float(errors.mean()), rows))
+        if len(names) > 2:
+            means = np.stack([arrays[name].mean(axis=1) for name in names[1:]])
+            rows.append(self._row(ALL, means, math.nan, rows))
+        return rows
+
+    def _row(self, name: str, scores: np.ndarray, error: float, rows: Sequence[Row]) -> Row:
+        """Return the row of (S, R) scores."""
+        low = high = math.nan
+        mean = float(scores.mean())
+        if scores.shape[1] > 1:
+            mean, low, high = interquartile_mean(scores)
+        clean = rows[0].mean if rows else mean
+        ratio = mean / clean if clean > 0 else math.nan
+        episodes = int(self.options["episodes"])
+        return Row(name, scores.shape[1], episodes, mean, low, high, error, ratio)
+
+    def markdown(self) -> str:
+        """Return the table in Markdown."""
+        rows = self.rows()
+        several = len(self.returns) > 1
+        heads = ["level", "return (IQM)" if several else "return"]
+        heads += ["95 % interval"] if several else []
+        heads += ["standard error", "ratio to clean"]
+        lines = []
+        for row in rows:
+            interval = [f"{row.low:.1f} to {row.high:.1f}"] if several else []
+            numbers = [_text(row.standard_error, 1), _text(row.ratio, 2)]
+            lines.append([row.level, f"{row.mean:.1f}", *interval, *numbers])
+        return table(heads, lines)
+
+    def csv(self) -> str:
+        """Return the rows as CSV, with all digits."""
+        text = io.StringIO()
+        names = list(Row.__dataclass_fields__)
+        writer = csv.DictWriter(text, names, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(asdict(row) for row in self.rows())
+        return text.getvalue()
+
+
+def _text(value: float, digits: int) -> str:
+    return "" if math.isnan(value) else f"{value:.{digits}f}"
+
+
+def play(
+    levels: Levels,
+    players: Mapping[str, Player],
+    scores: Scores,
+    folder: str | PathLike[str] | None = None,
+    report: Callable[[str], object] = lambda _: None,
+) -> Scores:
+    """Play all levels with all runs and return the runs' scores.
+
+    ``scores`` has the options and no returns. The folder gets the contact sheet first and the
+    returns after each level; levels whose returns it has are not played again. Errors are those of
+    ``read``, and an ImportError without Pillow.
+    """
+    path = None if folder is None else Path(folder)
+    known: Returns = {}
+    if path is not None:
+        known = read(scores, path)
+        path.mkdir(parents=True, exist_ok=True)
+        if not (known and (path / SHEET).exists()):
+            write_sheet(levels, path / SHEET)
+    for level in levels.levels:
+        name = level.level.name
+        for run, player in players.items():
+            of_run = known.setdefault(run, {})
+            is_new = name not in of_run
+            if is_new:
+                returns = np.asarray(player(level), np.float64)
+                of_run[name] = returns.tolist()
+                if path is not None:
+                    _write(path / RETURNS, _json(scores, known))
+            mean = float(np.mean(of_run[name]))
+            report(f"{name}, {run}: return {mean:.1f}{'' if is_new else ', from the file'}")
+    order = [level.level.name for level in levels.levels]
+    scores.returns = {run: {name: known[run][name] for name in order} for run in players}
+    if path is not None:
+        _write(path / ROWS, scores.csv())
+    return scores
+
+
+def read(scores: Scores, folder: Path) -> Returns:
+    """Read the returns in a folder's file, none if there is no file.
+
+    Raises:
+        ValueError: the file cannot be read, or is that of another suite, task or other options.
+    """
+    file = folder / RETURNS
+    if not file.exists():
+        return {}
+    try:
+        found = json.loads(file.read_text("utf-8"))
+        returns = found["returns"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{file} has no returns of a suite; choose another folder.") from error
+    wanted = json.loads(_json(scores, {}))
+    there, here = ({**one, **one["options"]} for one in (found, wanted))
+    for name in [*here, *there]:
+        if name in ("returns", "options") or there.get(name) == here.get(name):
+            continue
+        raise ValueError(
+            f"{file} has {name}={there.get(name)!r}, this call {here.get(name)!r}: its levels "
+            "cannot be taken over. Choose another folder, or delete the file."
+        )
+    return returns
+
+
+def _json(scores: Scores, returns: Mapping[str, Any]) -> str:
+    return json.dumps(asdict(scores) | {"returns": returns}) + "\n"
+
+
+def _write(path: Path, text: str) -> None:
+    """Write a file and rename it, so that it is complete after an interruption."""
+    part = path.with_name(path.name + ".part")
+    part.write_text(text, "utf-8")
+    part.replace(path)

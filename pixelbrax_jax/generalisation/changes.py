@@ -1,0 +1,218 @@
+"""Changes of one episode's parameters: direction of the camera, light, colors, sizes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pixelbrax_jax import spatial
+from pixelbrax_jax.distractors.base import Distractor
+from pixelbrax_jax.distractors.camera import MovingCamera
+from pixelbrax_jax.distractors.color import Color
+from pixelbrax_jax.types import CameraRig, EnvParams
+
+NUM_VIEWS = 100
+"""Number of directions of the camera in DMC-GB2; episode i and episode i + 100 have the same."""
+
+_ROTATION_STRIDE, _SHIFT_STRIDE = 61, 47
+"""Episode i takes direction (stride i) mod 100. Both visit all, the first few are spread evenly,
+and so are the pairs of both."""
+
+
+_LIGHT = ("ambient", "diffuse", "specular", "highlight", "headlight", "headlight_highlight")
+"""Coefficients of a look's light."""
+
+
+class Change:
+    """A change of parameters, a frozen dataclass of plain numbers."""
+
+    def change(self, params: EnvParams, key: jax.Array, episode: jax.Array) -> EnvParams:
+        """Return the parameters of ONE episode with this index, () int32, and typed key."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class Rotation(Change):
+    """Turns the camera about its viewing axis, by one of 100 angles that are evenly spaced.
+
+    They are in [-``degrees``, ``degrees``), one for each episode.
+    """
+
+    degrees: float
+
+    def change(self, params: EnvParams, key: jax.Array, episode: jax.Array) -> EnvParams:
+        """Return the parameters with a turned camera."""
+        place = (_ROTATION_STRIDE * episode) % NUM_VIEWS
+        angle = jnp.radians(self.degrees * (2.0 * place / NUM_VIEWS - 1.0))
+        return _turn_cameras(params, jnp.array([0.0, 0.0, 1.0]), angle)
+
+
+@dataclass(frozen=True)
+class Shift(Change):
+    """Turns the camera so that the body moves towards the border of the image.
+
+    The angles about the camera's up axis (y) and right axis (x) are one of 100 points on the border
+    of a rectangle, 25 on each side from one corner on, one for each episode. The turn about y is
+    applied after that about x.
+
+    Attributes:
+        y: degrees, least and greatest angle about the camera's up axis.
+        x: degrees, those about its right axis.
+    """
+
+    y: tuple[float, float]
+    x: tuple[float, float]
+
+    def change(self, params: EnvParams, key: jax.Array, episode: jax.Array) -> EnvParams:
+        """Return the parameters with a turned camera."""
+        (left, right), (low, high) = self.y, self.x
+        corners = np.array([(left, low), (right, low), (right, high), (left, high)], np.float32)
+        place = (_SHIFT_STRIDE * episode) % NUM_VIEWS
+        side, step = place // (NUM_VIEWS // 4), place % (NUM_VIEWS // 4)
+        start, end = jnp.asarray(corners)[side], jnp.asarray(np.roll(corners, -1, 0))[side]
+        about_y, about_x = jnp.radians(start + (end - start) * step / (NUM_VIEWS // 4))
+        params = _turn_cameras(params, jnp.array([0.0, 1.0, 0.0]), about_y)
+        return _turn_cameras(params, jnp.array([1.0, 0.0, 0.0]), about_x)
+
+
+@dataclass(frozen=True)
+class LightDirection(Change):
+    """Turns all lights by an angle about a horizontal axis whose azimuth is sampled.
+
+    Spot lights turn about the origin of the link that they follow, or else about the camera's
+    target.
+    """
+
+    degrees: float
+
+    def change(self, params: EnvParams, key: jax.Array, episode: jax.Array) -> EnvParams:
+        """Return the parameters with turned lights."""
+        azimuth = jax.random.uniform(key, maxval=2.0 * np.pi)
+        axis = jnp.stack([jnp.cos(azimuth), jnp.sin(azimuth), 0.0])
+        quat = _quat(axis, jnp.radians(self.degrees))
+        look, target = params.look, _cameras(params)[0].target
+        lamps = []
+        for lamp in look.lamps:
+            center = jnp.zeros(3) if lamp.link >= 0 else jnp.asarray(target)
+            pos = center + spatial.rotate(quat, jnp.asarray(lamp.pos) - center)
+            axis_of_light = spatial.rotate(quat, jnp.asarray(lamp.axis))
+            lamps.append(lamp.replace(pos=pos, axis=axis_of_light))
+        light = None if look.light is None else spatial.rotate(quat, jnp.asarray(look.light))
+        return params.replace(look=look.replace(light=light, lamps=tuple(lamps)))
+
+
+@dataclass(frozen=True)
+class LightIntensity(Change):
+    """Multiplies all coefficients of light by 1 - ``amount`` or 1 + ``amount``, sampled."""
+
+    amount: float
+
+    def change(self, params: EnvParams, key: jax.Array, episode: jax.Array) -> EnvParams:
+        """Return the parameters with darker or brighter light."""
+        factor = jnp.where(jax.random.bernoulli(key), 1.0 + self.amount, 1.0 - self.amount)
+        look = params.look
+        names = [name for name in _LIGHT if getattr(look, name, None) is not None]
+        scaled: dict[str, Any] = {name: getattr(look, name) * factor for name in names}
+        lamps = tuple(
+            lamp.replace(diffuse=lamp.diffuse * factor, highlight=lamp.highlight * factor)
+            for lamp in look.lamps
+        )
+        return params.replace(look=look.replace(lamps=lamps, **scaled))
+
+
+@dataclass(frozen=True)
+class BodyColor(Change):
+    """Shifts the colors of all materials but the ground's by N(0, ``scale``^2), within [0, 1]."""
+
+    scale: float
+
+    def change(self, params: EnvParams, key: jax.Array, episode: jax.Array) -> EnvParams:
+        """Return the parameters with other colors."""
+        geoms = params.geoms
+        of_ground = [m for g, m in enumerate(geoms.material) if geoms.is_ground(g)]
+        rgb = jnp.asarray(geoms.rgb)
+        moved = jnp.clip(rgb + self.scale * jax.random.normal(key, rgb.shape), 0.0, 1.0)
+        kept = np.isin(np.arange(len(rgb)), of_ground)[:, None]
+        return params.replace(geoms=geoms.replace(rgb=jnp.where(kept, rgb, moved)))
+
+
+@dataclass(frozen=True)
+class Radius(Change):
+    """Multiplies the radius of geoms in the image; physics and rewards keep theirs.
+
+    Attributes:
+        factor: positive.
+        names: starts of the names of the geoms.
+    """
+
+    factor: float
+    names: tuple[str, ...]
+
+    def change(self, params: EnvParams, key: jax.Array, episode: jax.Array) -> EnvParams:
+        """Return the parameters with other sizes."""
+        geoms = params.geoms
+        rows = [g for g, name in enumerate(geoms.name) if name.startswith(self.names)]
+        if not rows:
+            raise ValueError(
+                f"the task has no geom {' or '.join(self.names)}; it has {', '.join(geoms.name)}."
+            )
+        size = jnp.asarray(geoms.size).at[np.array(rows), 0].multiply(self.factor)
+        return params.replace(geoms=geoms.replace(size=size))
+
+
+def changes_params_alone(distractor: Distractor) -> bool:
+    """Return whether a distractor changes an episode's parameters, and nothing after its start."""
+    match distractor:
+        case Color(mode="geom", dynamics="static") | MovingCamera(dynamic=False):
+            return True
+    return False
+
+
+def apply(
+    change: Change | Distractor, params: EnvParams, key: jax.Array, episode: jax.Array
+) -> EnvParams:
+    """Return the parameters of one episode after a change, or after such a distractor's start."""
+    if isinstance(change, Change):
+        return change.change(params, key, episode)
+    return change.change_params(change.reset(key, params), params)
+
+
+def _cameras(params: EnvParams) -> tuple[CameraRig, ...]:
+    return params.rig if isinstance(params.rig, tuple) else (params.rig,)
+
+
+def _turn_cameras(params: EnvParams, axis: jax.Array, angle: jax.Array) -> EnvParams:
+    """Turn cameras at their places about an axis in their own frames, by radians."""
+    return _map_cameras(params, lambda rig: turned(rig, axis, angle))
+
+
+def _map_cameras(params: EnvParams, function: Callable[[CameraRig], CameraRig]) -> EnvParams:
+    rig = jax.tree.map(function, params.rig, is_leaf=lambda x: isinstance(x, CameraRig))
+    return params.replace(rig=rig)
+
+
+def turned(rig: CameraRig, axis: jax.Array, angle: jax.Array) -> CameraRig:
+    """Return a rig turned at its place by radians about an axis in the camera's frame.
+
+    The axis (3,) has unit length. The camera's orientation R becomes R times the rotation.
+    """
+    away = jnp.asarray(rig.eye - rig.target)
+    right, up, back = spatial.look_at(jnp.asarray(rig.eye), rig.target, rig.up).T
+    quat = _quat(axis, angle)
+
+    def in_world(own: list[float]) -> jax.Array:
+        x, y, z = spatial.rotate(quat, jnp.array(own))
+        return x * right + y * up + z * back
+
+    distance = jnp.sqrt(jnp.sum(away * away))
+    target = rig.eye - distance * in_world([0.0, 0.0, 1.0])
+    return rig.replace(target=target, up=in_world([0.0, 1.0, 0.0]))
+
+
+def _quat(axis: jax.Array, angle: jax.Array) -> jax.Array:
+    return jnp.concatenate([jnp.cos(0.5 * angle)[None], jnp.sin(0.5 * angle) * axis])
