@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.stats import trim_mean
 
 from pixelbrax_gym.bench.tables import table
 from pixelbrax_jax.agents.runner.checkpoint import read_about
@@ -128,13 +129,6 @@ def return_at(of: Entry, clock: str, when: float) -> float:
     return float(np.interp(when, times, of["return"]))
 
 
-def interquartile_mean(scores: Iterable[float]) -> float:
-    """Return the mean of the middle half, as rliable computes it (arXiv 2108.13264)."""
-    ordered = np.sort(list(scores))
-    cut = len(ordered) // 4
-    return float(np.mean(ordered[cut : len(ordered) - cut]))
-
-
 def page(folder: str | Path) -> str:
     """Return the table of a folder's entries in Markdown, a row for each task and agent."""
     groups: dict[tuple[str, str], list[Entry]] = {}
@@ -163,7 +157,8 @@ def _shown(runs: list[Entry], clock: str, when: float) -> str:
     scores = [x for run in runs if not math.isnan(x := return_at(run, clock, when))]
     if not scores:
         return ""
-    middle = f"{interquartile_mean(scores):.0f}"
+    # The interquartile mean, as in rliable (arXiv 2108.13264).
+    middle = f"{trim_mean(scores, 0.25):.0f}"
     if len(scores) == 1:
         return middle
     return f"{middle} ({min(scores):.0f} to {max(scores):.0f})"

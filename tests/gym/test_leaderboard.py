@@ -8,7 +8,7 @@ import math
 import pytest
 
 from pixelbrax_gym import cli
-from pixelbrax_gym.cli._leaderboard import interquartile_mean, read, return_at
+from pixelbrax_gym.cli._leaderboard import read, return_at
 from pixelbrax_jax.agents.runner.checkpoint import FORMAT
 
 SPEED = 100.0
@@ -84,14 +84,6 @@ def test_the_table_has_a_row_for_each_task_and_agent(tmp_path, capsys):
     assert ours == ["`ant`", "PPO, mine", "4", "2 (1 to 100)", "2 (1 to 100)", "", *ours[6:]]
     assert ours[6:] == ["2 (1 to 100)", "", ""]
     assert theirs == ["`ant`", "Other, published", "5", "", "", "", "", "7", ""]
-
-
-@pytest.mark.parametrize(
-    ("scores", "expected"),
-    [([3.0], 3.0), ([1.0, 2.0, 6.0], 3.0), ([0.0, 2.0, 4.0, 90.0], 3.0), (range(8), 3.5)],
-)
-def test_the_interquartile_mean_is_that_of_the_middle_half(scores, expected):
-    assert interquartile_mean(scores) == expected
 
 
 def test_another_run_is_not_overwritten(tmp_path, capsys):
