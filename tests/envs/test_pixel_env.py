@@ -230,7 +230,7 @@ class TestMake:
             ({"camera": "sid"}, "unknown camera of task 'ant': 'sid'.*Did you mean 'side'"),
             (
                 {"look": "orginal"},
-                r"'orginal'\. .*'original'\? Allowed: default, dmc, original",
+                r"'orginal'\. .*'original'\? Allowed: default, dmc, dmc-plain, original",
             ),
             ({"reward_preset": "papers"}, "Did you mean 'paper'"),
             ({"obs_mode": "image"}, "unknown obs_mode: 'image'; allowed: both, depth, pixels"),
