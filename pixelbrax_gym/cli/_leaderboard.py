@@ -60,8 +60,6 @@ def entry(folder: str | Path, agent: str | None = None) -> Entry:
         "agent": agent or about["algorithm"],
         "algorithm": about["algorithm"],
         "seed": config["seed"],
-        "processor": about["versions"]["processor"],
-        "devices": about["versions"]["devices"],
         "versions": about["versions"],
         "config": config,
         "compile_seconds": round(compilation, 1),

@@ -53,7 +53,7 @@ def test_an_entry_has_seconds_of_training_alone(tmp_path):
     assert one["seconds"] == [10.0, 20.0, 30.0]
     assert one["compile_seconds"] == 5.0
     assert one["return"] == [10.0, 20.0, 40.0]
-    assert one["processor"] == "a CPU, 2 cores"
+    assert one["versions"]["processor"] == "a CPU, 2 cores"
     assert one["agent"] == one["algorithm"] == "ppo"
 
 

@@ -23,5 +23,4 @@ def make_physics(task: str, *, engine: str = "auto") -> MujocoPhysics:
 def _load(task: str, engine: str) -> MujocoPhysics:
     formulas = FORMULAS[task]
     spec = load_spec(TASKS[task].domain, **formulas.options)
-    identity = Recipe(_load, (task, engine))
-    return MujocoPhysics(formulas, spec, engine=engine, identity=identity)
+    return MujocoPhysics(formulas, spec, engine=engine, identity=Recipe(_load, (task, engine)))
