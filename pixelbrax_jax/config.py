@@ -145,9 +145,14 @@ class EnvConfig(BraxOptions, MujocoOptions, ProgramConfig):
             )
 
     @property
+    def cameras(self) -> tuple[View, ...]:
+        """All viewpoints."""
+        return self.camera if isinstance(self.camera, tuple) else (self.camera,)
+
+    @property
     def num_cameras(self) -> int:
         """Number of cameras."""
-        return len(self.camera) if isinstance(self.camera, tuple) else 1
+        return len(self.cameras)
 
     def suite_options(self) -> dict[str, Any]:
         """Return the options that belong to one suite and differ from their defaults."""

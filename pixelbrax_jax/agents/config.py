@@ -166,8 +166,7 @@ def _check_env(env: EnvConfig) -> None:
     """Reject options without pixels, and options that JSON cannot store."""
     if not isinstance(env, EnvConfig):
         raise TypeError(f"env must be an EnvConfig, got {env!r}.")
-    cameras = env.camera if isinstance(env.camera, tuple) else (env.camera,)
-    named: list[tuple[str, Any]] = [("camera", camera) for camera in cameras]
+    named: list[tuple[str, Any]] = [("camera", camera) for camera in env.cameras]
     clips = "" if env.clips is None else env.clips
     for name, value in (*named, ("look", env.look), ("clips", clips)):
         if not isinstance(value, str):

@@ -60,8 +60,7 @@ def make(task: str | EnvConfig, **options: Any) -> tuple[PixelEnv, EnvParams]:
     program = {name: getattr(config, name) for name in PROGRAM_OPTIONS}
     program["distractors"] = resolve(config.distractors, config.task)
     env = PixelEnv(physics, num_cameras=config.num_cameras, **program)
-    cameras = config.camera if isinstance(config.camera, tuple) else (config.camera,)
-    rigs = tuple(_rig(config, camera, physics) for camera in cameras)
+    rigs = tuple(_rig(config, camera, physics) for camera in config.cameras)
     params = EnvParams(
         geoms=seen_from(physics.geoms, *rigs),
         rig=rigs if len(rigs) > 1 else rigs[0],
