@@ -274,8 +274,9 @@ def _opengl_light(look: Look, surface: _Surface, ways: Ways, *, in_kernel: bool)
         for here, way in ways(to_light, points):
             lit[1] &= ~((way > SHADOW_BIAS) & ~here)
     for k, lamp in enumerate(look.lamps, len(lights) - len(look.lamps)):
-        beam, inv_distance, _ = opengl.beam_of(lamp, points)
-        for here, way in ways(beam, vector(lamp.pos)):
+        pos = vector(lamp.pos)
+        beam, inv_distance, _ = shading.beam(lamp, pos, vector(lamp.axis), points)
+        for here, way in ways(beam, pos):
             blocked = (way > 0.0) & ((way + SHADOW_BIAS) * inv_distance < 1.0)
             lit[k] &= ~(blocked & ~here)
     shade: Any = 0.0

@@ -14,7 +14,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from pixelbrax_jax.renderer import shading
 from pixelbrax_jax.renderer.intersect import Axes, Vector, at_least, at_most, between, dot
+from pixelbrax_jax.renderer.view import vector
 from pixelbrax_jax.types import Lamp, Look
 
 _MOST_CELLS = 198
@@ -55,7 +57,7 @@ def lights_of(look: Look, back: Vector) -> list[Light]:
 
     def of_lamp(lamp: Lamp) -> Light:
         def light(ray: Vector, point: Vector, normal: Vector) -> tuple[Any, Any]:
-            beam, _, strength = beam_of(lamp, point)
+            beam, _, strength = shading.beam(lamp, vector(lamp.pos), vector(lamp.axis), point)
             to_lamp = tuple(-component for component in beam)
             n_l = dot(normal, to_lamp)
             strength = jnp.where(n_l > 0.0, strength, 0.0)
@@ -66,16 +68,6 @@ def lights_of(look: Look, back: Vector) -> list[Light]:
 
     suns = [] if look.light is None else [sun]
     return [ambient, *suns, *map(of_lamp, look.lamps)]
-
-
-def beam_of(lamp: Lamp, point: Vector) -> tuple[Vector, Any, Any]:
-    """Return the direction from a lamp to points, one over the distance, and its strength there."""
-    away = [p - lamp.pos[k] for k, p in enumerate(point)]
-    inv_distance = jax.lax.rsqrt(at_least(dot(away, away), _TINY))
-    beam = tuple(component * inv_distance for component in away)
-    along = dot(beam, (lamp.axis[0], lamp.axis[1], lamp.axis[2]))
-    strength = jnp.where(along >= lamp.cos_cutoff, at_least(along, 0.0) ** lamp.exponent, 0.0)
-    return beam, inv_distance, strength
 
 
 def _gloss(look: Look, ray: Vector, normal: Vector, to_light: Vector) -> Any:
