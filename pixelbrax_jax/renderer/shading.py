@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
+from pixelbrax_jax._platform.conditional import in_a_conditional
 from pixelbrax_jax.renderer.intersect import Vector, at_least, at_most, between, dot
 from pixelbrax_jax.types import Lamp, Look
 
@@ -48,8 +50,8 @@ def computed_apart(compute: Callable[[], list[jax.Array]]) -> list[jax.Array]:
     """Return values in [0, 1], rounded to 10 bits, that XLA computes in other loops than the rest.
 
     A loop over pixels that is too long compiles slowly, and XLA then computes values in it again;
-    so it does for each of several results. Hence three values share a word. On a CPU, XLA fuses
-    across barriers but not across conditionals. There is no derivative.
+    so it does for each of several results. Hence three values share a word. There is no
+    derivative.
     """
     number = len(jax.eval_shape(compute))
 
@@ -63,16 +65,12 @@ def computed_apart(compute: Callable[[], list[jax.Array]]) -> list[jax.Array]:
             packed.append(word)
         return packed
 
-    def in_a_conditional() -> list[jax.Array]:
-        zero = jax.lax.optimization_barrier(jnp.int32(0))
-        blank = [jnp.zeros(word.shape, word.dtype) for word in jax.eval_shape(words)]
-        taken: list[jax.Array] = jax.lax.cond(zero == 0, words, lambda: blank)
-        return taken
-
     def behind_a_barrier() -> list[jax.Array]:
         return list(jax.lax.optimization_barrier(words()))
 
-    found = jax.lax.platform_dependent(cpu=in_a_conditional, default=behind_a_barrier)
+    found = jax.lax.platform_dependent(
+        cpu=partial(in_a_conditional, words), default=behind_a_barrier
+    )
     return [
         ((found[k // 3] >> 10 * (k % 3)) & 1023).astype(jnp.float32) / 1023.0 for k in range(number)
     ]

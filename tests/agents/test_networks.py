@@ -13,7 +13,7 @@ from scipy import integrate, stats
 
 from pixelbrax_jax.agents.networks.actor_critic import POLICIES, Actor, Critic
 from pixelbrax_jax.agents.networks.distributions import Normal
-from pixelbrax_jax.agents.networks.encoders import ENCODERS, SMALLEST, convolve, max_pool
+from pixelbrax_jax.agents.networks.encoders import ENCODERS, SMALLEST, centered, convolve, max_pool
 
 
 def plain_max_pool(x):
@@ -76,6 +76,30 @@ def test_convolutions_and_their_gradients_are_jax_s():
             np.testing.assert_allclose(actual, expected, rtol=1e-5, atol=1e-5 * scale)
 
 
+def test_pixels_are_scaled_before_they_are_convolved():
+    """Also where bytes are rearranged first, and where zeros surround the scaled pixels."""
+
+    def both(key, size, kernel, stride, padding):
+        keys = jax.random.split(key)
+        pixels = jax.random.randint(keys[0], (2, size, size + 1, 3), 0, 256).astype(jnp.uint8)
+        weights = jax.random.normal(keys[1], (kernel, kernel, 3, 5))
+        pads = jax.lax.padtype_to_pads(pixels.shape[1:3], (kernel,) * 2, (stride,) * 2, padding)
+        by = partial(convolve, stride=stride, pads=tuple(pads))
+        x = pixels.astype(jnp.float32) / 255.0 - 0.5
+        for function in (partial(by, pixels, before=centered), partial(by, x)):
+            value, pull = jax.vjp(function, weights)
+            yield value, *pull(value)
+
+    @jax.jit
+    def convolved(key):
+        return [tuple(both(key, *case)) for case in CONVOLUTIONS]
+
+    for ours, plain in convolved(jax.random.key(6)):
+        for actual, expected in zip(ours, plain, strict=True):
+            scale = float(jnp.abs(expected).max())
+            np.testing.assert_allclose(actual, expected, rtol=1e-6, atol=1e-6 * scale)
+
+
 def inputs_of_last_layer(name: str, size: int) -> int:
     """Numbers that an encoder's dense layer gets of square images."""
     pixels = jnp.zeros((1, size, size, 3))
@@ -86,9 +110,9 @@ def inputs_of_last_layer(name: str, size: int) -> int:
 @pytest.mark.parametrize("name", ["small", "patch"])
 def test_encoders_of_ours_see_pixels_around_zero(name):
     """With pixels in [0, 1] nearly all filters of these went to zero under videos."""
-    encoder, grey = ENCODERS[name](), jnp.full((3, 24, 24, 3), 0.5)
+    encoder, grey = ENCODERS[name](), jnp.ones((3, 24, 24, 3))  # depths, of which 1 m is grey
     weights = encoder.init(jax.random.key(0), grey)
-    features = encoder.apply(weights, grey + jnp.array([0, 0.1, -0.1])[:, None, None, None])
+    features = encoder.apply(weights, grey + jnp.array([0, 0.2, -0.2])[:, None, None, None])
     # Biases are zero at first, so that only what differs from grey is seen.
     np.testing.assert_array_equal(features.any(1), [False, True, True])
 

@@ -18,7 +18,6 @@ import pytest
 
 from pixelbrax_jax import Physics, PhysicsState, PixelEnv, VectorPixelEnv
 from pixelbrax_jax.agents.networks.actor_critic import Actor, Critic
-from pixelbrax_jax.agents.networks.encoders import scaled
 from pixelbrax_jax.agents.off_policy.config import DrQv2Config
 from pixelbrax_jax.agents.off_policy.drqv2 import DrQv2
 from pixelbrax_jax.agents.on_policy.dcpg import DCPG, DCPGConfig
@@ -172,7 +171,7 @@ def images(envs):
 def values_of(algorithm, networks, images):
     """The mean of both Q functions at the best action."""
     module = algorithm.modules
-    features = module["encoder"].apply(networks["encoder"], scaled(images))
+    features = module["encoder"].apply(networks["encoder"], images)
     action = jnp.tanh(module["actor"].apply(networks["actor"], features))
     outputs = module["critic"].apply(networks["critic"], features, action)
     return algorithm.values(outputs).mean(0)

@@ -12,7 +12,7 @@ from flax import linen as nn
 from flax import struct
 
 from pixelbrax_jax.agents.networks.distributions import Normal
-from pixelbrax_jax.agents.networks.encoders import ENCODERS, dense, scaled
+from pixelbrax_jax.agents.networks.encoders import ENCODERS, dense
 from pixelbrax_jax.agents.train_state import Networks
 
 LOG_STD_RANGE = (-5.0, 2.0)
@@ -52,7 +52,7 @@ class Actor(nn.Module):
     @nn.compact
     def __call__(self, pixels: jax.Array, detach_value: bool = False) -> ActorOutput:
         """Map (B, H, W, C) uint8 pixels; ``detach_value`` stops value gradients at the encoder."""
-        features = ENCODERS[self.encoder]()(scaled(pixels))
+        features = ENCODERS[self.encoder]()(pixels)
         mean = dense(self.action_size, 0.01, "mean")(features)
         if self.policy == "deacrep":
             mean = jnp.tanh(mean)
@@ -84,7 +84,7 @@ class Critic(nn.Module):
             features = jnp.tanh(nn.LayerNorm()(dense(256)(state)))
             features = nn.relu(dense(256)(features))
         else:
-            features = ENCODERS[self.encoder]()(scaled(pixels))
+            features = ENCODERS[self.encoder]()(pixels)
         return dense(1, 1.0, "value")(features)[..., 0]
 
 

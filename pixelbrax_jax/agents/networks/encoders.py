@@ -11,6 +11,8 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
+from pixelbrax_jax._platform.conditional import in_a_conditional
+
 Pads = tuple[tuple[int, int], tuple[int, int]]
 
 Layers = tuple[tuple[int, int, int], ...]
@@ -18,21 +20,55 @@ Layers = tuple[tuple[int, int, int], ...]
 
 Initializer = Callable[..., jax.Array]
 
+Before = Callable[[jax.Array], jax.Array]
+"""Changes each number of an array by itself."""
 
-def convolve(x: jax.Array, kernel: jax.Array, stride: int, pads: Pads) -> jax.Array:
-    """Cross-correlate (B, H, W, C) with (h, w, C, D); on a CPU matrix products are faster."""
+
+def scaled(pixels: jax.Array) -> jax.Array:
+    """Scale uint8 pixels, or float32 depths in metres, to float32 in [0, 1] for an encoder.
+
+    A depth d becomes ``1 / (1 + d)``, which is near 0 for the sky.
+    """
+    if pixels.dtype == jnp.float32:
+        return 1.0 / (1.0 + pixels)
+    return pixels.astype(jnp.float32) / 255.0
+
+
+def centered(pixels: jax.Array) -> jax.Array:
+    """Scale pixels to [-0.5, 0.5].
+
+    Positive inputs give all weights of a filter gradients of the same sign, and large steps then
+    turn most filters off.
+    """
+    return scaled(pixels) - 0.5
+
+
+def _unchanged(x: jax.Array) -> jax.Array:
+    return x
+
+
+def convolve(
+    x: jax.Array, kernel: jax.Array, stride: int, pads: Pads, before: Before = _unchanged
+) -> jax.Array:
+    """Cross-correlate (B, H, W, C) with (h, w, C, D); on a CPU matrix products are faster.
+
+    ``before`` changes each number of ``x`` first.
+    """
 
     def native(x: jax.Array, kernel: jax.Array) -> jax.Array:
+        x = before(x).astype(kernel.dtype)
         return jax.lax.conv_general_dilated(
             x, kernel, (stride, stride), pads, dimension_numbers=("NHWC", "HWIO", "NHWC")
         )
 
-    products = partial(_as_products, stride=stride, pads=pads)
+    products = partial(_as_products, stride=stride, pads=pads, before=before)
     result: jax.Array = jax.lax.platform_dependent(x, kernel, cpu=products, default=native)
     return result
 
 
-def _as_products(x: jax.Array, kernel: jax.Array, stride: int, pads: Pads) -> jax.Array:
+def _as_products(
+    x: jax.Array, kernel: jax.Array, stride: int, pads: Pads, before: Before
+) -> jax.Array:
     """Convolve over blocks of stride x stride pixels, with one matrix product per kernel block."""
     batch, height, width, channels = x.shape
     (top, bottom), (left, right) = pads
@@ -47,9 +83,17 @@ def _as_products(x: jax.Array, kernel: jax.Array, stride: int, pads: Pads) -> ja
         (left, across * stride - left - width, 0),
         (0, 0, 0),
     )
-    x = jax.lax.pad(x, jnp.zeros((), x.dtype), borders)
-    x = x.reshape(batch, down, stride, across, stride, channels).transpose(0, 1, 3, 2, 4, 5)
-    x = x.reshape(batch, down, across, -1)
+
+    def blocks(x: jax.Array) -> jax.Array:
+        x = jax.lax.pad(x, jnp.zeros((), x.dtype), borders)
+        x = x.reshape(batch, down, stride, across, stride, channels).transpose(0, 1, 3, 2, 4, 5)
+        return x.reshape(batch, down, across, -1)
+
+    if x.dtype == jnp.uint8 and not any(side > 0 for border in borders for side in border):
+        # Bytes are moved fast, unless XLA moves and scales them at once.
+        x = before(in_a_conditional(partial(blocks, x))).astype(kernel.dtype)
+    else:
+        x = blocks(before(x).astype(kernel.dtype))
     missing = ((0, tall * stride - kernel.shape[0]), (0, wide * stride - kernel.shape[1]))
     kernel = jnp.pad(kernel, (*missing, (0, 0), (0, 0)))
     kernel = kernel.reshape(tall, stride, wide, stride, channels, -1).transpose(0, 2, 1, 3, 4, 5)
@@ -69,17 +113,18 @@ class Conv(nn.Module):
     stride: int = 1
     padding: str = "VALID"
     kernel_init: Initializer = nn.initializers.lecun_normal()
+    before: Before = _unchanged
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
-        """Map (B, H, W, C) float32 to (B, H', W', features)."""
+        """Map (B, H, W, C) to (B, H', W', features); ``before`` changes each number first."""
         shape = (self.size, self.size, x.shape[-1], self.features)
         kernel = self.param("kernel", self.kernel_init, shape)
         bias = self.param("bias", nn.initializers.zeros, (self.features,))
         rows, columns = jax.lax.padtype_to_pads(
             x.shape[1:3], shape[:2], (self.stride, self.stride), self.padding
         )
-        return convolve(x, kernel, self.stride, (rows, columns)) + bias
+        return convolve(x, kernel, self.stride, (rows, columns), self.before) + bias
 
 
 def max_pool(x: jax.Array) -> jax.Array:
@@ -121,8 +166,9 @@ class Impala(nn.Module):
     """The residual network of IMPALA with 15 convolutions (Espeholt et al., arXiv 1802.01561)."""
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
-        """Map (B, H, W, C) float32 to (B, 256) features."""
+    def __call__(self, pixels: jax.Array) -> jax.Array:
+        """Map (B, H, W, C) pixels to (B, 256) features."""
+        x = scaled(pixels)
         for channels in (16, 32, 32):
             x = max_pool(Conv(channels, 3, padding="SAME")(x))
             for _ in range(2):
@@ -139,23 +185,21 @@ class Stack(nn.Module):
     Attributes:
         layers: the convolutions.
         features: number of features F.
-        center: number that is subtracted from the input. Positive inputs give all weights of a
-            filter gradients of the same sign, and large steps then turn most filters off.
+        before: what changes pixels first.
         bounded: whether features are normalised and pass ``tanh`` instead of ``relu``.
     """
 
     layers: Layers
     features: int
-    center: float = 0.0
+    before: Before = scaled
     bounded: bool = False
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
-        """Map (B, H, W, C) float32 to (B, F) features."""
-        if self.center:
-            x = x - self.center
+    def __call__(self, pixels: jax.Array) -> jax.Array:
+        """Map (B, H, W, C) pixels to (B, F) features."""
+        x, before = pixels, self.before
         for channels, size, stride in self.layers:
-            x = nn.relu(Conv(channels, size, stride)(x))
+            x, before = nn.relu(Conv(channels, size, stride, before=before)(x)), _unchanged
         x = dense(self.features)(_flat(x))
         return jnp.tanh(nn.LayerNorm()(x)) if self.bounded else nn.relu(x)
 
@@ -166,11 +210,14 @@ class Convolutions(nn.Module):
     layers: Layers
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
-        """Map (B, H, W, C) in [0, 1] to (B, F) features."""
-        x = x - 0.5
+    def __call__(self, pixels: jax.Array) -> jax.Array:
+        """Map (B, H, W, C) pixels to (B, F) features."""
+        init = orthogonal(math.sqrt(2.0))
+        before: Before = centered
+        x = pixels
         for channels, size, stride in self.layers:
-            x = nn.relu(Conv(channels, size, stride, kernel_init=orthogonal(math.sqrt(2.0)))(x))
+            conv = Conv(channels, size, stride, kernel_init=init, before=before)
+            x, before = nn.relu(conv(x)), _unchanged
         return _flat(x)
 
 
@@ -190,22 +237,12 @@ ENCODERS: dict[str, Callable[[], nn.Module]] = {
     "impala": Impala,
     "nature": partial(Stack, LAYERS["nature"], 512, name="Nature_0"),
     "drq": partial(Stack, LAYERS["drq"], 50, bounded=True, name="DrQ_0"),
-    "small": partial(Stack, LAYERS["small"], 128, 0.5, name="Small_0"),
-    "patch": partial(Stack, LAYERS["patch"], 256, 0.5, name="Patch_0"),
+    "small": partial(Stack, LAYERS["small"], 128, centered, name="Small_0"),
+    "patch": partial(Stack, LAYERS["patch"], 256, centered, name="Patch_0"),
 }
 
 SMALLEST = {"impala": 1, "nature": 36, "drq": 15, "small": 18, "patch": 24}
 """Smallest height and width of each encoder's images in pixels."""
-
-
-def scaled(pixels: jax.Array) -> jax.Array:
-    """Scale uint8 pixels, or float32 depths in metres, to float32 in [0, 1] for an encoder.
-
-    A depth d becomes ``1 / (1 + d)``, which is near 0 for the sky.
-    """
-    if pixels.dtype == jnp.float32:
-        return 1.0 / (1.0 + pixels)
-    return pixels.astype(jnp.float32) / 255.0
 
 
 def _flat(x: jax.Array) -> jax.Array:

@@ -15,7 +15,7 @@ from flax import linen as nn
 from pixelbrax_jax._platform.batches import one_run_after_the_other
 from pixelbrax_jax.agents.algorithm import Algorithm
 from pixelbrax_jax.agents.config import TrainConfig
-from pixelbrax_jax.agents.networks.encoders import LAYERS, Convolutions, scaled
+from pixelbrax_jax.agents.networks.encoders import LAYERS, Convolutions
 from pixelbrax_jax.agents.networks.q_functions import DeterministicActor, TwinQ
 from pixelbrax_jax.agents.off_policy.config import DrQv2Config
 from pixelbrax_jax.agents.off_policy.losses import atoms, noisy, projected
@@ -99,7 +99,7 @@ class DrQv2(Algorithm):
     def _init_networks(self, key: jax.Array) -> Networks:
         spec, _ = split_obs(self.envs.env.obs_spec)
         keys = {name: jax.random.fold_in(key, i) for i, name in enumerate(self.modules)}
-        pixels = scaled(jnp.zeros((1, *spec.shape), spec.dtype))
+        pixels = jnp.zeros((1, *spec.shape), spec.dtype)
         features, encoder = self.modules["encoder"].init_with_output(keys["encoder"], pixels)
         action, actor = self.modules["actor"].init_with_output(keys["actor"], features)
         critic = self.modules["critic"].init(keys["critic"], features, action)
@@ -142,7 +142,7 @@ class DrQv2(Algorithm):
     @under_default_flags
     def act(self, networks: Networks, pixels: jax.Array, key: jax.Array | None = None) -> jax.Array:
         """See ``Algorithm.act``; sampled actions have the noise at the end of the schedule."""
-        features = self._apply("encoder", networks, scaled(pixels))
+        features = self._apply("encoder", networks, pixels)
         action = jnp.tanh(self._apply("actor", networks, features))
         return action if key is None else noisy(action, self.config.final_std, key)
 
@@ -163,7 +163,10 @@ class DrQv2(Algorithm):
         """Apply a network, in bfloat16 on request; the result is float32."""
         params = networks[name]
         if self.config.bfloat16:
-            params, inputs = jax.tree.map(lambda x: x.astype(jnp.bfloat16), (params, inputs))
+            params = jax.tree.map(lambda x: x.astype(jnp.bfloat16), params)
+            # The encoder scales pixels itself.
+            if name != "encoder":
+                inputs = tuple(x.astype(jnp.bfloat16) for x in inputs)
         output: Any = self.modules[name].apply(params, *inputs)
         return output.astype(jnp.float32)
 
@@ -265,9 +268,9 @@ class DrQv2(Algorithm):
         key: jax.Array,
     ) -> tuple[jax.Array, tuple[jax.Array, Metrics]]:
         """Return the loss of encoder and critic, the (B, F) features, and scalars to log."""
-        features = self._apply("encoder", learners, scaled(batch.pixels))
+        features = self._apply("encoder", learners, batch.pixels)
         # The encoder has no target: the online one encodes both observations.
-        later = self._apply("encoder", networks, scaled(batch.next_pixels))
+        later = self._apply("encoder", networks, batch.next_pixels)
         mean_action = jnp.tanh(self._apply("actor", networks, later))
         action = noisy(mean_action, std, key, self.config.std_clip)
         outputs = self._apply("critic", learners, features, batch.action)
