@@ -189,4 +189,5 @@ README = {
     "slowest": lambda: named(next(iter(ratios()))),
     "fastest": lambda: named(next(reversed(ratios()))),
     "reacher": lambda: end("ppo-dmc_reacher_easy"),
+    "cartpole": lambda: end("ppo-dmc_cartpole_swingup"),
 }
