@@ -9,6 +9,7 @@ from pixelbrax_jax.distractors.clips import (
     load_clips,
 )
 from pixelbrax_jax.distractors.color import Color
+from pixelbrax_jax.distractors.image_filter import ImageFilter
 from pixelbrax_jax.distractors.presets import PRESETS, preset
 from pixelbrax_jax.distractors.video import Video
 
@@ -17,6 +18,7 @@ __all__ = [
     "ClipBank",
     "Color",
     "Distractor",
+    "ImageFilter",
     "MovingCamera",
     "OnlySplitWarning",
     "ProceduralClipsWarning",

@@ -126,6 +126,28 @@ class LightIntensity(Change):
 
 
 @dataclass(frozen=True)
+class LightColor(Change):
+    """Multiplies red, green and blue of all light by factors on [1 - ``amount``, 1 + ``amount``].
+
+    Materials and the ground carry the factors, which is the same for all light that they scatter.
+    Highlights and the sky stay white, and colors are clipped to [0, 1].
+    """
+
+    amount: float
+
+    def change(self, params: EnvParams, key: jax.Array, episode: jax.Array) -> EnvParams:
+        """Return the parameters in light of another color."""
+        factor = jax.random.uniform(key, (3,), minval=1 - self.amount, maxval=1 + self.amount)
+
+        def lit(rgb: Any) -> jax.Array:
+            return jnp.clip(jnp.asarray(rgb) * factor, 0.0, 1.0)
+
+        geoms = params.geoms.replace(rgb=lit(params.geoms.rgb))
+        look = params.look.replace(ground_rgb=lit(params.look.ground_rgb))
+        return params.replace(geoms=geoms, look=look)
+
+
+@dataclass(frozen=True)
 class BodyColor(Change):
     """Shifts the colors of all materials but the ground's by N(0, ``scale``^2), within [0, 1]."""
 

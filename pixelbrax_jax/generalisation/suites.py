@@ -8,11 +8,13 @@ from dataclasses import dataclass, replace
 from pixelbrax_jax.distractors.base import Distractor
 from pixelbrax_jax.distractors.camera import MovingCamera
 from pixelbrax_jax.distractors.color import Color
+from pixelbrax_jax.distractors.image_filter import ImageFilter
 from pixelbrax_jax.distractors.presets import NUM_CLIPS, preset
 from pixelbrax_jax.distractors.video import Video
 from pixelbrax_jax.generalisation.changes import (
     BodyColor,
     Change,
+    LightColor,
     LightDirection,
     LightIntensity,
     Radius,
@@ -193,7 +195,10 @@ def _axes(task: str) -> tuple[Level, ...]:
         "body-color": tuple(BodyColor(b) for b in (0.1, 0.2, 0.3)),
         "light-direction": tuple(LightDirection(angle) for angle in (20.0, 40.0, 60.0)),
         "light-intensity": tuple(LightIntensity(amount) for amount in (0.2, 0.4, 0.6)),
+        "light-color": tuple(LightColor(amount) for amount in (0.2, 0.4, 0.6)),
         "camera": tuple(MovingCamera(b, dynamic=False) for b in (0.1, 0.2, 0.3)),
+        "contrast": tuple(ImageFilter(contrast=factor) for factor in (0.75, 0.5, 0.25)),
+        "noise": tuple(ImageFilter(noise=size) for size in (0.05, 0.1, 0.2)),
         "tint": tuple(Color("frame", "static", b) for b in (0.1, 0.2, 0.3)),
     }
     return (

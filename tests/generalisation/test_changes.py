@@ -11,6 +11,7 @@ from pixelbrax_jax.generalisation import suites
 from pixelbrax_jax.generalisation.changes import (
     NUM_VIEWS,
     BodyColor,
+    LightColor,
     LightDirection,
     LightIntensity,
     Radius,
@@ -115,6 +116,20 @@ def test_light_is_darker_or_brighter():
     factors = np.asarray(look.diffuse, float) / TILTED.look.diffuse
     assert set(np.round(factors, 4).tolist()) == {0.6, 1.4}
     np.testing.assert_allclose(look.ambient / TILTED.look.ambient, factors, rtol=1e-6)
+
+
+def test_light_has_another_color():
+    changed = rows(LightColor(0.2))
+    rgb, ground = np.asarray(TILTED.geoms.rgb), np.asarray(TILTED.look.ground_rgb)
+    seen = rgb[(rgb > 0.0).all(1) & (rgb < 1 / 1.2).all(1)][0]
+    of_seen = [list(row) for row in rgb].index(list(seen))
+    factor = np.asarray(changed.geoms.rgb)[:, of_seen] / seen
+    assert 0.8 <= factor.min() < 0.83
+    assert 1.17 < factor.max() < 1.2 + 1e-6
+    assert (np.ptp(factor, axis=1) > 0).all()
+    for found, before in ((changed.geoms.rgb, rgb), (changed.look.ground_rgb, ground)):
+        expected = np.clip(before[None] * factor[:, None], 0.0, 1.0)
+        np.testing.assert_allclose(found, expected, rtol=1e-5)
 
 
 def test_the_body_alone_has_other_colors():
