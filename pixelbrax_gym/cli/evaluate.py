@@ -81,6 +81,7 @@ def run(arguments: Sequence[str]) -> int:
         clips = options.clips
         report(f"the run has no digest of its clips; assuming that {clips} has the same clips")
     for name, (env, params) in make_splits(config, options.split, shown=shown, report=report):
+        report(f"split {name}: playing {episodes} episodes, after up to a minute of compilation")
         result = Evaluator(agent.algorithm, env, params, num_episodes=episodes)(agent.networks)
         row = {"steps": agent.steps, "seed": agent.seed, "split": name, "episodes": episodes}
         if params.clips is not None:
@@ -134,6 +135,7 @@ def _compare(
     with closing(simulator):
         clean, params = make_split(config, "clean")
         player, networks = agent.algorithm, agent.networks
+        report(f"playing {episodes} episodes here, after up to a minute of compilation")
         here = Evaluator(player, clean, params, num_episodes=episodes)(networks)
         report(f"here: return {here.mean:.1f}")
         there = play_in(

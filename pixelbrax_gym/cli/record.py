@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from pixelbrax_gym.cli import parse
+from pixelbrax_gym.cli import parse, say
 from pixelbrax_gym.cli._agents import AgentOptions, load
 from pixelbrax_jax.validation import check_choice, check_positive_int
 from pixelbrax_jax.video import write_frames
@@ -60,6 +60,11 @@ def run(arguments: Sequence[str]) -> int:
     name = "_".join([options.pretrained or str(agent.steps), split, *run])
     path = options.output or Path(options.folder or "") / "videos" / f"{name}.mp4"
     fps = min(max(1, round(1.0 / env.dt)), 60)
+    episodes = options.grid**2
+    say(
+        "record",
+        f"{options.num_frames} frames of {episodes} episodes, after up to a minute of compilation",
+    )
     sys.stdout.write(f"{write_frames(path, _frames(agent, env, params, options), fps)}\n")
     return 0
 

@@ -76,6 +76,7 @@ _SMALL_DRQV2 = {
     "action_repeat": 2,
     "replay_ratio": 0.125,
     "learning_rate": 3e-4,
+    "random_shift": 2,
 }
 
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
@@ -108,9 +109,13 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
         "dcpg": _CPU | _DCPG,
         "drqv2": _SMALL_DRQV2
         | {
-            "encoder": "patch",
+            "samples": 4,
+            "encoder": "patch2",
             "num_steps": 4,
-            "hidden_dim": 256,
+            "batch_size": 128,
+            "hidden_dim": 128,
+            "layer_norm": True,
+            "std_steps": 150_000,
             "buffer_size": 250_000,
             "total_steps": 800_000,
         },

@@ -109,7 +109,7 @@ def experiments() -> dict[str, list[str]]:
             add(algorithm, "walker2d", seed, *more, name="brax")
     for seed in range(3):
         for task in TIMED:
-            add("drqv2", task, seed, "--num-evals", "40")
+            add("drqv2", task, seed, "--num-evals", "16")
     for seed in range(3):
         for task in TASK_SETTINGS["cpu"]["ppo"]:
             if task in DMC_TASKS:

@@ -230,6 +230,7 @@ LAYERS: dict[str, Layers] = {
     "small": ((16, 4, 2), (32, 4, 2), (32, 3, 1)),
     # First over disjoint patches (Dosovitskiy et al., arXiv 2010.11929).
     "patch": ((32, 4, 4), (32, 2, 2), (32, 3, 1)),
+    "patch2": ((32, 4, 4), (32, 2, 2)),
 }
 """Convolutions by name of the encoder."""
 
@@ -239,9 +240,10 @@ ENCODERS: dict[str, Callable[[], nn.Module]] = {
     "drq": partial(Stack, LAYERS["drq"], 50, bounded=True, name="DrQ_0"),
     "small": partial(Stack, LAYERS["small"], 128, centered, name="Small_0"),
     "patch": partial(Stack, LAYERS["patch"], 256, centered, name="Patch_0"),
+    "patch2": partial(Stack, LAYERS["patch2"], 256, centered, name="Patch2_0"),
 }
 
-SMALLEST = {"impala": 1, "nature": 36, "drq": 15, "small": 18, "patch": 24}
+SMALLEST = {"impala": 1, "nature": 36, "drq": 15, "small": 18, "patch": 24, "patch2": 8}
 """Smallest height and width of each encoder's images in pixels."""
 
 
