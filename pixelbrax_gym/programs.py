@@ -217,7 +217,7 @@ def pack(state: EnvState) -> Packed:
     if len(state.key) > _FEW:
         return Packed(state.frames, tuple(map(_data, parts)))
     # Without a barrier, XLA would fuse the computation of the parts into the loop that writes them.
-    parts = jax.lax.optimization_barrier(parts)
+    parts = jax.lax.optimization_barrier([_data(part) for part in parts])
     return Packed(state.frames, (jnp.concatenate([_words(part) for part in parts]),))
 
 
@@ -227,7 +227,7 @@ def unpack(packed: Packed, like: EnvState) -> EnvState:
     if like.key.shape[0] > _FEW:
         restored = list(map(_from_data, packed.rest, parts))
     else:
-        sizes = [jax.eval_shape(_words, part).size for part in parts]
+        sizes = [jax.eval_shape(lambda part: _words(_data(part)), part).size for part in parts]
         (words,) = packed.rest
         restored = [
             _from_words(words[end - size : end], part)
@@ -266,8 +266,10 @@ def _from_data(data: jax.Array, like: Any) -> jax.Array:
 
 
 def _words(part: jax.Array) -> jax.Array:
-    """Return the bits of an array as (W,) uint32, one word per element of a narrow dtype."""
-    part = _data(part)
+    """Return the bits of an array as (W,) uint32, one word per element of a narrow dtype.
+
+    The array may be the data of keys.
+    """
     if part.dtype == bool:
         part = part.astype(jnp.uint8)
     bits = part.dtype.itemsize * 8

@@ -8,6 +8,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 
 from pixelbrax_jax._platform.batches import map_runs
@@ -62,7 +63,7 @@ class Runs:
 
     def template(self, env_params: EnvParams) -> TrainState:
         """Return shapes, dtypes and, with several devices, shardings of the state."""
-        template: TrainState = jax.eval_shape(self._init, jnp.uint32(0), env_params)
+        template: TrainState = jax.eval_shape(self._init, np.uint32(0), env_params)
         mesh = mesh_of(self.algorithm)
         if mesh is None:
             return template
