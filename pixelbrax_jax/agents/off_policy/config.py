@@ -33,7 +33,7 @@ class DrQv2Config(TrainConfig):
     num_envs: PositiveInt = 16
     """Number of environments N that run in parallel."""
     encoder: str = "drq"
-    """Convolutions that encode pixels: ``drq``, ``nature``, ``small`` or ``patch``."""
+    """Convolutions that encode pixels: ``drq``, ``nature``, ``small``, ``patch`` or ``patch2``."""
     learning_rate: Positive = 1e-4
     """Adam's step size."""
     adam_eps: Positive = 1e-8
