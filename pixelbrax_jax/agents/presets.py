@@ -115,9 +115,10 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
             "batch_size": 128,
             "hidden_dim": 128,
             "layer_norm": True,
-            "std_steps": 150_000,
+            "replay_ratio": 0.25,
+            "std_steps": 75_000,
             "buffer_size": 250_000,
-            "total_steps": 800_000,
+            "total_steps": 500_000,
         },
     },
     # Yarats et al. for the DM Control Suite (the code of arXiv 2107.09645).
