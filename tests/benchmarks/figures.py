@@ -129,6 +129,10 @@ def main() -> None:
 
         results.plot()
         plots.learning_dmc(dmc_page.kept_runs(), dmc_page.FOLDER / "learning.png")
+        folder = ROOT / "docs/leaderboard"
+        if entries := leaderboard.read(folder):
+            published = json.loads((folder / leaderboard.PUBLISHED).read_text("utf-8"))["agents"]
+            plots.leaderboard(entries, published, folder / "curves.png")
 
 
 if __name__ == "__main__":

@@ -80,6 +80,41 @@ def learning_dmc(runs: dict[str, list[dict]], path: Path) -> None:
     figure.savefig(path, dpi=130)
 
 
+def leaderboard(entries: list[dict], published: dict[str, dict], path: Path) -> None:
+    """Return of the mean action: over minutes above, over frames below, a column for each task.
+
+    Each agent has a color, each seed a line; dots are published returns.
+    """
+    tasks, agents = (sorted({one[key] for one in entries}) for key in ("task", "agent"))
+    size = (1 + 2.6 * len(tasks), 5)
+    figure, panels = plt.subplots(2, len(tasks), figsize=size, layout="constrained", squeeze=False)
+    for row, (clock, unit, label) in zip(
+        panels, [("seconds", 60, "minutes of training"), ("frames", 1000, "thousand frames")],
+        strict=True,
+    ):  # fmt: skip
+        row[0].set_ylabel("return")
+        for axes, task in zip(row, tasks, strict=True):
+            for one in entries:
+                if one["task"] == task:
+                    color = f"C{agents.index(one['agent'])}"
+                    times = [time / unit for time in one[clock]]
+                    axes.plot(times, one["return"], color=color, label=one["agent"])
+            for number, (agent, about) in enumerate(published.items(), len(agents)):
+                found = about["returns"].get(task) if clock == "frames" else None
+                if found:
+                    points = [(int(at) / unit, mean) for at, mean in found.items()]
+                    style = {"color": f"C{number}", "label": f"{agent}, published"}
+                    axes.plot(*zip(*points, strict=True), "o", **style)
+            axes.set(xlabel=label, title=title(task))
+            axes.grid(alpha=0.3)
+            if task.startswith("dmc_"):
+                axes.set_ylim(0, 1050)
+    handles, labels = panels[1, 0].get_legend_handles_labels()
+    named = dict(zip(labels, handles, strict=True))
+    panels[0, 0].legend(named.values(), named.keys(), fontsize=7)
+    figure.savefig(path, dpi=110)
+
+
 def speed(file: Path) -> None:
     """Steps per second over the number of environments, if the results in ``file`` have any.
 
