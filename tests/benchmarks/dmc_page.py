@@ -183,6 +183,14 @@ FIGURES = {
     "part": part,
 }
 ALL = {"speed": speed, "physics": physics}
+
+
+def walker_walk() -> str:
+    """Return at the end of DrQ-v2's run on walker walk."""
+    run = json.loads((FOLDER.parent / "leaderboard/drqv2-dmc_walker_walk-0.json").read_text())
+    return f"{run['return'][-1]:.0f}"
+
+
 README = {
     "cheetah": lambda: number(speeds("dmc_cheetah_run")[0]),
     "cheetah-ratio": lambda: f"{ratios()['dmc_cheetah_run']:.0f}",
@@ -190,4 +198,5 @@ README = {
     "fastest": lambda: named(next(reversed(ratios()))),
     "reacher": lambda: end("ppo-dmc_reacher_easy"),
     "cartpole": lambda: end("ppo-dmc_cartpole_swingup"),
+    "walker": walker_walk,
 }

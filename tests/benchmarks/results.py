@@ -13,6 +13,7 @@ from pixelbrax_gym.bench.tables import table as markdown_table
 from pixelbrax_jax import list_pretrained
 from pixelbrax_jax.agents.presets import preset
 from pixelbrax_jax.policy import read_pretrained
+from pixelbrax_jax.tasks import DMC_TASKS
 from tests.benchmarks.experiments import DOCS, TASKS
 from tests.benchmarks.pages import Figures
 from tests.benchmarks.performance import rounded, span
@@ -231,13 +232,13 @@ def pretrained_table() -> str:
         "PixelBrax",
     )
     lines = []
-    for name in sorted(list_pretrained(), key=TASKS.index):
+    for name in sorted(list_pretrained(), key=lambda name: (name in DMC_TASKS, name)):
         about = read_pretrained(name)
         lines.append(
             [
                 f"`{name}`",
-                f"`{about['env_options']['reward_preset']}`",
-                about["algorithm"].upper(),
+                "" if name in DMC_TASKS else f"`{about['env_options']['reward_preset']}`",
+                {"drqv2": "DrQ-v2"}.get(name := about["algorithm"], name.upper()),
                 f"{about['steps'] / 1e6:.1f}",
                 f"{about['return']:,.0f} ± {about['standard_error']:,.0f}",
                 about["versions"]["pixelbrax"],
