@@ -87,7 +87,7 @@ def _as_products(
     def blocks(x: jax.Array) -> jax.Array:
         x = jax.lax.pad(x, jnp.zeros((), x.dtype), borders)
         x = x.reshape(batch, down, stride, across, stride, channels).transpose(0, 1, 3, 2, 4, 5)
-        return x.reshape(batch, down, across, -1)
+        return x.reshape(batch, down, across, stride * stride * channels)
 
     if x.dtype == jnp.uint8 and not any(side > 0 for border in borders for side in border):
         # Bytes are moved fast, unless XLA moves and scales them at once.
