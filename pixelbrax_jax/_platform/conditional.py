@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -11,13 +11,14 @@ import jax.numpy as jnp
 _Result = TypeVar("_Result")
 
 
-def in_a_conditional(compute: Callable[[], _Result]) -> _Result:
-    """Return ``compute()``, which XLA for CPUs does not fuse into what reads it.
+def in_a_conditional(compute: Callable[[jax.Array], _Result], like: Any) -> _Result:
+    """Return ``compute(zero)``, which XLA for CPUs does not fuse into what reads it.
 
-    It fuses across barriers but not across conditionals. The barrier hides from the compiler that
-    the conditional is always taken; otherwise the compiler would remove it.
+    It fuses across barriers but not across conditionals. ``zero`` is () int32 behind a barrier,
+    which hides from the compiler that the conditional is always taken; otherwise the compiler would
+    remove it. ``like`` has the shapes and dtypes of the result.
     """
     zero = jax.lax.optimization_barrier(jnp.int32(0))
-    blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(compute))
-    taken: _Result = jax.lax.cond(zero == 0, compute, lambda: blank)
+    blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
+    taken: _Result = jax.lax.cond(zero == 0, lambda: compute(zero), lambda: blank)
     return taken

@@ -81,7 +81,8 @@ class TrainConfig:
     """Number of environments N that run in parallel."""
 
     encoder: str = "impala"
-    """Network that encodes pixels: a name of ``ENCODERS``, such as ``impala`` or ``small``."""
+    """Network that encodes pixels: ``impala``, ``nature``, ``drq``, ``small``, ``patch`` or
+    ``patch2``."""
     state_critic: bool = False
     """Trains a separate critic on the simulator's state instead of pixels."""
 

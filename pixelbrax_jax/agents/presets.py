@@ -74,7 +74,6 @@ _SMALL_DRQV2 = {
     "height": 32,
     "width": 32,
     "action_repeat": 2,
-    "replay_ratio": 0.125,
     "learning_rate": 3e-4,
     "random_shift": 2,
 }
@@ -128,6 +127,7 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
         "drqv2": _SMALL_DRQV2
         | {
             "encoder": "small",
+            "replay_ratio": 0.125,
             "num_envs": 256,
             "batch_size": 512,
             "learning_starts": 10_000,

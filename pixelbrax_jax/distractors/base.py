@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from typing import Any, ClassVar
 
 import jax
+import jax.numpy as jnp
 
 from pixelbrax_jax.types import EnvParams, Frame
 
@@ -62,6 +63,11 @@ class Distractor:
     def info(self, state: Any) -> dict[str, jax.Array]:
         """Return the entries that the state adds to ``Timestep.info``."""
         return {}
+
+
+def levels(packed: jax.Array) -> list[jax.Array]:
+    """Return red, green and blue of uint32 packed pixels, float32 in [0, 255]."""
+    return [(packed >> shift & 0xFF).astype(jnp.float32) for shift in (0, 8, 16)]
 
 
 class Chain:

@@ -8,7 +8,7 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
-from pixelbrax_jax.distractors.base import Distractor
+from pixelbrax_jax.distractors.base import Distractor, levels
 from pixelbrax_jax.types import EnvParams, Frame
 from pixelbrax_jax.validation import check_fraction
 
@@ -59,12 +59,11 @@ class ImageFilter(Distractor):
 
     def change_frame(self, state: jax.Array, frame: Frame, backdrop: jax.Array | None) -> Frame:
         """Return the frame with other contrast and noise."""
-
-        def changed(plane: jax.Array, channel: int) -> jax.Array:
-            moved = 0.5 + self.contrast * (plane - 0.5)
-            if backdrop is not None:
-                level = (backdrop >> 8 * channel & 255).astype(jnp.float32)
-                moved = moved + self.noise * (level * (2.0 / 255.0) - 1.0)
-            return jnp.clip(moved, 0.0, 1.0)
-
-        return frame.replace(r=changed(frame.r, 0), g=changed(frame.g, 1), b=changed(frame.b, 2))
+        planes = [0.5 + self.contrast * (plane - 0.5) for plane in (frame.r, frame.g, frame.b)]
+        if backdrop is not None:
+            planes = [
+                plane + self.noise * (level * (2.0 / 255.0) - 1.0)
+                for plane, level in zip(planes, levels(backdrop), strict=True)
+            ]
+        r, g, b = (jnp.clip(plane, 0.0, 1.0) for plane in planes)
+        return frame.replace(r=r, g=g, b=b)

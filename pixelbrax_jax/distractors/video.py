@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from pixelbrax_jax.distractors.base import Distractor
+from pixelbrax_jax.distractors.base import Distractor, levels
 from pixelbrax_jax.types import FAR, Clips, EnvParams, Frame
 from pixelbrax_jax.validation import check_choice, check_fraction, check_positive_int
 
@@ -144,10 +144,9 @@ class Video(Distractor):
                 kept = jnp.where(frame.ground, self.ground_alpha, kept)
         # For a pixel that is kept the video's fraction is exactly 0, so it keeps its bits.
         added = (1.0 - kept) * (1.0 / 255.0)
-        video = [(backdrop >> shift & 0xFF).astype(jnp.float32) for shift in (0, 8, 16)]
         r, g, b = (
             kept * plane + added * level
-            for plane, level in zip((frame.r, frame.g, frame.b), video, strict=True)
+            for plane, level in zip((frame.r, frame.g, frame.b), levels(backdrop), strict=True)
         )
         return frame.replace(r=r, g=g, b=b)
 

@@ -129,8 +129,8 @@ class LightIntensity(Change):
 class LightColor(Change):
     """Multiplies red, green and blue of all light by factors on [1 - ``amount``, 1 + ``amount``].
 
-    Materials and the ground carry the factors, which is the same for all light that they scatter.
-    Highlights and the sky stay white, and colors are clipped to [0, 1].
+    The colors of materials and ground are multiplied, which is the same for all light that they
+    scatter, and clipped to [0, 1]. Highlights and the sky stay as they are.
     """
 
     amount: float

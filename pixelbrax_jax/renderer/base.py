@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pixelbrax_jax._platform.conditional import in_a_conditional
 from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.observations import IMAGES
 from pixelbrax_jax.renderer import choice, fused, reference, shading
@@ -141,18 +142,15 @@ def draw(
         bands = jax.lax.map(lambda first_row: draw_rows(first_row, num_rows), first_rows)
         return tuple(band.reshape(-1, width)[:height] for band in bands)
 
-    def in_a_conditional() -> tuple[jax.Array, ...]:
+    def conditionally() -> tuple[jax.Array, ...]:
         # On a CPU, XLA first clears the result of a loop, and runs what is fused into the writes
-        # to it in one thread. A conditional costs nothing. The inner barrier hides from the
-        # compiler that it is always taken; otherwise the compiler would remove it.
-        zero = jax.lax.optimization_barrier(jnp.int32(0))
-        blank = tuple(jnp.zeros(height * width, IMAGES[name].drawn) for name in images)
-
-        def flat() -> tuple[jax.Array, ...]:
+        # to it in one thread. A conditional costs nothing.
+        def flat(first_row: jax.Array) -> tuple[jax.Array, ...]:
             # As the renderer computes it.
-            return tuple(image.ravel() for image in draw_rows(zero, height))
+            return tuple(image.ravel() for image in draw_rows(first_row, height))
 
-        drawn = jax.lax.cond(zero == 0, flat, lambda: blank)
+        like = tuple(jax.ShapeDtypeStruct((height * width,), IMAGES[name].drawn) for name in images)
+        drawn = in_a_conditional(flat, like)
         return tuple(image.reshape(height, width) for image in drawn)
 
     def behind_a_barrier() -> tuple[jax.Array, ...]:
@@ -170,7 +168,7 @@ def draw(
 
     if renderer == "pallas":
         return by_kernel()
-    forms = {"cpu": in_a_conditional, "tpu": behind_a_barrier}
+    forms = {"cpu": conditionally, "tpu": behind_a_barrier}
     if renderer == "auto" and choice.why_no_kernel() is None:
         forms["cuda"] = by_kernel
     drawn: tuple[jax.Array, ...] = jax.lax.platform_dependent(default=in_bands, **forms)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import jax
@@ -68,9 +67,10 @@ def computed_apart(compute: Callable[[], list[jax.Array]]) -> list[jax.Array]:
     def behind_a_barrier() -> list[jax.Array]:
         return list(jax.lax.optimization_barrier(words()))
 
-    found = jax.lax.platform_dependent(
-        cpu=partial(in_a_conditional, words), default=behind_a_barrier
-    )
+    def conditionally() -> list[jax.Array]:
+        return in_a_conditional(lambda _: words(), jax.eval_shape(words))
+
+    found = jax.lax.platform_dependent(cpu=conditionally, default=behind_a_barrier)
     return [
         ((found[k // 3] >> 10 * (k % 3)) & 1023).astype(jnp.float32) / 1023.0 for k in range(number)
     ]

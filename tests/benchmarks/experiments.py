@@ -195,8 +195,8 @@ def offer(task: str, folder: Path, kept: dict) -> None:
         return
     PRETRAINED.mkdir(exist_ok=True)
     shutil.copyfile(folder / "policy.jax", PRETRAINED / f"{task}.jax")
-    names = ("task", "backend", "reward_preset", "height", "width", "samples", "frame_stack")
-    names += ("action_repeat",)
+    names = ["task", "backend", "reward_preset"]
+    names += ["height", "width", "samples", "frame_stack", "action_repeat"]
     written = {
         "return": last["clean/return"],
         "standard_error": last["clean/standard_error"],

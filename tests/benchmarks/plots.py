@@ -74,10 +74,15 @@ def learning_dmc(runs: dict[str, list[dict]], path: Path) -> None:
             axes.plot(*zip(*evaluated, strict=True), "o", color="C1", label="mean action")
         axes.set(xlabel="million control steps", title=name.split("-")[1], ylim=(0, 1000))
     row[0].set_ylabel("return")
-    handles, labels = row[0].get_legend_handles_labels()
-    named = dict(zip(labels, handles, strict=True))
-    row[0].legend(named.values(), named.keys(), fontsize=8)
+    _legend(row[0], row[0], fontsize=8)
     figure.savefig(path, dpi=130)
+
+
+def _legend(axes: plt.Axes, of: plt.Axes, fontsize: int) -> None:
+    """Show the labels of ``of`` once each."""
+    handles, labels = of.get_legend_handles_labels()
+    named = dict(zip(labels, handles, strict=True))
+    axes.legend(named.values(), named.keys(), fontsize=fontsize)
 
 
 def leaderboard(entries: list[dict], published: dict[str, dict], path: Path) -> None:
@@ -109,9 +114,7 @@ def leaderboard(entries: list[dict], published: dict[str, dict], path: Path) -> 
             axes.grid(alpha=0.3)
             if task.startswith("dmc_"):
                 axes.set_ylim(0, 1050)
-    handles, labels = panels[1, 0].get_legend_handles_labels()
-    named = dict(zip(labels, handles, strict=True))
-    panels[0, 0].legend(named.values(), named.keys(), fontsize=7)
+    _legend(panels[0, 0], panels[1, 0], fontsize=7)
     figure.savefig(path, dpi=110)
 
 

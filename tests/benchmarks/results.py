@@ -232,13 +232,13 @@ def pretrained_table() -> str:
         "PixelBrax",
     )
     lines = []
-    for name in sorted(list_pretrained(), key=lambda name: (name in DMC_TASKS, name)):
+    for name in sorted(list_pretrained(), key=(*TASKS, *DMC_TASKS).index):
         about = read_pretrained(name)
         lines.append(
             [
                 f"`{name}`",
                 "" if name in DMC_TASKS else f"`{about['env_options']['reward_preset']}`",
-                {"drqv2": "DrQ-v2"}.get(name := about["algorithm"], name.upper()),
+                "DrQ-v2" if about["algorithm"] == "drqv2" else about["algorithm"].upper(),
                 f"{about['steps'] / 1e6:.1f}",
                 f"{about['return']:,.0f} ± {about['standard_error']:,.0f}",
                 about["versions"]["pixelbrax"],

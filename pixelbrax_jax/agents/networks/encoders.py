@@ -91,7 +91,8 @@ def _as_products(
 
     if x.dtype == jnp.uint8 and not any(side > 0 for border in borders for side in border):
         # Bytes are moved fast, unless XLA moves and scales them at once.
-        x = before(in_a_conditional(partial(blocks, x))).astype(kernel.dtype)
+        moved = in_a_conditional(lambda _: blocks(x), jax.eval_shape(blocks, x))
+        x = before(moved).astype(kernel.dtype)
     else:
         x = blocks(before(x).astype(kernel.dtype))
     missing = ((0, tall * stride - kernel.shape[0]), (0, wide * stride - kernel.shape[1]))
@@ -197,10 +198,7 @@ class Stack(nn.Module):
     @nn.compact
     def __call__(self, pixels: jax.Array) -> jax.Array:
         """Map (B, H, W, C) pixels to (B, F) features."""
-        x, before = pixels, self.before
-        for channels, size, stride in self.layers:
-            x, before = nn.relu(Conv(channels, size, stride, before=before)(x)), _unchanged
-        x = dense(self.features)(_flat(x))
+        x = dense(self.features)(_convolved(pixels, self.layers, self.before))
         return jnp.tanh(nn.LayerNorm()(x)) if self.bounded else nn.relu(x)
 
 
@@ -213,12 +211,7 @@ class Convolutions(nn.Module):
     def __call__(self, pixels: jax.Array) -> jax.Array:
         """Map (B, H, W, C) pixels to (B, F) features."""
         init = orthogonal(math.sqrt(2.0))
-        before: Before = centered
-        x = pixels
-        for channels, size, stride in self.layers:
-            conv = Conv(channels, size, stride, kernel_init=init, before=before)
-            x, before = nn.relu(conv(x)), _unchanged
-        return _flat(x)
+        return _convolved(pixels, self.layers, centered, kernel_init=init)
 
 
 LAYERS: dict[str, Layers] = {
@@ -245,6 +238,14 @@ ENCODERS: dict[str, Callable[[], nn.Module]] = {
 
 SMALLEST = {"impala": 1, "nature": 36, "drq": 15, "small": 18, "patch": 24, "patch2": 8}
 """Smallest height and width of each encoder's images in pixels."""
+
+
+def _convolved(x: jax.Array, layers: Layers, before: Before, **options: Any) -> jax.Array:
+    """Return the features of convolutions in the module that calls; ``before`` acts on ``x``."""
+    for channels, size, stride in layers:
+        x = nn.relu(Conv(channels, size, stride, before=before, **options)(x))
+        before = _unchanged
+    return _flat(x)
 
 
 def _flat(x: jax.Array) -> jax.Array:
