@@ -185,10 +185,20 @@ FIGURES = {
 ALL = {"speed": speed, "physics": physics}
 
 
-def walker_walk() -> str:
-    """Return at the end of DrQ-v2's run on walker walk."""
-    run = json.loads((FOLDER.parent / "leaderboard/drqv2-dmc_walker_walk-0.json").read_text())
-    return f"{run['return'][-1]:.0f}"
+def of_leaderboard(file: str) -> dict:
+    """A file of the leaderboard."""
+    return json.loads((FOLDER.parent / "leaderboard" / file).read_text("utf-8"))
+
+
+def walker_walk(key: str, unit: float = 1.0) -> str:
+    """The end of DrQ-v2's run on walker walk."""
+    return f"{of_leaderboard('drqv2-dmc_walker_walk-0.json')[key][-1] / unit:.0f}"
+
+
+def published_walker_walk() -> str:
+    """DrQ-v2's published return on walker walk at 1M frames."""
+    returns = of_leaderboard("published.json")["agents"]["DrQ-v2"]["returns"]
+    return f"{returns['dmc_walker_walk']['1000000']:.0f}"
 
 
 README = {
@@ -198,5 +208,7 @@ README = {
     "fastest": lambda: named(next(reversed(ratios()))),
     "reacher": lambda: end("ppo-dmc_reacher_easy"),
     "cartpole": lambda: end("ppo-dmc_cartpole_swingup"),
-    "walker": walker_walk,
+    "walker": lambda: walker_walk("return"),
+    "walker-minutes": lambda: walker_walk("seconds", 60.0),
+    "walker-published": published_walker_walk,
 }
