@@ -15,6 +15,10 @@ _CHUNK = 128
 """Largest number of rows that a CPU computes together, to keep intermediate results in its
 caches."""
 
+_RAYS = 2**18
+"""Number of rays, about, that a CPU computes together. More than 32 MB of intermediate results
+would be mapped into memory anew in every call."""
+
 Step = Callable[..., tuple[Any, jax.Array]]
 
 
@@ -36,6 +40,35 @@ def step_rows(
         state, rows, shared, cpu=in_chunks, default=together
     )
     return moved
+
+
+def draw_rows(draw: Callable[..., Any], arguments: tuple[Any, ...], like: Any, rays: int) -> Any:
+    """Return ``jax.vmap(draw)(*arguments)``, the images of every row of a batch.
+
+    For images with intermediate ones: a CPU draws only so many together that those stay small.
+    Some may be drawn twice. ``like`` has the shapes and dtypes of a row's images, of ``rays``.
+    """
+    num_rows = len(jax.tree.leaves(arguments)[0])
+    together = jax.vmap(jax.jit(draw, inline=True))
+    turns = -(-num_rows * rays // _RAYS)
+    size = -(-num_rows // turns)
+    if size == num_rows:
+        return together(*arguments)
+
+    def in_turns(*arguments: Any) -> Any:
+        def put(i: jax.Array, images: Any) -> Any:
+            first = i * size  # moved back where the last turn would go past the end
+            rows = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, first, size), arguments)
+            return jax.tree.map(
+                lambda x, drawn: jax.lax.dynamic_update_slice_in_dim(x, drawn, first, 0),
+                images,
+                together(*rows),
+            )
+
+        blank = jax.tree.map(lambda x: jnp.zeros((num_rows, *x.shape), x.dtype), like)
+        return jax.lax.fori_loop(0, turns, put, blank)
+
+    return jax.lax.platform_dependent(*arguments, cpu=in_turns, default=together)
 
 
 def map_runs(function: Callable[[Any], Any], runs: Any) -> Any:

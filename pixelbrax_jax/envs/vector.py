@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from pixelbrax_jax._platform.batches import step_rows
+from pixelbrax_jax._platform.batches import draw_rows, step_rows
 from pixelbrax_jax._platform.resets import replace_rows, reset_rows
 from pixelbrax_jax.envs.arguments import check_action, check_key
 from pixelbrax_jax.envs.param_rows import ParamRows, split_params
@@ -184,8 +184,16 @@ class VectorPixelEnv:
     def _push_frames(
         self, frames: Any, sim: SimState, params: ParamRows, is_first: jax.Array
     ) -> Any:
-        push = jax.vmap(params.of_row(self.env.push_frame))
-        return push(frames, sim, is_first, params.own)
+        if not self.env.images:
+            return frames
+        env, rows = self.env, (sim, params.own)
+        draw = params.of_row(env.draw_obs)
+        if params.join(params.own).look.in_layers:
+            rays = env.height * env.width * env.num_cameras * env.samples
+            newest = draw_rows(draw, rows, env.drawn_spec, rays)
+        else:
+            newest = jax.vmap(draw)(*rows)
+        return jax.vmap(push_each)(frames, newest, is_first)
 
     def _reset_rows(
         self, state: EnvState, mask: jax.Array, episode: jax.Array, params: ParamRows

@@ -11,7 +11,7 @@ import pytest
 
 import pixelbrax_jax as pb
 from pixelbrax_jax._platform import batches
-from pixelbrax_jax._platform.batches import chunk_size, map_runs, step_rows
+from pixelbrax_jax._platform.batches import chunk_size, draw_rows, map_runs, step_rows
 from tests.envs.toy import PARAMS, Ball
 
 
@@ -74,6 +74,35 @@ def test_only_a_cpu_has_a_loop_over_chunks(platform, loops):
 
     text = jax.jit(put).trace(states, rows).lower(lowering_platforms=(platform,)).as_text()
     assert text.count("stablehlo.while") == loops
+
+
+@pytest.mark.parametrize("num_rows", [1, 6, 7])
+@pytest.mark.parametrize("rays", [4, 10, 21, 100])
+def test_images_in_turns_are_those_of_all_together(num_rows, rays, monkeypatch):
+    monkeypatch.setattr(batches, "_RAYS", 21)
+    keys = jax.random.split(jax.random.key(0), num_rows)
+
+    def draw(key, shade):
+        return {"a": jax.random.uniform(key, (2, 5)) * shade, "b": jnp.int32(shade)}
+
+    like = jax.eval_shape(draw, keys[0], 1.0)
+    shades = jnp.arange(num_rows) + 1.0
+    found = jax.jit(lambda *rows: draw_rows(draw, rows, like, rays))(keys, shades)
+    jax.tree.map(np.testing.assert_array_equal, found, jax.jit(jax.vmap(draw))(keys, shades))
+
+
+@pytest.mark.parametrize(("look", "loops"), [("dmc", 1), ("default", 0)])
+def test_only_images_of_several_are_drawn_in_turns(look, loops, monkeypatch):
+    monkeypatch.setattr(batches, "_RAYS", 3 * 8 * 8)
+    env, params = pb.make("dmc_cartpole_swingup", height=8, width=8, look=look)
+    envs = pb.VectorPixelEnv(env, 7)
+    state, _ = jax.eval_shape(envs.reset, jax.random.key(0), params)
+
+    def push(frames, sim):
+        return envs._push_frames(frames, sim, envs._rows(params), jnp.ones(7, bool))
+
+    traced = jax.jit(push).trace(state.frames, state.sim)
+    assert traced.lower(lowering_platforms=("cpu",)).as_text().count("stablehlo.while") == loops
 
 
 def test_runs_are_mapped_one_after_the_other_on_a_cpu():
