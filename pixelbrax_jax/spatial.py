@@ -44,6 +44,11 @@ def quat_normalize(quat: jax.Array) -> jax.Array:
     return jnp.where(square > 0, unit, identity)
 
 
+def axis_angle(axis: jax.Array, angle: jax.Array) -> jax.Array:
+    """Return the unit quaternion (4,) of a turn about ``axis`` (3,), of length 1, by radians."""
+    return jnp.concatenate([jnp.cos(0.5 * angle)[None], jnp.sin(0.5 * angle) * axis])
+
+
 def quat_to_mat(quat: jax.Array) -> jax.Array:
     """Return the matrix (..., 3, 3) of a unit quaternion; its columns are the rotated axes."""
     w, x, y, z = (quat[..., i] for i in range(4))

@@ -10,6 +10,7 @@ from pixelbrax_jax.distractors.clips import (
 )
 from pixelbrax_jax.distractors.color import Color
 from pixelbrax_jax.distractors.image_filter import ImageFilter
+from pixelbrax_jax.distractors.light import Light
 from pixelbrax_jax.distractors.presets import PRESETS, preset
 from pixelbrax_jax.distractors.video import Video
 
@@ -19,6 +20,7 @@ __all__ = [
     "Color",
     "Distractor",
     "ImageFilter",
+    "Light",
     "MovingCamera",
     "OnlySplitWarning",
     "ProceduralClipsWarning",

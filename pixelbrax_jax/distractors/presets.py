@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from pixelbrax_jax.distractors.base import Distractor
 from pixelbrax_jax.distractors.camera import MovingCamera
 from pixelbrax_jax.distractors.color import Color
+from pixelbrax_jax.distractors.light import Light
 from pixelbrax_jax.distractors.video import Video
 from pixelbrax_jax.validation import check_choice
 
@@ -31,6 +32,7 @@ _FIXED: dict[str, tuple[Distractor, ...]] = {
     "color": (Color(),),
     "video": (Video(),),
     "camera": (MovingCamera(),),
+    "light": (Light(),),
     "paper-color": (Color(mode="frame", dynamics="iid", scale=0.3, distribution="normal"),),
     "paper-video": (Video(mode="overlay", alpha=0.5, dynamics="loop"),),
     "video-easy": (Video(ground_alpha=1.0, dynamics="loop", num_clips=10, random_start=False),),
@@ -53,7 +55,7 @@ PRESETS = (
 def preset(name: str, task: str) -> tuple[Distractor, ...]:
     """Return the distractors of a benchmark, one of ``PRESETS``; others raise ValueError.
 
-    * ``"color"``, ``"video"``, ``"camera"``: each with its defaults.
+    * ``"color"``, ``"video"``, ``"camera"``, ``"light"``: each with its defaults.
     * ``"paper-color"``, ``"paper-video"``: those of the paper, arXiv 2502.00021.
     * ``"dcs-easy"``, ``"dcs-medium"``, ``"dcs-hard"``, and each with ``"-static"``: color, video
       and camera of the Distracting Control Suite, arXiv 2101.02722. The task decides how much of

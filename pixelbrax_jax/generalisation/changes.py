@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +13,7 @@ from pixelbrax_jax import spatial
 from pixelbrax_jax.distractors.base import Distractor
 from pixelbrax_jax.distractors.camera import MovingCamera
 from pixelbrax_jax.distractors.color import Color
+from pixelbrax_jax.distractors.light import Light, color_lights, scale_lights, turn_lights
 from pixelbrax_jax.types import CameraRig, EnvParams
 
 NUM_VIEWS = 100
@@ -22,10 +22,6 @@ NUM_VIEWS = 100
 _ROTATION_STRIDE, _SHIFT_STRIDE = 61, 47
 """Episode i takes direction (stride i) mod 100. Both visit all, the first few are spread evenly,
 and so are the pairs of both."""
-
-
-_LIGHT = ("ambient", "diffuse", "specular", "highlight", "headlight", "headlight_highlight")
-"""Coefficients of a look's light."""
 
 
 class Change:
@@ -82,28 +78,14 @@ class Shift(Change):
 
 @dataclass(frozen=True)
 class LightDirection(Change):
-    """Turns all lights by an angle about a horizontal axis whose azimuth is sampled.
-
-    Spot lights turn about the origin of the link that they follow, or else about the camera's
-    target.
-    """
+    """Turns all lights by an angle about a horizontal axis whose azimuth is sampled."""
 
     degrees: float
 
     def change(self, params: EnvParams, key: jax.Array, episode: jax.Array) -> EnvParams:
         """Return the parameters with turned lights."""
         azimuth = jax.random.uniform(key, maxval=2.0 * np.pi)
-        axis = jnp.stack([jnp.cos(azimuth), jnp.sin(azimuth), 0.0])
-        quat = _quat(axis, jnp.radians(self.degrees))
-        look, target = params.look, _cameras(params)[0].target
-        lamps = []
-        for lamp in look.lamps:
-            center = jnp.zeros(3) if lamp.link >= 0 else jnp.asarray(target)
-            pos = center + spatial.rotate(quat, jnp.asarray(lamp.pos) - center)
-            axis_of_light = spatial.rotate(quat, jnp.asarray(lamp.axis))
-            lamps.append(lamp.replace(pos=pos, axis=axis_of_light))
-        light = None if look.light is None else spatial.rotate(quat, jnp.asarray(look.light))
-        return params.replace(look=look.replace(light=light, lamps=tuple(lamps)))
+        return turn_lights(params, azimuth, jnp.radians(self.degrees))
 
 
 @dataclass(frozen=True)
@@ -115,22 +97,14 @@ class LightIntensity(Change):
     def change(self, params: EnvParams, key: jax.Array, episode: jax.Array) -> EnvParams:
         """Return the parameters with darker or brighter light."""
         factor = jnp.where(jax.random.bernoulli(key), 1.0 + self.amount, 1.0 - self.amount)
-        look = params.look
-        names = [name for name in _LIGHT if getattr(look, name, None) is not None]
-        scaled: dict[str, Any] = {name: getattr(look, name) * factor for name in names}
-        lamps = tuple(
-            lamp.replace(diffuse=lamp.diffuse * factor, highlight=lamp.highlight * factor)
-            for lamp in look.lamps
-        )
-        return params.replace(look=look.replace(lamps=lamps, **scaled))
+        return scale_lights(params, factor)
 
 
 @dataclass(frozen=True)
 class LightColor(Change):
     """Multiplies red, green and blue of all light by factors on [1 - ``amount``, 1 + ``amount``].
 
-    The colors of materials and ground are multiplied, which is the same for all light that they
-    scatter, and clipped to [0, 1]. Highlights and the sky stay as they are.
+    See ``distractors.light.color_lights``.
     """
 
     amount: float
@@ -138,13 +112,7 @@ class LightColor(Change):
     def change(self, params: EnvParams, key: jax.Array, episode: jax.Array) -> EnvParams:
         """Return the parameters in light of another color."""
         factor = jax.random.uniform(key, (3,), minval=1 - self.amount, maxval=1 + self.amount)
-
-        def lit(rgb: Any) -> jax.Array:
-            return jnp.clip(jnp.asarray(rgb) * factor, 0.0, 1.0)
-
-        geoms = params.geoms.replace(rgb=lit(params.geoms.rgb))
-        look = params.look.replace(ground_rgb=lit(params.look.ground_rgb))
-        return params.replace(geoms=geoms, look=look)
+        return color_lights(params, factor)
 
 
 @dataclass(frozen=True)
@@ -190,7 +158,7 @@ class Radius(Change):
 def changes_params_alone(distractor: Distractor) -> bool:
     """Return whether a distractor changes an episode's parameters, and nothing after its start."""
     match distractor:
-        case Color(mode="geom", dynamics="static") | MovingCamera(dynamic=False):
+        case Color(mode="geom", dynamics="static") | MovingCamera(dynamic=False) | Light():
             return True
     return False
 
@@ -202,10 +170,6 @@ def apply(
     if isinstance(change, Change):
         return change.change(params, key, episode)
     return change.change_params(change.reset(key, params), params)
-
-
-def _cameras(params: EnvParams) -> tuple[CameraRig, ...]:
-    return params.rig if isinstance(params.rig, tuple) else (params.rig,)
 
 
 def _turn_cameras(params: EnvParams, axis: jax.Array, angle: jax.Array) -> EnvParams:
@@ -225,7 +189,7 @@ def turned(rig: CameraRig, axis: jax.Array, angle: jax.Array) -> CameraRig:
     """
     away = jnp.asarray(rig.eye - rig.target)
     right, up, back = spatial.look_at(jnp.asarray(rig.eye), rig.target, rig.up).T
-    quat = _quat(axis, angle)
+    quat = spatial.axis_angle(axis, angle)
 
     def in_world(own: list[float]) -> jax.Array:
         x, y, z = spatial.rotate(quat, jnp.array(own))
@@ -234,7 +198,3 @@ def turned(rig: CameraRig, axis: jax.Array, angle: jax.Array) -> CameraRig:
     distance = jnp.sqrt(jnp.sum(away * away))
     target = rig.eye - distance * in_world([0.0, 0.0, 1.0])
     return rig.replace(target=target, up=in_world([0.0, 1.0, 0.0]))
-
-
-def _quat(axis: jax.Array, angle: jax.Array) -> jax.Array:
-    return jnp.concatenate([jnp.cos(0.5 * angle)[None], jnp.sin(0.5 * angle) * axis])
