@@ -12,6 +12,7 @@ from pixelbrax_jax.tasks import TASKS
 
 if TYPE_CHECKING:
     from pixelbrax_gym.generalisation.evaluation import evaluate_suite as evaluate_suite
+    from pixelbrax_gym.generalisation.pairs import record_pairs as record_pairs
     from pixelbrax_gym.gymnasium.check import check_vector_env as check_vector_env
     from pixelbrax_gym.gymnasium.env import GymnasiumEnv as GymnasiumEnv
     from pixelbrax_gym.gymnasium.vector_env import GymnasiumVectorEnv as GymnasiumVectorEnv
@@ -20,7 +21,14 @@ if TYPE_CHECKING:
     from pixelbrax_gym.torchrl.env import TorchRLEnv as TorchRLEnv
 
 # Names that need an extra are missing, so that a star import works without it.
-__all__ = ["GymnasiumEnv", "GymnasiumVectorEnv", "check_vector_env", "evaluate_suite", "register"]
+__all__ = [
+    "GymnasiumEnv",
+    "GymnasiumVectorEnv",
+    "check_vector_env",
+    "evaluate_suite",
+    "record_pairs",
+    "register",
+]
 
 _LAZY = {
     "GymnasiumEnv": "pixelbrax_gym.gymnasium.env",
@@ -30,6 +38,7 @@ _LAZY = {
     "TorchRLEnv": "pixelbrax_gym.torchrl.env",
     "check_vector_env": "pixelbrax_gym.gymnasium.check",
     "evaluate_suite": "pixelbrax_gym.generalisation.evaluation",
+    "record_pairs": "pixelbrax_gym.generalisation.pairs",
 }
 
 _ENV = "pixelbrax_gym.gymnasium.env:GymnasiumEnv"

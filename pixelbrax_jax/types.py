@@ -291,11 +291,6 @@ class Look(struct.PyTreeNode):
     reflectance: jax.Array | None = None
     opengl: bool = struct.field(pytree_node=False, default=False)
 
-    @property
-    def in_layers(self) -> bool:
-        """Whether an image is made of several: of reflections, or a texture of the sky."""
-        return self.reflectance is not None or self.sky_texture is not None
-
 
 class Scene(struct.PyTreeNode):
     """Input of a renderer for one image, in the world frame.

@@ -21,7 +21,7 @@ from pixelbrax_jax.validation import check_choice
 
 Policy = Callable[[Any], Any]
 
-_LEFT_OUT = ("task", "clips", "split", "distractors", "dynamics")
+LEFT_OUT = ("task", "clips", "split", "distractors", "dynamics")
 """Options that a suite decides."""
 
 
@@ -70,7 +70,7 @@ def evaluate_suite(
     if not policies:
         raise ValueError("policy must have at least one policy, got an empty mapping.")
     check_choice("suite", suite, SUITES)
-    if own := [name for name in _LEFT_OUT if name in options]:
+    if own := [name for name in LEFT_OUT if name in options]:
         raise TypeError(f"{own[0]} is decided by the levels of a suite; leave it out.")
     config = env_config(task, options, ("episodes", "clips", "output", "output_dir", "report"))
     episodes = SUITES[suite].episodes if episodes is None else episodes
@@ -88,7 +88,7 @@ def evaluate_suite(
 def scores_of(config: EnvConfig, suite: str, levels: Levels) -> Scores:
     """Return scores without returns, with all that decides them but the policy."""
     options = {name: to_plain(getattr(config, name)) for name in ENV_OPTIONS}
-    for name in _LEFT_OUT:
+    for name in LEFT_OUT:
         del options[name]
     bank = levels.bank
     shown = None if bank is None else f"{len(bank.names)} clips, {bank.digest[:16]}"
@@ -122,8 +122,8 @@ class _Envs:
                 )
             obs, _, terminated, truncated, infos = envs.step(actions)
             # Later episodes of an environment are ignored.
-            returns = np.where(over, returns, _numpy(infos["episode_return"]))
-            over |= _numpy(terminated) | _numpy(truncated)
+            returns = np.where(over, returns, numpy_of(infos["episode_return"]))
+            over |= numpy_of(terminated) | numpy_of(truncated)
         return returns
 
     def _envs(self, one: LevelEnv) -> GymnasiumVectorEnv:
@@ -141,6 +141,6 @@ class _Envs:
         return envs
 
 
-def _numpy(array: Any) -> np.ndarray:
+def numpy_of(array: Any) -> np.ndarray:
     """Return an array of NumPy, JAX or torch in host memory."""
     return np.asarray(array.cpu().numpy() if hasattr(array, "cpu") else array)

@@ -187,8 +187,9 @@ class VectorPixelEnv:
         if not self.env.images:
             return frames
         env, rows = self.env, (sim, params.own)
-        draw = params.of_row(env.draw_obs)
-        if params.join(params.own).look.in_layers:
+        draw, look = params.of_row(env.draw_obs), params.join(params.own).look
+        # Reflections and the sky's texture are images of their own.
+        if look.reflectance is not None or look.sky_texture is not None:
             rays = env.height * env.width * env.num_cameras * env.samples
             newest = draw_rows(draw, rows, env.drawn_spec, rays)
         else:

@@ -18,6 +18,7 @@ from pixelbrax_jax.distractors.base import Chain, Distractor
 from pixelbrax_jax.distractors.clips import ClipBank, load_clips
 from pixelbrax_jax.distractors.procedural import SPLITS
 from pixelbrax_jax.envs.making import make
+from pixelbrax_jax.envs.param_rows import split_params
 from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.flags import default_flags
@@ -26,7 +27,7 @@ from pixelbrax_jax.generalisation.suites import EPISODES, Level, levels_of
 from pixelbrax_jax.registry import find_task
 from pixelbrax_jax.scene.cameras import seen_from
 from pixelbrax_jax.types import EnvParams
-from pixelbrax_jax.validation import check_positive_int
+from pixelbrax_jax.validation import check_choice, check_positive_int
 
 _EPISODE = 2**32 - 1
 """Index of the episode whose keys draw the levels' parameters; no training reaches it."""
@@ -82,6 +83,11 @@ class Levels:
         """Number of different programs."""
         return len({level.program for level in self.levels})
 
+    def params_of(self, level: LevelEnv, index: np.ndarray) -> EnvParams:
+        """Return the parameters of the episodes with these numbers (M,), a row for each."""
+        rows = split_params(level.params, self.episodes)
+        return rows.join([own[index] for own in rows.own])
+
 
 @default_flags()
 def make_levels(
@@ -90,6 +96,7 @@ def make_levels(
     episodes: int,
     clips: str | PathLike[str] | None = None,
     report: Callable[[str], object] = lambda _: None,
+    only: str | None = None,
 ) -> Levels:
     """Make the levels of a suite for a task with these options.
 
@@ -103,10 +110,11 @@ def make_levels(
         episodes: number E of episodes, rows of the parameters.
         clips: folder of the clips, or ``procedural``.
         report: takes lines about replaced clips.
+        only: the only level to make, as it is among all.
 
     Raises:
-        ValueError: the suite is unknown or has no levels for the task, a level cannot be made for
-            it, or clips are given for a suite without video.
+        ValueError: the suite or level is unknown, the suite has no levels for the task, a level
+            cannot be made for it, or clips are given without video.
         FileNotFoundError: clips are missing; the message says where to get them.
     """
     if config.obs_mode == "state":
@@ -114,7 +122,11 @@ def make_levels(
     episodes = check_positive_int("episodes", episodes)
     config = replace(config, task=find_task(config.task))
     levels = levels_of(suite, config.task)
-    bank, splits = _bank(config, suite, levels, clips, report)
+    if only is not None:
+        check_choice("level", only, [level.name for level in levels])
+        levels = tuple(level for level in levels if level.name == only)
+    what = f"suite {suite!r}" if only is None else f"level {only!r} of suite {suite!r}"
+    bank, splits = _bank(config, what, levels, clips, report)
     made = [_make(config, level, bank) for level in levels]
     keys = VectorPixelEnv.env_keys(jax.random.key(EPISODES), episodes)
     keys = jax.vmap(lambda key: jax.random.fold_in(key, _EPISODE))(keys)
@@ -217,7 +229,7 @@ def _show(clips: Any, shown: Sequence[int], in_order: bool, keys: jax.Array) -> 
 
 def _bank(
     config: EnvConfig,
-    suite: str,
+    what: str,
     levels: Sequence[Level],
     clips: str | PathLike[str] | None,
     report: Callable[[str], object],
@@ -226,10 +238,10 @@ def _bank(
     wanted = dict.fromkeys(level.clips for level in levels if level.clips)
     if not wanted:
         if clips is not None:
-            raise ValueError(f"suite {suite!r} shows no video; leave out clips={str(clips)!r}.")
+            raise ValueError(f"{what} shows no video; leave out clips={str(clips)!r}.")
         return None, {}
     if clips is None:
-        raise FileNotFoundError(f"suite {suite!r} shows videos: give their folder. {_WHERE}.")
+        raise FileNotFoundError(f"{what} shows videos: give their folder. {_WHERE}.")
     banks: dict[str, ClipBank] = {}
     for names in wanted:
         split, bank = _first_split(clips, names, config)

@@ -1,0 +1,275 @@
+"""Record the same episodes clean and under a level, as a dataset of Minari."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from importlib import metadata
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import jax
+import numpy as np
+
+from pixelbrax_gym.generalisation.evaluation import LEFT_OUT, Policy, numpy_of, scores_of
+from pixelbrax_gym.gymnasium.vector_env import GymnasiumVectorEnv
+from pixelbrax_jax import EnvConfig, VectorPixelEnv
+from pixelbrax_jax.config import ENV_OPTIONS, env_config
+from pixelbrax_jax.extras import install_extra
+from pixelbrax_jax.flags import default_flags
+from pixelbrax_jax.generalisation.making import Levels, make_levels
+from pixelbrax_jax.generalisation.suites import EPISODES, SUITES
+from pixelbrax_jax.validation import check_choice, check_positive_int
+
+VIEWS = ("clean", "level")
+IMAGES = ("depth", "segmentation")
+
+_SETTINGS = "pixelbrax"
+"""Key of the recording's settings in the metadata."""
+
+
+def record_pairs(
+    policy: Policy | None,
+    task: str,
+    suite: str,
+    level: str,
+    output_dir: str | PathLike[str],
+    *,
+    episodes: int | None = None,
+    clips: str | PathLike[str] | None = None,
+    images: Sequence[str] = (),
+    sees: str = "clean",
+    policy_name: str = "policy",
+    num_envs: int = 8,
+    output: str = "numpy",
+    report: Callable[[str], object] = lambda _: None,
+    **options: Any,
+) -> Path:
+    """Record episodes that differ only in their images: clean, and under a level of a suite.
+
+    Episode i is that of ``evaluate_suite``. The dataset is Minari's, lossless, with a Parquet file
+    for each episode: ``minari.MinariDataset(path)`` reads it, and so does everything that reads
+    Parquet. An observation is a dictionary, of one frame each:
+
+    * ``pixels`` and ``pixels_level``: (H, W, 3 C) uint8, clean and under the level, C cameras;
+    * ``depth`` (H, W, C) float32, metres, and ``segmentation`` (H, W, C) int32, row of the geom or
+      -1, of the clean image, if in ``images``;
+    * ``state``: (S,) float32, the task's observation of the state.
+
+    Actions are (A,) float32. Numbers that are the same in both, such as rewards, are stored once.
+
+    Args:
+        policy: as in ``evaluate_suite``; None samples actions uniformly.
+        task: one of ``pixelbrax_jax.list_envs()``.
+        suite: a suite that has the level.
+        level: name of the level.
+        output_dir: folder of the dataset. If it has episodes of the same recording already, the
+            others follow.
+        episodes: number E of episodes; None for the suite's.
+        clips: folder of the videos, or ``"procedural"``, for levels that show any.
+        images: any of ``depth`` and ``segmentation``.
+        sees: which images the policy sees, ``clean`` or ``level``.
+        policy_name: name of the policy in the dataset.
+        num_envs: number of episodes that are played, and held in memory, together.
+        output: type of the policy's observations, ``"numpy"``, ``"torch"`` or ``"jax"``.
+        report: takes lines about the size and progress.
+        **options: other options of ``pixelbrax_jax.make``, such as ``action_repeat``.
+
+    Returns:
+        The folder.
+
+    Raises:
+        ValueError: a name or number is not allowed, the policy returns another shape, or the
+            folder has something else.
+        FileNotFoundError: clips are missing; the message says where to get them.
+        TypeError: an option is unknown, the suite's own or ``obs_mode``.
+        ImportError: Minari is missing; the message says how to install it.
+    """
+    if policy is not None and not callable(policy):
+        raise TypeError(f"policy must be a function of observations or None, got {policy!r}.")
+    check_choice("suite", suite, SUITES)
+    check_choice("sees", sees, VIEWS)
+    for name in images:
+        check_choice("images", name, IMAGES)
+    if own := [name for name in (*LEFT_OUT, "obs_mode") if name in options]:
+        raise TypeError(f"{own[0]} is decided by the recording; leave it out.")
+    reserved = ("output_dir", "policy_name", "num_envs", "output", "report")
+    config = env_config(task, options, reserved)
+    episodes = SUITES[suite].episodes if episodes is None else episodes
+    levels = make_levels(config, suite, episodes, clips, report, only=level)
+    num_envs = min(check_positive_int("num_envs", num_envs), levels.episodes)
+    pairs = _Pairs(config, levels, tuple(images), num_envs, output)
+    settings = scores_of(config, suite, levels).options | {
+        "task": config.task,
+        "suite": suite,
+        "level": level,
+        "images": list(images),
+        "sees": sees,
+        "policy": "uniform" if policy is None else policy_name,
+    }
+    storage = _storage(Path(output_dir), pairs, settings)
+    first = storage.total_episodes
+    size = pairs.bytes_per_episode * (episodes - first) / 1e9
+    report(f"{episodes - first} episodes, at most {size:.2f} GB before compression")
+    while first < episodes:
+        batch = pairs.play(first, policy, sees)
+        storage.update_episodes(batch)
+        first = storage.total_episodes
+        report(f"{first} of {episodes} episodes")
+    return Path(output_dir)
+
+
+class _Pairs:
+    """The environments of both views, which step under the same actions.
+
+    Attributes:
+        spaces: of an observation: one frame of each image, and the state.
+        action_space: of one environment.
+    """
+
+    def __init__(
+        self,
+        config: EnvConfig,
+        levels: Levels,
+        images: tuple[str, ...],
+        num_envs: int,
+        output: str,
+    ) -> None:
+        (self._one,) = levels.levels
+        self._levels, self._num_envs = levels, num_envs
+        shared: dict[str, Any] = {n: getattr(config, n) for n in ENV_OPTIONS if n not in LEFT_OUT}
+        make = partial(GymnasiumVectorEnv, config.task, num_envs, output=output)
+        shown = "+".join(("pixels", *images, "state"))
+        clean = make(**shared | {"obs_mode": shown})
+        shared |= {"distractors": self._one.env.distractors}
+        if levels.bank is not None:
+            shared |= {"clips": levels.bank, "split": "train"}
+        self._envs = {"clean": clean, "level": make(**shared)}
+        stacks: Any = clean.single_observation_space
+        stacks = {**stacks.spaces, "pixels_level": self._envs["level"].single_observation_space}
+        frames = {n: 1 if n == "state" else config.frame_stack for n in stacks}
+        self.spaces = {n: _one_frame(space, frames[n]) for n, space in stacks.items()}
+        self.action_space: Any = clean.single_action_space
+        self._num_steps = -(-clean._stateful.episode_length // config.action_repeat)
+
+    @property
+    def bytes_per_episode(self) -> int:
+        """Bytes of an episode's arrays."""
+        parts = [np.zeros(x.shape, x.dtype).nbytes for x in self.spaces.values()]
+        return (self._num_steps + 1) * sum(parts)
+
+    def play(self, first: int, policy: Policy | None, sees: str) -> Iterator[Any]:
+        """Play episodes from ``first`` on; yield Minari's buffers."""
+        from minari.data_collector import EpisodeBuffer
+
+        index = np.arange(first, min(first + self._num_envs, self._levels.episodes))
+        obs = self._reset(np.resize(index, self._num_envs))
+        random = np.random.default_rng((EPISODES, first))
+        shape = (self._num_envs, *self.action_space.shape)
+        frames, steps, length = [self._frames(obs)], [], np.zeros(self._num_envs, int)
+        over = np.zeros(self._num_envs, bool)
+        while not over.all():
+            if policy is None:
+                actions: Any = random.uniform(-1.0, 1.0, shape).astype(np.float32)
+            else:
+                seen = obs[sees]
+                actions = policy(seen["pixels"] if sees == "clean" else seen)
+                if (got := tuple(np.shape(actions))) != shape:
+                    raise ValueError(
+                        f"the policy must return actions of shape {shape}, a row for each of "
+                        f"num_envs={self._num_envs} episodes, got {got}."
+                    )
+            length += ~over
+            stepped = {name: envs.step(actions) for name, envs in self._envs.items()}
+            obs = {name: result[0] for name, result in stepped.items()}
+            frames.append(self._frames(obs))
+            flags = [numpy_of(x) for x in stepped["clean"][1:4]]
+            steps.append((numpy_of(actions).astype(np.float32), *flags))
+            over |= flags[1] | flags[2]
+        for row, episode in enumerate(index):
+            end = int(length[row])
+            actions, *numbers = (
+                np.stack([step[part][row] for step in steps[:end]]) for part in range(4)
+            )
+            yield EpisodeBuffer(
+                id=int(episode),
+                observations={
+                    name: np.stack([frame[name][row] for frame in frames[: end + 1]])
+                    for name in self.spaces
+                },
+                actions=actions,
+                rewards=numbers[0],
+                terminations=numbers[1],
+                truncations=numbers[2],
+            )
+
+    def _reset(self, index: np.ndarray) -> dict[str, Any]:
+        """Start the episodes with these numbers; return both observations."""
+        with default_flags():
+            keys = VectorPixelEnv.env_keys(jax.random.key(EPISODES), self._levels.episodes)[index]
+        self._envs["level"]._stateful.params = self._levels.params_of(self._one, index)
+        found = {}
+        for name, envs in self._envs.items():
+            env, params = envs._stateful.env, envs._stateful.params
+            state, _ = VectorPixelEnv(env, self._num_envs).reset(keys, params)
+            found[name] = envs.reset(options={"state": state})[0]
+        return found
+
+    def _frames(self, obs: dict[str, Any]) -> dict[str, np.ndarray]:
+        """Return the newest frame of each image, and the state."""
+        parts = {**obs["clean"], "pixels_level": obs["level"]}
+        sizes = {name: space.shape[-1] for name, space in self.spaces.items()}
+        return {name: numpy_of(x)[..., -sizes[name] :].copy() for name, x in parts.items()}
+
+
+def _one_frame(space: Any, frames: int) -> Any:
+    """Return the part of a space that belongs to the newest of several frames."""
+    channels = slice(space.shape[-1] - space.shape[-1] // frames, None)
+    return gym.spaces.Box(space.low[..., channels], space.high[..., channels], dtype=space.dtype)
+
+
+def _storage(folder: Path, pairs: _Pairs, settings: dict[str, Any]) -> Any:
+    """Return Minari's storage of the folder, with the episodes that it has."""
+    try:
+        import minari.dataset._storages.arrow_storage  # noqa: F401  # it needs pyarrow
+        from minari.dataset.minari_storage import METADATA_FILE_NAME, MinariStorage
+    except ImportError as error:
+        raise ImportError(f"{error}; try: {install_extra('dataset')}") from error
+    settings = json.loads(json.dumps(settings, default=str))
+    about = folder / METADATA_FILE_NAME
+    if about.exists():
+        try:
+            found = MinariStorage.read_raw_metadata(folder).get(_SETTINGS)
+        except json.JSONDecodeError as error:
+            raise ValueError(f"{about} is damaged ({error}); delete the folder.") from error
+        if found != settings:
+            found = found if isinstance(found, dict) else {}
+            names = [n for n in {**settings, **found} if settings.get(n) != found.get(n)]
+            differ = "; ".join(f"{n}={found.get(n)!r}, not {settings.get(n)!r}" for n in names)
+            raise ValueError(f"{folder} has another recording: {differ}. Take another folder.")
+        return MinariStorage.read(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    if any(folder.iterdir()):
+        raise ValueError(f"{folder} has files, but no recording; take another folder.")
+    storage = MinariStorage.new(
+        folder,
+        gym.spaces.Dict(pairs.spaces),
+        pairs.action_space,
+        data_format="parquet",
+        jpeg_encoding=False,
+    )
+    name = "-".join([settings["task"], settings["suite"], settings["level"]])
+    storage.update_metadata(
+        {
+            "dataset_id": f"pixelbrax/{name}-v0",
+            "algorithm_name": settings["policy"],
+            "minari_version": metadata.version("minari"),
+            "description": f"Episodes of {settings['task']}, clean and under level "
+            f"{settings['level']} of suite {settings['suite']}, recorded by PixelBrax.",
+            _SETTINGS: settings,
+        }
+    )
+    return storage
