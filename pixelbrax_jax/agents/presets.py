@@ -165,6 +165,13 @@ _CPU_DMC_TASKS: dict[str, dict[str, Any]] = {
         "update_epochs": 3,
         "total_steps": 3_000_000,
     },
+    "dmc_ball_in_cup_catch": {
+        "action_repeat": 4,
+        "frame_stack": 3,
+        "gamma": 0.98,
+        "update_epochs": 3,
+        "total_steps": 3_000_000,
+    },
 }
 _CPU_SHARES = {"ppo": 1.0, "ppg": 0.7, "dcpg": 0.6}
 """Number of steps relative to PPO, whose updates are faster."""

@@ -7,9 +7,9 @@
     python -m tests.benchmarks.experiments --gpu                   those for a GPU in place of them
 
 A run that was cut short, by Ctrl-C or by --minutes, goes on from its checkpoint at the next call.
-Of a finished one docs/results/runs/<name>.json is kept, or docs/dmc/runs/<name>.json of a task of
-the DM Control Suite; of DrQ-v2 an entry of docs/leaderboard. `tests.benchmarks.figures` draws all
-of them, with the minutes that follow from the speed that `tests.benchmarks.pace` measures apart.
+Of a finished one docs/results/runs/<name>.json is kept; of DrQ-v2, or a task of the DM Control
+Suite, an entry of docs/leaderboard. `tests.benchmarks.figures` draws all of them, and those of
+docs/results with the minutes that follow from the speed that `tests.benchmarks.pace` measures.
 The best policy of each task goes into the package, for --pretrained.
 """
 
@@ -40,7 +40,6 @@ from pixelbrax_jax.tasks import DMC_TASKS
 
 DOCS = Path(__file__).parents[2] / "docs"
 KEPT = DOCS / "results" / "runs"
-KEPT_DMC = DOCS / "dmc" / "runs"
 LEADERBOARD = DOCS / "leaderboard"
 PRETRAINED = Path(pixelbrax_jax.__file__).parent / "pretrained"
 EPISODES = 32
@@ -113,15 +112,15 @@ def experiments() -> dict[str, list[str]]:
     for seed in range(3):
         for task in TASK_SETTINGS["cpu"]["ppo"]:
             if task in DMC_TASKS:
-                add("ppo", task, seed, "--num-evals", "3")
+                add("ppo", task, seed, "--num-evals", "16")
     return runs
 
 
 def kept_at(name: str) -> Path:
     """The file that keeps a run."""
-    if name.startswith("drqv2"):
-        return LEADERBOARD / f"{name}.json"
-    return (KEPT_DMC if name.split("-")[1] in DMC_TASKS else KEPT) / f"{name}.json"
+    algorithm, task, *_ = name.split("-")
+    timed = algorithm == "drqv2" or task in DMC_TASKS
+    return (LEADERBOARD if timed else KEPT) / f"{name}.json"
 
 
 def gpu_experiments() -> dict[str, list[str]]:
@@ -150,7 +149,7 @@ def record(folder: Path, arguments: list[str]) -> dict:
     """What is kept of a finished run: settings, returns over steps and time, evaluations."""
     about = read_about(folder / "checkpoints")
     command = {"command": shlex.join(["pixelbrax", *arguments]), "revision": REVISION}
-    if about["algorithm"] == "drqv2":
+    if about["algorithm"] == "drqv2" or about["config"]["task"] in DMC_TASKS:
         return command | leaderboard.entry(folder)
     records = read_metrics(folder / "metrics.jsonl")
     training = [r for r in records if "episode/return" in r]
@@ -160,8 +159,7 @@ def record(folder: Path, arguments: list[str]) -> dict:
         for r in records
         if "eval/clean/return" in r
     ]
-    physics = ("mujoco", "mujoco-mjx") if about["config"]["task"] in DMC_TASKS else ("brax",)
-    packages = ("jax", "jaxlib", *physics, "pixelbrax")
+    packages = ("jax", "jaxlib", "brax", "pixelbrax")
     return command | {
         "algorithm": about["algorithm"],
         "config": about["config"],
