@@ -26,6 +26,11 @@ class Distractor:
     kind: ClassVar[str]
     stream: ClassVar[int]
 
+    @property
+    def whole_image(self) -> bool:
+        """Whether ``change_frame`` needs all rows at once: a pixel depends on other rows."""
+        return False
+
     def reset(self, key: jax.Array, params: EnvParams) -> Any:
         """Sample the state at the first frame of an episode."""
         raise NotImplementedError(
@@ -86,6 +91,11 @@ class Chain:
             raise ValueError(f"the distractors {', '.join(kinds)} must have different streams.")
         known = {kind: place for place, kind in enumerate(self._ORDER)}
         self.links = tuple(sorted(links, key=lambda d: known.get(d.kind, len(known))))
+
+    @property
+    def whole_image(self) -> bool:
+        """Whether ``change_frame`` needs all rows at once."""
+        return any(link.whole_image for link in self.links)
 
     def reset(self, key: jax.Array, params: EnvParams) -> tuple[Any, ...]:
         """Sample states at the first frame of the episode with this key."""

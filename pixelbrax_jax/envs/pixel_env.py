@@ -365,7 +365,8 @@ class PixelEnv(ProgramConfig):
         def change(frame: Frame, rows: jax.Array) -> Frame:
             return self.chain.change_frame(sim.distractor_state, params, frame, rows, height, width)
 
-        return draw(scene, height, width, self.renderer, change, images, self.samples)
+        whole = self.chain.whole_image
+        return draw(scene, height, width, self.renderer, change, images, self.samples, whole)
 
     def blank_frames(self) -> Any:
         """Return frame stacks of zeros; an empty one without images."""

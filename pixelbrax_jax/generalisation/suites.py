@@ -197,6 +197,7 @@ def _axes(task: str) -> tuple[Level, ...]:
         "light-intensity": tuple(LightIntensity(amount) for amount in (0.2, 0.4, 0.6)),
         "light-color": tuple(LightColor(amount) for amount in (0.2, 0.4, 0.6)),
         "camera": tuple(MovingCamera(b, dynamic=False) for b in (0.1, 0.2, 0.3)),
+        "blur": tuple(ImageFilter(blur=size) for size in (0.01, 0.02, 0.04)),
         "contrast": tuple(ImageFilter(contrast=factor) for factor in (0.75, 0.5, 0.25)),
         "noise": tuple(ImageFilter(noise=size) for size in (0.05, 0.1, 0.2)),
         "tint": tuple(Color("frame", "static", b) for b in (0.1, 0.2, 0.3)),

@@ -107,12 +107,14 @@ def draw(
     change: Callable[[Frame, jax.Array], Frame],
     images: tuple[str, ...] = ("pixels",),
     samples: int = 1,
+    whole: bool = False,
 ) -> tuple[jax.Array, ...]:
     """Render images of one view, (height, width) each, only once in a program.
 
     ``pixels`` are packed, uint32; ``change(frame, rows)`` returns rows of the image with other
-    colors, for their indices (R,) int32. Its pixelwise part runs in the kernel, if a pixel has one
-    of the ``samples``. ``depth`` and ``segmentation`` are ``Frame.depth`` and ``Frame.seg``.
+    colors, for their indices (R,) int32: all of them if it needs the ``whole`` image. Its pixelwise
+    part runs in the kernel, if a pixel has one of the ``samples``. ``depth`` and ``segmentation``
+    are ``Frame.depth`` and ``Frame.seg``.
 
     Without a barrier XLA fuses the renderer into every reader of its image and runs it again for
     each. A Pallas kernel is never fused. Otherwise the barrier is control flow that XLA keeps: a
@@ -171,7 +173,8 @@ def draw(
     forms = {"cpu": conditionally, "tpu": behind_a_barrier}
     if renderer == "auto" and choice.why_no_kernel() is None:
         forms["cuda"] = by_kernel
-    drawn: tuple[jax.Array, ...] = jax.lax.platform_dependent(default=in_bands, **forms)
+    elsewhere = behind_a_barrier if whole else in_bands
+    drawn: tuple[jax.Array, ...] = jax.lax.platform_dependent(default=elsewhere, **forms)
     return drawn
 
 

@@ -1,4 +1,4 @@
-"""Tables, figures and learning curves about the DM Control Suite, from the results in docs/dmc."""
+"""Tables and figures about the DM Control Suite, from docs/dmc and docs/leaderboard."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from pathlib import Path
 from pixelbrax_gym.bench.tables import find, number, table
 from pixelbrax_jax.tasks import DMC_TASKS
 from tests.benchmarks import tables
-from tests.benchmarks.results import final, groups
 
 FOLDER = Path(__file__).parents[2] / "docs" / "dmc"
 
@@ -30,34 +29,6 @@ def rows() -> list[dict]:
 def speed() -> str:
     """Each task beside dm_control, in Markdown."""
     return tables.dmc(rows())
-
-
-def kept_runs() -> dict[str, list[dict]]:
-    """What is kept of the agents, by name; those of one name differ in their seeds alone."""
-    runs = {path.stem: json.loads(path.read_text("utf-8")) for path in FOLDER.glob("runs/*.json")}
-    return groups(runs)
-
-
-def learned() -> str:
-    """What the agents reach, in Markdown; their clocks went on while they were paused."""
-    lines = []
-    for name, seeds in kept_runs().items():
-        algorithm, task = name.split("-")[:2]
-        config = seeds[0]["config"]
-        ends = [final(run) for run in seeds]
-        reached = ", ".join(f"{end['return']:.0f} ± {end['standard_error']:.0f}" for end in ends)
-        steps = f"{config['total_steps'] / 1e6:.1f}"
-        lines.append(
-            [
-                f"`{task}`",
-                algorithm.upper(),
-                config["action_repeat"],
-                steps,
-                reached,
-            ]
-        )
-    heads = ("task", "agent", "action repeat", "million control steps", "return")
-    return table(heads, lines)
 
 
 def tasks() -> str:
@@ -164,14 +135,7 @@ def named(task: str) -> str:
     return f"{ratios()[task]:.0f} ({task.removeprefix('dmc_').replace('_', ' ')})"
 
 
-def end(name: str) -> str:
-    """The return at the end of the only run of that name."""
-    (run,) = kept_runs()[name]
-    return f"{final(run)['return']:.0f}"
-
-
 FIGURES = {
-    "learned": learned,
     "tasks": tasks,
     "least": lambda: named(next(iter(ratios()))),
     "most": lambda: named(next(reversed(ratios()))),
@@ -190,9 +154,9 @@ def of_leaderboard(file: str) -> dict:
     return json.loads((FOLDER.parent / "leaderboard" / file).read_text("utf-8"))
 
 
-def walker_walk(key: str, unit: float = 1.0) -> str:
-    """The end of DrQ-v2's run on walker walk."""
-    return f"{of_leaderboard('drqv2-dmc_walker_walk-0.json')[key][-1] / unit:.0f}"
+def end(name: str, key: str = "return", unit: float = 1.0) -> str:
+    """The last return of a run, or its frames or seconds."""
+    return f"{of_leaderboard(f'{name}.json')[key][-1] / unit:.0f}"
 
 
 def published_walker_walk() -> str:
@@ -206,9 +170,9 @@ README = {
     "cheetah-ratio": lambda: f"{ratios()['dmc_cheetah_run']:.0f}",
     "slowest": lambda: named(next(iter(ratios()))),
     "fastest": lambda: named(next(reversed(ratios()))),
-    "reacher": lambda: end("ppo-dmc_reacher_easy"),
-    "cartpole": lambda: end("ppo-dmc_cartpole_swingup"),
-    "walker": lambda: walker_walk("return"),
-    "walker-minutes": lambda: walker_walk("seconds", 60.0),
+    "reacher": lambda: end("ppo-dmc_reacher_easy-0"),
+    "cup": lambda: end("ppo-dmc_ball_in_cup_catch-0"),
+    "walker": lambda: end("drqv2-dmc_walker_walk-0"),
+    "walker-minutes": lambda: end("drqv2-dmc_walker_walk-0", "seconds", 60.0),
     "walker-published": published_walker_walk,
 }

@@ -128,7 +128,6 @@ def main() -> None:
         from tests.benchmarks import plots
 
         results.plot()
-        plots.learning_dmc(dmc_page.kept_runs(), dmc_page.FOLDER / "learning.png")
         folder = ROOT / "docs/leaderboard"
         if entries := leaderboard.read(folder):
             published = json.loads((folder / leaderboard.PUBLISHED).read_text("utf-8"))["agents"]

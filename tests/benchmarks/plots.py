@@ -61,23 +61,6 @@ def _curve(axes: plt.Axes, seeds: list[dict]) -> None:
     axes.plot(grid / 1e6, lines.mean(0), color=color, linewidth=1.8, label=algorithm.upper())
 
 
-def learning_dmc(runs: dict[str, list[dict]], path: Path) -> None:
-    """Return of training episodes over control steps, a line for each seed."""
-    figure, row = row_of_panels(len(runs), (4 * len(runs), 3.4))
-    for (name, seeds), axes in zip(runs.items(), row, strict=True):
-        for run in seeds:
-            end = run["steps"][-1]
-            grid = np.linspace(0.04 * end, end, 60)
-            line = [return_at(run, when, "steps", 0.04 * end) for when in grid]
-            axes.plot(grid / 1e6, line, color="C0", label="training episodes")
-            evaluated = [(e["steps"] / 1e6, e["clean/return"]) for e in run["evaluations"]]
-            axes.plot(*zip(*evaluated, strict=True), "o", color="C1", label="mean action")
-        axes.set(xlabel="million control steps", title=name.split("-")[1], ylim=(0, 1000))
-    row[0].set_ylabel("return")
-    _legend(row[0], row[0], fontsize=8)
-    figure.savefig(path, dpi=130)
-
-
 def _legend(axes: plt.Axes, of: plt.Axes, fontsize: int) -> None:
     """Show the labels of ``of`` once each."""
     handles, labels = of.get_legend_handles_labels()

@@ -1,12 +1,16 @@
-"""Contrast and noise, against formulas in NumPy."""
+"""Blur, contrast and noise, against formulas in NumPy."""
 
 from __future__ import annotations
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from pixelbrax_jax.distractors import ImageFilter
-from tests.distractors.conftest import episode
+from pixelbrax_jax.envs.pixel_env import PixelEnv
+from tests.distractors.conftest import SIZE, episode
+from tests.envs.toy import PARAMS, Ball
 
 
 def images(distractor, num_frames=3):
@@ -27,6 +31,55 @@ def test_contrast_moves_colors_towards_grey(clean, contrast):
     assert np.abs(images(ImageFilter(contrast=contrast)) - expected).max() <= 1.0
 
 
+@pytest.mark.parametrize("blur", [0.02, 0.1])
+def test_blur_is_a_mean_with_gaussian_weights(clean, blur):
+    scale = blur * clean.shape[1]
+    reach = int(np.ceil(3 * scale))
+    weights = np.exp(-(np.arange(-reach, reach + 1) ** 2) / (2 * scale**2))
+    weights /= weights.sum()
+    expected = np.zeros_like(clean)
+    height, width = clean.shape[1:3]
+    for row in range(height):
+        for column in range(width):
+            rows = np.clip(np.arange(row - reach, row + reach + 1), 0, height - 1)
+            columns = np.clip(np.arange(column - reach, column + reach + 1), 0, width - 1)
+            part = clean[:, rows][:, :, columns]
+            expected[:, row, column] = np.einsum("i,j,nijc->nc", weights, weights, part)
+    assert np.abs(expected - clean).max() > 10
+    # Both images are rounded.
+    assert np.abs(images(ImageFilter(blur=blur)) - expected).max() <= 1.0
+
+
+@pytest.mark.parametrize("platform", ["cuda", "tpu", "rocm"])
+def test_a_blurred_image_is_drawn_at_once(platform):
+    """A loop over bands of rows would blur each alone."""
+
+    def loops(distractor):
+        env = PixelEnv(Ball(), **SIZE, renderer="fused", distractors=(distractor,))
+        state = jax.eval_shape(env.reset, jax.random.key(0), PARAMS)[0]
+        traced = jax.jit(lambda sim: env.draw(sim, PARAMS)).trace(state.sim)
+        return traced.lower(lowering_platforms=(platform,)).as_text().count("stablehlo.while")
+
+    assert loops(ImageFilter(blur=0.05)) == 0
+    assert loops(ImageFilter(contrast=0.5)) == (0 if platform == "tpu" else 1)
+
+
+def test_colors_have_derivatives_through_a_blur():
+    env = PixelEnv(Ball(), **SIZE, distractors=(ImageFilter(blur=0.05),))
+    state, _ = env.reset(jax.random.key(0), PARAMS)
+
+    def red(rgb):
+        changed = PARAMS.replace(geoms=PARAMS.geoms.replace(rgb=rgb))
+        return env.render(state, changed).r.sum()
+
+    rgb = jnp.asarray(PARAMS.geoms.rgb) * 0.5
+    slope = jax.grad(red)(rgb)
+    change = jnp.zeros_like(rgb).at[:, 0].set(1e-2)
+    numeric = (red(rgb + change) - red(rgb - change)) / 2e-2
+    assert slope[:, 0].sum() > 1
+    np.testing.assert_allclose(slope[:, 0].sum(), numeric, rtol=0.02)
+
+
 def test_noise_is_uniform_and_new_in_every_pixel_channel_and_frame(clean):
     noise = images(ImageFilter(noise=0.1)) - clean
     assert np.abs(noise).max() <= 0.1 * 255 + 1
@@ -43,6 +96,11 @@ def test_noise_is_uniform_and_new_in_every_pixel_channel_and_frame(clean):
     pairs.append((pixels[1:, 0], pixels[:-1, 0]))
     for one, other in pairs:
         assert abs(np.corrcoef(one, other)[0, 1]) < 5 / np.sqrt(len(one))
+
+
+def test_blur_is_bounded():
+    with pytest.raises(ValueError, match=r"blur of ImageFilter must lie in \[0, 0.1\], got 0.2"):
+        ImageFilter(blur=0.2)
 
 
 @pytest.mark.parametrize("options", [{"contrast": 1.5}, {"noise": -0.1}])

@@ -93,7 +93,7 @@ def test_subtle_has_five_sizes():
 
 @pytest.mark.parametrize(
     ("suite", "num_levels", "num_programs"),
-    [("axes", 31, 13), ("dmcgb", 13, 11), ("dcs", 13, 5), ("paper", 3, 3), ("tiny", 3, 1)],
+    [("axes", 34, 16), ("dmcgb", 13, 11), ("dcs", 13, 5), ("paper", 3, 3), ("tiny", 3, 1)],
 )
 def test_levels_share_programs(suite, num_levels, num_programs):
     clips = None if suite == "tiny" else "procedural"
