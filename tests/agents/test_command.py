@@ -61,7 +61,7 @@ def test_a_preset_without_settings_of_the_task_is_told(capsys):
     assert main(["train", "ppo", "--preset", "cpu", "--task", "pusher"]) == 1
     told = capsys.readouterr().err
     assert "the preset 'cpu' has no settings for task 'pusher'; use preset 'default'" in told
-    assert "one of its tasks: ant, dmc_cartpole" in told
+    assert "one of its tasks: ant, dmc_ball_in_cup_catch, dmc_cartpole" in told
     assert main(["train", "ppo", "--preset", "gpu"]) == 2
     assert "Did you mean 'cpu'" in capsys.readouterr().err
 
