@@ -139,6 +139,13 @@ def test_links_resolve(name):
             assert anchor in anchors_of(text), f"{name}: {link}"
 
 
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_no_line_of_a_paragraph_begins_with_a_figure(page):
+    """Markdown would end the paragraph before a line that begins with a comment."""
+    found = re.findall(r"^ *<!-- [\w-]+ -->\S.*", page.read_text("utf-8"), re.MULTILINE)
+    assert not found
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_included_sections_exist(name):
     page = (ROOT / name).read_text("utf-8")

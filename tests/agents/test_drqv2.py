@@ -80,7 +80,7 @@ def test_no_turn_of_the_learning_loop_copies_the_replay():
     assert not re.search(frames, program)
 
 
-@pytest.mark.parametrize("stored", [True, False])
+@pytest.mark.parametrize("stored", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_resumed_run_goes_on_with_or_without_its_replay(tmp_path, stored):
     def algorithm(iterations):
         config = LATE.config.replace(checkpoint_replay=stored, total_steps=32 * iterations)
@@ -115,6 +115,7 @@ def test_a_replay_that_does_not_fit_beside_the_state_is_told_with_the_largest(tm
     run(DrQv2(config.replace(buffer_size=largest), ball_envs()), PARAMS, options)
 
 
+@pytest.mark.slow
 def test_returns_outside_the_range_of_c51_are_told_once(tmp_path):
     narrow = replace(LATE.config, critic="c51", v_min=-0.01, v_max=0.01)
     lines = []
@@ -132,6 +133,7 @@ def test_a_policy_in_a_file_acts_as_the_agent(tmp_path):
     np.testing.assert_allclose(load_policy(path)(pixels), expected, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_seeds_of_one_program_are_those_of_their_own(tmp_path):
     config = LATE.config.replace(total_steps=32 * 3)
     agent, options = DrQv2(config, ball_envs()), RunConfig(str(tmp_path / "2"), progress=False)

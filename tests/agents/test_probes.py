@@ -177,7 +177,12 @@ def values_of(algorithm, networks, images):
     return algorithm.values(outputs).mean(0)
 
 
-@pytest.fixture(scope="module", params=AGENTS)
+# Phasic agents and C51 learn by what the others learn by.
+FEW = ("ppo", "drqv2")
+LEARNERS = [pytest.param(n, marks=() if n in FEW else pytest.mark.slow) for n in AGENTS]
+
+
+@pytest.fixture(scope="module", params=LEARNERS)
 def learned(request, envs, images):
     """Values and mean actions by place, of an agent that has learned."""
     make, config = AGENTS[request.param]
@@ -241,6 +246,7 @@ class Memory(Probes):
         return first.replace(engine=jnp.int32(place))
 
 
+@pytest.mark.slow
 def test_a_stack_tells_what_the_second_newest_frame_shows():
     settings = SHARED | REPLAY | {"total_steps": 16 * 8 * 40}
     config = DrQv2Config(**settings).replace(frame_stack=2, episode_length=5)

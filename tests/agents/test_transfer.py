@@ -140,6 +140,7 @@ def is_loaded(monkeypatch: pytest.MonkeyPatch, policy: Any = waver, **options: A
     monkeypatch.setattr(evaluate, "load", lambda *_: agent)
 
 
+@pytest.mark.slow
 def test_our_picture_of_dm_controls_physics_is_the_same(monkeypatch, capsys):
     pytest.importorskip("dm_control.suite", exc_type=ImportError)
     is_loaded(monkeypatch, distractors=("color",))

@@ -149,6 +149,7 @@ def test_a_value_moves_what_the_layout_lets_it(layout, moved):
     assert moved_by_value(layout) == moved
 
 
+@pytest.mark.slow
 def test_a_run_is_its_iterations_and_runs_may_be_mapped_over_keys():
     keys = jax.vmap(jax.random.key)(jnp.arange(2))
     train = train_function(PPG_AGENT.algorithm, PARAMS)
