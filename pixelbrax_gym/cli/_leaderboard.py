@@ -135,24 +135,33 @@ def page(folder: str | Path) -> str:
     file = Path(folder) / PUBLISHED
     published = json.loads(file.read_text("utf-8"))["agents"] if file.exists() else {}
     heads = ["task", "agent", "seeds", *(f"{minutes} min" for minutes in MINUTES)]
-    heads += [f"{frames // 1000:,}k frames" for frames in FRAMES]
+    heads += [f"{frames // 1000:,}k frames" for frames in FRAMES] + ["end"]
     lines = []
     for task in sorted({task for task, _ in groups}):
         for (_, agent), runs in sorted(item for item in groups.items() if item[0][0] == task):
             times = [_shown(runs, "seconds", 60.0 * minutes) for minutes in MINUTES]
             counts = [_shown(runs, "frames", frames) for frames in FRAMES]
-            lines.append([f"`{task}`", agent, len(runs), *times, *counts])
+            lines.append([f"`{task}`", agent, len(runs), *times, *counts, _end(runs)])
         for agent, about in published.items():
             if found := about["returns"].get(task):
                 counts = [f"{found[str(n)]:.0f}" if str(n) in found else "" for n in FRAMES]
                 lines.append(
-                    [f"`{task}`", f"{agent}, published", about["seeds"], "", "", "", *counts]
+                    [f"`{task}`", f"{agent}, published", about["seeds"], "", "", "", *counts, ""]
                 )
     return table(heads, lines)
 
 
+def _end(runs: list[Entry]) -> str:
+    """Return the last returns, and after how many frames."""
+    frames = max(run["frames"][-1] for run in runs)
+    return f"{_middle([run['return'][-1] for run in runs])} at {frames / 1e6:.1f}M"
+
+
 def _shown(runs: list[Entry], clock: str, when: float) -> str:
-    scores = [x for run in runs if not math.isnan(x := return_at(run, clock, when))]
+    return _middle([x for run in runs if not math.isnan(x := return_at(run, clock, when))])
+
+
+def _middle(scores: list[float]) -> str:
     if not scores:
         return ""
     # The interquartile mean, as in rliable (arXiv 2108.13264).

@@ -135,7 +135,23 @@ def named(task: str) -> str:
     return f"{ratios()[task]:.0f} ({task.removeprefix('dmc_').replace('_', ' ')})"
 
 
+def transfer() -> str:
+    """Returns of policies here and in dm_control, from the same starts, in Markdown."""
+    lines = [
+        [
+            f"`{one['task']}`",
+            one["episodes"],
+            f"{one['return']:.0f}",
+            f"{one['return_there']:.0f}",
+            f"{one['difference']:+.0f} ± {one['difference_standard_error']:.0f}",
+        ]
+        for one in json.loads((FOLDER / "transfer.json").read_text("utf-8"))
+    ]
+    return table(["policy", "episodes", "here", "in dm_control", "difference"], lines)
+
+
 FIGURES = {
+    "transfer": transfer,
     "tasks": tasks,
     "least": lambda: named(next(iter(ratios()))),
     "most": lambda: named(next(reversed(ratios()))),

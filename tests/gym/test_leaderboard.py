@@ -82,8 +82,8 @@ def test_the_table_has_a_row_for_each_task_and_agent(tmp_path, capsys):
     )
     # 100,000 frames take 1,000 seconds.
     assert ours == ["`ant`", "PPO, mine", "4", "2 (1 to 100)", "2 (1 to 100)", "", *ours[6:]]
-    assert ours[6:] == ["2 (1 to 100)", "", ""]
-    assert theirs == ["`ant`", "Other, published", "5", "", "", "", "", "7", ""]
+    assert ours[6:] == ["2 (1 to 100)", "", "", "2 (1 to 100) at 0.1M"]
+    assert theirs == ["`ant`", "Other, published", "5", "", "", "", "", "7", "", ""]
 
 
 def test_another_run_is_not_overwritten(tmp_path, capsys):
