@@ -25,8 +25,9 @@ def features(pixels: np.ndarray, cells: int) -> np.ndarray:
     """Map (T, H, W, C) uint8 pixels to (T - 2, D) means of cells of three consecutive frames."""
     _, height, width, _ = pixels.shape
     rows, columns = (np.arange(cells) * size // cells for size in (height, width))
-    means = np.add.reduceat(np.add.reduceat(pixels, rows, 1, np.float64), columns, 2)
-    means = means.reshape(len(pixels), -1) / means.max(initial=1.0)
+    sums = np.add.reduceat(np.add.reduceat(pixels, rows, 1, np.float64), columns, 2)
+    areas = np.outer(np.diff(rows, append=height), np.diff(columns, append=width))
+    means = (sums / (255.0 * areas[..., None])).reshape(len(pixels), -1)
     ends = range(FRAMES, len(pixels) + 1)
     return np.stack([means[end - FRAMES : end].ravel() for end in ends])
 
@@ -45,6 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
     parser.add_argument("--ridge", type=float, default=1.0, help="weight of the penalty")
     options = parser.parse_args(arguments)
     episodes = list(minari.MinariDataset(options.dataset).iterate_episodes())
+    episodes = [one for one in episodes if len(one.rewards) >= FRAMES - 1]
     if len(episodes) < 5:
         parser.error(f"{options.dataset} has {len(episodes)} episodes; record at least 5.")
 

@@ -153,8 +153,9 @@ def page(folder: str | Path) -> str:
 
 def _end(runs: list[Entry]) -> str:
     """Return the last returns, and after how many frames."""
-    frames = max(run["frames"][-1] for run in runs)
-    return f"{_middle([run['return'][-1] for run in runs])} at {frames / 1e6:.1f}M"
+    ends = [run["frames"][-1] / 1e6 for run in runs]
+    frames = dict.fromkeys(f"{end:.1f}" for end in (min(ends), max(ends)))
+    return f"{_middle([run['return'][-1] for run in runs])} at {' to '.join(frames)}M"
 
 
 def _shown(runs: list[Entry], clock: str, when: float) -> str:

@@ -43,10 +43,12 @@ class Options(AgentOptions):
     """Images that the agent sees: clean or level."""
     num_envs: int = 8
     """Number of episodes that are played, and held in memory, together."""
-    height: int = 84
-    """Height of the images in pixels, with --task; else as in the training."""
-    width: int = 84
-    """Width of the images in pixels, with --task; else as in the training."""
+    height: int | None = None
+    """Height of the images in pixels, only with --task; default: 84."""
+    width: int | None = None
+    """Width of the images in pixels, only with --task; default: 84."""
+    clips: str | None = None
+    """Folder of the videos, or procedural, for levels that show any."""
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -54,13 +56,22 @@ def run(arguments: Sequence[str]) -> int:
     options = parse("dataset", Options, arguments)
     from pixelbrax_gym.generalisation.pairs import record_pairs
 
-    if options.task is None:
-        policy, name, env = _played(load(options, options.folder), options)
-    elif options.folder is None and options.pretrained is None:
-        policy, name = None, "uniform"
-        env = {"task": options.task, "height": options.height, "width": options.width}
+    size = {name: getattr(options, name) for name in ("height", "width")}
+    size = {name: number for name, number in size.items() if number is not None}
+    agent = [options.folder, options.pretrained, options.steps, options.best, options.run_index]
+    if options.task is not None:
+        if any(agent):
+            raise ValueError("--task is for random actions; leave out the agent and its options.")
+        policy, name, env = None, "uniform", {"task": options.task, **size}
+    elif not any(agent[:2]):
+        raise ValueError(
+            "who acts? Give the folder of a run, --pretrained with a name, or --task for random "
+            "actions."
+        )
+    elif size:
+        raise ValueError(f"--{next(iter(size))} is only for --task; an agent has its own size.")
     else:
-        raise ValueError("--task is for random actions; leave it out, or the agent.")
+        policy, name, env = _played(load(options, options.folder), options)
     path = record_pairs(
         policy,
         env.pop("task"),

@@ -142,5 +142,8 @@ class _Envs:
 
 
 def numpy_of(array: Any) -> np.ndarray:
-    """Return an array of NumPy, JAX or torch in host memory."""
-    return np.asarray(array.cpu().numpy() if hasattr(array, "cpu") else array)
+    """Return an array of NumPy, JAX or torch in host memory; bfloat16 becomes float32."""
+    if hasattr(array, "detach"):
+        array = array.detach().cpu()
+        array = (array.float() if array.is_floating_point() else array).numpy()
+    return np.asarray(array)

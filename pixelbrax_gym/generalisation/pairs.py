@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from importlib import metadata
@@ -26,6 +27,9 @@ from pixelbrax_jax.validation import check_choice, check_positive_int
 
 VIEWS = ("clean", "level")
 IMAGES = ("depth", "segmentation")
+
+_ABOUT, _KEPT = "metadata.json", ".kept"
+"""Minari's file about the dataset or an episode, and the suffix of the former's copy."""
 
 _SETTINGS = "pixelbrax"
 """Key of the recording's settings in the metadata."""
@@ -59,7 +63,8 @@ def record_pairs(
       -1, of the clean image, if in ``images``;
     * ``state``: (S,) float32, the task's observation of the state.
 
-    Actions are (A,) float32. Numbers that are the same in both, such as rewards, are stored once.
+    Actions are (A,) float32, clipped to [-1, 1] as the environment does. Numbers that are the same
+    in both, such as rewards, are stored once.
 
     Args:
         policy: as in ``evaluate_suite``; None samples actions uniformly.
@@ -72,7 +77,7 @@ def record_pairs(
         clips: folder of the videos, or ``"procedural"``, for levels that show any.
         images: any of ``depth`` and ``segmentation``.
         sees: which images the policy sees, ``clean`` or ``level``.
-        policy_name: name of the policy in the dataset.
+        policy_name: name of the policy in the dataset; another policy needs another name or folder.
         num_envs: number of episodes that are played, and held in memory, together.
         output: type of the policy's observations, ``"numpy"``, ``"torch"`` or ``"jax"``.
         report: takes lines about the size and progress.
@@ -87,7 +92,9 @@ def record_pairs(
         FileNotFoundError: clips are missing; the message says where to get them.
         TypeError: an option is unknown, the suite's own or ``obs_mode``.
         ImportError: Minari is missing; the message says how to install it.
+        RuntimeError: rewards or ends under the level are not those of the clean episode.
     """
+    images = (images,) if isinstance(images, str) else tuple(images)
     if policy is not None and not callable(policy):
         raise TypeError(f"policy must be a function of observations or None, got {policy!r}.")
     check_choice("suite", suite, SUITES)
@@ -96,12 +103,12 @@ def record_pairs(
         check_choice("images", name, IMAGES)
     if own := [name for name in (*LEFT_OUT, "obs_mode") if name in options]:
         raise TypeError(f"{own[0]} is decided by the recording; leave it out.")
-    reserved = ("output_dir", "policy_name", "num_envs", "output", "report")
-    config = env_config(task, options, reserved)
+    reserved = ("output_dir", "episodes", "clips", "images", "sees", "policy_name", "num_envs")
+    config = env_config(task, options, (*reserved, "output", "report"))
     episodes = SUITES[suite].episodes if episodes is None else episodes
     levels = make_levels(config, suite, episodes, clips, report, only=level)
     num_envs = min(check_positive_int("num_envs", num_envs), levels.episodes)
-    pairs = _Pairs(config, levels, tuple(images), num_envs, output)
+    pairs = _Pairs(config, levels, images, num_envs, output)
     settings = scores_of(config, suite, levels).options | {
         "task": config.task,
         "suite": suite,
@@ -114,10 +121,14 @@ def record_pairs(
     first = storage.total_episodes
     size = pairs.bytes_per_episode * (episodes - first) / 1e9
     report(f"{episodes - first} episodes, at most {size:.2f} GB before compression")
+    about = storage.data_path / _ABOUT
     while first < episodes:
-        batch = pairs.play(first, policy, sees)
-        storage.update_episodes(batch)
+        for number in range(first, min(first + num_envs, episodes)):
+            # Of an episode that was being written when a recording was stopped.
+            (storage.data_path / str(number) / _ABOUT).unlink(missing_ok=True)
+        storage.update_episodes(pairs.play(first, policy, sees))
         first = storage.total_episodes
+        shutil.copyfile(about, about.with_suffix(_KEPT))
         report(f"{first} of {episodes} episodes")
     return Path(output_dir)
 
@@ -153,7 +164,7 @@ class _Pairs:
         frames = {n: 1 if n == "state" else config.frame_stack for n in stacks}
         self.spaces = {n: _one_frame(space, frames[n]) for n, space in stacks.items()}
         self.action_space: Any = clean.single_action_space
-        self._num_steps = -(-clean._stateful.episode_length // config.action_repeat)
+        self._num_steps = clean._stateful.max_episode_steps
 
     @property
     def bytes_per_episode(self) -> int:
@@ -167,13 +178,15 @@ class _Pairs:
 
         index = np.arange(first, min(first + self._num_envs, self._levels.episodes))
         obs = self._reset(np.resize(index, self._num_envs))
-        random = np.random.default_rng((EPISODES, first))
+        random = [np.random.default_rng([EPISODES, int(number)]) for number in index]
         shape = (self._num_envs, *self.action_space.shape)
-        frames, steps, length = [self._frames(obs)], [], np.zeros(self._num_envs, int)
+        frames, length = [self._frames(obs)], np.zeros(self._num_envs, int)
+        steps: list[tuple[np.ndarray, ...]] = []
         over = np.zeros(self._num_envs, bool)
         while not over.all():
             if policy is None:
-                actions: Any = random.uniform(-1.0, 1.0, shape).astype(np.float32)
+                drawn = [one.uniform(-1.0, 1.0, shape[1:]) for one in random]
+                actions: Any = np.resize(np.array(drawn, np.float32), shape)
             else:
                 seen = obs[sees]
                 actions = policy(seen["pixels"] if sees == "clean" else seen)
@@ -186,9 +199,17 @@ class _Pairs:
             stepped = {name: envs.step(actions) for name, envs in self._envs.items()}
             obs = {name: result[0] for name, result in stepped.items()}
             frames.append(self._frames(obs))
-            flags = [numpy_of(x) for x in stepped["clean"][1:4]]
-            steps.append((numpy_of(actions).astype(np.float32), *flags))
-            over |= flags[1] | flags[2]
+            rewards, terminated, truncated = (numpy_of(x) for x in stepped["clean"][1:4])
+            for one, other in zip(stepped["clean"][1:4], stepped["level"][1:4], strict=True):
+                if not np.allclose(numpy_of(one)[~over], numpy_of(other)[~over], 1e-3, 1e-3):
+                    raise RuntimeError(
+                        f"the episodes part in step {len(steps)} of episodes {index[0]} to "
+                        f"{index[-1]}: the simulation is not the same in both programs. Please "
+                        "report it with the output of `pixelbrax doctor`."
+                    )
+            played = np.clip(numpy_of(actions).astype(np.float32), -1.0, 1.0)
+            steps.append((played, rewards, terminated, truncated))
+            over |= terminated | truncated
         for row, episode in enumerate(index):
             end = int(length[row])
             actions, *numbers = (
@@ -235,16 +256,20 @@ def _storage(folder: Path, pairs: _Pairs, settings: dict[str, Any]) -> Any:
     """Return Minari's storage of the folder, with the episodes that it has."""
     try:
         import minari.dataset._storages.arrow_storage  # noqa: F401  # it needs pyarrow
-        from minari.dataset.minari_storage import METADATA_FILE_NAME, MinariStorage
+        from minari.dataset.minari_storage import MinariStorage
     except ImportError as error:
         raise ImportError(f"{error}; try: {install_extra('dataset')}") from error
     settings = json.loads(json.dumps(settings, default=str))
-    about = folder / METADATA_FILE_NAME
+    about = folder / _ABOUT
     if about.exists():
         try:
             found = MinariStorage.read_raw_metadata(folder).get(_SETTINGS)
         except json.JSONDecodeError as error:
-            raise ValueError(f"{about} is damaged ({error}); delete the folder.") from error
+            # It was being written when a recording was stopped.
+            if not about.with_suffix(_KEPT).exists():
+                raise ValueError(f"{about} is damaged ({error}); delete the folder.") from error
+            shutil.copyfile(about.with_suffix(_KEPT), about)
+            found = MinariStorage.read_raw_metadata(folder).get(_SETTINGS)
         if found != settings:
             found = found if isinstance(found, dict) else {}
             names = [n for n in {**settings, **found} if settings.get(n) != found.get(n)]

@@ -50,9 +50,9 @@ def draw_rows(draw: Callable[..., Any], arguments: tuple[Any, ...], like: Any, r
     """
     num_rows = len(jax.tree.leaves(arguments)[0])
     together = jax.vmap(jax.jit(draw, inline=True))
-    turns = -(-num_rows * rays // _RAYS)
-    size = -(-num_rows // turns)
-    if size == num_rows:
+    size = -(-num_rows // -(-num_rows * rays // _RAYS))
+    turns = -(-num_rows // size)
+    if turns == 1:
         return together(*arguments)
 
     def in_turns(*arguments: Any) -> Any:

@@ -79,7 +79,7 @@ class PixelEnv(ProgramConfig):
 
     def _check_distractors(self) -> None:
         for kind in (link.kind for link in self.chain.links):
-            if kind in ("color", "video") and "pixels" not in self.images:
+            if kind in ("color", "video", "light", "filter") and "pixels" not in self.images:
                 raise ValueError(
                     f"distractor {kind!r} changes only colors, which obs_mode={self.obs_mode!r} "
                     "does not show: leave it out, or add 'pixels' to obs_mode."

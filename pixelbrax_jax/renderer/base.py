@@ -132,17 +132,22 @@ def draw(
             planes["pixels"] = pack(change(frame, rows))
         return tuple(planes[name] for name in images)
 
-    def draw_rows(first_row: jax.Array, num_rows: int) -> tuple[jax.Array, ...]:
-        frame = render(
+    def render_rows(first_row: jax.Array, num_rows: int) -> Frame:
+        return render(
             scene, height, width, plain, first_row=first_row, num_rows=num_rows, samples=samples
         )
-        return planes_of(frame, jnp.minimum(first_row + jnp.arange(num_rows), height - 1))
+
+    def draw_rows(first_row: jax.Array, num_rows: int) -> tuple[jax.Array, ...]:
+        rows = jnp.minimum(first_row + jnp.arange(num_rows), height - 1)
+        return planes_of(render_rows(first_row, num_rows), rows)
 
     def in_bands() -> tuple[jax.Array, ...]:
         num_rows = -(-height // _BANDS)
+        band = render_rows if whole else draw_rows
         first_rows = jnp.arange(_BANDS) * num_rows
-        bands = jax.lax.map(lambda first_row: draw_rows(first_row, num_rows), first_rows)
-        return tuple(band.reshape(-1, width)[:height] for band in bands)
+        bands = jax.lax.map(lambda first_row: band(first_row, num_rows), first_rows)
+        joined = jax.tree.map(lambda x: x.reshape(-1, width)[:height], bands)
+        return planes_of(joined, jnp.arange(height)) if whole else joined
 
     def conditionally() -> tuple[jax.Array, ...]:
         # On a CPU, XLA first clears the result of a loop, and runs what is fused into the writes
@@ -173,8 +178,7 @@ def draw(
     forms = {"cpu": conditionally, "tpu": behind_a_barrier}
     if renderer == "auto" and choice.why_no_kernel() is None:
         forms["cuda"] = by_kernel
-    elsewhere = behind_a_barrier if whole else in_bands
-    drawn: tuple[jax.Array, ...] = jax.lax.platform_dependent(default=elsewhere, **forms)
+    drawn: tuple[jax.Array, ...] = jax.lax.platform_dependent(default=in_bands, **forms)
     return drawn
 
 

@@ -7,6 +7,7 @@ import pytest
 
 from pixelbrax_gym import evaluate_suite, record_pairs
 from pixelbrax_gym.cli import dataset, main
+from pixelbrax_gym.gymnasium.vector_env import GymnasiumVectorEnv
 from pixelbrax_jax.generalisation import suites
 from pixelbrax_jax.generalisation.changes import BodyColor
 from tests.examples.test_examples import load
@@ -86,6 +87,8 @@ def test_a_stopped_recording_continues(policy, tmp_path):
     # The last episode was being written.
     (tmp_path / "cut" / "2").mkdir()
     (tmp_path / "cut" / "2" / "part-0.parquet").write_bytes(b"PAR1 and no more")
+    (tmp_path / "cut" / "2" / "metadata.json").write_text('{"id": ')
+    (tmp_path / "cut" / "metadata.json").write_text('{"total_')
     for one, other in zip(record(tmp_path / "cut", policy, report=told.append), whole, strict=True):
         same(one, other)
     assert told == [
@@ -137,7 +140,7 @@ def test_the_example_reads_the_state_of_clean_images_alone(tmp_path, monkeypatch
     [
         ({"level": "turnt"}, ValueError, "unknown level: 'turnt'.*Did you mean 'turned'"),
         ({"sees": "both"}, ValueError, "unknown sees: 'both'; allowed: clean, level"),
-        ({"images": ("normals",)}, ValueError, "unknown images: 'normals'; allowed: depth, seg"),
+        ({"images": "normals"}, ValueError, "unknown images: 'normals'; allowed: depth, seg"),
         ({"obs_mode": "depth"}, TypeError, "obs_mode is decided by the recording; leave it out"),
         ({"policy": 3}, TypeError, "policy must be a function of observations or None, got 3"),
         ({"num_envs": 0}, ValueError, "num_envs must be a positive integer, got 0"),
@@ -170,5 +173,50 @@ def test_a_folder_holds_one_recording(tmp_path):
     with pytest.raises(ValueError, match="full has files, but no recording"):
         record(tmp_path / "full")
     (tmp_path / "one" / "metadata.json").write_text('{"total_')
+    # The copy of the last batch continues; without it nobody knows what the folder has.
+    assert len(record(tmp_path / "one", of_jax, output="jax", episodes=1)) == 1
+    (tmp_path / "one" / "metadata.json").write_text('{"total_')
+    (tmp_path / "one" / "metadata.kept").unlink()
     with pytest.raises(ValueError, match=r"metadata\.json is damaged .*; delete the folder"):
         record(tmp_path / "one", of_jax, output="jax", episodes=1)
+
+
+def test_torch_policies_may_need_a_gradient_or_have_low_precision(tmp_path):
+    torch = pytest.importorskip("torch")
+    weight = torch.ones(1, requires_grad=True)
+
+    def policy(obs):
+        action = torch.as_tensor(of_numpy(obs.numpy())) * 5.0
+        return (action * weight).to(torch.bfloat16)
+
+    for episode in record(tmp_path, policy, output="torch", episodes=1):
+        assert episode.actions.dtype == np.float32
+        assert np.abs(episode.actions).max() == 1.0, "as played"
+
+
+def test_another_simulation_under_the_level_is_told(tmp_path, monkeypatch):
+    step = GymnasiumVectorEnv.step
+
+    def drifting(envs, actions):
+        found = step(envs, actions)
+        clean = isinstance(found[0], dict)
+        return found if clean else (found[0], found[1] + 0.1, *found[2:])
+
+    monkeypatch.setattr(GymnasiumVectorEnv, "step", drifting)
+    with pytest.raises(RuntimeError, match="the episodes part in step 0 of episodes 0 to 1"):
+        record(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("more", "told"),
+    [
+        (["--height", "9"], "who acts? Give the folder of a run, --pretrained with a name"),
+        (["run", "--task", "ant"], "--task is for random actions; leave out the agent"),
+        (["--task", "ant", "--best"], "--task is for random actions; leave out the agent"),
+        (["run", "--width", "9"], "--width is only for --task; an agent has its own size"),
+    ],
+)
+def test_the_command_tells_who_may_act(more, told, tmp_path, capsys):
+    where = ["--suite", "tiny", "--level", "painted", "--output-dir", str(tmp_path)]
+    assert main(["dataset", *more, *where]) == 1
+    assert told in capsys.readouterr().err

@@ -91,6 +91,23 @@ def test_images_in_turns_are_those_of_all_together(num_rows, rays, monkeypatch):
     jax.tree.map(np.testing.assert_array_equal, found, jax.jit(jax.vmap(draw))(keys, shades))
 
 
+@pytest.mark.parametrize(
+    ("num_rows", "rays", "turns"), [(7, 7, 3), (10, 18, 5), (10, 8, 4), (128, 9, 43), (3, 7, 0)]
+)
+def test_no_turn_draws_again_what_others_drew(num_rows, rays, turns, monkeypatch):
+    monkeypatch.setattr(batches, "_RAYS", 21)
+    loops = []
+
+    def counted(first, last, body, carry):
+        loops.append(last - first)
+        return carry
+
+    monkeypatch.setattr(batches.jax.lax, "fori_loop", counted)
+    like = jax.ShapeDtypeStruct((), jnp.float32)
+    jax.eval_shape(lambda x: draw_rows(jnp.sin, (x,), like, rays), jnp.zeros(num_rows))
+    assert sum(loops) == turns
+
+
 @pytest.mark.parametrize(("look", "loops"), [("dmc", 1), ("default", 0)])
 def test_only_images_of_several_are_drawn_in_turns(look, loops, monkeypatch):
     monkeypatch.setattr(batches, "_RAYS", 3 * 8 * 8)
