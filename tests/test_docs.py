@@ -116,7 +116,7 @@ def test_make_commands_exist(name):
     for block in blocks_of((ROOT / name).read_text("utf-8")):
         if block.language not in ("bash", "console", "sh"):
             continue
-        for line in block.code.splitlines():
+        for line in block.code.replace("\\\n", " ").splitlines():
             words = shlex.split(line, comments=True)
             if words[:1] == ["make"]:
                 targets = {w for w in words[1:] if "=" not in w and not w.startswith("-")}

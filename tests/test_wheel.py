@@ -91,7 +91,18 @@ def test_the_metadata_says_what_a_user_needs(wheel):
     assert metadata["Name"] == "pixelbrax"
     assert metadata["License-Expression"] == "Apache-2.0"
     assert metadata["Requires-Python"] == ">=3.11"
-    extras = {"torch", "torchrl", "sb3", "dmc", "clips", "human", "video", "demo", "train"}
+    extras = {
+        "torch",
+        "torchrl",
+        "sb3",
+        "dmc",
+        "clips",
+        "human",
+        "video",
+        "demo",
+        "train",
+        "dataset",
+    }
     extras |= {"cuda12", "cuda13"}
     extras |= {"all", "test", "dev", "docs"}
     assert set(metadata.get_all("Provides-Extra")) == extras
