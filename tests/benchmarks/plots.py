@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -61,10 +62,12 @@ def _curve(axes: plt.Axes, seeds: list[dict]) -> None:
     axes.plot(grid / 1e6, lines.mean(0), color=color, linewidth=1.8, label=algorithm.upper())
 
 
-def _legend(axes: plt.Axes, of: plt.Axes, fontsize: int) -> None:
-    """Show the labels of ``of`` once each."""
-    handles, labels = of.get_legend_handles_labels()
-    named = dict(zip(labels, handles, strict=True))
+def _legend(axes: plt.Axes, panels: Iterable[plt.Axes], fontsize: int) -> None:
+    """Show the labels of all panels once each."""
+    named: dict[str, Any] = {}
+    for panel in panels:
+        handles, labels = panel.get_legend_handles_labels()
+        named |= zip(labels, handles, strict=True)
     axes.legend(named.values(), named.keys(), fontsize=fontsize)
 
 
@@ -97,7 +100,7 @@ def leaderboard(entries: list[dict], published: dict[str, dict], path: Path) -> 
             axes.grid(alpha=0.3)
             if task.startswith("dmc_"):
                 axes.set_ylim(0, 1050)
-    _legend(panels[0, 0], panels[1, 0], fontsize=7)
+    _legend(panels[0, 0], panels.flat, fontsize=7)
     figure.savefig(path, dpi=110)
 
 
