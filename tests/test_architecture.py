@@ -53,7 +53,7 @@ ALLOWED: dict[str, set[str]] = {
     "pixelbrax_jax.ranges": {"pixelbrax_jax.types", "pixelbrax_jax.validation"},
     "pixelbrax_jax.config": _below("plain", "ranges", *LAYERS),
     # What differs by device: it knows nothing of PixelBrax.
-    "pixelbrax_jax._platform": set(),
+    "pixelbrax_jax._platform": {"pixelbrax_jax.flags"},
     "pixelbrax_jax.registry": _below("tasks", "physics"),
     "pixelbrax_jax.envs": _below("config", "ranges", "registry", *LAYERS),
     "pixelbrax_jax.generalisation": _below("config", "envs", "registry", *LAYERS),

@@ -82,11 +82,11 @@ def without(*parts: str) -> dict[str, str]:
 @pytest.mark.parametrize(
     ("flags", "part"),
     [
-        (X64 | RULES, f"env:{TASK}"),
         (TRACED, "program:dmc_pendulum_swingup,color"),
-        (CHECKS, "gymnasium"),
+        pytest.param(X64 | RULES, f"env:{TASK}", marks=pytest.mark.slow),
+        pytest.param(CHECKS, "gymnasium", marks=pytest.mark.slow),
     ],
-    ids=["rules", "program", "checks"],
+    ids=["program", "rules", "checks"],
 )
 def test_environments_are_the_same(flags, part):
     assert under(flags, part) == without(part)

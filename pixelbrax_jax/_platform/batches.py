@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from pixelbrax_jax._platform.by_platform import by_platform, traced
 from pixelbrax_jax._platform.interpreter import batch_last
 
 _CHUNK = 128
@@ -31,51 +32,65 @@ def step_rows(
     ``step`` returns a row's next state, with the same tree, and a () float32. With ``last`` the
     batch is the last axis of intermediate results on a CPU, see ``batch_last``.
     """
-    step = jax.jit(step, inline=True)  # traced once for all forms
     together = jax.vmap(step, in_axes=(0, 0, None))
     if len(jax.tree.leaves(state)[0]) == 1:
         return together(state, rows, shared)
     in_chunks = partial(_step_chunks, step, last)
-    moved: tuple[Any, jax.Array] = jax.lax.platform_dependent(
-        state, rows, shared, cpu=in_chunks, default=together
+    num_rows = len(jax.tree.leaves(state)[0])
+    like = (state, jax.ShapeDtypeStruct((num_rows,), jnp.float32))
+    moved: tuple[Any, jax.Array] = by_platform(
+        (state, rows, shared), like, cpu=in_chunks, default=together
     )
     return moved
 
 
-def draw_rows(draw: Callable[..., Any], arguments: tuple[Any, ...], like: Any, rays: int) -> Any:
+def draw_rows(draw: Callable[..., Any], arguments: tuple[Any, ...], rays: int) -> Any:
     """Return ``jax.vmap(draw)(*arguments)``, the images of every row of a batch.
 
-    For images with intermediate ones: a CPU draws only so many together that those stay small.
-    Some may be drawn twice. ``like`` has the shapes and dtypes of a row's images, of ``rays``.
+    For images of ``rays`` with intermediate ones: a CPU draws only so many together that those stay
+    small. Some may be drawn twice.
     """
     num_rows = len(jax.tree.leaves(arguments)[0])
-    together = jax.vmap(jax.jit(draw, inline=True))
     size = -(-num_rows // -(-num_rows * rays // _RAYS))
     turns = -(-num_rows // size)
     if turns == 1:
-        return together(*arguments)
+        return jax.vmap(draw)(*arguments)
+    program, compute, like = traced(draw, *shapes_of_a_row(arguments))
+    like = jax.tree.map(lambda x: jax.ShapeDtypeStruct((num_rows, *x.shape), x.dtype), like)
 
-    def in_turns(*arguments: Any) -> Any:
+    def together(consts: list[Any], *arguments: Any) -> Any:
+        return jax.vmap(partial(compute, consts))(*arguments)
+
+    def in_turns(consts: list[Any], *arguments: Any) -> Any:
         def put(i: jax.Array, images: Any) -> Any:
             first = i * size  # moved back where the last turn would go past the end
             rows = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, first, size), arguments)
             return jax.tree.map(
                 lambda x, drawn: jax.lax.dynamic_update_slice_in_dim(x, drawn, first, 0),
                 images,
-                together(*rows),
+                together(consts, *rows),
             )
 
-        blank = jax.tree.map(lambda x: jnp.zeros((num_rows, *x.shape), x.dtype), like)
+        blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
         return jax.lax.fori_loop(0, turns, put, blank)
 
-    return jax.lax.platform_dependent(*arguments, cpu=in_turns, default=together)
+    return by_platform((program.consts, *arguments), like, cpu=in_turns, default=together)
+
+
+def shapes_of_a_row(arguments: Any) -> Any:
+    """Return the shapes and dtypes of one row of a batch."""
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), arguments)
 
 
 def map_runs(function: Callable[[Any], Any], runs: Any) -> Any:
     """Return ``jax.vmap(function)(runs)``; on a CPU one run after the other."""
-    function = jax.jit(function, inline=True)
-    return jax.lax.platform_dependent(
-        runs, cpu=partial(jax.lax.map, function), default=jax.vmap(function)
+    program, compute, like = traced(function, *shapes_of_a_row((runs,)))
+    num_runs = len(jax.tree.leaves(runs)[0])
+    return by_platform(
+        (program.consts, runs),
+        jax.tree.map(lambda x: jax.ShapeDtypeStruct((num_runs, *x.shape), x.dtype), like),
+        cpu=lambda consts, runs: jax.lax.map(partial(compute, consts), runs),
+        default=lambda consts, runs: jax.vmap(partial(compute, consts))(runs),
     )
 
 

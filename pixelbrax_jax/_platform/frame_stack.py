@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pixelbrax_jax._platform.by_platform import by_platform
+
 
 def unpack(packed: jax.Array) -> jax.Array:
     """Unpack pixels, channels last: (..., H, W) uint32 -> (..., H, W, 3) uint8."""
@@ -19,8 +21,8 @@ def push(frames: jax.Array, newest: jax.Array, is_first: jax.Array) -> jax.Array
     is 3 C; otherwise numbers of the stack's dtype, where c is C. With ``is_first``, () bool, the
     stack becomes K copies of the frame.
     """
-    pushed: jax.Array = jax.lax.platform_dependent(
-        frames, newest, is_first, cpu=_concatenate, default=_shift
+    pushed: jax.Array = by_platform(
+        (frames, newest, is_first), frames, cpu=_concatenate, default=_shift
     )
     return pushed
 

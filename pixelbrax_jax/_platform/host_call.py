@@ -41,11 +41,13 @@ def host_call(
 ) -> list[jax.Array]:
     """Return what the function registered as ``name`` makes of float32 or bool arrays.
 
-    Only a CPU's programs may contain it. An exception of the function ends the program with an
+    Only a CPU's programs may contain it. Under ``jax.vmap`` the function gets all rows at once,
+    arrays with more axes in front. An exception of the function ends the program with an
     error of JAX that contains the traceback.
     """
     _register_target()
-    return list(jax.ffi.ffi_call(_TARGET, list(results))(*operands, function=name))
+    call = jax.ffi.ffi_call(_TARGET, list(results), vmap_method="broadcast_all")
+    return list(call(*operands, function=name))
 
 
 class _Extension(ctypes.Structure):

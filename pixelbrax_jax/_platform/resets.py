@@ -9,6 +9,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from pixelbrax_jax._platform.by_platform import by_platform, traced
+
 _BLOCK = 32
 """Environments that are reset together; their number is rounded up to a multiple."""
 
@@ -22,13 +24,15 @@ def reset_rows(
     would wait for the host in every iteration, so it resets all rows and selects, unless the reset
     contains a loop that waits in any case.
     """
-    fn = jax.jit(fn, inline=True)
     row = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), arguments)
-    replace = partial(replace_rows, fn)
-    if _has_open_loop(jax.make_jaxpr(fn)(*row).jaxpr):
-        return replace(arguments, mask, rows)
-    return jax.lax.platform_dependent(
-        arguments, mask, rows, cpu=replace, default=partial(_select_rows, fn)
+    program, compute, _ = traced(fn, *row)
+    if _has_open_loop(program.jaxpr):
+        return replace_rows(partial(compute, program.consts), arguments, mask, rows)
+    return by_platform(
+        (program.consts, arguments, mask, rows),
+        rows,
+        cpu=lambda consts, *rest: replace_rows(partial(compute, consts), *rest),
+        default=lambda consts, *rest: _select_rows(partial(compute, consts), *rest),
     )
 
 

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pixelbrax_jax._platform.by_platform import by_platform
 from pixelbrax_jax._platform.conditional import in_a_conditional
 from pixelbrax_jax.distractors.base import Distractor, levels
 from pixelbrax_jax.types import EnvParams, Frame
@@ -89,8 +90,9 @@ class ImageFilter(Distractor):
 def _stored(planes: list[jax.Array]) -> list[jax.Array]:
     """Return the planes, which XLA computes once: it would render a pixel again for each reader."""
     like = [jax.ShapeDtypeStruct(plane.shape, plane.dtype) for plane in planes]
-    stored: list[jax.Array] = jax.lax.platform_dependent(
-        planes,
+    stored: list[jax.Array] = by_platform(
+        (planes,),
+        like,
         cpu=lambda planes: in_a_conditional(lambda _: planes, like),
         default=jax.lax.optimization_barrier,
     )

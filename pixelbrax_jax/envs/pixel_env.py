@@ -362,11 +362,11 @@ class PixelEnv(ProgramConfig):
         width: int,
         images: tuple[str, ...],
     ) -> tuple[jax.Array, ...]:
-        def change(frame: Frame, rows: jax.Array) -> Frame:
-            return self.chain.change_frame(sim.distractor_state, params, frame, rows, height, width)
+        def change(frame: Frame, rows: jax.Array, state: Any, params: EnvParams) -> Frame:
+            return self.chain.change_frame(state, params, frame, rows, height, width)
 
-        whole = self.chain.whole_image
-        return draw(scene, height, width, self.renderer, change, images, self.samples, whole)
+        given, whole = (sim.distractor_state, params), self.chain.whole_image
+        return draw(scene, height, width, self.renderer, change, given, images, self.samples, whole)
 
     def blank_frames(self) -> Any:
         """Return frame stacks of zeros; an empty one without images."""

@@ -191,7 +191,7 @@ class VectorPixelEnv:
         # Reflections and the sky's texture are images of their own.
         if look.reflectance is not None or look.sky_texture is not None:
             rays = env.height * env.width * env.num_cameras * env.samples
-            newest = draw_rows(draw, rows, env.drawn_spec, rays)
+            newest = draw_rows(draw, rows, rays)
         else:
             newest = jax.vmap(draw)(*rows)
         return jax.vmap(push_each)(frames, newest, is_first)

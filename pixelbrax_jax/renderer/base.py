@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pixelbrax_jax._platform.by_platform import by_platform
 from pixelbrax_jax._platform.conditional import in_a_conditional
 from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.observations import IMAGES
@@ -104,82 +107,124 @@ def draw(
     height: int,
     width: int,
     renderer: str,
-    change: Callable[[Frame, jax.Array], Frame],
+    change: Callable[..., Frame],
+    given: tuple[Any, ...] = (),
     images: tuple[str, ...] = ("pixels",),
     samples: int = 1,
     whole: bool = False,
 ) -> tuple[jax.Array, ...]:
     """Render images of one view, (height, width) each, only once in a program.
 
-    ``pixels`` are packed, uint32; ``change(frame, rows)`` returns rows of the image with other
-    colors, for their indices (R,) int32: all of them if it needs the ``whole`` image. Its pixelwise
-    part runs in the kernel, if a pixel has one of the ``samples``. ``depth`` and ``segmentation``
-    are ``Frame.depth`` and ``Frame.seg``.
+    ``pixels`` are packed, uint32; ``change(frame, rows, *given)`` returns rows of the image with
+    other colors, for their indices (R,) int32: all of them if it needs the ``whole`` image. Its
+    pixelwise part runs in the kernel, if a pixel has one of the ``samples``. ``depth`` and
+    ``segmentation`` are ``Frame.depth`` and ``Frame.seg``.
 
     Without a barrier XLA fuses the renderer into every reader of its image and runs it again for
     each. A Pallas kernel is never fused. Otherwise the barrier is control flow that XLA keeps: a
     conditional on a CPU (a GPU would wait for the host), an optimization barrier on a TPU, and
     elsewhere a loop over bands, which also halves the memory of intermediate images.
     """
-    plain = "fused" if renderer == "auto" else renderer
-
     # Without colors no samples are needed.
     samples = samples if "pixels" in images else 1
 
-    def planes_of(frame: Frame, rows: jax.Array) -> tuple[jax.Array, ...]:
-        planes = {"depth": frame.depth, "segmentation": frame.seg}
-        if "pixels" in images:
-            planes["pixels"] = pack(change(frame, rows))
-        return tuple(planes[name] for name in images)
+    def form(method: Callable[[_Drawing], tuple[jax.Array, ...]]) -> Callable[..., Any]:
+        def draw_with(scene: Scene, given: tuple[Any, ...]) -> tuple[jax.Array, ...]:
+            def changed(frame: Frame, rows: jax.Array) -> Frame:
+                return change(frame, rows, *given)
 
-    def render_rows(first_row: jax.Array, num_rows: int) -> Frame:
-        return render(
-            scene, height, width, plain, first_row=first_row, num_rows=num_rows, samples=samples
-        )
+            return method(_Drawing(scene, height, width, renderer, changed, images, samples, whole))
 
-    def draw_rows(first_row: jax.Array, num_rows: int) -> tuple[jax.Array, ...]:
-        rows = jnp.minimum(first_row + jnp.arange(num_rows), height - 1)
-        return planes_of(render_rows(first_row, num_rows), rows)
-
-    def in_bands() -> tuple[jax.Array, ...]:
-        num_rows = -(-height // _BANDS)
-        band = render_rows if whole else draw_rows
-        first_rows = jnp.arange(_BANDS) * num_rows
-        bands = jax.lax.map(lambda first_row: band(first_row, num_rows), first_rows)
-        joined = jax.tree.map(lambda x: x.reshape(-1, width)[:height], bands)
-        return planes_of(joined, jnp.arange(height)) if whole else joined
-
-    def conditionally() -> tuple[jax.Array, ...]:
-        # On a CPU, XLA first clears the result of a loop, and runs what is fused into the writes
-        # to it in one thread. A conditional costs nothing.
-        def flat(first_row: jax.Array) -> tuple[jax.Array, ...]:
-            # As the renderer computes it.
-            return tuple(image.ravel() for image in draw_rows(first_row, height))
-
-        like = tuple(jax.ShapeDtypeStruct((height * width,), IMAGES[name].drawn) for name in images)
-        drawn = in_a_conditional(flat, like)
-        return tuple(image.reshape(height, width) for image in drawn)
-
-    def behind_a_barrier() -> tuple[jax.Array, ...]:
-        # A TPU's compiler keeps the barrier, which needs less memory than a loop over bands.
-        drawn: tuple[jax.Array, ...] = jax.lax.optimization_barrier(draw_rows(jnp.int32(0), height))
-        return drawn
-
-    def by_kernel() -> tuple[jax.Array, ...]:
-        from pixelbrax_jax.renderer import kernel
-
-        rows = jnp.arange(height)
-        if samples > 1:
-            return planes_of(render(scene, height, width, "pallas", samples=samples), rows)
-        return kernel.draw(scene, height, width, lambda frame: pack(change(frame, rows)), images)
+        return draw_with
 
     if renderer == "pallas":
-        return by_kernel()
-    forms = {"cpu": conditionally, "tpu": behind_a_barrier}
-    if renderer == "auto" and choice.why_no_kernel() is None:
-        forms["cuda"] = by_kernel
-    drawn: tuple[jax.Array, ...] = jax.lax.platform_dependent(default=in_bands, **forms)
-    return drawn
+        drawn: tuple[jax.Array, ...] = form(_Drawing.by_kernel)(scene, given)
+        return drawn
+    has_kernel = renderer == "auto" and choice.why_no_kernel() is None
+    drawn = by_platform(
+        (scene, given),
+        tuple(jax.ShapeDtypeStruct((height, width), IMAGES[name].drawn) for name in images),
+        cpu=form(_Drawing.conditionally),
+        cuda=form(_Drawing.by_kernel) if has_kernel else None,
+        tpu=form(_Drawing.behind_a_barrier),
+        default=form(_Drawing.in_bands),
+    )
+    return drawn  # noqa: RET504, its type
+
+
+@dataclass(frozen=True)
+class _Drawing:
+    """Images of a view, and the ways to draw them; the attributes are arguments of ``draw``."""
+
+    scene: Scene
+    height: int
+    width: int
+    renderer: str
+    change: Callable[[Frame, jax.Array], Frame]
+    images: tuple[str, ...]
+    samples: int
+    whole: bool
+
+    def conditionally(self) -> tuple[jax.Array, ...]:
+        # On a CPU, XLA first clears the result of a loop, and runs what is fused into the writes
+        # to it in one thread. A conditional costs nothing.
+        size = self.height, self.width
+
+        def flat(first_row: jax.Array) -> tuple[jax.Array, ...]:
+            # As the renderer computes it.
+            return tuple(image.ravel() for image in self._draw_rows(first_row, self.height))
+
+        like = tuple(
+            jax.ShapeDtypeStruct((math.prod(size),), IMAGES[name].drawn) for name in self.images
+        )
+        return tuple(image.reshape(size) for image in in_a_conditional(flat, like))
+
+    def behind_a_barrier(self) -> tuple[jax.Array, ...]:
+        # A TPU's compiler keeps the barrier, which needs less memory than a loop over bands.
+        drawn: tuple[jax.Array, ...] = jax.lax.optimization_barrier(
+            self._draw_rows(jnp.int32(0), self.height)
+        )
+        return drawn
+
+    def in_bands(self) -> tuple[jax.Array, ...]:
+        num_rows = -(-self.height // _BANDS)
+        band = self._render_rows if self.whole else self._draw_rows
+        first_rows = jnp.arange(_BANDS) * num_rows
+        bands: Any = jax.lax.map(lambda first_row: band(first_row, num_rows), first_rows)
+        joined = jax.tree.map(lambda x: x.reshape(-1, self.width)[: self.height], bands)
+        return self._planes_of(joined, jnp.arange(self.height)) if self.whole else joined
+
+    def by_kernel(self) -> tuple[jax.Array, ...]:
+        from pixelbrax_jax.renderer import kernel
+
+        size, rows = (self.height, self.width), jnp.arange(self.height)
+        if self.samples > 1:
+            frame = render(self.scene, *size, "pallas", samples=self.samples)
+            return self._planes_of(frame, rows)
+        return kernel.draw(
+            self.scene, *size, lambda frame: pack(self.change(frame, rows)), self.images
+        )
+
+    def _draw_rows(self, first_row: jax.Array, num_rows: int) -> tuple[jax.Array, ...]:
+        rows = jnp.minimum(first_row + jnp.arange(num_rows), self.height - 1)
+        return self._planes_of(self._render_rows(first_row, num_rows), rows)
+
+    def _render_rows(self, first_row: jax.Array, num_rows: int) -> Frame:
+        return render(
+            self.scene,
+            self.height,
+            self.width,
+            "fused" if self.renderer == "auto" else self.renderer,
+            first_row=first_row,
+            num_rows=num_rows,
+            samples=self.samples,
+        )
+
+    def _planes_of(self, frame: Frame, rows: jax.Array) -> tuple[jax.Array, ...]:
+        planes = {"depth": frame.depth, "segmentation": frame.seg}
+        if "pixels" in self.images:
+            planes["pixels"] = pack(self.change(frame, rows))
+        return tuple(planes[name] for name in self.images)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(2, 3, 4, 5, 6))
@@ -247,19 +292,22 @@ def pack(frame: Frame) -> jax.Array:
 def _fast(
     scene: Scene, first_row: jax.Array, height: int, width: int, num_rows: int, renderer: str
 ) -> Frame:
-    def plain() -> Frame:
+    def plain(scene: Scene, first_row: jax.Array) -> Frame:
         return fused.render(scene, height, width, first_row, num_rows)
 
-    def by_kernel() -> Frame:
+    def by_kernel(scene: Scene, first_row: jax.Array) -> Frame:
         from pixelbrax_jax.renderer import kernel
 
         return kernel.render(scene, height, width, first_row, num_rows)
 
     if renderer == "pallas":
-        return by_kernel()
+        return by_kernel(scene, first_row)
     if renderer == "fused" or choice.why_no_kernel() is not None:
-        return plain()
-    frame: Frame = jax.lax.platform_dependent(cuda=by_kernel, default=plain)
+        return plain(scene, first_row)
+    plane: Any = jax.ShapeDtypeStruct((num_rows, width), jnp.float32)
+    seg, ground = plane.update(dtype=jnp.int32), plane.update(dtype=bool)
+    like = Frame(r=plane, g=plane, b=plane, depth=plane, seg=seg, ground=ground)
+    frame: Frame = by_platform((scene, first_row), like, cuda=by_kernel, default=plain)
     return frame
 
 

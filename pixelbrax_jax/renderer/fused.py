@@ -163,6 +163,7 @@ def see(
     return Frame(r=red, g=green, b=blue, depth=depth, seg=winner, ground=on_ground)
 
 
+@partial(jax.jit, static_argnames=("height", "width", "num_rows"), inline=True)
 def render(
     scene: Scene, height: int, width: int, first_row: jax.Array | int, num_rows: int
 ) -> Frame:

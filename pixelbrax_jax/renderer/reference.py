@@ -6,6 +6,8 @@ distance ``inf``, and every root and quotient is guarded so that no gradient is 
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 
@@ -14,6 +16,7 @@ from pixelbrax_jax.renderer import opengl, shading
 from pixelbrax_jax.types import FAR, Camera, Frame, GeomKind, Lamp, Scene
 
 
+@partial(jax.jit, static_argnames=("height", "width", "num_rows"), inline=True)
 def render(
     scene: Scene, height: int, width: int, first_row: jax.Array | int, num_rows: int
 ) -> Frame:

@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from pixelbrax_jax._platform.by_platform import by_platform, traced
 from pixelbrax_jax._platform.conditional import in_a_conditional
 from pixelbrax_jax.renderer.intersect import Vector, at_least, at_most, between, dot
 from pixelbrax_jax.types import Lamp, Look
@@ -52,10 +53,12 @@ def computed_apart(compute: Callable[[], list[jax.Array]]) -> list[jax.Array]:
     so it does for each of several results. Hence three values share a word. There is no
     derivative.
     """
-    number = len(jax.eval_shape(compute))
+    number = 0
 
     def words() -> list[jax.Array]:
+        nonlocal number
         levels = [(value * 1023.0 + 0.5).astype(jnp.uint32) for value in compute()]
+        number = len(levels)
         packed = []
         for first in range(0, number, 3):
             word = levels[first]
@@ -64,13 +67,13 @@ def computed_apart(compute: Callable[[], list[jax.Array]]) -> list[jax.Array]:
             packed.append(word)
         return packed
 
-    def behind_a_barrier() -> list[jax.Array]:
-        return list(jax.lax.optimization_barrier(words()))
-
-    def conditionally() -> list[jax.Array]:
-        return in_a_conditional(lambda _: words(), jax.eval_shape(words))
-
-    found = jax.lax.platform_dependent(cpu=conditionally, default=behind_a_barrier)
+    program, compute_words, like = traced(words)
+    found = by_platform(
+        (program.consts,),
+        like,
+        cpu=lambda consts: in_a_conditional(lambda _: compute_words(consts), like),
+        default=lambda consts: jax.lax.optimization_barrier(compute_words(consts)),
+    )
     return [
         ((found[k // 3] >> 10 * (k % 3)) & 1023).astype(jnp.float32) / 1023.0 for k in range(number)
     ]

@@ -56,10 +56,10 @@ def test_an_image_that_is_drawn_in_bands_is_blurred_whole(monkeypatch):
     state, _ = env.reset(jax.random.key(0), PARAMS)
     expected = env.draw(state.sim, PARAMS)
 
-    def elsewhere(*operands, default, **_):
+    def elsewhere(operands, like, *, default, **_):
         return default(*operands)
 
-    monkeypatch.setattr(base.jax.lax, "platform_dependent", elsewhere)
+    monkeypatch.setattr(base, "by_platform", elsewhere)
     bands = env.draw(state.sim, PARAMS)
     np.testing.assert_array_equal(bands, expected)
 

@@ -58,10 +58,10 @@ def test_physics_say_which_axis_a_batch_is(monkeypatch):
         envs = pb.VectorPixelEnv(pb.PixelEnv(physics, obs_mode="state", frame_stack=9), 3)
         state, _ = jax.eval_shape(envs.reset, jax.random.key(0), PARAMS)
         if physics.__class__ is BallByFirstAxis:
-            jax.eval_shape(envs.step, state, jnp.zeros((3, 1)), PARAMS)
+            envs.step.lower(envs, state, jnp.zeros((3, 1)), PARAMS)
         else:
             with pytest.raises(AssertionError, match="last axis"):
-                jax.eval_shape(envs.step, state, jnp.zeros((3, 1)), PARAMS)
+                envs.step.lower(envs, state, jnp.zeros((3, 1)), PARAMS)
 
 
 @pytest.mark.parametrize(("platform", "loops"), [("cpu", 1), ("cuda", 0)])
@@ -85,9 +85,8 @@ def test_images_in_turns_are_those_of_all_together(num_rows, rays, monkeypatch):
     def draw(key, shade):
         return {"a": jax.random.uniform(key, (2, 5)) * shade, "b": jnp.int32(shade)}
 
-    like = jax.eval_shape(draw, keys[0], 1.0)
     shades = jnp.arange(num_rows) + 1.0
-    found = jax.jit(lambda *rows: draw_rows(draw, rows, like, rays))(keys, shades)
+    found = jax.jit(lambda *rows: draw_rows(draw, rows, rays))(keys, shades)
     jax.tree.map(np.testing.assert_array_equal, found, jax.jit(jax.vmap(draw))(keys, shades))
 
 
@@ -103,8 +102,7 @@ def test_no_turn_draws_again_what_others_drew(num_rows, rays, turns, monkeypatch
         return carry
 
     monkeypatch.setattr(batches.jax.lax, "fori_loop", counted)
-    like = jax.ShapeDtypeStruct((), jnp.float32)
-    jax.eval_shape(lambda x: draw_rows(jnp.sin, (x,), like, rays), jnp.zeros(num_rows))
+    jax.jit(lambda x: draw_rows(jnp.sin, (x,), rays)).lower(jnp.zeros(num_rows))
     assert sum(loops) == turns
 
 

@@ -76,7 +76,7 @@ def assert_same_pictures(task, options):
 
 @pytest.mark.parametrize(
     ("task", "look"),
-    [("ant", "default"), ("hopper", "all three"), ("reacher", "dmc, shadows"), ("hopper", "color")],
+    [("ant", "default"), ("hopper", "all three"), ("reacher", "dmc, shadows")],
 )
 def test_it_draws_what_the_plain_one_draws(task, look):
     assert_same_pictures(task, LOOKS[look])
@@ -115,8 +115,17 @@ def test_it_draws_all_images_of_an_observation(images):
         assert (np.abs(bytes_of[0] - bytes_of[1]) <= 1).mean() >= 0.999
 
 
-@pytest.mark.parametrize("lamps", [0, 2])
-@pytest.mark.parametrize("size", [(HEIGHT, WIDTH), (1, 1), (3, 300)])
+@pytest.mark.parametrize(
+    ("size", "lamps"),
+    [
+        ((HEIGHT, WIDTH), 2),
+        pytest.param((HEIGHT, WIDTH), 0, marks=pytest.mark.slow),
+        ((1, 1), 0),
+        pytest.param((1, 1), 2, marks=pytest.mark.slow),
+        pytest.param((3, 300), 0, marks=pytest.mark.slow),
+        pytest.param((3, 300), 2, marks=pytest.mark.slow),
+    ],
+)
 def test_depth_and_geoms_are_those_of_the_plain_one(size, lamps):
     """All primitives, planes that end, lamps, and a size that is no multiple of a block."""
     look = make_look("dmc", shadows=True).replace(lamps=(LAMP, LAMP.replace(exponent=3))[:lamps])

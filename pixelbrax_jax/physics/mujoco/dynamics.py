@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from pixelbrax_jax._platform.by_platform import by_platform
 from pixelbrax_jax._platform.host_call import host_call, register
-from pixelbrax_jax._platform.row_function import call
 from pixelbrax_jax.physics.mujoco.multipliers import check_varies
 from pixelbrax_jax.physics.mujoco.native import Native
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
@@ -175,41 +175,42 @@ class Dynamics:
         self, method: str, arrays: list[jax.Array], shapes: list[tuple[int, ...]], *options: int
     ) -> list[jax.Array]:
         arrays = [jnp.asarray(x, jnp.float32) for x in arrays]
-        function = _Function(self, method, options, tuple(shapes))
+        like = [jax.ShapeDtypeStruct(shape, np.float32) for shape in shapes]
+
+        def by_native(*row: jax.Array) -> list[jax.Array]:
+            function = partial(getattr(self.native, method), *options)
+            name = "/".join([self.name, method, *map(str, options)])
+            register(name, partial(_of_rows, function, [(x.size,) for x in row] + shapes))
+            return host_call(name, row, like)
+
+        def by_xla(*row: jax.Array) -> list[jax.Array]:
+            if self.engine == "mujoco":
+                raise NotImplementedError(
+                    "engine='mujoco' computes on a CPU alone; for programs of other devices choose "
+                    "engine='xla', or engine='auto'."
+                )
+            return list(getattr(self.xla, method)(*options, *row))
+
         if self.engine in ("xla", "mjx") or (method == "step" and self._steps_by_xla):
-            return list(function.elsewhere(*arrays))
-        return call(function, *arrays)
-
-
-@dataclass(frozen=True)
-class _Function:
-    """A method of ``Native`` and ``Xla``."""
-
-    dynamics: Dynamics
-    method: str
-    options: tuple[int, ...]
-    shapes: tuple[tuple[int, ...], ...]
-    no_derivative: ClassVar[str] = (
-        "MuJoCo itself has no derivatives: choose engine='xla', MuJoCo XLA, which has them."
-    )
-
-    def on_cpu(self, *rows: jax.Array) -> list[jax.Array]:
-        """See ``RowFunction``."""
-        function = partial(getattr(self.dynamics.native, self.method), *self.options)
-        name = "/".join([self.dynamics.name, self.method, *map(str, self.options)])
-        register(name, function)
-        sizes = [(rows[0].shape[0], *shape) for shape in self.shapes]
-        return host_call(name, rows, [jax.ShapeDtypeStruct(size, np.float32) for size in sizes])
-
-    def elsewhere(self, *row: jax.Array) -> Sequence[jax.Array]:
-        """See ``RowFunction``."""
-        if self.dynamics.engine == "mujoco":
-            raise NotImplementedError(
-                "engine='mujoco' computes on a CPU alone; for programs of other devices choose "
-                "engine='xla', or engine='auto'."
-            )
-        results: Sequence[jax.Array] = getattr(self.dynamics.xla, self.method)(*self.options, *row)
+            return by_xla(*arrays)
+        results: list[jax.Array] = by_platform(
+            tuple(arrays),
+            like,
+            cpu=by_native,
+            default=by_xla,
+            no_derivative="MuJoCo itself has no derivatives: choose engine='xla', MuJoCo XLA, "
+            "which has them.",
+        )
         return results
+
+
+def _of_rows(
+    function: Callable[..., None], shapes: Sequence[tuple[int, ...]], *arrays: np.ndarray
+) -> None:
+    """Call ``function`` of (N, ...) rows of these shapes, which have any axes in front."""
+    num_axes = [x.ndim - len(shape) for x, shape in zip(arrays, shapes, strict=True)]
+    sizes = [math.prod(x.shape[:n]) for x, n in zip(arrays, num_axes, strict=True)]
+    function(*(x.reshape(n, *s) for x, n, s in zip(arrays, sizes, shapes, strict=True)))
 
 
 def _digest(model: mujoco.MjModel) -> str:

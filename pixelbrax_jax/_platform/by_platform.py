@@ -1,0 +1,171 @@
+"""Functions with a form for each platform, of which only the one that is lowered is traced."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.extend import core
+from jax.interpreters import ad, batching, mlir
+
+from pixelbrax_jax.flags import default_flags
+
+_Form = Callable[..., Any]
+
+
+def by_platform(
+    arguments: tuple[Any, ...],
+    like: Any,
+    *,
+    default: _Form,
+    cpu: _Form | None = None,
+    cuda: _Form | None = None,
+    tpu: _Form | None = None,
+    no_derivative: str = "",
+) -> Any:
+    """Return what the form for a platform makes of the arguments, as ``platform_dependent`` does.
+
+    ``jax.lax.platform_dependent`` traces all forms, and ``jax.vmap`` of it all of them again. Here
+    the form of the platform is traced when the program is lowered, and all of them only for a
+    derivative. So a form may not close over values of the program: they are arguments (``traced``
+    makes them such).
+
+    Args:
+        arguments: trees of arrays.
+        like: the tree of the results' shapes and dtypes.
+        default: the form for platforms without their own.
+        cpu: the form for CPUs.
+        cuda: the form for NVIDIA GPUs.
+        tpu: the form for TPUs.
+        no_derivative: why there is no derivative, the message of the error.
+    """
+    leaves, tree = jax.tree.flatten(arguments)
+    shapes, result_tree = jax.tree.flatten(like)
+
+    def flat(form: _Form) -> _Form:
+        def of_leaves(*leaves: Any) -> list[Any]:
+            with default_flags():
+                return jax.tree.leaves(form(*jax.tree.unflatten(tree, leaves)))
+
+        return of_leaves
+
+    forms = {"cpu": cpu, "cuda": cuda, "tpu": tpu}
+    named = {name: flat(form) for name, form in forms.items() if form is not None}
+    results = _primitive.bind(
+        *map(jnp.asarray, leaves),
+        forms=_Forms(flat(default), named, no_derivative),
+        shapes=tuple((x.shape, x.dtype) for x in shapes),
+    )
+    return jax.tree.unflatten(result_tree, results)
+
+
+class Traced(NamedTuple):
+    """A function that has been traced.
+
+    Attributes:
+        program: its program; the constants may be values of another one that is being traced.
+        compute: the function, of these constants and its arguments.
+        like: the tree of its results' shapes and dtypes.
+    """
+
+    program: core.ClosedJaxpr
+    compute: Callable[..., Any]
+    like: Any
+
+
+def traced(function: Callable[..., Any], *like: Any) -> Traced:
+    """Trace a function for arguments with these shapes and dtypes."""
+    program, shapes = jax.make_jaxpr(function, return_shape=True)(*like)
+    tree = jax.tree.structure(shapes)
+
+    def compute(consts: list[Any], *arguments: Any) -> Any:
+        evaluate = core.jaxpr_as_fun(core.ClosedJaxpr(program.jaxpr, consts))
+        return jax.tree.unflatten(tree, evaluate(*jax.tree.leaves(arguments)))
+
+    return Traced(program, compute, shapes)
+
+
+@dataclass(frozen=True, eq=False)
+class _Forms:
+    default: _Form
+    named: Mapping[str, _Form]
+    no_derivative: str
+
+    def map(self, change: Callable[[_Form], _Form]) -> _Forms:
+        named = {name: change(form) for name, form in self.named.items()}
+        return _Forms(change(self.default), named, self.no_derivative)
+
+
+_primitive = core.Primitive("by_platform")
+_primitive.multiple_results = True
+
+
+@_primitive.def_impl
+def _by_jax(*arrays: Any, forms: _Forms, shapes: Any = ()) -> Any:
+    """Compute outside of programs, or trace all forms."""
+    del shapes
+    return jax.lax.platform_dependent(*arrays, default=forms.default, **forms.named)
+
+
+@_primitive.def_abstract_eval
+def _shapes(*avals: Any, forms: _Forms, shapes: Sequence[tuple[Any, Any]]) -> list[Any]:
+    del forms
+    aval = max(avals, key=_num_varying)
+    return [aval.update(shape=s, dtype=dtype, weak_type=False) for s, dtype in shapes]
+
+
+def _num_varying(aval: Any) -> int:
+    """Return how many axes of ``jax.shard_map`` are known to vary."""
+    return len(getattr(getattr(aval, "manual_axis_type", None), "varying", ()))
+
+
+def _batch(arrays: Any, axes: Any, *, forms: _Forms, shapes: Sequence[tuple[Any, Any]]) -> Any:
+    (size,) = {x.shape[axis] for x, axis in zip(arrays, axes, strict=True) if axis is not None}
+    results = _primitive.bind(
+        *arrays,
+        forms=forms.map(lambda form: jax.vmap(form, in_axes=axes)),
+        shapes=tuple(((size, *shape), dtype) for shape, dtype in shapes),
+    )
+    return results, [0] * len(results)
+
+
+def _derivative(primals: Any, tangents: Any, *, forms: _Forms, shapes: Any) -> Any:
+    del shapes
+    if forms.no_derivative:
+        raise NotImplementedError(forms.no_derivative)
+    varied = [i for i, tangent in enumerate(tangents) if not isinstance(tangent, ad.Zero)]
+
+    def compute(*some: Any) -> Any:
+        leaves = list(primals)
+        for i, leaf in zip(varied, some, strict=True):
+            leaves[i] = leaf
+        return _by_jax(*leaves, forms=forms)
+
+    results, changes = jax.jvp(compute, [primals[i] for i in varied], [tangents[i] for i in varied])
+    return results, [
+        ad.Zero(jax.typeof(x).to_tangent_aval()) if change.dtype == jax.dtypes.float0 else change
+        for x, change in zip(results, changes, strict=True)
+    ]
+
+
+def _lower(platform: str, ctx: Any, *values: Any, forms: _Forms, shapes: Any) -> Any:
+    form = forms.named.get(platform, forms.default)
+
+    def checked(*leaves: Any) -> list[Any]:
+        results = form(*leaves)
+        found = tuple((x.shape, x.dtype) for x in results)
+        assert found == shapes, f"{form} gave {found} in place of {shapes}"
+        return results
+
+    return mlir.lower_fun(checked, multiple_results=True)(ctx, *values)
+
+
+batching.primitive_batchers[_primitive] = _batch
+ad.primitive_jvps[_primitive] = _derivative
+mlir.register_lowering(_primitive, partial(_lower, ""))
+for _platform in ("cpu", "cuda", "tpu"):
+    mlir.register_lowering(_primitive, partial(_lower, _platform), platform=_platform)
