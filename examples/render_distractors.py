@@ -3,7 +3,7 @@
     python examples/render_distractors.py --output-dir docs/images/distractors
 
 Real observations of HalfCheetah and Ant under procedural clips: ``levels.png`` has a row for each
-preset and a column for each of six environments, ``motion.gif`` shows some of them in time.
+preset and a column for each of six environments, ``motion.webp`` shows some of them in time.
 ``--tasks ant --presets dcs-easy dcs-hard --num-frames 8`` draws fewer in less time.
 """
 
@@ -34,18 +34,19 @@ ROWS: dict[str, tuple] = {
         for scale in (0.1, 0.2, 0.3)
     },
     **{f"camera, {scale}": (distractors.MovingCamera(scale=scale),) for scale in (0.1, 0.2, 0.3)},
-    **{name: (name,) for name in ("dcs-easy", "dcs-medium", "dcs-hard")},
+    **{name: (name,) for name in ("light", "dcs-easy", "dcs-medium", "dcs-hard")},
 }
-MOVING = ("paper-color", "paper-video", "video-hard", "dcs-easy", "dcs-medium", "dcs-hard")
+# Not paper-color: it flashes, up to twenty times a second.
+MOVING = ("paper-video", "video-easy", "video-hard", "dcs-easy", "dcs-medium", "dcs-hard")
 TASKS = ("halfcheetah", "ant")
 EACH = 3  # environments of a task
 SIZE = 84  # pixels that agents get
 SHOWN = 8  # the frame in levels.png: by then what moves has moved
 SEED = 4  # agents of this one do not stretch beyond the image
-STAR = 2  # the environment in motion.gif: its viewpoint strays further with every level
+STAR = 2  # the environment in motion.webp: its viewpoint strays further with every level
 
-ZOOM, GAP, CAPTION = 2, 4, 20  # pixels in motion.gif
-COLORS = 128  # well chosen ones are as near as the 256 of Pillow's default, and take less space
+ZOOM, GAP, CAPTION = 2, 4, 20  # pixels in motion.webp
+QUALITY = 80  # of 100
 
 
 def simulate(task: str, num_frames: int) -> Any:
@@ -129,8 +130,10 @@ def motion(frames: dict[str, np.ndarray], path: Path) -> None:
             for row, pixels in enumerate(video[t]):
                 tile = pixels.repeat(ZOOM, axis=0).repeat(ZOOM, axis=1)
                 image.paste(Image.fromarray(tile), (left, CAPTION + row * (side + GAP)))
-        images.append(image.quantize(COLORS, kmeans=2))
-    images[0].save(path, save_all=True, append_images=images[1:], duration=80, loop=0)
+        images.append(image)
+    images[0].save(
+        path, save_all=True, append_images=images[1:], duration=80, loop=0, quality=QUALITY
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -149,7 +152,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     }
     levels(frames, options.output_dir / "levels.png")
     moving = {name: video for name, video in frames.items() if name in MOVING}
-    motion(moving or frames, options.output_dir / "motion.gif")
+    motion(moving or frames, options.output_dir / "motion.webp")
 
 
 if __name__ == "__main__":

@@ -4,8 +4,8 @@
     python examples/render_tasks.py --output-dir runs/images --num-frames 8 --only ant reacher
     python examples/render_tasks.py --output-dir docs/images --suite dmc
 
-Tasks for which a policy comes with the package are played by it, the others by random actions.
-Under distractors the policy sees the clean observation, for it was trained on that.
+Tasks for which a policy comes with the package are played by it, the others by random actions. An
+episode that ends is followed by the next. Time passes as in the simulation.
 """
 
 from __future__ import annotations
@@ -16,17 +16,15 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 import pixelbrax_jax as pb
-from pixelbrax_jax.distractors import Video
-from pixelbrax_jax.distractors.presets import resolve
 
 SIZE = 120  # pixels of a tile
 GAP = 4
 CAPTION = 16
-COLUMNS = 5
 VIEWS = {
     "default": {},
     "shadows": {"shadows": True},
@@ -37,46 +35,26 @@ VIEWS = {
 }
 """Looks and cameras, and the options that they take."""
 SHADOWS = pb.make_look("default", shadows=True)
-COLORS = 128  # one palette for all frames: small files that do not flicker
 FPS = 20
-WARM_UP = 20  # frames before the first that is shown: by then agents are under way
+QUALITY = 80  # of 100, of WebP
+WARM_UP = 1.0  # seconds before the first frame that is shown: by then agents are under way
 
-TILES: tuple[tuple[str, str | None], ...] = (
-    ("halfcheetah", None),
-    ("ant", None),
-    ("humanoid", None),
-    ("walker2d", None),
-    ("hopper", None),
-    ("reacher", None),
-    ("halfcheetah", "dcs-medium"),
-    ("ant", "video-hard"),
-    ("humanoid", "paper-color"),
-    ("walker2d", "paper-video"),
+TRAINED = (
+    *("halfcheetah", "ant", "humanoid", "walker2d"),
+    *("dmc_walker_walk", "dmc_walker_stand", "dmc_ball_in_cup_catch", "dmc_reacher_easy"),
 )
-"""Task and distractors of each tile, row by row."""
+"""Tasks of ``wall.webp``, row by row."""
 
-DMC_TILES: tuple[tuple[str, str | None], ...] = (
-    ("dmc_acrobot_swingup", None),
-    ("dmc_ball_in_cup_catch", None),
-    ("dmc_cartpole_swingup", None),
-    ("dmc_cheetah_run", None),
-    ("dmc_finger_spin", None),
-    ("dmc_fish_swim", None),
-    ("dmc_hopper_hop", None),
-    ("dmc_humanoid_walk", None),
-    ("dmc_manipulator_bring_ball", None),
-    ("dmc_quadruped_walk", None),
-    ("dmc_reacher_easy", None),
-    ("dmc_swimmer_swimmer6", None),
-    ("dmc_walker_walk", None),
-    ("dmc_walker_walk", "dcs-medium"),
-    ("dmc_cheetah_run", "video-hard"),
+DMC_TILES = (
+    *("acrobot_swingup", "ball_in_cup_catch", "cartpole_swingup", "cheetah_run", "finger_spin"),
+    *("fish_swim", "hopper_hop", "humanoid_walk", "manipulator_bring_ball", "pendulum_swingup"),
+    *("point_mass_easy", "quadruped_walk", "reacher_easy", "swimmer_swimmer6", "walker_walk"),
 )
-"""The same of the DM Control Suite."""
+"""Tasks of ``dmc/wall.webp``."""
 
 
 def episode(task: str, num_frames: int) -> Any:
-    """States of an episode, one after the other, (T, ...)."""
+    """States of episodes, one for each frame of an animation, (T, ...)."""
     policy = pb.load_policy(task) if task in pb.list_pretrained() else None
     random = {"task": task, "obs_mode": "state"}
     env, params = pb.make(**((policy and policy.env_options) or random))
@@ -87,43 +65,36 @@ def episode(task: str, num_frames: int) -> Any:
             action = policy.program(obs[None])[0]
         else:
             action = jax.random.uniform(key, (env.action_size,), minval=-1.0)
-        state, timestep = env.step(state, action, params)
-        return (state, timestep.obs), state
+        after, timestep = jax.lax.cond(
+            state.done,
+            lambda: env.next_episode(state, params),
+            lambda: env.step(state, action, params),
+        )
+        return (after, timestep.obs), state
+
+    seconds = WARM_UP + np.arange(num_frames) / FPS
+    shown = jnp.asarray(seconds / env.dt, jnp.int32)
 
     def run(key):
         state, timestep = env.reset(key, params)
-        keys = jax.random.split(key, WARM_UP + num_frames)
-        return jax.lax.scan(step, (state, timestep.obs), keys)[1]
+        keys = jax.random.split(key, int(seconds[-1] / env.dt) + 1)
+        states = jax.lax.scan(step, (state, timestep.obs), keys)[1]
+        return jax.tree.map(lambda x: x[shown], states)
 
-    states = jax.jit(run)(jax.random.key(0))
-    return jax.tree.map(lambda x: x[WARM_UP:], states)
+    return jax.jit(run)(jax.random.key(0))
 
 
-def tile(task: str, distractors: str | None, states: Any, seed: int) -> np.ndarray:
+def tile(task: str, states: Any) -> np.ndarray:
     """One tile's frames, (T, SIZE, SIZE, 3) uint8."""
-    links = resolve((distractors,) if distractors else (), task)
-    plays = any(isinstance(link, Video) for link in links)
-    env, params = pb.make(
-        task,
-        height=SIZE,
-        width=SIZE,
-        look="default" if task in pb.list_envs(suite="dmc") else SHADOWS,
-        distractors=links,
-        clips="procedural" if plays else None,
-    )
-    chain, key = env.chain, jax.random.key(seed)
-
-    def step(distractor_state, state):
-        later = chain.advance(distractor_state, key, state.sim.step_count + 1, params)
-        shown = state.replace(sim=state.sim.replace(distractor_state=distractor_state))
-        return later, env.image(shown, params)
-
-    return np.asarray(jax.jit(lambda s: jax.lax.scan(step, chain.reset(key, params), s)[1])(states))
+    look = "default" if task in pb.list_envs(suite="dmc") else SHADOWS
+    env, params = pb.make(task, height=SIZE, width=SIZE, look=look)
+    draw = jax.jit(lambda states: jax.lax.map(lambda state: env.image(state, params), states))
+    return np.asarray(draw(states))
 
 
-def wall(tiles: Sequence[np.ndarray]) -> np.ndarray:
+def wall(tiles: Sequence[np.ndarray], columns: int) -> np.ndarray:
     """Tiles in rows, (T, H, W, 3) uint8."""
-    columns = min(COLUMNS, len(tiles))
+    columns = min(columns, len(tiles))
     padded = [np.pad(t, ((0, 0), (0, GAP), (0, GAP), (0, 0)), constant_values=255) for t in tiles]
     padded += [np.full_like(padded[0], 255)] * (-len(padded) % columns)
     rows = [np.concatenate(padded[k : k + columns], axis=2) for k in range(0, len(padded), columns)]
@@ -151,18 +122,15 @@ def views(task: str, states: Any) -> np.ndarray:
 
 
 def save(frames: np.ndarray, path: Path) -> None:
-    """Write a GIF whose frames have one palette."""
-    sample = Image.fromarray(np.concatenate(frames[:: max(1, len(frames) // 6)]))
-    # Octrees keep rare colors, such as the red of targets.
-    palette = sample.quantize(COLORS, method=Image.Quantize.FASTOCTREE)
-    images = [
-        Image.fromarray(f).quantize(palette=palette, dither=Image.Dither.NONE) for f in frames
-    ]
-    images[0].save(path, save_all=True, append_images=images[1:], duration=1000 // FPS, loop=0)
+    """Write a WebP animation that is repeated."""
+    images = [Image.fromarray(f) for f in frames]
+    images[0].save(
+        path, save_all=True, append_images=images[1:], duration=1000 // FPS, loop=0, quality=QUALITY
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Writes ``wall.gif``, ``tasks/<task>.gif`` and ``views.png``, or ``dmc/wall.gif``."""
+    """Writes ``wall.webp``, ``tasks/<task>.webp`` and ``views.png``, or ``dmc/wall.webp``."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--output-dir", type=Path, default=Path("docs/images"))
     parser.add_argument("--num-frames", type=int, default=60)
@@ -170,29 +138,28 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--suite", choices=("brax", "dmc"), default="brax")
     parser.add_argument("--only", nargs="+", default=tasks, choices=tasks, help="tasks of Brax")
     options = parser.parse_args(arguments)
+
+    def animation(task: str) -> np.ndarray:
+        return named(task, tile(task, episode(task, options.num_frames)))
+
     if options.suite == "dmc":
         if options.only is not tasks:
             parser.error("--only is for --suite brax")
         (options.output_dir / "dmc").mkdir(parents=True, exist_ok=True)
-        states = {task: episode(task, options.num_frames) for task, _ in DMC_TILES}
-        tiles = [tile(task, behind, states[task], 0) for task, behind in DMC_TILES]
-        save(wall(tiles), options.output_dir / "dmc" / "wall.gif")
+        tiles = [animation(f"dmc_{task}") for task in DMC_TILES]
+        save(wall(tiles, 5), options.output_dir / "dmc" / "wall.webp")
         return
     (options.output_dir / "tasks").mkdir(parents=True, exist_ok=True)
-    states = {task: episode(task, options.num_frames) for task in options.only}
-    clean = {task: tile(task, None, states[task], 0) for task in states}
-    for task, frames in clean.items():
-        save(named(task, frames), options.output_dir / "tasks" / f"{task}.gif")
-    tiles = [
-        tile(task, behind, states[task], seed) if behind else clean[task]
-        for seed, (task, behind) in enumerate(TILES)
-        if task in states
-    ]
-    if tiles:
-        save(wall(tiles), options.output_dir / "wall.gif")
-    first = next(iter(states))
-    shown = "ant" if "ant" in states else first
-    Image.fromarray(views(shown, states[shown])).save(options.output_dir / "views.png")
+    animations = {task: animation(task) for task in options.only}
+    for task, frames in animations.items():
+        save(frames, options.output_dir / "tasks" / f"{task}.webp")
+    if options.only is tasks:
+        animations |= {task: animation(task) for task in TRAINED if task not in tasks}
+    if tiles := [animations[task] for task in TRAINED if task in animations]:
+        save(wall(tiles, 4), options.output_dir / "wall.webp")
+    shown = "ant" if "ant" in animations else options.only[0]
+    images = views(shown, episode(shown, 1))
+    Image.fromarray(images).save(options.output_dir / "views.png")
 
 
 if __name__ == "__main__":

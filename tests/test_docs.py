@@ -160,8 +160,8 @@ def test_included_sections_exist(name):
 
 def test_every_brax_task_has_its_animation():
     page = (ROOT / "docs/tasks.md").read_text("utf-8")
-    shown = re.findall(r"!\[(\w+)\]\((images/tasks/\w+\.gif)\)", page)
-    assert shown == [(name, f"images/tasks/{name}.gif") for name in BRAX_TASKS]
+    shown = re.findall(r"!\[(\w+)\]\((images/tasks/\w+\.webp)\)", page)
+    assert shown == [(name, f"images/tasks/{name}.webp") for name in BRAX_TASKS]
 
 
 def test_the_options_of_adapters_are_listed():

@@ -151,7 +151,7 @@ _CPU_TASKS: dict[str, dict[str, Any]] = {
     "humanoid": {"action_repeat": 3, "gamma": 0.98, "total_steps": 3_500_000},
 }
 # Tasks of the DM Control Suite, only for PPO.
-_CPU_DMC_TASKS: dict[str, dict[str, Any]] = {
+_CPU_MUJOCO_TASKS: dict[str, dict[str, Any]] = {
     "dmc_cartpole_swingup": {
         "action_repeat": 8,
         "frame_stack": 3,
@@ -169,6 +169,12 @@ _CPU_DMC_TASKS: dict[str, dict[str, Any]] = {
         "action_repeat": 4,
         "frame_stack": 3,
         "gamma": 0.98,
+        "update_epochs": 3,
+        "total_steps": 3_000_000,
+    },
+    "gym_halfcheetah": {
+        "action_repeat": 2,
+        "gamma": 0.97,
         "update_epochs": 3,
         "total_steps": 3_000_000,
     },
@@ -210,7 +216,7 @@ TASK_SETTINGS: dict[str, dict[str, dict[str, dict[str, Any]]]] = {
             | {"backend": "spring", "total_steps": int(share * settings["total_steps"])}
             for task, settings in _CPU_TASKS.items()
         }
-        | (_CPU_DMC_TASKS if algorithm == "ppo" else {})
+        | (_CPU_MUJOCO_TASKS if algorithm == "ppo" else {})
         for algorithm, share in _CPU_SHARES.items()
     },
     "drqv2": {

@@ -188,6 +188,7 @@ README = {
     "fastest": lambda: named(next(reversed(ratios()))),
     "reacher": lambda: end("ppo-dmc_reacher_easy-0"),
     "cup": lambda: end("ppo-dmc_ball_in_cup_catch-0"),
+    "stand": lambda: end("drqv2-dmc_walker_stand-0"),
     "walker": lambda: end("drqv2-dmc_walker_walk-0"),
     "walker-minutes": lambda: end("drqv2-dmc_walker_walk-0", "seconds", 60.0),
     "walker-published": published_walker_walk,

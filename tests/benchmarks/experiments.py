@@ -7,8 +7,8 @@
     python -m tests.benchmarks.experiments --gpu                   those for a GPU in place of them
 
 A run that was cut short, by Ctrl-C or by --minutes, goes on from its checkpoint at the next call.
-Of a finished one docs/results/runs/<name>.json is kept; of DrQ-v2, or a task of the DM Control
-Suite, an entry of docs/leaderboard. `tests.benchmarks.figures` draws all of them, and those of
+Of a finished one docs/results/runs/<name>.json is kept; of DrQ-v2, or a task that is not Brax's, an
+entry of docs/leaderboard. `tests.benchmarks.figures` draws all of them, and those of
 docs/results with the minutes that follow from the speed that `tests.benchmarks.pace` measures.
 The best policy of each task goes into the package, for --pretrained.
 """
@@ -36,7 +36,7 @@ from pixelbrax_jax.agents.runner.metrics import read_metrics
 from pixelbrax_jax.agents.runner.trained import load_config
 from pixelbrax_jax.processor import describe_cpu
 from pixelbrax_jax.stop_signals import handling
-from pixelbrax_jax.tasks import DMC_TASKS
+from pixelbrax_jax.tasks import BRAX_TASKS
 
 DOCS = Path(__file__).parents[2] / "docs"
 KEPT = DOCS / "results" / "runs"
@@ -111,7 +111,7 @@ def experiments() -> dict[str, list[str]]:
             add("drqv2", task, seed, "--num-evals", "16")
     for seed in range(3):
         for task in TASK_SETTINGS["cpu"]["ppo"]:
-            if task in DMC_TASKS:
+            if task not in BRAX_TASKS:
                 add("ppo", task, seed, "--num-evals", "16")
     return runs
 
@@ -119,7 +119,7 @@ def experiments() -> dict[str, list[str]]:
 def kept_at(name: str) -> Path:
     """The file that keeps a run."""
     algorithm, task, *_ = name.split("-")
-    timed = algorithm == "drqv2" or task in DMC_TASKS
+    timed = algorithm == "drqv2" or task not in BRAX_TASKS
     return (LEADERBOARD if timed else KEPT) / f"{name}.json"
 
 
@@ -149,7 +149,7 @@ def record(folder: Path, arguments: list[str]) -> dict:
     """What is kept of a finished run: settings, returns over steps and time, evaluations."""
     about = read_about(folder / "checkpoints")
     command = {"command": shlex.join(["pixelbrax", *arguments]), "revision": REVISION}
-    if about["algorithm"] == "drqv2" or about["config"]["task"] in DMC_TASKS:
+    if about["algorithm"] == "drqv2" or about["config"]["task"] not in BRAX_TASKS:
         return command | leaderboard.entry(folder)
     records = read_metrics(folder / "metrics.jsonl")
     training = [r for r in records if "episode/return" in r]
@@ -272,7 +272,7 @@ def main() -> int:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(kept) + "\n")
         # DrQ-v2 has other rewards on Brax's tasks.
-        own = kept["algorithm"] != "drqv2" or kept["config"]["task"] in DMC_TASKS
+        own = kept["algorithm"] != "drqv2" or kept["config"]["task"] not in BRAX_TASKS
         if own and not kept["config"]["distractors"]:
             offer(kept["config"]["task"], folder, kept)
     if failed:

@@ -13,7 +13,7 @@ from pixelbrax_gym.bench.tables import table as markdown_table
 from pixelbrax_jax import list_pretrained
 from pixelbrax_jax.agents.presets import preset
 from pixelbrax_jax.policy import read_pretrained
-from pixelbrax_jax.tasks import DMC_TASKS
+from pixelbrax_jax.tasks import DMC_TASKS, GYM_TASKS
 from tests.benchmarks.experiments import DOCS, TASKS
 from tests.benchmarks.pages import Figures
 from tests.benchmarks.performance import rounded, span
@@ -232,12 +232,12 @@ def pretrained_table() -> str:
         "PixelBrax",
     )
     lines = []
-    for name in sorted(list_pretrained(), key=(*TASKS, *DMC_TASKS).index):
+    for name in sorted(list_pretrained(), key=(*TASKS, *DMC_TASKS, *GYM_TASKS).index):
         about = read_pretrained(name)
         lines.append(
             [
                 f"`{name}`",
-                "" if name in DMC_TASKS else f"`{about['env_options']['reward_preset']}`",
+                "" if name not in TASKS else f"`{about['env_options']['reward_preset']}`",
                 "DrQ-v2" if about["algorithm"] == "drqv2" else about["algorithm"].upper(),
                 f"{about['steps'] / 1e6:.1f}",
                 f"{about['return']:,.0f} ± {about['standard_error']:,.0f}",
