@@ -9,7 +9,7 @@ import stat
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import psutil
@@ -150,24 +150,28 @@ print('RESULT {{"values": 1}}', flush=True)
     assert not [t for t in times if end - 0.4 < t < end]
 
 
-def test_failures_have_their_reasons():
+def test_failures_have_their_reasons(monkeypatch):
+    monkeypatch.setattr(schedule, "GRACE", 0.2)
     broken = Fake("speeds", "broken", {}, script="raise RuntimeError('no such task')")
     absent = Fake("speeds", "absent", {}, script="import sys; sys.exit('x' and 3)")
     memory = Fake("speeds", "memory", {}, script="raise MemoryError('out of memory')")
     slow = fake("slow", wait=60)
-    found = run([broken, absent, memory, slow], patience=0.3)
+    long = replace(fake("long", measure=60), seconds=0.2)
+    found = run([broken, absent, memory, slow, long], patience=5.0)
     status = {name: outcome["status"] for name, outcome in found.items()}
     assert status == {
         "broken": "failed", "absent": "absent", "memory": "out of memory", "slow": "failed",
+        "long": "failed",
     }  # fmt: skip
     assert "no such task" in found["broken"]["why"]
     assert "compiled for longer" in found["slow"]["why"]
+    assert "took longer than 0 s" in found["long"]["why"]
 
 
 def test_the_end_comes_in_time_and_what_is_ready_is_still_timed():
     began = time.monotonic()
-    found = run([fake("endless", wait=60), fake("ready")], seconds=1.5)
-    assert time.monotonic() - began < 4
+    found = run([fake("endless", wait=60), fake("ready")], seconds=4)
+    assert time.monotonic() - began < 10
     assert list(found) == ["ready"]
     assert not psutil.Process().children()
 
@@ -320,7 +324,9 @@ def measured(tmp_path):
         found = VALUES.get(case.measure)
         results.add(
             case,
-            {"status": "ok", "values": found} if found else {"status": "absent", "why": "no wheel"},
+            {"status": "ok", "values": found, "prepared_seconds": 7.5}
+            if found
+            else {"status": "absent", "why": "no wheel"},
         )
     return tmp_path
 
@@ -331,7 +337,7 @@ def test_tables_of_what_there_is(measured):
     page = "\n".join(" ".join(line.split()) for line in page.splitlines())
     assert "# Measurements on cpu" in page
     assert "| InvertedPendulum | 100.000 | 1 | 99.850 | 77 |" in page
-    assert "| InvertedPendulum | 48 x 48 | random | 1,230 | 1,230 |" in page
+    assert "| InvertedPendulum | 48 x 48 | random | 1,230 | 1,230 | 7.50 |" in page
     assert "not yet" in page
     assert "frames: shared without a copy; back: COPIED" in page
     assert "return at 30 s" in page

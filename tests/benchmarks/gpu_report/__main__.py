@@ -110,7 +110,7 @@ def _measure(options: Options, folder: Path, card: Card | None, began: float) ->
     results = Results(folder)
     results.start(machine)
     _say(f"{machine['device']}; images are drawn by {machine['renderer']!r}: {machine['why']}")
-    usable = options.rehearse or machine["renderer"] == "pallas"
+    usable = options.rehearse or machine["kernel"]
     cases = _that_fit(plan(REHEARSAL if options.rehearse else CARD, usable), card)
     todo = [case for case in cases if not results.has(case)]
     parallel = _parallel(card)
@@ -142,8 +142,10 @@ def _environ(folder: Path, rehearse: bool) -> dict[str, str]:
         "PIP_RETRIES": "1",
         "PIP_DEFAULT_TIMEOUT": "10",
         FOLDER: str(folder.resolve()),
-        # Several cards would share a training run.
-        **({"CUDA_VISIBLE_DEVICES": _first_card()} if not rehearse else {"JAX_PLATFORMS": "cpu"}),
+        # nvidia-smi counts cards in this order, and several would share a training run.
+        "CUDA_DEVICE_ORDER": "PCI_BUS_ID",
+        "CUDA_VISIBLE_DEVICES": "" if rehearse else _first_card(),
+        **({"JAX_PLATFORMS": "cpu"} if rehearse else {}),
     }
 
 
@@ -180,7 +182,7 @@ def _tables(folder: Path) -> int:
     from tests.benchmarks.gpu_report import tables
 
     machine, rows = results.machine, list(results.rows.values())
-    kernel = machine["rehearsal"] or machine["renderer"] == "pallas"
+    kernel = machine["rehearsal"] or machine["kernel"]
     cases = plan(REHEARSAL if machine["rehearsal"] else CARD, kernel)
     whole = {"machine": machine, "cases": results.rows}
     _replace(folder / "report.json", json.dumps(whole, indent=1) + "\n")

@@ -17,10 +17,14 @@ NUM_POSES = 5
 
 
 def identity() -> Callable[[float], dict[str, Any]]:
-    """Describe the device and the renderer that draws on it; ``why`` says why not the kernel."""
+    """Describe the device and the renderer that ``"auto"`` means there, and why.
+
+    ``kernel`` is whether the device can run the kernel, be it right or not.
+    """
     found = {**machine.describe(), "memory": jax.devices()[0].memory_stats()}
     renderer, why = choice.auto_renderer()
-    return lambda _: found | {"renderer": renderer, "why": why}
+    can = choice.why_not_here() is None
+    return lambda _: found | {"renderer": renderer, "why": why, "kernel": can}
 
 
 def kernel(task: str, size: int) -> Callable[[float], list[dict[str, Any]]]:

@@ -123,12 +123,12 @@ def _ordered(extent: Extent) -> Iterator[Timed]:
     for algorithm, preset, task, options in extent.runs:
         names = {"algorithm": algorithm, "preset": preset, "task": task, "options": options}
         yield Timed(
-            "learning", "programs.learning", (names),
-            seconds=extent.learning_seconds, least=45.0, gigabytes=4.0,
+            "learning", "programs.learning", names,
+            seconds=extent.learning_seconds, least=0.4 * extent.learning_seconds, gigabytes=4.0,
         )  # fmt: skip
     yield Timed(
-        "tests", "programs.tests", ({"arguments": extent.tests}),
-        seconds=extent.tests_seconds, least=45.0, gigabytes=4.0,
+        "tests", "programs.tests", {"arguments": extent.tests},
+        seconds=extent.tests_seconds, least=0.5 * extent.tests_seconds, gigabytes=4.0,
     )  # fmt: skip
     # A handful of cases, before a grid that may take what is left.
     for task, num_envs, size in extent.peers:

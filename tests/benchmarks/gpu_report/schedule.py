@@ -9,8 +9,8 @@ import tempfile
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from pixelbrax_gym.bench.cases import AbsentError
@@ -24,8 +24,8 @@ PATIENCE = 300.0
 LAST = 30.0
 """Seconds before the end in which whatever is compiled is timed, in any order."""
 
-GRACE = 15.0
-"""Seconds that a case may take beyond its time, to end what it began."""
+GRACE = 5.0
+"""Seconds that a case may take beyond its time."""
 
 Record = Callable[[Timed, dict[str, Any]], object]
 
@@ -36,12 +36,14 @@ class Process:
     Attributes:
         ready: set when it waits, or has ended.
         prepared_seconds: how long it took until then; None if it failed before.
+        paused_seconds: how long it was paused meanwhile.
     """
 
     def __init__(self, case: Timed, environ: Mapping[str, str]) -> None:
         self.case = case
         self.ready = threading.Event()
         self.prepared_seconds: float | None = None
+        self.paused_seconds = 0.0
         self._result = ""
         self._errors = tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")  # noqa: SIM115
         flags = f"{environ.get('XLA_FLAGS', '')} {case.arguments.get('flags', '')}".strip()
@@ -67,8 +69,8 @@ class Process:
                 self._result = line.removeprefix(RESULT)
         self.ready.set()
 
-    def time(self, seconds: float) -> dict[str, Any]:
-        """Have a case that is ready measure, and return its outcome."""
+    def time(self, seconds: float) -> dict[str, Any] | None:
+        """Have a case that is ready measure; return its outcome, or None if it takes longer."""
         assert self._process.stdin is not None
         started = time.monotonic()
         with suppress(OSError):  # it has ended, and its status says why
@@ -77,12 +79,13 @@ class Process:
         try:
             self._process.wait(seconds + GRACE)
         except subprocess.TimeoutExpired:
-            return {"status": "failed", "why": f"it took longer than {seconds:.0f} s"}
+            return None
         self._reader.join(GRACE)
         self._errors.seek(0)
         found = outcome_of(self._process.returncode, self._result, self._errors.read())
+        prepared = self.prepared_seconds
         return found | {
-            "prepared_seconds": self.prepared_seconds,
+            "prepared_seconds": None if prepared is None else prepared - self.paused_seconds,
             "seconds": round(time.monotonic() - started, 1),
         }
 
@@ -140,10 +143,14 @@ def run(
                     record(head.case, {"status": "failed", "why": why, "seconds": patience})
                 elif left >= head.case.least or head.prepared_seconds is None:
                     paused = [process for process in pool if not process.ready.is_set()]
-                    _signal(paused, signal.SIGSTOP)
-                    outcome = head.time(min(head.case.seconds, left))
-                    _signal(paused, signal.SIGCONT)
-                    record(head.case, outcome)
+                    limit = min(head.case.seconds, left)
+                    with _pause(paused):
+                        outcome = head.time(limit)
+                    if outcome is not None:
+                        record(head.case, outcome)
+                    elif limit == head.case.seconds:
+                        why = f"it took longer than {limit:.0f} s"
+                        record(head.case, {"status": "failed", "why": why, "seconds": limit})
             finally:
                 head.end()
             fill()
@@ -171,6 +178,15 @@ def _await_head(
     return head
 
 
-def _signal(processes: Sequence[Process], number: signal.Signals) -> None:
+@contextmanager
+def _pause(processes: Sequence[Process]) -> Iterator[None]:
+    """Pause processes that compile."""
+    began = time.monotonic()
     for process in processes:
-        process.signal(number)
+        process.signal(signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        for process in processes:
+            process.paused_seconds += time.monotonic() - began
+            process.signal(signal.SIGCONT)

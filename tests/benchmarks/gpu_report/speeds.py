@@ -54,9 +54,7 @@ def steps(
 
     seen = None if act is None else timestep.obs
     reset, _ = compiled(env, venv.reset, key, params)
-    program, seconds = compiled(
-        env, loop, state, seen, key, params, jnp.int32(1), donate_argnums=(0, 1)
-    )
+    program, _ = compiled(env, loop, state, seen, key, params, jnp.int32(1), donate_argnums=(0, 1))
     # Before this nothing is allocated, so that many may wait.
     carry: dict[str, Any] = {}
 
@@ -75,7 +73,6 @@ def steps(
         return {
             "steps_per_second": num_envs * speed["median"],
             "speed": speed,
-            "compile_seconds": seconds,
             "temporary_bytes": _temporaries(program),
         }
 
@@ -128,7 +125,7 @@ def frames(task: str, num_envs: int, size: int, renderer: str) -> Callable[[floa
     env, params = pb.make(task, height=size, width=size, renderer=renderer)
     params = jax.device_put(params)
     states = first_states(env, params, num_envs)
-    program, seconds = compiled(env, jax.vmap(env.draw, in_axes=(0, None)), states, params)
+    program, _ = compiled(env, jax.vmap(env.draw, in_axes=(0, None)), states, params)
 
     def run(calls: int) -> Any:
         for _ in range(calls):
@@ -140,7 +137,6 @@ def frames(task: str, num_envs: int, size: int, renderer: str) -> Callable[[floa
         return {
             "frames_per_second": num_envs * speed["median"],
             "speed": speed,
-            "compile_seconds": seconds,
             "temporary_bytes": _temporaries(program),
         }
 

@@ -7,7 +7,16 @@ from typing import Any
 
 from pixelbrax_gym.bench import report
 from pixelbrax_gym.bench.cases import Group
-from pixelbrax_gym.bench.tables import Row, interleaved, number, ratio, succeeded, table, title
+from pixelbrax_gym.bench.tables import (
+    Row,
+    cell,
+    interleaved,
+    number,
+    ratio,
+    succeeded,
+    table,
+    title,
+)
 from tests.benchmarks.gpu_report.plan import HOST_LOOPS, Timed
 
 TIMES = (30, 60, 120, 240)
@@ -50,7 +59,7 @@ def _card(machine: Row) -> str:
 def kernel(rows: list[Row]) -> str:
     """Return the table of the checks of the kernel, the worst first."""
     lines = [
-        (title(row["arguments"]["task"]), *(cell for one in row["values"] for cell in _same(one)))
+        (title(row["arguments"]["task"]), *(text for one in row["values"] for text in _same(one)))
         for row in sorted(succeeded(rows), key=lambda row: min(v["same"] for v in row["values"]))
     ]
     heads = ("task", "pixels alike, %", "most levels apart", "with shadows, %", "levels")
@@ -64,19 +73,21 @@ def _same(found: Row) -> tuple[str, int]:
 def speeds(rows: list[Row]) -> str:
     """Return the table of steps per second, with a column for each number of environments."""
     batches = sorted({row["arguments"]["num_envs"] for row in rows})
-    lines: dict[tuple[str, ...], dict[int, str]] = {}
+    lines: dict[tuple[str, ...], dict[int, Row]] = {}
     for row in rows:
         where = row["arguments"]
         size = f"{where['size']} x {where['size']}" if where["size"] else "state"
         how = where["policy"] + (", loops by the host" if where["flags"] == HOST_LOOPS else "")
-        ok = row["status"] == "ok"
-        cell = number(row["values"]["steps_per_second"]) if ok else row["status"]
-        lines.setdefault((title(where["task"]), size, how), {})[where["num_envs"]] = cell
-    heads = ("task", "observation", "policy", *(f"N = {n:,}" for n in batches))
+        lines.setdefault((title(where["task"]), size, how), {})[where["num_envs"]] = row
+    heads = ("task", "observation", "policy", *(f"N = {n:,}" for n in batches), "compiled in, s")
     return table(
         heads,
         [
-            (*name, *(line.get(n, "not yet") for n in batches))
+            (
+                *name,
+                *(cell(line.get(n), "steps_per_second") for n in batches),
+                number(max(row.get("prepared_seconds") or 0.0 for row in line.values())),
+            )
             for name, line in sorted(lines.items())
         ],
     )
@@ -177,7 +188,8 @@ _TABLES = {
         speeds,
         "Environment steps per second in one compiled loop, with autoreset and three stacked "
         "frames. The network is DQN's encoder on images and 2 x 256 on states, and its actions are "
-        "sampled.",
+        "sampled. The last column is the longest time from the start of a process until it is "
+        "compiled, beside others that compile.",
     ),
     "adapters": (
         adapters,
