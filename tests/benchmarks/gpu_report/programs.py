@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -76,7 +77,7 @@ def learning(
         from pixelbrax_jax.agents.runner.metrics import read_metrics
 
         metrics = folder / "metrics.jsonl"
-        metrics.unlink(missing_ok=True)
+        shutil.rmtree(folder, ignore_errors=True)  # of a call that was cut short
         told, status = run_program(command, seconds, {})
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "log.txt").write_text(told, "utf-8")
