@@ -17,7 +17,7 @@ WORKERS := -n 2 --dist worksteal
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-all test-slow test-newest test-oldest test-gpu test-programs test-clients bench-gpu lint format bench golden docs docs-serve clean
+.PHONY: help demo test test-all test-slow test-newest test-oldest test-gpu test-programs test-clients gpu-report lint format bench golden docs docs-serve clean
 
 help: ## show this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1|/' | \
@@ -65,11 +65,11 @@ test-gpu: $(VENV)/.installed-dev ## run the tests that need an NVIDIA GPU, on a 
 		XLA_FLAGS="--xla_gpu_deterministic_ops=true" \
 		$(RUN) -m pytest -m gpu tests/gpu $(ARGS)
 
-bench-gpu: $(VENV)/.installed-dev ## measure on an NVIDIA GPU; JSON, tables and plot in runs/gpu
-	$(PIP) "jax[$(CUDA)]"
-	$(RUN) -m tests.benchmarks.run --only renderer adapters distractors environments --output-dir runs/gpu $(ARGS)
-	XLA_FLAGS="--xla_gpu_enable_command_buffer=-WHILE" \
-		$(RUN) -m tests.benchmarks.run --only environments --output-dir runs/gpu/host-loops $(ARGS)
+# mjx.render needs warp-lang; where it does not install, the report says so.
+gpu-report: $(VENV)/.installed-dev ## measure on an NVIDIA GPU in 25 minutes; tables and plots in runs/gpu-report
+	$(if $(findstring --rehearse,$(ARGS)),,$(PIP) "jax[$(CUDA)]")
+	-$(if $(findstring --rehearse,$(ARGS)),,$(PIP) "mujoco-mjx[warp]")
+	$(RUN) -m tests.benchmarks.gpu_report $(ARGS)
 
 test-programs: $(VENV)/.installed-dev .venv-newest/.installed ## compile for an H100 and a TPU that need not be here
 	$(RUN) -m pytest -m gpu_program tests/test_gpu_program.py $(ARGS)

@@ -77,6 +77,14 @@ def compare(task: str, num_envs: int, seconds: float = SECONDS) -> list[dict[str
     All get the same actions and play the same episodes. ``ratio`` is the speed relative to a
     Python loop over the compiled step that has the same autoreset mode and waits for each step.
     """
+    return compare_runs(*adapter_runs(task, num_envs), seconds)
+
+
+def adapter_runs(task: str, num_envs: int) -> tuple[dict[tuple[str, str], Run], int]:
+    """Return the runs by adapter and autoreset mode, and the environment steps of each.
+
+    A run compiles when it is first called.
+    """
     env, params = pb.make(task)
     actions = random_actions(max(8, min(100, 512 // num_envs)), num_envs, env.action_size)
     runs: dict[tuple[str, str], Run] = {
@@ -91,7 +99,13 @@ def compare(task: str, num_envs: int, seconds: float = SECONDS) -> list[dict[str
         runs["JAX loop", "same_step"] = loop(env, params, num_envs, actions, "same_step")
     for name, make in installed:
         runs[name, "same_step"] = make(task, num_envs, actions)
-    steps = num_envs * len(actions)
+    return runs, num_envs * len(actions)
+
+
+def compare_runs(
+    runs: Mapping[tuple[str, str], Run], steps: int, seconds: float
+) -> list[dict[str, Any]]:
+    """Measure the runs of ``adapter_runs``; see ``compare``."""
     found = compare_speeds(runs, steps, lambda name: ("JAX loop", name[1]), seconds)
     return [
         {"adapter": name, "autoreset_mode": mode, **speed} for (name, mode), speed in found.items()

@@ -57,13 +57,18 @@ def run_process(
             return {"status": "failed", "why": f"took longer than {timeout:.0f} s"}
         finally:
             _kill(child)
+    return outcome_of(child.returncode, output, errors)
+
+
+def outcome_of(status: int, output: str, errors: str) -> dict[str, Any]:
+    """Return the outcome of a process that has ended with an exit status."""
     lines = errors.strip().splitlines()
-    last = lines[-1] if lines else f"exit status {child.returncode}"
-    if os.name == "posix" and child.returncode == -signal.SIGKILL:
+    last = lines[-1] if lines else f"exit status {status}"
+    if os.name == "posix" and status == -signal.SIGKILL:
         return {"status": "killed", "why": "by the system, probably because memory ran out"}
-    if child.returncode == ABSENT:
+    if status == ABSENT:
         return {"status": "absent", "why": last}
-    if child.returncode != 0:
+    if status != 0:
         if any(word in errors.lower() for word in OUT_OF_MEMORY):
             return {"status": "out of memory", "why": last}
         return {"status": "failed", "why": "\n".join(lines[-20:])[-2000:] or last}
