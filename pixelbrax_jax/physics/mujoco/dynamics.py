@@ -180,7 +180,7 @@ class Dynamics:
         def by_native(*row: jax.Array) -> list[jax.Array]:
             function = partial(getattr(self.native, method), *options)
             name = "/".join([self.name, method, *map(str, options)])
-            register(name, partial(_of_rows, function, [(x.size,) for x in row] + shapes))
+            register(name, partial(_of_rows, function, [len(shape) for shape in shapes]))
             return host_call(name, row, like)
 
         def by_xla(*row: jax.Array) -> list[jax.Array]:
@@ -205,12 +205,19 @@ class Dynamics:
 
 
 def _of_rows(
-    function: Callable[..., None], shapes: Sequence[tuple[int, ...]], *arrays: np.ndarray
+    function: Callable[..., None], result_axes: Sequence[int], *arrays: np.ndarray
 ) -> None:
-    """Call ``function`` of (N, ...) rows of these shapes, which have any axes in front."""
-    num_axes = [x.ndim - len(shape) for x, shape in zip(arrays, shapes, strict=True)]
-    sizes = [math.prod(x.shape[:n]) for x, n in zip(arrays, num_axes, strict=True)]
-    function(*(x.reshape(n, *s) for x, n, s in zip(arrays, sizes, shapes, strict=True)))
+    """Call ``function`` of (N, ...) rows, where there are any axes in place of N.
+
+    A row of an operand is a vector, that of a result has ``result_axes``.
+    """
+    num_operands = len(arrays) - len(result_axes)
+    axes = [1] * num_operands + list(result_axes)
+    shapes = [
+        (x.shape[: x.ndim - n], x.shape[x.ndim - n :]) for x, n in zip(arrays, axes, strict=True)
+    ]
+    rows = (x.reshape(math.prod(s), *row) for x, (s, row) in zip(arrays, shapes, strict=True))
+    function(*rows)
 
 
 def _digest(model: mujoco.MjModel) -> str:
