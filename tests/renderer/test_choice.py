@@ -30,6 +30,7 @@ def test_the_kernel_passes_its_check(interpreted):
     assert check.text == "it renders 1920 pixels like renderer='fused'"
 
 
+@pytest.mark.slow
 def test_the_images_of_the_check_are_far_from_rounding():
     """Everything moved by more than rounding does: the images are the same, in all their parts."""
 
@@ -197,6 +198,7 @@ def test_a_batch_is_one_kernel_in_a_program_for_cuda(monkeypatch, renderer):
     assert ("stablehlo.while" in text) == (renderer == "fused")
 
 
+@pytest.mark.slow
 def test_a_program_for_a_cpu_is_that_of_the_plain_one(monkeypatch):
     texts = []
     for renderer, why in (("auto", None), ("auto", "no card"), ("fused", None)):
