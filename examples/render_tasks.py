@@ -104,7 +104,8 @@ def wall(tiles: Sequence[np.ndarray], columns: int) -> np.ndarray:
 def named(name: str, frames: np.ndarray) -> np.ndarray:
     """Frames with a name below, (T, SIZE + CAPTION, SIZE, 3) uint8."""
     caption = Image.new("RGB", (SIZE, CAPTION), "white")
-    font = ImageFont.load_default(size=11 if len(name) < 20 else 9)
+    fonts = map(ImageFont.load_default, range(11, 4, -1))
+    font = next(font for font in fonts if font.getlength(name) <= SIZE)
     ImageDraw.Draw(caption).text((SIZE / 2, CAPTION / 2), name, "black", font, anchor="mm")
     below = np.broadcast_to(np.asarray(caption), (len(frames), CAPTION, SIZE, 3))
     return np.concatenate([frames, below], axis=1)

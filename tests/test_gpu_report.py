@@ -411,6 +411,7 @@ def test_ctrl_c_keeps_what_there_is(tmp_path, monkeypatch):
     assert len(Results(tmp_path).rows) == 1
 
 
+@pytest.mark.slow
 def test_a_case_of_the_smallest_size():
     case = plan.steps("inverted_pendulum", 2, None, "network")
     environ = {**os.environ, "JAX_PLATFORMS": "cpu"}
