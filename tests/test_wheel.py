@@ -24,9 +24,9 @@ import pixelbrax_jax
 
 assert "site-packages" in pixelbrax_jax.__file__, pixelbrax_jax.__file__
 assert "site-packages" in pixelbrax_gym.__file__, pixelbrax_gym.__file__
-assert len(pixelbrax_jax.list_envs()) == 40
+assert len(pixelbrax_jax.list_envs()) == 52
 ids = [name for name in gymnasium.registry if name.startswith("PixelBrax/")]
-assert len(ids) == 40, ids
+assert len(ids) == 52, ids
 
 options = dict(num_envs=2, height=8, width=12, frame_stack=1)
 envs = gymnasium.make_vec("PixelBrax/InvertedPendulum-v0", **options)

@@ -80,9 +80,9 @@ REHEARSAL = Extent(
     batches=(4, 1),
     check_size=24,
     runs=(("ppo", "ci", "inverted_pendulum", ("--num-envs", "32")),),
-    learning_seconds=60.0,
+    learning_seconds=120.0,
     tests=("tests/gpu/test_sharing.py", "-k", "buffer or action_is"),
-    tests_seconds=60.0,
+    tests_seconds=150.0,
     adapters=("inverted_pendulum", 4, 2.0),
     peers=(("inverted_pendulum", 4, 24),),
 )
@@ -118,7 +118,7 @@ def _ordered(extent: Extent) -> Iterator[Timed]:
     yield from (steps(task, n, None) for task in extent.headline for n in few)
     task, num_envs, seconds = extent.adapters
     sharing = {"task": task, "num_envs": num_envs, "seconds": seconds}
-    yield Timed("adapters", "sharing.compare", sharing, seconds=4 * seconds, gigabytes=3.0)
+    yield Timed("adapters", "sharing.compare", sharing, seconds=60 + 3 * seconds, gigabytes=3.0)
     yield from map(check, extent.checked)
     for algorithm, preset, task, options in extent.runs:
         names = {"algorithm": algorithm, "preset": preset, "task": task, "options": options}
