@@ -140,26 +140,30 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--only", nargs="+", default=tasks, choices=tasks, help="tasks of Brax")
     options = parser.parse_args(arguments)
 
-    def animation(task: str) -> np.ndarray:
-        return named(task, tile(task, episode(task, options.num_frames)))
+    def played(names: Sequence[str]) -> dict[str, Any]:
+        return {task: episode(task, options.num_frames) for task in names}
+
+    def animated(states: dict[str, Any]) -> dict[str, np.ndarray]:
+        return {task: named(task, tile(task, those)) for task, those in states.items()}
 
     if options.suite == "dmc":
         if options.only is not tasks:
             parser.error("--only is for --suite brax")
         (options.output_dir / "dmc").mkdir(parents=True, exist_ok=True)
-        tiles = [animation(f"dmc_{task}") for task in DMC_TILES]
-        save(wall(tiles, 5), options.output_dir / "dmc" / "wall.webp")
+        tiles = animated(played([f"dmc_{task}" for task in DMC_TILES]))
+        save(wall(list(tiles.values()), 5), options.output_dir / "dmc" / "wall.webp")
         return
     (options.output_dir / "tasks").mkdir(parents=True, exist_ok=True)
-    animations = {task: animation(task) for task in options.only}
+    states = played(options.only)
+    animations = animated(states)
     for task, frames in animations.items():
         save(frames, options.output_dir / "tasks" / f"{task}.webp")
     if options.only is tasks:
-        animations |= {task: animation(task) for task in TRAINED if task not in tasks}
+        animations |= animated(played([task for task in TRAINED if task not in tasks]))
     if tiles := [animations[task] for task in TRAINED if task in animations]:
         save(wall(tiles, 4), options.output_dir / "wall.webp")
     shown = "ant" if "ant" in animations else options.only[0]
-    images = views(shown, episode(shown, 1))
+    images = views(shown, states[shown])
     Image.fromarray(images).save(options.output_dir / "views.png")
 
 

@@ -62,6 +62,19 @@ def renderer(
     env, params = pb.make(
         task, look=look, shadows=shadows, height=size, width=size, renderer=renderer
     )
+    _, run, compile_seconds = drawing(env, params, num_envs)
+    speed = rate(run)
+    return {
+        "frames_per_second": num_envs * speed["median"],
+        "speed": speed,
+        "compile_seconds": compile_seconds,
+    }
+
+
+def drawing(
+    env: pb.PixelEnv, params: Any, num_envs: int
+) -> tuple[Any, Callable[[int], Any], float]:
+    """Return the program that draws first states, its calls for ``rate``, and compile seconds."""
     states = first_states(env, params, num_envs)
     program, compile_seconds = compiled(env, jax.vmap(env.draw, in_axes=(0, None)), states, params)
 
@@ -70,12 +83,7 @@ def renderer(
             words = program(states, params)
         return words
 
-    speed = rate(run)
-    return {
-        "frames_per_second": num_envs * speed["median"],
-        "speed": speed,
-        "compile_seconds": compile_seconds,
-    }
+    return program, run, compile_seconds
 
 
 def first_states(env: pb.PixelEnv, params: Any, num_envs: int) -> Any:

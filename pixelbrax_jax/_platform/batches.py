@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from pixelbrax_jax._platform.by_platform import by_platform, traced
+from pixelbrax_jax._platform.by_platform import by_platform, traced_row
 from pixelbrax_jax._platform.interpreter import batch_last
 
 _CHUNK = 128
@@ -33,10 +33,10 @@ def step_rows(
     batch is the last axis of intermediate results on a CPU, see ``batch_last``.
     """
     together = jax.vmap(step, in_axes=(0, 0, None))
-    if len(jax.tree.leaves(state)[0]) == 1:
+    num_rows = len(jax.tree.leaves(state)[0])
+    if num_rows == 1:
         return together(state, rows, shared)
     in_chunks = partial(_step_chunks, step, last)
-    num_rows = len(jax.tree.leaves(state)[0])
     like = (state, jax.ShapeDtypeStruct((num_rows,), jnp.float32))
     moved: tuple[Any, jax.Array] = by_platform(
         (state, rows, shared), like, cpu=in_chunks, default=together
@@ -55,8 +55,7 @@ def draw_rows(draw: Callable[..., Any], arguments: tuple[Any, ...], rays: int) -
     turns = -(-num_rows // size)
     if turns == 1:
         return jax.vmap(draw)(*arguments)
-    program, compute, like = traced(draw, *shapes_of_a_row(arguments))
-    like = jax.tree.map(lambda x: jax.ShapeDtypeStruct((num_rows, *x.shape), x.dtype), like)
+    program, compute, like = traced_row(draw, *arguments)
 
     def together(consts: list[Any], *arguments: Any) -> Any:
         return jax.vmap(partial(compute, consts))(*arguments)
@@ -77,18 +76,12 @@ def draw_rows(draw: Callable[..., Any], arguments: tuple[Any, ...], rays: int) -
     return by_platform((program.consts, *arguments), like, cpu=in_turns, default=together)
 
 
-def shapes_of_a_row(arguments: Any) -> Any:
-    """Return the shapes and dtypes of one row of a batch."""
-    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), arguments)
-
-
 def map_runs(function: Callable[[Any], Any], runs: Any) -> Any:
     """Return ``jax.vmap(function)(runs)``; on a CPU one run after the other."""
-    program, compute, like = traced(function, *shapes_of_a_row((runs,)))
-    num_runs = len(jax.tree.leaves(runs)[0])
+    program, compute, like = traced_row(function, runs)
     return by_platform(
         (program.consts, runs),
-        jax.tree.map(lambda x: jax.ShapeDtypeStruct((num_runs, *x.shape), x.dtype), like),
+        like,
         cpu=lambda consts, runs: jax.lax.map(partial(compute, consts), runs),
         default=lambda consts, runs: jax.vmap(partial(compute, consts))(runs),
     )

@@ -89,6 +89,15 @@ def traced(function: Callable[..., Any], *like: Any) -> Traced:
     return Traced(program, compute, shapes)
 
 
+def traced_row(function: Callable[..., Any], *batches: Any) -> Traced:
+    """Trace a function for one row of some batches; ``like`` is that of the results of all rows."""
+    num_rows = len(jax.tree.leaves(batches)[0])
+    row = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), batches)
+    program, compute, like = traced(function, *row)
+    all_rows = jax.tree.map(lambda x: jax.ShapeDtypeStruct((num_rows, *x.shape), x.dtype), like)
+    return Traced(program, compute, all_rows)
+
+
 @dataclass(frozen=True, eq=False)
 class _Forms:
     default: _Form
@@ -114,11 +123,11 @@ def _by_jax(*arrays: Any, forms: _Forms, shapes: Any = ()) -> Any:
 @_primitive.def_abstract_eval
 def _shapes(*avals: Any, forms: _Forms, shapes: Sequence[tuple[Any, Any]]) -> list[Any]:
     del forms
-    aval = max(avals, key=_num_varying)
+    aval = max(avals, key=num_varying)
     return [aval.update(shape=s, dtype=dtype, weak_type=False) for s, dtype in shapes]
 
 
-def _num_varying(aval: Any) -> int:
+def num_varying(aval: Any) -> int:
     """Return how many axes of ``jax.shard_map`` are known to vary."""
     return len(getattr(getattr(aval, "manual_axis_type", None), "varying", ()))
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax import lax
 from jax.extend import core
 
+from pixelbrax_jax._platform.by_platform import num_varying
 from pixelbrax_jax._platform.rules import FEW, RULES, Operand, bind, row_aval, rule, spread
 
 _LANES = 16
@@ -73,7 +74,7 @@ def batch_last(fn: Callable[..., Any], in_axes: Sequence[int | None]) -> Callabl
 
 def _varies(x: jax.Array) -> bool:
     """Return whether ``jax.shard_map`` tracks that ``x`` differs between devices."""
-    return bool(getattr(getattr(jax.typeof(x), "manual_axis_type", None), "varying", ()))
+    return num_varying(jax.typeof(x)) > 0
 
 
 def _row(x: jax.Array) -> jax.ShapeDtypeStruct:

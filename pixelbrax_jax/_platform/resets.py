@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from pixelbrax_jax._platform.by_platform import by_platform, traced
+from pixelbrax_jax._platform.by_platform import by_platform, traced_row
 
 _BLOCK = 32
 """Environments that are reset together; their number is rounded up to a multiple."""
@@ -24,8 +24,7 @@ def reset_rows(
     would wait for the host in every iteration, so it resets all rows and selects, unless the reset
     contains a loop that waits in any case.
     """
-    row = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), arguments)
-    program, compute, _ = traced(fn, *row)
+    program, compute, _ = traced_row(fn, *arguments)
     if _has_open_loop(program.jaxpr):
         return replace_rows(partial(compute, program.consts), arguments, mask, rows)
     return by_platform(

@@ -128,7 +128,9 @@ def draw(
     # Without colors no samples are needed.
     samples = samples if "pixels" in images else 1
 
-    def form(method: Callable[[_Drawing], tuple[jax.Array, ...]]) -> Callable[..., Any]:
+    def form(
+        method: Callable[[_Drawing], tuple[jax.Array, ...]],
+    ) -> Callable[[Scene, tuple[Any, ...]], tuple[jax.Array, ...]]:
         def draw_with(scene: Scene, given: tuple[Any, ...]) -> tuple[jax.Array, ...]:
             def changed(frame: Frame, rows: jax.Array) -> Frame:
                 return change(frame, rows, *given)
@@ -138,10 +140,9 @@ def draw(
         return draw_with
 
     if renderer == "pallas":
-        drawn: tuple[jax.Array, ...] = form(_Drawing.by_kernel)(scene, given)
-        return drawn
+        return form(_Drawing.by_kernel)(scene, given)
     has_kernel = renderer == "auto" and choice.why_no_kernel() is None
-    drawn = by_platform(
+    drawn: tuple[jax.Array, ...] = by_platform(
         (scene, given),
         tuple(jax.ShapeDtypeStruct((height, width), IMAGES[name].drawn) for name in images),
         cpu=form(_Drawing.conditionally),
@@ -149,7 +150,7 @@ def draw(
         tpu=form(_Drawing.behind_a_barrier),
         default=form(_Drawing.in_bands),
     )
-    return drawn  # noqa: RET504, its type
+    return drawn
 
 
 @dataclass(frozen=True)

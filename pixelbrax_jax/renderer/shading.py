@@ -53,29 +53,28 @@ def computed_apart(compute: Callable[[], list[jax.Array]]) -> list[jax.Array]:
     so it does for each of several results. Hence three values share a word. There is no
     derivative.
     """
-    number = 0
+    program, compute_values, values = traced(compute)
+    like = [jax.ShapeDtypeStruct(value.shape, jnp.uint32) for value in values[::3]]
 
-    def words() -> list[jax.Array]:
-        nonlocal number
-        levels = [(value * 1023.0 + 0.5).astype(jnp.uint32) for value in compute()]
-        number = len(levels)
+    def words(consts: list[jax.Array]) -> list[jax.Array]:
+        levels = [(value * 1023.0 + 0.5).astype(jnp.uint32) for value in compute_values(consts)]
         packed = []
-        for first in range(0, number, 3):
+        for first in range(0, len(levels), 3):
             word = levels[first]
             for k, level in enumerate(levels[first + 1 : first + 3], 1):
                 word |= level << 10 * k
             packed.append(word)
         return packed
 
-    program, compute_words, like = traced(words)
     found = by_platform(
         (program.consts,),
         like,
-        cpu=lambda consts: in_a_conditional(lambda _: compute_words(consts), like),
-        default=lambda consts: jax.lax.optimization_barrier(compute_words(consts)),
+        cpu=lambda consts: in_a_conditional(lambda _: words(consts), like),
+        default=lambda consts: jax.lax.optimization_barrier(words(consts)),
     )
     return [
-        ((found[k // 3] >> 10 * (k % 3)) & 1023).astype(jnp.float32) / 1023.0 for k in range(number)
+        ((found[k // 3] >> 10 * (k % 3)) & 1023).astype(jnp.float32) / 1023.0
+        for k in range(len(values))
     ]
 
 

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 import pixelbrax_jax as pb
-from pixelbrax_gym.bench.throughput import compiled, first_states, rate
+from pixelbrax_gym.bench.throughput import compiled, drawing, rate
 
 Policy = Callable[[Any, jax.Array], jax.Array]
 """Maps a batch of observations and a key to actions."""
@@ -123,14 +123,7 @@ def frames(task: str, num_envs: int, size: int, renderer: str) -> Callable[[floa
     if renderer == "pallas" and jax.default_backend() != "gpu":
         renderer = "auto"
     env, params = pb.make(task, height=size, width=size, renderer=renderer)
-    params = jax.device_put(params)
-    states = first_states(env, params, num_envs)
-    program, _ = compiled(env, jax.vmap(env.draw, in_axes=(0, None)), states, params)
-
-    def run(calls: int) -> Any:
-        for _ in range(calls):
-            words = program(states, params)
-        return words
+    program, run, _ = drawing(env, jax.device_put(params), num_envs)
 
     def timed(_: float) -> dict[str, Any]:
         speed = rate(run)
