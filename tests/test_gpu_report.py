@@ -169,11 +169,13 @@ def test_failures_have_their_reasons(monkeypatch):
 
 
 def test_the_end_comes_in_time_and_what_is_ready_is_still_timed():
+    # Python's own, such as the tracker of shared memory that another test needed.
+    before = set(psutil.Process().children())
     began = time.monotonic()
     found = run([fake("endless", wait=60), fake("ready")], seconds=4)
     assert time.monotonic() - began < 10
     assert list(found) == ["ready"]
-    assert not psutil.Process().children()
+    assert set(psutil.Process().children()) <= before
 
 
 def test_a_worker_ends_with_whoever_started_it(tmp_path):
