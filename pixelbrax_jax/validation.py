@@ -97,6 +97,13 @@ def check_positive_int(what: str, value: object) -> int:
     raise ValueError(f"{what} must be a positive integer, got {value!r}.")
 
 
+def check_count(what: str, value: object) -> int:
+    """Return an integer of at least 0 as a Python int; raise ValueError for anything else."""
+    if isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= 0:
+        return int(value)
+    raise ValueError(f"{what} must be a whole number of at least 0, got {value!r}.")
+
+
 def check_fraction(what: str, value: object) -> float:
     """Return ``value`` if it is a number in [0, 1]; raise ValueError otherwise."""
     if isinstance(value, Real) and not isinstance(value, bool) and 0.0 <= float(value) <= 1.0:

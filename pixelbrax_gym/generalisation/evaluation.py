@@ -113,13 +113,7 @@ class _Envs:
         shape = (num, one.env.action_size)
         over, returns = np.zeros(num, bool), np.zeros(num)
         while not over.all():
-            actions = policy(obs)
-            got = tuple(actions.shape) if hasattr(actions, "shape") else np.shape(actions)
-            if got != shape:
-                raise ValueError(
-                    f"the policy must return actions of shape {shape}, a row for each of the "
-                    f"{num} episodes, got {got}."
-                )
+            actions = checked(policy(obs), shape)
             obs, _, terminated, truncated, infos = envs.step(actions)
             # Later episodes of an environment are ignored.
             returns = np.where(over, returns, numpy_of(infos["episode_return"]))
@@ -139,6 +133,16 @@ class _Envs:
         # Levels differ in the parameters that a vector environment passes to its programs.
         envs._stateful.params = one.params
         return envs
+
+
+def checked(actions: Any, shape: tuple[int, ...]) -> Any:
+    """Return a policy's actions; another shape than (E, A) is a ValueError."""
+    if (got := tuple(np.shape(actions))) != shape:
+        raise ValueError(
+            f"the policy must return actions of shape {shape}, a row for each of {shape[0]} "
+            f"episodes, got {got}."
+        )
+    return actions
 
 
 def numpy_of(array: Any) -> np.ndarray:

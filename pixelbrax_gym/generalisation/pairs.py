@@ -15,7 +15,13 @@ import gymnasium as gym
 import jax
 import numpy as np
 
-from pixelbrax_gym.generalisation.evaluation import LEFT_OUT, Policy, numpy_of, scores_of
+from pixelbrax_gym.generalisation.evaluation import (
+    LEFT_OUT,
+    Policy,
+    checked,
+    numpy_of,
+    scores_of,
+)
 from pixelbrax_gym.gymnasium.vector_env import GymnasiumVectorEnv
 from pixelbrax_jax import EnvConfig, VectorPixelEnv
 from pixelbrax_jax.config import ENV_OPTIONS, env_config
@@ -189,12 +195,7 @@ class _Pairs:
                 actions: Any = np.resize(np.array(drawn, np.float32), shape)
             else:
                 seen = obs[sees]
-                actions = policy(seen["pixels"] if sees == "clean" else seen)
-                if (got := tuple(np.shape(actions))) != shape:
-                    raise ValueError(
-                        f"the policy must return actions of shape {shape}, a row for each of "
-                        f"num_envs={self._num_envs} episodes, got {got}."
-                    )
+                actions = checked(policy(seen["pixels"] if sees == "clean" else seen), shape)
             length += ~over
             stepped = {name: envs.step(actions) for name, envs in self._envs.items()}
             obs = {name: result[0] for name, result in stepped.items()}

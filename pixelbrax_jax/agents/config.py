@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from numbers import Integral, Real
+from numbers import Real
 from typing import Annotated, Any, ClassVar, Self, get_type_hints
 
 import numpy as np
@@ -20,6 +20,7 @@ from pixelbrax_jax.ranges import Ranges, check_ranges
 from pixelbrax_jax.types import EnvParams
 from pixelbrax_jax.validation import (
     check_choice,
+    check_count,
     check_fraction,
     check_options,
     check_positive_int,
@@ -32,12 +33,6 @@ def check_positive(name: str, value: object, or_zero: bool = False) -> None:
     if not (known and (value > 0 or (or_zero and value == 0))):  # type: ignore[operator]
         wanted = "a number of at least 0" if or_zero else "a positive number"
         raise ValueError(f"{name} must be {wanted}, got {value!r}.")
-
-
-def check_count(name: str, value: object) -> None:
-    """Raise a ValueError unless the setting is an integer of at least 0."""
-    if not isinstance(value, Integral) or isinstance(value, bool) or value < 0:
-        raise ValueError(f"{name} must be a whole number of at least 0, got {value!r}.")
 
 
 def check_finite(name: str, value: object) -> None:

@@ -30,7 +30,7 @@ COUNTS = (
     "num_policy_phases", "aux_minibatches", "buffer_size", "learning_starts", "batch_size",
     "n_step", "policy_delay", "num_atoms", "feature_dim", "hidden_dim", "std_steps",
 )  # fmt: skip
-COUNTS_OR_0 = ("random_shift", "aux_epochs")
+COUNTS_OR_0 = ("random_shift", "aux_epochs", "num_starts")
 SHARES = ("gamma", "gae_lambda", "clip_coef", "target_rate", "tau")
 POSITIVE = (
     "learning_rate", "initial_std", "adam_eps", "memory_budget_gb", "target_kl", "replay_ratio",

@@ -26,7 +26,13 @@ def ppo(**changes) -> PPO:
     return PPO(PPOConfig(**SMALL, layout="shared", **changes), ball_envs())
 
 
-SINCE: dict[str, object] = {"engine": "auto", "samples": 1, "dynamics": "", "test_dynamics": ""}
+SINCE: dict[str, object] = {
+    "engine": "auto",
+    "num_starts": 0,
+    "samples": 1,
+    "dynamics": "",
+    "test_dynamics": "",
+}
 """Settings that release 0.2.0 lacks, and the values that it trained with."""
 
 

@@ -116,11 +116,14 @@ def experiments() -> dict[str, list[str]]:
     return runs
 
 
+def on_leaderboard(algorithm: str, task: str) -> bool:
+    """Whether a run is kept as an entry of the leaderboard."""
+    return algorithm == "drqv2" or task not in BRAX_TASKS
+
+
 def kept_at(name: str) -> Path:
     """The file that keeps a run."""
-    algorithm, task, *_ = name.split("-")
-    timed = algorithm == "drqv2" or task not in BRAX_TASKS
-    return (LEADERBOARD if timed else KEPT) / f"{name}.json"
+    return (LEADERBOARD if on_leaderboard(*name.split("-")[:2]) else KEPT) / f"{name}.json"
 
 
 def gpu_experiments() -> dict[str, list[str]]:
@@ -149,7 +152,7 @@ def record(folder: Path, arguments: list[str]) -> dict:
     """What is kept of a finished run: settings, returns over steps and time, evaluations."""
     about = read_about(folder / "checkpoints")
     command = {"command": shlex.join(["pixelbrax", *arguments]), "revision": REVISION}
-    if about["algorithm"] == "drqv2" or about["config"]["task"] not in BRAX_TASKS:
+    if on_leaderboard(about["algorithm"], about["config"]["task"]):
         return command | leaderboard.entry(folder)
     records = read_metrics(folder / "metrics.jsonl")
     training = [r for r in records if "episode/return" in r]

@@ -13,29 +13,30 @@ from pixelbrax_jax.physics.gym.formulas import FORMULAS
 from pixelbrax_jax.physics.gym.tasks import TASKS, GymTask
 from pixelbrax_jax.physics.mujoco.native import compile_model
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
-from pixelbrax_jax.physics.mujoco.options import ENGINES
+from pixelbrax_jax.physics.mujoco.options import MujocoOptions
 from pixelbrax_jax.physics.mujoco.physics import MujocoPhysics
 from pixelbrax_jax.spatial import make_rig
 from pixelbrax_jax.types import CameraRig
-from pixelbrax_jax.validation import check_choice
 
 
-def make_physics(task: str, *, engine: str = "auto") -> MujocoPhysics:
+def make_physics(task: str, *, engine: str = "auto", num_starts: int = 0) -> MujocoPhysics:
     """Make the physics of a task in ``TASKS``. Equal arguments give equal objects."""
-    return _load(task, check_choice("engine", engine, ENGINES))
+    options = MujocoOptions(engine=engine, num_starts=num_starts)
+    return _load(task, options.engine, options.num_starts)
 
 
 # Loading a model takes a second. A model that is loaded again equals the first one.
 @lru_cache(maxsize=16)
-def _load(task: str, engine: str) -> MujocoPhysics:
+def _load(task: str, engine: str, num_starts: int) -> MujocoPhysics:
     spec = mujoco.MjSpec.from_file(str(_assets() / TASKS[task].model))
     return MujocoPhysics(
         FORMULAS[task],
         spec,
         engine=engine,
+        num_starts=num_starts,
         time_limit=TASKS[task].time_limit,
         rigs={"free": free_camera(TASKS[task], spec)},
-        identity=Recipe(_load, (task, engine)),
+        identity=Recipe(_load, (task, engine, num_starts)),
     )
 
 

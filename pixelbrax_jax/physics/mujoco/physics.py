@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Hashable, Mapping
+from functools import cached_property, partial
 from types import MappingProxyType
 from typing import Any
 
@@ -32,6 +33,14 @@ from pixelbrax_jax.types import CameraRig, Look, PhysicsState
 _UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 
 
+def _cpu() -> jax.Device | None:
+    """Return the host's device; None, for JAX's default, where JAX_PLATFORMS has no CPU."""
+    try:
+        return jax.local_devices(backend="cpu")[0]
+    except RuntimeError:
+        return None
+
+
 class MujocoPhysics(GuardedPhysics):
     """A task of a MuJoCo model.
 
@@ -52,6 +61,7 @@ class MujocoPhysics(GuardedPhysics):
         spec: mujoco.MjSpec,
         *,
         engine: str,
+        num_starts: int = 0,
         rigs: Mapping[str, CameraRig] = MappingProxyType({}),
         time_limit: int | None = None,
         colors: Mapping[str, Color] | None = None,
@@ -95,6 +105,7 @@ class MujocoPhysics(GuardedPhysics):
         self.dt = float(f"{model.opt.timestep * formulas.substeps:.6g}")
         self.action_size = int(model.nu)
         self._formulas = formulas
+        self._num_starts = num_starts
         self._model = model
         self._extra_links = scene.links
         self.time_limit = time_limit
@@ -134,7 +145,7 @@ class MujocoPhysics(GuardedPhysics):
 
     def first(self, key: jax.Array, dynamics: jax.Array | None = None) -> tuple[State, Readings]:
         """Sample an initial state; return it and its readings."""
-        return self._settle(self._formulas.start(self.dynamics, key), dynamics)
+        return self._settle(self._start(key), dynamics)
 
     @under_default_flags
     def from_qpos(
@@ -147,9 +158,26 @@ class MujocoPhysics(GuardedPhysics):
     ) -> PhysicsState:
         """See ``Physics.from_qpos``; ``key`` samples a target that is not a joint."""
         q, qd = check_pose(self._model, q, qd)
-        start = self._formulas.start(self.dynamics, jax.random.key(0) if key is None else key)
+        start = self._start(jax.random.key(0) if key is None else key)
         start = start.replace(qpos=with_unit_rotations(self._model, q), qvel=qd)
         return self._guard_first(self.observe(*self._settle(start, dynamics)))
+
+    def _start(self, key: jax.Array) -> Start:
+        if not self._num_starts:
+            return self._formulas.start(self.dynamics, key)
+        row = jax.random.randint(key, (), 0, self._num_starts)
+        start: Start = jax.tree.map(lambda rows: jnp.asarray(rows)[row], self._starts)
+        return start
+
+    @cached_property
+    def _starts(self) -> Start:
+        """Initial states of one sequence of keys, a row of NumPy arrays each, made on a CPU."""
+        # The first use may be within a program that is being traced, for an accelerator.
+        with jax.ensure_compile_time_eval(), jax.default_device(_cpu()):
+            keys = jax.random.split(jax.random.key(0), self._num_starts)
+            starts = jax.jit(jax.vmap(partial(self._formulas.start, self.dynamics)))(keys)
+            made: Start = jax.device_get(starts)
+        return made
 
     def _settle(self, start: Start, dynamics: jax.Array | None) -> tuple[State, Readings]:
         state = self.dynamics.state(start.qpos, start.qvel, start.target, dynamics)
