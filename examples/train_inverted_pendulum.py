@@ -281,7 +281,6 @@ def record(agent: Agent, config: Config, device: torch.device, path: Path) -> No
     """Makes a video of the trained agent at 480 x 480 pixels, in the task's own time."""
     env = gymnasium.make(
         config.env_id,
-        disable_env_checker=True,  # Gymnasium's checker knows NumPy arrays alone
         render_mode="rgb_array",
         output="torch",
         height=config.image_size,

@@ -15,12 +15,18 @@ from typing import Any, NamedTuple
 from pixelbrax_gym.bench.machine import PACKAGES, installed_version
 from pixelbrax_jax.cache import cache_folder
 from pixelbrax_jax.extras import install_extra
+from pixelbrax_jax.processor import name_cpu
 
 EXTRAS = {
     "torch": "torch",
     "torchrl": "torchrl",
     "stable-baselines3": "sb3",
     "dm-control": "dmc",
+    "orbax-checkpoint": "train",
+    "tqdm": "clips",
+    "imageio-ffmpeg": "video",
+    "pygame": "human",
+    "minari": "dataset",
 }
 """Package -> the extra that installs it."""
 
@@ -103,11 +109,13 @@ def diagnose(machine: Machine) -> list[Finding]:
 
 
 def _findings(m: Machine) -> Iterator[Finding]:
+    yield _ok(f"{platform.platform()}, {name_cpu()}")
     here = ", ".join(f"{name} {release}" for name, release in m.versions.items() if release)
     yield _ok(f"Python {platform.python_version()}, {here}")
-    for name, extra in EXTRAS.items():
-        if m.versions[name] is None:
-            yield _note(f"{name} is not installed", f"optional: {install_extra(extra)}")
+    lacking = [extra for name, extra in EXTRAS.items() if m.versions[name] is None]
+    if lacking:
+        what = f"{', '.join(lacking)} {'are' if len(lacking) > 1 else 'is'} not installed"
+        yield _note(f"extras: {what}", f"optional: {install_extra(','.join(lacking))}")
 
     on_cpu, on_gpu = m.jax_platform == "cpu", m.jax_platform in _GPUS
     if m.jax_error is None:

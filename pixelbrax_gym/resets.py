@@ -38,7 +38,9 @@ def seeds_of(seed: Any, num_envs: int) -> list[int | None]:
         return [None] * num_envs
     if np.ndim(seed):
         if len(seed) != num_envs:
-            raise ValueError(f"expected one seed for each of {num_envs}, got {len(seed)}.")
+            raise ValueError(
+                f"seed has {len(seed)} entries, but there are {num_envs} environments."
+            )
         return [None if s is None else check_seed(s) for s in seed]
     first = check_seed(seed)
     if first + num_envs > SEEDS:

@@ -27,6 +27,8 @@ _ELSEWHERE = {
 """Names of options in other libraries."""
 
 _ADVICE = {
+    "channels_first": " Frames have their channels last; in PyTorch obs.permute(0, 3, 1, 2) is a "
+    "view with the channels first.",
     "device": " Frames are where JAX computes: on an NVIDIA GPU with the extra cuda12 or cuda13.",
     "num_envs": " Several environments in one program: gymnasium.make_vec, or in JAX "
     "VectorPixelEnv(env, num_envs).",

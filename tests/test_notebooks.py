@@ -38,7 +38,9 @@ def run(name: str, replaced: dict[str, str]) -> dict:
     return namespace
 
 
-@pytest.mark.parametrize("name", SMALL)
+@pytest.mark.parametrize(
+    "name", ["pytorch", pytest.param("jax-distractors", marks=pytest.mark.slow)]
+)
 def test_a_notebook_runs(name):
     source = "\n".join(code_cells(name))
     assert all(old in source for old in SMALL[name])

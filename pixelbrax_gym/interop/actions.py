@@ -74,8 +74,10 @@ def _check_nan(values: np.ndarray) -> None:
         return
     if values.ndim == 1:
         raise ValueError("the action contains NaN; nothing was stepped.")
-    rows = name_rows(bad.any(axis=1))
-    raise ValueError(f"the action of environment {rows} contains NaN; nothing was stepped.")
+    broken = bad.any(axis=1)
+    one = "the action of environment" if broken.sum() == 1 else "the actions of environments"
+    verb = "contains" if broken.sum() == 1 else "contain"
+    raise ValueError(f"{one} {name_rows(broken)} {verb} NaN; nothing was stepped.")
 
 
 def name_rows(mask: np.ndarray) -> str:

@@ -248,7 +248,8 @@ def preset(
             or the task.
     """
     check_choice("algorithm", algorithm, ALGORITHMS)
-    check_choice("preset", name, PRESETS)
+    if name not in PRESETS:
+        check_choice("preset", name, preset_names(algorithm))
     if algorithm not in PRESETS[name]:
         raise ValueError(
             f"the preset {name!r} has no settings for {algorithm}; use one of "

@@ -1,13 +1,21 @@
-"""What random actions, and none, earn in the tasks of docs/results.md."""
+"""What random actions, and none, earn.
+
+    python -m tests.benchmarks.baselines     MuJoCo's tasks, where it is not known; an hour
+
+`tests.benchmarks.figures` adds the tasks of docs/results.md.
+"""
 
 from __future__ import annotations
 
 import json
+from functools import partial
 
 import jax
 import numpy as np
 
-from pixelbrax_jax import VectorPixelEnv, make
+from pixelbrax_jax import VectorPixelEnv, compiler_options, make
+from pixelbrax_jax.physics.dmc.tasks import TASKS as DMC_TASKS
+from pixelbrax_jax.physics.gym.tasks import TASKS as GYM_TASKS
 from tests.benchmarks.results import FOLDER
 
 KEPT = FOLDER / "untrained.json"
@@ -21,7 +29,7 @@ def untrained(settings: dict, episodes: int = 256) -> dict:
     envs = VectorPixelEnv(env, episodes, "disabled")
     steps = -(-settings["episode_length"] // env.action_repeat)
 
-    @jax.jit
+    @partial(jax.jit, compiler_options=compiler_options(env))
     def play(key, params, scale):
         def step(state, key):
             action = scale * jax.random.uniform(key, (episodes, env.action_size), minval=-1.0)
@@ -42,11 +50,21 @@ def untrained(settings: dict, episodes: int = 256) -> dict:
     return result
 
 
-def play_baselines(configs: dict[str, dict]) -> None:
-    """Play where it is not known yet."""
+def play_baselines(configs: dict[str, dict], episodes: int = 256) -> None:
+    """Play where it is not known yet; each result is kept at once."""
     known = json.loads(KEPT.read_text()) if KEPT.exists() else {}
     for name, config in configs.items():
-        settings = {setting: config[setting] for setting in SETTINGS}
+        settings = {setting: config[setting] for setting in SETTINGS if setting in config}
         if known.get(name, {}).get("settings") != settings:
-            known[name] = untrained(settings)
-    KEPT.write_text(json.dumps(known, indent=1) + "\n")
+            known[name] = untrained(settings, episodes)
+            KEPT.write_text(json.dumps(known, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    play_baselines(
+        {
+            task: {"task": task, "action_repeat": 1, "episode_length": 1000}
+            for task in (*DMC_TASKS, *GYM_TASKS)
+        },
+        episodes=64,
+    )

@@ -226,6 +226,12 @@ def _read(name: str) -> dict[str, Any]:
     return json.loads((DOCS / name).read_text("utf-8"))
 
 
+def _random(kept: Mapping[str, Any]) -> str:
+    end = kept["random"]
+    digits = 0 if end["standard_error"] >= 1 else 1
+    return f"{end['return']:,.{digits}f} ± {end['standard_error']:,.{digits}f}"
+
+
 @cache
 def brax() -> list[Described]:
     """Brax's tasks."""
@@ -236,8 +242,7 @@ def brax() -> list[Described]:
         names = Labels(physics._model).names() | {"physics": physics}
         random = ""
         if kept := earned.get(f"{name}-brax"):
-            end, repeat = kept["random"], kept["settings"]["action_repeat"]
-            random = f"{end['return']:,.0f} ± {end['standard_error']:,.0f} (action repeat {repeat})"
+            random = f"{_random(kept)} (action repeat {kept['settings']['action_repeat']})"
         found.append(
             Described(
                 row,
@@ -252,10 +257,8 @@ def brax() -> list[Described]:
     return found
 
 
-def _of_mujoco(
-    rows: Mapping[str, Any], formulas: Mapping[str, Any], random: Callable[[str], str]
-) -> list[Described]:
-    found = []
+def _of_mujoco(rows: Mapping[str, Any], formulas: Mapping[str, Any]) -> list[Described]:
+    earned, found = _read("results/untrained.json"), []
     for name, row in rows.items():
         physics, formula = make_physics(name), formulas[name]
         names = Labels(physics._model).names()
@@ -270,7 +273,7 @@ def _of_mujoco(
                 ends,
                 Text.of(formula.observe, names),
                 formula.substeps,
-                random(name),
+                _random(earned[name]) if name in earned else "",
             )
         )
     return found
@@ -279,18 +282,13 @@ def _of_mujoco(
 @cache
 def dmc() -> list[Described]:
     """Tasks of the DM Control Suite."""
-    kept = _read("dmc/physics.json")["tasks"]
-    return _of_mujoco(
-        DMC_TASKS,
-        DMC_FORMULAS,
-        lambda name: f"{kept[name]['episode']['return']:.3g}" if name in kept else "",
-    )
+    return _of_mujoco(DMC_TASKS, DMC_FORMULAS)
 
 
 @cache
 def gym() -> list[Described]:
     """Gymnasium's MuJoCo tasks."""
-    return _of_mujoco(GYM_TASKS, GYM_FORMULAS, lambda name: "")
+    return _of_mujoco(GYM_TASKS, GYM_FORMULAS)
 
 
 def _title(task: Described) -> str:

@@ -296,8 +296,7 @@ def converts(wrapped, kind, action):
     assert bool(steps.truncated[-1])
 
 
-# Gymnasium's own checker, inside of `make`, knows NumPy alone.
-IN_JAX = {"output": "jax", "disable_env_checker": True}
+IN_JAX = {"output": "jax"}
 
 
 @case("ArrayConversion")

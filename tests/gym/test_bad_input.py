@@ -160,7 +160,7 @@ def test_human_rendering_of_many():
         (None, ValueError, r"shape \(3, 1\), got \(\)"),
         ([[1.0], [1.0, 2.0], [3.0]], ValueError, "got rows of different lengths"),
         (torch.zeros(3, 1).to_sparse(), TypeError, r"must be a dense tensor.*to_dense"),
-        (np.array([[0.0], [np.nan], [np.nan]]), ValueError, "environment 1, 2 contains NaN"),
+        (np.array([[0.0], [np.nan], [np.nan]]), ValueError, "environments 1, 2 contain NaN"),
         (torch.tensor([[0.0], [0.0], [torch.nan]]), ValueError, "environment 2 contains NaN"),
     ],
 )
@@ -182,7 +182,7 @@ def test_actions_leave_the_environment_usable(make_vector, action, error, messag
             r"action must have shape \(3, 1\), got \(3, 2\)",
         ),
         (np.zeros((3, 1), np.int64), TypeError, "floating point.*int64"),
-        (np.full((3, 1), np.nan, np.float32), ValueError, "environment 0, 1, 2 contains NaN"),
+        (np.full((3, 1), np.nan, np.float32), ValueError, "environments 0, 1, 2 contain NaN"),
     ],
 )
 def test_actions_of_other_frameworks(name, actions, error, message):
@@ -293,7 +293,7 @@ def test_first_reset_must_be_whole(make_vector):
         (-1, ValueError, r"\[0, 2\*\*32\), got -1"),
         (2**32, ValueError, r"\[0, 2\*\*32\), got 4294967296"),
         (2**32 - 1, ValueError, "seed=4294967295 would give 3 .* give at most 4294967293"),
-        ([1, 2], ValueError, "one seed for each of 3, got 2"),
+        ([1, 2], ValueError, "seed has 2 entries, but there are 3 environments"),
         ([1, 2, -3], ValueError, r"\[0, 2\*\*32\), got -3"),
         (b"abc", TypeError, "an integer, got b'abc'"),
         ([1, 2, 0.5], TypeError, "an integer, got 0.5"),

@@ -10,7 +10,7 @@ import pytest
 from pixelbrax_gym import cli, doctor
 
 HEALTHY = doctor.Machine(
-    versions=dict.fromkeys(("jax", "torch", "torchrl", "stable-baselines3", "dm-control"), "1.0"),
+    versions=dict.fromkeys(("jax", *doctor.EXTRAS), "1.0"),
     jax_device="cuda:0",
     jax_platform="gpu",
     jax_error=None,
@@ -119,7 +119,7 @@ def test_a_healthy_machine():
         (
             {"versions": HEALTHY.versions | {"torchrl": None}},
             "note",
-            "torchrl is not installed",
+            "extras: torchrl is not installed",
             "pixelbrax[torchrl]",
         ),
     ],

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 
 import pixelbrax_jax as pb
 from pixelbrax_gym.bench.throughput import compiled, drawing, rate
+from pixelbrax_jax.tasks import DMC_TASKS
 
 Policy = Callable[[Any, jax.Array], jax.Array]
 """Maps a batch of observations and a key to actions."""
@@ -22,14 +23,16 @@ def steps(
     """Measure environment steps in one compiled loop, with autoreset.
 
     Args:
-        task: the task.
+        task: the task; those of DM Control draw their initial states from 4096 made once.
         num_envs: N.
         size: height and width of images in pixels; None has states as observations.
         policy: ``"random"``, uniform actions; or ``"network"``, which sees every observation.
         flags: XLA's flags of the process, which are set before it starts.
     """
     del flags
-    options = {"height": size, "width": size} if size else {"obs_mode": "state"}
+    options: dict[str, Any] = {"height": size, "width": size} if size else {"obs_mode": "state"}
+    if task in DMC_TASKS:
+        options["num_starts"] = 4096
     env, params = pb.make(task, **options)
     params = jax.device_put(params)
     venv = pb.VectorPixelEnv(env, num_envs)
