@@ -77,7 +77,7 @@ def _register(task: str, name: str) -> None:
         entry_point=_ENV,
         vector_entry_point="pixelbrax_gym.gymnasium.vector_env:GymnasiumVectorEnv",
         kwargs={"task": task},
-        # It warns of observations that are no NumPy arrays.
+        # Gymnasium's checker warns of observations that are no NumPy arrays.
         disable_env_checker=True,
     )
 

@@ -24,7 +24,7 @@ EXTRAS = {
     "dm-control": "dmc",
     "orbax-checkpoint": "train",
     "tqdm": "clips",
-    "imageio-ffmpeg": "video",
+    "moviepy": "video",
     "pygame": "human",
     "minari": "dataset",
 }

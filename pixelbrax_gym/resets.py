@@ -39,7 +39,8 @@ def seeds_of(seed: Any, num_envs: int) -> list[int | None]:
     if np.ndim(seed):
         if len(seed) != num_envs:
             raise ValueError(
-                f"seed has {len(seed)} entries, but there are {num_envs} environments."
+                f"seed has {len(seed)} entries, but there are {num_envs} environments: give one "
+                "seed, or one for each."
             )
         return [None if s is None else check_seed(s) for s in seed]
     first = check_seed(seed)

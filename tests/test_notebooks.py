@@ -39,7 +39,8 @@ def run(name: str, replaced: dict[str, str]) -> dict:
 
 
 @pytest.mark.parametrize(
-    "name", ["pytorch", pytest.param("jax-distractors", marks=pytest.mark.slow)]
+    "name",
+    [pytest.param(n, marks=pytest.mark.slow if n == "jax-distractors" else ()) for n in SMALL],
 )
 def test_a_notebook_runs(name):
     source = "\n".join(code_cells(name))

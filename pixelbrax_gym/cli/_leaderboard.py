@@ -35,7 +35,7 @@ def entry(folder: str | Path, agent: str | None = None) -> Entry:
 
     Raises:
         CheckpointError: the folder has no checkpoint.
-        ValueError: the run has too few evaluations, several seeds, or distractors.
+        ValueError: the run has too few evaluations, several seeds, distractors, or ``num_starts``.
     """
     folder = Path(folder)
     about = read_about(folder / "checkpoints")
@@ -46,6 +46,11 @@ def entry(folder: str | Path, agent: str | None = None) -> Entry:
         raise ValueError(
             f"{folder} trained with distractors={config['distractors']}; the leaderboard has runs "
             "without."
+        )
+    if config.get("num_starts"):
+        raise ValueError(
+            f"{folder} trained with num_starts={config['num_starts']}, so it was evaluated from "
+            "initial states that it knew; the leaderboard has runs with num_starts=0."
         )
     records = read_metrics(folder / "metrics.jsonl")
     evaluations = [record for record in records if "eval/clean/return" in record]

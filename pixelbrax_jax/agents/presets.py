@@ -253,8 +253,8 @@ def preset(
             or the task.
     """
     check_choice("algorithm", algorithm, ALGORITHMS)
-    if name not in PRESETS:
-        check_choice("preset", name, preset_names(algorithm))
+    known = preset_names(algorithm) if name not in list(PRESETS) else PRESETS
+    check_choice("preset", name, known)
     if algorithm not in PRESETS[name]:
         raise ValueError(
             f"the preset {name!r} has no settings for {algorithm}; use one of "

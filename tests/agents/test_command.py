@@ -57,6 +57,15 @@ def test_a_preset_may_have_settings_of_a_task(algorithm, task):
     assert {name: describe(config)[name] for name in wanted} == wanted
 
 
+def test_cartpole_has_as_many_updates_as_other_tasks():
+    cartpole, walker = (
+        preset("drqv2", "cpu", task) for task in ("dmc_cartpole_swingup", "dmc_walker_walk")
+    )
+    assert cartpole.env.action_repeat == 4 * walker.env.action_repeat
+    assert cartpole.replay_ratio == 4 * walker.replay_ratio
+    assert cartpole.total_steps == walker.total_steps
+
+
 def test_a_preset_without_settings_of_the_task_is_told(capsys):
     assert main(["train", "ppo", "--preset", "cpu", "--task", "pusher"]) == 1
     told = capsys.readouterr().err

@@ -7,6 +7,7 @@ formulas, see ``formula_texts``.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache, partial
@@ -228,7 +229,7 @@ def _read(name: str) -> dict[str, Any]:
 
 def _random(kept: Mapping[str, Any]) -> str:
     end = kept["random"]
-    digits = 0 if end["standard_error"] >= 1 else 1
+    digits = max(0, -math.floor(math.log10(end["standard_error"] or 1.0)))
     return f"{end['return']:,.{digits}f} ± {end['standard_error']:,.{digits}f}"
 
 

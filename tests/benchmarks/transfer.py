@@ -36,7 +36,8 @@ def main() -> None:
         command += ["--pretrained", policy.stem, "--in", "dm_control", "--episodes", str(EPISODES)]
         line = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
         rows[policy.stem] = json.loads(line) | {"policy": digest}
-        KEPT.write_text(json.dumps(sorted(rows.values(), key=lambda row: row["task"]), indent=1))
+        kept = sorted(rows.values(), key=lambda row: row["task"])
+        KEPT.write_text(json.dumps(kept, indent=1) + "\n")
 
 
 if __name__ == "__main__":

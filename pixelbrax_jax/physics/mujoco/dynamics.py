@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Iterable, Sequence
+from copy import copy
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
@@ -109,6 +110,12 @@ class Dynamics:
         fields = [getattr(data, name).shape for name in reads]
         self._shapes = [(model.nbody, 3), (model.nbody, 4), (model.nsensordata,), *fields]
         self._reads = tuple(reads)
+
+    def by_mujoco(self) -> Dynamics:
+        """Return the same dynamics, all computed by MuJoCo itself in programs for a CPU."""
+        other = copy(self)
+        other.engine, other._steps_by_xla = "auto", False
+        return other
 
     @cached_property
     def xla(self) -> Xla:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping
+from dataclasses import asdict
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -20,13 +21,13 @@ from pixelbrax_jax.physics.mujoco.formulas import Formulas, Snapshot, Start, nev
 from pixelbrax_jax.physics.mujoco.geometry import VISIBLE_GROUPS
 from pixelbrax_jax.physics.mujoco.omissions import check_simulated
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
-from pixelbrax_jax.physics.mujoco.options import ENGINES
+from pixelbrax_jax.physics.mujoco.options import MujocoOptions
 from pixelbrax_jax.physics.mujoco.physics import MujocoPhysics
 from pixelbrax_jax.physics.mujoco.poses import with_unit_rotations
 from pixelbrax_jax.physics.mujoco.viewpoints import followed_body
 from pixelbrax_jax.physics.task import Color
 from pixelbrax_jax.types import PhysicsState
-from pixelbrax_jax.validation import check_choice, check_positive_int
+from pixelbrax_jax.validation import check_positive_int
 
 RewardFn = Callable[[Snapshot, Snapshot, jax.Array], jax.Array]
 
@@ -42,8 +43,7 @@ class MjcfPhysics(MujocoPhysics):
         super().__init__(formulas, spec, identity=None, **options)
         self.followed_link = max(followed_body(self._model) - 1, 0)
         # Its functions are checked before a program is traced.
-        first = jax.eval_shape(self.reset, jax.random.key(0))
-        jax.eval_shape(self.step, first, jnp.zeros(self.action_size))
+        jax.eval_shape(self.step, self._first, jnp.zeros(self.action_size))
 
     def _step(self, state: PhysicsState, action: jax.Array) -> PhysicsState:
         before = Snapshot(self._model, state.engine, state.engine.remembered)
@@ -65,6 +65,7 @@ def mjcf_physics(
     reset_noise: float | None = None,
     n_frames: int = 5,
     engine: str = "auto",
+    num_starts: int = 0,
     colors: Mapping[str, Color] | None = None,
     geom_groups: Collection[int] = VISIBLE_GROUPS,
 ) -> MjcfPhysics:
@@ -93,6 +94,8 @@ def mjcf_physics(
             of ``init_q`` and 0 (metres, radians, per second); 0.01 by default.
         n_frames: the model's time steps per control step.
         engine: ``auto``, ``mujoco``, ``xla`` or ``mjx``, as for the DM Control Suite.
+        num_starts: number of initial states made once, of which each episode draws one; 0 samples
+            a new one for each.
         colors: replacements for the model's colors by geom name, red, green, blue in [0, 1].
         geom_groups: MuJoCo's groups of visible geoms and sites.
 
@@ -102,7 +105,7 @@ def mjcf_physics(
             is given with ``init_q`` or ``reset_noise``; or a function returns a wrong shape or
             dtype.
     """
-    check_choice("engine", engine, ENGINES)
+    options = MujocoOptions(engine=engine, num_starts=num_starts)
     if reset is not None and (reset_noise is not None or init_q is not None):
         raise ValueError(
             "reset samples the whole initial state: leave reset_noise and init_q out, and add the "
@@ -132,7 +135,7 @@ def mjcf_physics(
         starts_with_forces=senses_forces,
     )
     return MjcfPhysics(
-        reward, formulas, spec, engine=engine, colors=colors, geom_groups=geom_groups
+        reward, formulas, spec, colors=colors, geom_groups=geom_groups, **asdict(options)
     )
 
 

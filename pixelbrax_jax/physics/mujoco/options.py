@@ -4,10 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from pixelbrax_jax.memory import check_fits
 from pixelbrax_jax.validation import check_choice, check_count
 
 ENGINES = ("auto", "mujoco", "xla", "mjx")
 """Names of the engines."""
+
+
+_BYTES_OF_START = 40
+"""Of the smallest model's initial state, with its key and the work to sample it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,10 +24,12 @@ class MujocoOptions:
     (MuJoCo XLA, on any device and with gradients), ``mjx`` (the same with no stage of our own), or
     ``auto``: ``mujoco`` in programs for a CPU, ``xla`` in others."""
     num_starts: int = 0
-    """Number of initial states that are made once, for each episode to draw one; 0 samples a new
-    one for each. An accelerator computes the reset of all environments in every step, in which
-    DM Control's cheetah takes 200 physics steps to settle; 4096 are usual there."""
+    """Number of initial states, such as 4096, that a process makes once, in seconds; each episode
+    draws one of them, with all seeds. 0 samples a new state for each episode. On an accelerator
+    every step computes resets, in which DM Control's cheetah settles for 200 physics steps."""
 
     def __post_init__(self) -> None:
         check_choice("engine", self.engine, ENGINES)
-        check_count("num_starts", self.num_starts)
+        num_starts = check_count("num_starts", self.num_starts)
+        object.__setattr__(self, "num_starts", num_starts)
+        check_fits(f"num_starts={num_starts}", num_starts * _BYTES_OF_START)

@@ -114,8 +114,12 @@ class MujocoPhysics(GuardedPhysics):
         low, high = np.where(limited, model.actuator_ctrlrange.T, [[-1], [1]]).astype(np.float32)
         self._is_unit_range = bool((low == -1).all() and (high == 1).all())
         self._control_range = low, high
-        first = jax.eval_shape(self.reset, jax.random.key(0))
-        self.state_size = int(first.obs.shape[0])
+        # By an initial state of its own, which needs none of ``num_starts``.
+        self._first = jax.eval_shape(
+            lambda key: self.observe(*self._settle(formulas.start(self.dynamics, key), None)),
+            jax.random.key(0),
+        )
+        self.state_size = int(self._first.obs.shape[0])
 
     def detailed_look(self, pixel: float) -> Look:
         """Return the look with all that MuJoCo's renderer draws; see ``Physics``."""
@@ -172,11 +176,11 @@ class MujocoPhysics(GuardedPhysics):
     @cached_property
     def _starts(self) -> Start:
         """Initial states of one sequence of keys, a row of NumPy arrays each, made on a CPU."""
-        # The first use may be within a program that is being traced, for an accelerator.
+        sample = jax.vmap(partial(self._formulas.start, self.dynamics.by_mujoco()))
+        # The first use is within a program that is being traced, perhaps for an accelerator.
         with jax.ensure_compile_time_eval(), jax.default_device(_cpu()):
             keys = jax.random.split(jax.random.key(0), self._num_starts)
-            starts = jax.jit(jax.vmap(partial(self._formulas.start, self.dynamics)))(keys)
-            made: Start = jax.device_get(starts)
+            made: Start = jax.device_get(jax.jit(sample)(keys))
         return made
 
     def _settle(self, start: Start, dynamics: jax.Array | None) -> tuple[State, Readings]:
