@@ -175,10 +175,10 @@ def end(name: str, key: str = "return", unit: float = 1.0) -> str:
     return f"{of_leaderboard(f'{name}.json')[key][-1] / unit:.0f}"
 
 
-def published_walker_walk() -> str:
-    """DrQ-v2's published return on walker walk at 1M frames."""
+def published(task: str) -> str:
+    """DrQ-v2's published return of a task at 500k frames."""
     returns = of_leaderboard("published.json")["agents"]["DrQ-v2"]["returns"]
-    return f"{returns['dmc_walker_walk']['1000000']:.0f}"
+    return f"{returns[task]['500000']:.0f}"
 
 
 README = {
@@ -191,5 +191,8 @@ README = {
     "stand": lambda: end("drqv2-dmc_walker_stand-0"),
     "walker": lambda: end("drqv2-dmc_walker_walk-0"),
     "walker-minutes": lambda: end("drqv2-dmc_walker_walk-0", "seconds", 60.0),
-    "walker-published": published_walker_walk,
+    "swingup": lambda: end("drqv2-dmc_cartpole_swingup-0"),
+    "stand-published": partial(published, "dmc_walker_stand"),
+    "walker-published": partial(published, "dmc_walker_walk"),
+    "swingup-published": partial(published, "dmc_cartpole_swingup"),
 }
