@@ -179,7 +179,7 @@ _CPU_MUJOCO_TASKS: dict[str, dict[str, Any]] = {
         "total_steps": 3_000_000,
     },
 }
-# In 32 x 32 pixels the pole hardly moves from one frame to the next but one. PlaNet's and DrQ's
+# In 32 x 32 pixels the pole moves by less than a pixel in two control steps. PlaNet's and DrQ's
 # action repeat of 8 makes its velocity visible; the updates are as many as elsewhere.
 _CPU_CARTPOLE = {"action_repeat": 8, "replay_ratio": 1.0, "std_steps": 20_000}
 _CPU_SHARES = {"ppo": 1.0, "ppg": 0.7, "dcpg": 0.6}

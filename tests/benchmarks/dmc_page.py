@@ -192,7 +192,9 @@ README = {
     "walker": lambda: end("drqv2-dmc_walker_walk-0"),
     "walker-minutes": lambda: end("drqv2-dmc_walker_walk-0", "seconds", 60.0),
     "swingup": lambda: end("drqv2-dmc_cartpole_swingup-0"),
+    "sparse": lambda: end("drqv2-dmc_cartpole_balance_sparse-0"),
     "stand-published": partial(published, "dmc_walker_stand"),
     "walker-published": partial(published, "dmc_walker_walk"),
     "swingup-published": partial(published, "dmc_cartpole_swingup"),
+    "sparse-published": partial(published, "dmc_cartpole_balance_sparse"),
 }
