@@ -6,7 +6,6 @@ from typing import Any
 
 from pixelbrax_jax.agents.config import TrainConfig
 from pixelbrax_jax.agents.registry import ALGORITHMS
-from pixelbrax_jax.physics.dmc.tasks import TASKS as DMC_TASKS
 from pixelbrax_jax.validation import check_choice, suggest
 
 _DEACREP = {
@@ -222,7 +221,12 @@ TASK_SETTINGS: dict[str, dict[str, dict[str, dict[str, Any]]]] = {
         | (_CPU_MUJOCO_TASKS if algorithm == "ppo" else {})
         for algorithm, share in _CPU_SHARES.items()
     }
-    | {"drqv2": {name: _CPU_CARTPOLE for name in DMC_TASKS if name.startswith("dmc_cartpole")}},
+    | {
+        "drqv2": {
+            f"dmc_cartpole_{goal}": _CPU_CARTPOLE
+            for goal in ("balance", "balance_sparse", "swingup", "swingup_sparse")
+        }
+    },
     "drqv2": {
         "drqv2": {
             f"dmc_{task}": {"total_steps": total, "std_steps": over} | _drqv2_settings(task)

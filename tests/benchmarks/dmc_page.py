@@ -165,9 +165,12 @@ FIGURES = {
 ALL = {"speed": speed, "physics": physics}
 
 
+LEADERBOARD = FOLDER.parent / "leaderboard"
+
+
 def of_leaderboard(file: str) -> dict:
     """A file of the leaderboard."""
-    return json.loads((FOLDER.parent / "leaderboard" / file).read_text("utf-8"))
+    return json.loads((LEADERBOARD / file).read_text("utf-8"))
 
 
 def end(name: str, key: str = "return", unit: float = 1.0) -> str:
@@ -190,7 +193,9 @@ README = {
     "cup": lambda: end("ppo-dmc_ball_in_cup_catch-0"),
     "stand": lambda: end("drqv2-dmc_walker_stand-0"),
     "walker": lambda: end("drqv2-dmc_walker_walk-0"),
-    "walker-minutes": lambda: end("drqv2-dmc_walker_walk-0", "seconds", 60.0),
+    "drqv2-minutes": lambda: max(
+        (end(path.stem, "seconds", 60.0) for path in LEADERBOARD.glob("drqv2-dmc_*.json")), key=int
+    ),
     "swingup": lambda: end("drqv2-dmc_cartpole_swingup-0"),
     "sparse": lambda: end("drqv2-dmc_cartpole_balance_sparse-0"),
     "stand-published": partial(published, "dmc_walker_stand"),

@@ -4,15 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pixelbrax_jax.memory import check_fits
 from pixelbrax_jax.validation import check_choice, check_count
 
 ENGINES = ("auto", "mujoco", "xla", "mjx")
 """Names of the engines."""
-
-
-_BYTES_OF_START = 40
-"""Of the smallest model's initial state, with its key and the work to sample it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,4 +27,3 @@ class MujocoOptions:
         check_choice("engine", self.engine, ENGINES)
         num_starts = check_count("num_starts", self.num_starts)
         object.__setattr__(self, "num_starts", num_starts)
-        check_fits(f"num_starts={num_starts}", num_starts * _BYTES_OF_START)

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pixelbrax_jax.flags import default_flags, under_default_flags
+from pixelbrax_jax.memory import check_fits
 from pixelbrax_jax.physics.divergence import GuardedPhysics
 from pixelbrax_jax.physics.mujoco.dynamics import Dynamics, Readings, State
 from pixelbrax_jax.physics.mujoco.formulas import Formulas, Snapshot, Start
@@ -106,6 +107,8 @@ class MujocoPhysics(GuardedPhysics):
         self.action_size = int(model.nu)
         self._formulas = formulas
         self._num_starts = num_starts
+        # Of the arrays of float32; sampling takes more.
+        check_fits(f"num_starts={num_starts}", 4 * num_starts * (model.nq + model.nv))
         self._model = model
         self._extra_links = scene.links
         self.time_limit = time_limit
