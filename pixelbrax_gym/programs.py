@@ -141,7 +141,8 @@ class Programs:
         if packed is not None and mask is not None:
             state = _where(mask, state, self._state(packed, params))
         rewards = jnp.zeros(self.vector.num_envs)
-        return self._stepped(state, jax.vmap(self.vector.env.timestep)(state, rewards))
+        see = jax.vmap(self.vector.env.timestep, in_axes=(0, 0, None))
+        return self._stepped(state, see(state, rewards, params))
 
     @compilation.jit(_env, static_argnums=(0, 3, 4))
     def images(self, packed: Packed, params: EnvParams, height: int, width: int) -> jax.Array:

@@ -187,7 +187,7 @@ class PixelEnv(ProgramConfig):
         sim, reward = self.advance(state.sim, state.key, action, params)
         frames = self.push_frame(state.frames, sim, jnp.bool_(False), params)
         state = state.replace(sim=sim, frames=frames)
-        return state, self.timestep(state, reward)
+        return state, self.timestep(state, reward, params)
 
     @partial(jax.jit, static_argnums=0)
     @under_default_flags
@@ -224,7 +224,7 @@ class PixelEnv(ProgramConfig):
         sim = self.reset_sim(key, episode, params, pose)
         frames = self.push_frame(self.blank_frames(), sim, jnp.bool_(True), params)
         state = EnvState(sim=sim, frames=frames, key=key)
-        return state, self.timestep(state, jnp.float32(0.0))
+        return state, self.timestep(state, jnp.float32(0.0), params)
 
     @partial(jax.jit, static_argnums=(0, 3, 4))
     @under_default_flags
@@ -380,14 +380,15 @@ class PixelEnv(ProgramConfig):
             return frames
         return push_each(frames, self.draw_obs(sim, params), is_first)
 
-    def timestep(self, state: EnvState, reward: jax.Array) -> Timestep:
+    def timestep(self, state: EnvState, reward: jax.Array, params: EnvParams) -> Timestep:
         """Return the timestep of a state."""
         sim, terminated = state.sim, state.sim.physics.terminated
+        limit_reached = sim.step_count + sim.time_limit_offset >= params.episode_length
         return Timestep(
             obs=self.obs(state),
             reward=reward,
             terminated=terminated,
-            truncated=sim.done & ~terminated,
+            truncated=~terminated & limit_reached,
             info={
                 "episode_return": sim.episode_return,
                 "episode_length": sim.step_count,

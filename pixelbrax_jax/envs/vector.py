@@ -84,7 +84,7 @@ class VectorPixelEnv:
         frames = jax.tree.map(lambda x: jnp.broadcast_to(x, (self.num_envs, *x.shape)), blank)
         frames = self._push_frames(frames, sim, rows, jnp.ones(self.num_envs, bool))
         state = EnvState(sim=sim, frames=frames, key=keys)
-        return state, self._timestep(state, jnp.zeros(self.num_envs))
+        return state, self._timestep(state, jnp.zeros(self.num_envs), rows)
 
     @partial(jax.jit, static_argnums=0)
     @under_default_flags
@@ -118,7 +118,7 @@ class VectorPixelEnv:
             state = state.replace(key=jnp.where(mask, keys, state.key))
             episode = jnp.zeros_like(episode)
         state = self._reset_and_draw(state, mask, episode, rows)
-        return state, self._timestep(state, jnp.zeros(self.num_envs))
+        return state, self._timestep(state, jnp.zeros(self.num_envs), rows)
 
     @partial(jax.jit, static_argnums=0)
     @under_default_flags
@@ -149,14 +149,14 @@ class VectorPixelEnv:
             state = state.replace(sim=self._reset_rows(state, ended, sim.episode + 1, rows))
             frames = self._push_frames(state.frames, state.sim, rows, ended)
             state = state.replace(frames=frames)
-            return state, self._timestep(state, jnp.where(ended, 0.0, reward))
+            return state, self._timestep(state, jnp.where(ended, 0.0, reward), rows)
         frames = self._push_frames(state.frames, sim, rows, jnp.zeros(self.num_envs, bool))
         state = state.replace(frames=frames)
-        timestep = self._timestep(state, reward)
+        timestep = self._timestep(state, reward, rows)
         if self.autoreset_mode == "disabled":
             return state, timestep
         state = self._reset_and_draw(state, state.done, state.sim.episode + 1, rows)
-        first = self._timestep(state, reward)
+        first = self._timestep(state, reward, rows)
         info = {**first.info, "final_obs": timestep.obs, "final_info": timestep.info}
         return state, timestep.replace(obs=first.obs, info=info)
 
@@ -176,8 +176,9 @@ class VectorPixelEnv:
     def _rows(self, params: EnvParams) -> ParamRows:
         return split_params(params, self.num_envs)
 
-    def _timestep(self, state: EnvState, reward: jax.Array) -> Timestep:
-        timestep: Timestep = jax.vmap(self.env.timestep)(state, reward)
+    def _timestep(self, state: EnvState, reward: jax.Array, params: ParamRows) -> Timestep:
+        see = jax.vmap(params.of_row(self.env.timestep))
+        timestep: Timestep = see(state, reward, params.own)
         return timestep
 
     def _push_frames(

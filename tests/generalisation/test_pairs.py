@@ -147,7 +147,7 @@ def test_the_example_reads_the_state_of_clean_images_alone(tmp_path, monkeypatch
         (
             {"policy": lambda obs: np.zeros((2, 3))},
             ValueError,
-            r"actions of shape \(2, 1\), a row for each of num_envs=2 episodes, got \(2, 3\)",
+            r"actions of shape \(2, 1\), a row for each of 2 episodes, got \(2, 3\)",
         ),
     ],
 )
