@@ -185,8 +185,9 @@ import os, signal, time
 from pathlib import Path
 from tests.benchmarks.gpu_report.schedule import Process
 from tests.benchmarks.gpu_report.plan import Timed
-process = Process(Timed("x", "checks.missing"), dict(os.environ))
-time.sleep(5.0)
+process = Process(Timed("x", "checks.identity"), dict(os.environ))
+process.ready.wait()
+assert process.prepared_seconds is not None
 process.signal(signal.SIGSTOP)
 Path({str(tmp_path / "pid")!r}).write_text(str(process._process.pid))
 time.sleep(60)
@@ -197,7 +198,7 @@ time.sleep(60)
             time.sleep(0.05)
         worker = psutil.Process(int(file.read_text()))
         parent.kill()
-    assert not psutil.wait_procs([worker], timeout=30)[1]
+    assert not psutil.wait_procs([worker], timeout=5)[1]
 
 
 def test_results_outlive_a_kill_and_are_not_measured_again(tmp_path):

@@ -86,8 +86,15 @@ def test_the_sky_and_other_ground_are_not_reflected():
 
 
 @pytest.mark.usefixtures("interpreted")
-@pytest.mark.parametrize("mirror", [0, pytest.param(None, marks=pytest.mark.slow)])
-def test_renderers_agree_with_all_lights_and_shadows(mirror):
+@pytest.mark.parametrize(
+    ("seed", "mirror"),
+    [
+        (0, 0),
+        pytest.param(3, 0, marks=pytest.mark.slow),
+        pytest.param(2, None, marks=pytest.mark.slow),
+    ],
+)
+def test_renderers_agree_with_all_lights_and_shadows(seed, mirror):
     look = LOOK.replace(
         light=jnp.array([-0.3, -0.5, 1.0]),
         diffuse=jnp.float32(0.3),
@@ -96,7 +103,7 @@ def test_renderers_agree_with_all_lights_and_shadows(mirror):
         reflectance=None if mirror is None else jnp.float32(0.5),
         lamps=(LAMP.replace(cos_cutoff=jnp.float32(-1.0), exponent=0),),
     )
-    scene = random_scene(0, look)
+    scene = random_scene(seed, look)
     others = len(scene.geoms.kind) - 1
     geoms = scene.geoms.replace(
         bounded=(True,) + (False,) * others,
