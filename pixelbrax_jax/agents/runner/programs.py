@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax
@@ -41,6 +42,7 @@ class Runs:
         """Return the initial state; the runs have consecutive seeds."""
         return self._spread(self._init(seed, env_params), {})[0]
 
+    @partial(jax.jit, static_argnums=0, inline=True)
     @under_default_flags
     def _init(self, seed: jax.Array, env_params: EnvParams) -> TrainState:
         if self.num_seeds == 1:
@@ -63,7 +65,7 @@ class Runs:
 
     def template(self, env_params: EnvParams) -> TrainState:
         """Return shapes, dtypes and, with several devices, shardings of the state."""
-        template: TrainState = jax.eval_shape(self._init, np.uint32(0), env_params)
+        template: TrainState = Runs._init.eval_shape(self, np.uint32(0), env_params)
         mesh = mesh_of(self.algorithm)
         if mesh is None:
             return template

@@ -6,6 +6,7 @@ between planes and capsules. ``mjx.step`` has the others in the same order.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -37,8 +38,11 @@ def is_supported(model: mujoco.MjModel) -> bool:
 
 def step(model: Any, data: Any) -> Any:
     """Advance by one time step, as ``mjx.step`` does."""
-    data = forward(model, data)
-    return (_runge_kutta if int(model.opt.integrator) == _RK4 else _euler)(model, data)
+    if int(model.opt.integrator) == _EULER:
+        return _euler(model, forward(model, data))
+    # Traced once, used four times.
+    compute = jax.jit(lambda data: forward(model, data))
+    return _runge_kutta(model, compute(data), compute)
 
 
 def forward(model: Any, data: Any) -> Any:
@@ -107,8 +111,11 @@ def _euler(model: Any, data: Any) -> Any:
     return mjx_forward._advance(model, data, data.act_dot, acceleration)
 
 
-def _runge_kutta(model: Any, data: Any) -> Any:
-    """Advance as ``mjx.rungekutta4`` does: the classical method of order 4."""
+def _runge_kutta(model: Any, data: Any, compute: Callable[[Any], Any]) -> Any:
+    """Advance as ``mjx.rungekutta4`` does: the classical method of order 4.
+
+    ``compute`` is ``forward`` of the model; ``data`` has its results.
+    """
     timestep = model.opt.timestep
     first, velocity = data, data.qvel
     weights, fractions = (1 / 6, 1 / 3, 1 / 3, 1 / 6), (0.5, 0.5, 1.0)
@@ -126,14 +133,13 @@ def _runge_kutta(model: Any, data: Any) -> Any:
     for fraction, weight in zip(fractions, weights[1:], strict=True):
         change, acceleration, act_dot = weighted(fraction, velocity, data)
         velocity = first.qvel + acceleration * timestep
-        data = forward(
-            model,
+        data = compute(
             data.replace(
                 qpos=position(change),
                 qvel=velocity,
                 act=first.act + act_dot * timestep,
                 time=first.time + fraction * timestep,
-            ),
+            )
         )
         added = weighted(weight, velocity, data)
         total = tuple(a + b for a, b in zip(total, added, strict=True))

@@ -87,7 +87,8 @@ class Xla:
             )
 
         carry: Arrays = (qpos, qvel, act, qacc_warmstart, jnp.zeros(self._model.nsensordata))
-        carry += tuple(jnp.zeros(x.shape, x.dtype) for x in jax.eval_shape(one, carry)[5:])
+        unread = self._data(qpos, qvel)
+        carry += tuple(jnp.zeros_like(getattr(unread, name)) for name in self._fields)
         if num_steps == 1:
             carry = one(carry)
         else:
