@@ -15,7 +15,7 @@ import jax
 import pytest
 
 from pixelbrax_gym.bench import runner
-from tests.benchmarks.ahead.case import AheadCase
+from tests.benchmarks.ahead.case import MUJOCO_STEPS, AheadCase
 
 pytestmark = [pytest.mark.gpu_program, pytest.mark.timeout(900)]
 
@@ -42,10 +42,10 @@ def compiled(task: str, program: str, platform: str = "cuda", **options: Any) ->
     return outcome["values"]
 
 
-def kept(task: str, program: str) -> dict[str, Any] | None:
+def kept(task: str, program: str, **options: Any) -> dict[str, Any] | None:
     """The same of the kept report; None if that is of another JAX."""
     report = json.loads(KEPT.read_text("utf-8"))
-    where = {"task": task, "program": program, "num_envs": N, "card": "H100"}
+    where = {"task": task, "program": program, "num_envs": N, "card": "H100", **options}
     for row in report["cases"].values():
         release = report["machines"][row["machine"]]["versions"]["jax"]
         if row["arguments"] == where and release == jax.__version__:
@@ -88,6 +88,17 @@ def test_a_step_launches_no_more_than_it_did(program):
         pytest.skip(f"no report of jax {jax.__version__} is kept")
     assert values["launches"] <= 1.1 * before["launches"]
     assert values["longest_chain"] <= 1.1 * before["longest_chain"]
+
+
+@pytest.mark.parametrize("where", MUJOCO_STEPS, ids=lambda where: where["task"])
+def test_a_step_of_mujoco_xla_is_one_graph(where):
+    options = {name: x for name, x in where.items() if name not in ("num_envs", "card")}
+    values = compiled(**options)
+    assert values["host_steps"] == 1
+    before = kept(**options)
+    if before is None:
+        pytest.skip(f"no report of jax {jax.__version__} is kept")
+    assert values["launches"] <= 1.1 * before["launches"]
 
 
 def test_pixels_add_few_launches_to_a_step():

@@ -181,7 +181,6 @@ _CPU_MUJOCO_TASKS: dict[str, dict[str, Any]] = {
 # In 32 x 32 pixels the pole moves by less than a pixel in two control steps. PlaNet's and DrQ's
 # action repeat of 8 makes its velocity visible; the updates are as many as elsewhere.
 _CPU_CARTPOLE = {"action_repeat": 8, "replay_ratio": 1.0, "std_steps": 20_000}
-_CPU_REPEAT_4 = {"action_repeat": 4, "replay_ratio": 0.5, "std_steps": 37_500}
 _CPU_SHARES = {"ppo": 1.0, "ppg": 0.7, "dcpg": 0.6}
 """Number of steps relative to PPO, whose updates are faster."""
 
@@ -227,7 +226,6 @@ TASK_SETTINGS: dict[str, dict[str, dict[str, dict[str, Any]]]] = {
             f"dmc_cartpole_{goal}": _CPU_CARTPOLE
             for goal in ("balance", "balance_sparse", "swingup", "swingup_sparse")
         }
-        | {f"dmc_{task}": _CPU_REPEAT_4 for task in ("cheetah_run", "hopper_stand", "pendulum_swingup")}
     },
     "drqv2": {
         "drqv2": {

@@ -16,7 +16,7 @@ from pixelbrax_jax.processor import num_cores
 from pixelbrax_jax.tasks import DMC_TASKS
 from tests.benchmarks import tables
 from tests.benchmarks.ahead import tables as compiled
-from tests.benchmarks.ahead.case import PROGRAMS, AheadCase
+from tests.benchmarks.ahead.case import MUJOCO_STEPS, PROGRAMS, AheadCase
 from tests.benchmarks.ahead.targets import CARDS
 from tests.benchmarks.original import ORIGINAL
 from tests.benchmarks.peers.install import peer_python
@@ -171,7 +171,8 @@ GROUPS = {
             for num_envs in (1024, 8192)
             for task in TASKS
             for program in PROGRAMS
-        ],
+        ]
+        + [AheadCase("gpu-program", "compiling.gpu", where) for where in MUJOCO_STEPS],
         compiled.gpu,
         "Compiled, not run. Parts for the host are launched one after the other, a loop outside a "
         "graph among them as one; 1 is one CUDA graph. A loop of unknown length counts as one "

@@ -20,7 +20,7 @@ from pixelbrax_gym.bench import report
 from pixelbrax_gym.bench.tables import table
 from pixelbrax_gym.cli import _leaderboard as leaderboard
 from pixelbrax_jax.tasks import BRAX_TASKS
-from tests.benchmarks import dmc_page, gym_page, performance, results, task_pages
+from tests.benchmarks import dmc_page, generalisation, gym_page, performance, results, task_pages
 from tests.benchmarks.cases import GROUPS
 from tests.benchmarks.pages import Figures, filled
 
@@ -91,6 +91,7 @@ PAGES: dict[str, Figures] = {
     "docs/leaderboard.md": {"board": lambda: leaderboard.page(ROOT / "docs/leaderboard")},
     "docs/dmc.md": dmc_page.FIGURES,
     "docs/benchmarks/dmc.md": dmc_page.ALL,
+    "docs/benchmarks/generalisation.md": generalisation.FIGURES,
     "docs/gym-tasks.md": gym_page.FIGURES,
     "docs/tasks.md": {"tasks": brax_tasks},
     **{f"docs/tasks/{suite}.md": figures for suite, figures in task_pages.FIGURES.items()},

@@ -11,7 +11,7 @@ from typing import Any
 from pixelbrax_gym.bench.cases import TASKS
 from pixelbrax_gym.bench.tables import cell, find, number, ratio, table, title, value
 from tests.benchmarks.ahead import tables as compiled
-from tests.benchmarks.ahead.case import PROGRAMS
+from tests.benchmarks.ahead.case import MUJOCO_STEPS, PROGRAMS
 from tests.benchmarks.ahead.targets import LAUNCH_SECONDS
 from tests.benchmarks.original import ORIGINAL
 
@@ -139,6 +139,13 @@ def programs() -> str:
         for program in PROGRAMS
         if program != "scan"
     ]
+    return compiled.gpu(shown, LEFT_OUT)
+
+
+def mujoco_programs() -> str:
+    """Steps of DM Control's tasks for an H100."""
+    rows = rows_of("programs", "gpu-program")
+    shown = [find(rows, "compiling.gpu", **where) for where in MUJOCO_STEPS]
     return compiled.gpu(shown, LEFT_OUT)
 
 
@@ -281,6 +288,7 @@ PERFORMANCE = {
 
 ACCELERATORS = {
     "gpu-programs": programs,
+    "mujoco-programs": mujoco_programs,
     "tpu-programs": tpu_programs,
     "traffic": lambda: span(traffic("renderer")),
     "traffic-plain": lambda: f"{max(traffic('plain renderer')):.0f}",

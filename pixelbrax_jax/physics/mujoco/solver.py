@@ -195,16 +195,23 @@ def _rows(jacobian: jax.Array) -> int:
 
 
 def _over_rows(left: jax.Array, right: jax.Array) -> jax.Array:
-    """Return ``left.T @ right``, some rows at a time: CPUs unroll short products into sums."""
+    """Return ``left.T @ right``; on a CPU some rows at a time, which it unrolls into sums."""
+    rows = _rows(left)
 
     def add(total: jax.Array, pieces: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
         return total + pieces[0].T @ pieces[1], None
 
-    rows = _rows(left)
-    if rows == len(left):
+    def by_pieces(left: jax.Array, right: jax.Array) -> jax.Array:
+        pieces = left.reshape(-1, rows, left.shape[1]), right.reshape(-1, rows, right.shape[1])
+        return jax.lax.scan(add, jnp.zeros((left.shape[1], right.shape[1])), pieces)[0]
+
+    def at_once(left: jax.Array, right: jax.Array) -> jax.Array:
         return left.T @ right
-    pieces = left.reshape(-1, rows, left.shape[1]), right.reshape(-1, rows, right.shape[1])
-    return jax.lax.scan(add, jnp.zeros((left.shape[1], right.shape[1])), pieces)[0]
+
+    if rows == len(left):
+        return at_once(left, right)
+    product: jax.Array = jax.lax.platform_dependent(left, right, cpu=by_pieces, default=at_once)
+    return product
 
 
 def _line_search(

@@ -23,6 +23,19 @@ PROGRAMS = ("renderer", "plain renderer", "step", "state step", "scan")
 a loop over steps with pixels."""
 
 
+MUJOCO_STEPS = [
+    {
+        **{"task": f"dmc_{task}", "program": "state step", "num_envs": 1024},
+        **{"card": "H100", "num_starts": 4096},
+    }
+    for task in (
+        *("cartpole_swingup", "walker_walk", "cheetah_run"),
+        *("finger_spin", "reacher_easy", "hopper_hop"),
+    )
+]
+"""Steps of DM Control's tasks, by MuJoCo XLA."""
+
+
 @dataclass(frozen=True)
 class AheadCase(Case):
     """A program that is compiled for another device than there is: ``cuda`` or ``tpu``."""

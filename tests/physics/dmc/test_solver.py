@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -105,6 +107,22 @@ def test_forces_are_those_of_mujoco(cone, condim, batch):
     assert slips == (cone == "elliptic")
 
 
+def test_forms_for_a_gpu_give_the_same(monkeypatch):
+    def for_cuda(*arguments, default, cpu, cuda=None):
+        used.append(cpu)
+        return (cuda or default)(*arguments)
+
+    used = []
+    monkeypatch.setattr(jax.lax, "platform_dependent", for_cuda)
+    model = model_of("pyramidal", 3, arms=3)
+    qpos, qvel = states(model)
+    ours = after_a_step(model, qpos, qvel)[3]
+    assert len(used) >= 4, "of products over rows and of linear systems"
+    for found, data in zip(ours, mujocos(model, qpos, qvel, mujoco.mj_forward), strict=True):
+        scale = np.maximum(1.0, np.abs(data.qacc).max())
+        np.testing.assert_allclose(found / scale, data.qacc / scale, atol=1e-4)
+
+
 def test_cones_of_several_dimensions_are_left_to_mujoco_xla():
     assert not is_supported(model_of("elliptic", 4, arms=3))
 
@@ -135,17 +153,26 @@ def test_steep_capsules_slide_as_in_mujoco():
         np.testing.assert_allclose(found, data.qvel, atol=1e-3)
 
 
-@pytest.mark.parametrize("unknowns", [1, 3, elimination.LARGEST, elimination.LARGEST + 1])
-@pytest.mark.parametrize("batch", [jax.vmap, last])
-def test_solutions_are_numpys(unknowns, batch):
+# On a GPU the humanoid's 27 unknowns are eliminated in a loop, fewer without one.
+@pytest.mark.parametrize(
+    ("solve", "unknowns", "batch"),
+    [
+        *(
+            (elimination.solve, unknowns, batch)
+            for unknowns in (1, 3, elimination.LARGEST, elimination.LARGEST + 1)
+            for batch in (jax.vmap, last)
+        ),
+        (partial(elimination.eliminate, unroll=True), 9, jax.vmap),
+        (elimination.eliminate, 27, jax.vmap),
+    ],
+)
+def test_solutions_are_numpys(solve, unknowns, batch):
     random = np.random.default_rng(unknowns)
     root = random.normal(size=(32, unknowns, unknowns))
     scale = 10.0 ** random.uniform(-1, 1, (32, unknowns, 1))  # As masses of fingers and torsos.
     matrix = scale * (root @ root.mT + np.eye(unknowns)) * scale.mT
     right = random.normal(size=(32, unknowns))
-    found = jax.jit(batch(elimination.solve))(
-        jnp.asarray(matrix, jnp.float32), jnp.asarray(right, jnp.float32)
-    )
+    found = jax.jit(batch(solve))(jnp.asarray(matrix, jnp.float32), jnp.asarray(right, jnp.float32))
     expected = np.linalg.solve(matrix, right[..., None])[..., 0]
     error = np.abs(found - expected).max(axis=1) / np.abs(expected).max(axis=1)
     assert error.max() < 1e-3
