@@ -1,11 +1,10 @@
-"""Trains agents with and without distractors, and plays suites with them.
+"""Trains agents with and without distractors, and plays DMC-GB2 with them.
 
-    python -m tests.benchmarks.generalisation              all, an hour or more for each seed
-    python -m tests.benchmarks.generalisation ball_in_cup  those with this in their names
-    python -m tests.benchmarks.generalisation --seeds 1 --suite dmcgb2
+    python -m tests.benchmarks.generalisation --seeds 1              all of one seed, half a day
+    python -m tests.benchmarks.generalisation --seeds 1 ball_in_cup  those with this in their names
 
-What is trained and played already is not repeated. Returns go to docs/benchmarks/generalisation,
-tables to docs/benchmarks/generalisation.md.
+Returns go to docs/benchmarks/generalisation, and are not computed again; a stopped training goes
+on. ``python -m tests.benchmarks.figures`` then writes the tables.
 """
 
 from __future__ import annotations
@@ -16,98 +15,83 @@ import math
 import shutil
 import subprocess
 import sys
-from functools import partial
 from pathlib import Path
 
 from pixelbrax_gym.bench.tables import table
 from pixelbrax_gym.generalisation.scores import RETURNS, SHEET, Row, Scores
-from pixelbrax_jax.tasks import DMC_TASKS
 from tests.benchmarks.experiments import DOCS, EPISODES, REVISION, run
 
 KEPT = DOCS / "benchmarks" / "generalisation"
+SUITE = "dmcgb2"
 TASKS = {
     "dmc_ball_in_cup_catch": "ppo",
     "dmc_cartpole_swingup": "drqv2",
     "dmc_finger_spin": "drqv2",
     "dmc_walker_walk": "drqv2",
-    "halfcheetah": "ppo",
 }
 """The agent of each task, with its preset `cpu`."""
-SHIFTS = {"ppo": ("--random-shift", "2"), "drqv2": ()}
-"""DrQ-v2 always shifts images."""
-VARIANTS = {
-    "clean": (),
-    "shifts": None,
+DISTRACTED = {
     "color-easy": ("--distractors", "color-easy"),
     "video-easy": ("--distractors", "video-easy", "--clips", "procedural"),
 }
-"""What agents are trained with; None stands for ``SHIFTS``."""
-SUITES = ("dmcgb2", "axes")
+TRAININGS = {
+    "ppo": {"clean": (), "shifts": ("--random-shift", "2"), **DISTRACTED},
+    # It always shifts images.
+    "drqv2": {"shifts": (), **DISTRACTED},
+}
+"""Options by agent and by what it is trained with."""
 
 
-def variants(task: str) -> dict[str, tuple[str, ...]]:
-    """Options of the trainings of a task, by name."""
-    found = {name: SHIFTS[TASKS[task]] if line is None else line for name, line in VARIANTS.items()}
-    if found["shifts"] == found["clean"]:
-        del found["clean"]
-    return found
-
-
-def kept_at(suite: str, task: str, variant: str) -> Path:
+def kept_at(task: str, training: str) -> Path:
     """The file with the returns of all seeds."""
-    return KEPT / f"{suite}-{task}-{variant}.json"
+    return KEPT / f"{task}-{training}.json"
 
 
-def trained(task: str, variant: str, seed: int, folder: Path) -> Path | None:
-    """Train an agent, or finish its training; return its folder, None if it failed."""
+def kept(task: str, training: str) -> Scores | None:
+    """The returns of all seeds, if there are any."""
+    path = kept_at(task, training)
+    return Scores(**json.loads(path.read_text("utf-8"))) if path.exists() else None
+
+
+def train(task: str, training: str, seed: int, folder: Path) -> int:
+    """Train an agent, or finish its training; the exit status is that of ``run``."""
     agent = TASKS[task]
-    made = folder / f"revision-{REVISION}" / f"{agent}-{task}-{variant}-{seed}"
     command = ["train", agent, "--preset", "cpu", "--task", task, "--seed", str(seed)]
-    command += ["--eval-episodes", str(EPISODES), "--num-evals", "1", *variants(task)[variant]]
-    if not (made / "policy.jax").exists() and run(command, made, math.inf):
-        return None
-    return made
+    command += ["--eval-episodes", str(EPISODES), "--num-evals", "1", *TRAININGS[agent][training]]
+    return run(command, folder, math.inf)
 
 
-def play(suite: str, task: str, variant: str, runs: list[Path], folder: Path) -> None:
-    """Play the levels that have not been played."""
-    played = folder / f"revision-{REVISION}" / f"{suite}-{task}-{variant}"
-    command = [sys.executable, "-m", "pixelbrax_gym.cli", "evaluate", *map(str, runs)]
-    command += ["--suite", suite, "--clips", "procedural", "--output-dir", str(played)]
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+def play(task: str, training: str, runs: list[Path], folder: Path) -> bool:
+    """Play the levels that have not been played, and keep all returns of these runs."""
+    command = ["nice", "-n", "19", sys.executable, "-m", "pixelbrax_gym.cli", "evaluate"]
+    command += [*map(str, runs), "--suite", SUITE, "--clips", "procedural"]
+    command += ["--output-dir", str(folder)]
+    if subprocess.run(command, check=False, stdout=subprocess.DEVNULL).returncode:
+        return False
+    found = json.loads((folder / RETURNS).read_text("utf-8"))
+    found["returns"] = {
+        f"seed {seed}": next(
+            levels for name, levels in found["returns"].items() if name.startswith(f"{made}, seed ")
+        )
+        for seed, made in enumerate(runs)
+    }
     KEPT.mkdir(parents=True, exist_ok=True)
-    shutil.copyfile(played / RETURNS, kept_at(suite, task, variant))
-    shutil.copyfile(played / SHEET, KEPT / f"{suite}-{task}.png")
+    kept_at(task, training).write_text(json.dumps(found) + "\n", "utf-8")
+    shutil.copyfile(folder / SHEET, KEPT / f"{task}.png")
+    return True
 
 
-def rows(suite: str, task: str) -> dict[str, list[Row]]:
-    """Rows of a suite's table, by what the agents were trained with."""
-    found = {}
-    for variant in variants(task):
-        if (path := kept_at(suite, task, variant)).exists():
-            kept = json.loads(path.read_text("utf-8"))
-            found[variant] = Scores(**kept).rows()
-    return found
-
-
-def page_of(suite: str) -> str:
+def page() -> str:
     """A table for each task, a column for each training, in Markdown."""
     parts = []
     for task, agent in TASKS.items():
-        of_variants = rows(suite, task)
-        if not of_variants:
+        scores = {name: found for name in TRAININGS[agent] if (found := kept(task, name))}
+        if not scores:
             continue
-        first = next(iter(of_variants.values()))
-        columns = [{row.level: row for row in found} for found in of_variants.values()]
-        lines = [
-            [row.level, *(_cell(column[row.level]) for column in columns)]
-            for row in first
-            if all(row.level in column for column in columns)
-        ]
-        seeds = min(found[0].runs for found in of_variants.values())
-        title = f"**`{task}`**, {agent}, {seeds} seed{'s' if seeds > 1 else ''}"
-        parts.append(f"{title}\n\n{table(('level', *of_variants), lines)}")
-    return "\n\n".join(parts) or "Not measured yet."
+        columns = {f"{name} ({len(found.returns)})": found.rows() for name, found in scores.items()}
+        lines = [[rows[0].level, *map(_cell, rows)] for rows in zip(*columns.values(), strict=True)]
+        parts.append(f"**`{task}`**, {agent}\n\n{table(('level', *columns), lines)}")
+    return "\n\n".join(parts)
 
 
 def _cell(row: Row) -> str:
@@ -115,40 +99,45 @@ def _cell(row: Row) -> str:
     return f"{row.mean:.0f}{spread}"
 
 
-FIGURES = {"dmcgb2": partial(page_of, "dmcgb2")}
+FIGURES = {SUITE: page}
 
 
 def main() -> int:
-    """Run the command; the exit status is 1 if a training failed."""
+    """Run the command; the exit status is 1 if a training or an evaluation failed."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("name", nargs="?", default="", help="part of the names")
     parser.add_argument("--seeds", type=int, default=3, help="how many of each")
-    parser.add_argument("--suite", choices=SUITES, help="the only suite to play")
     parser.add_argument("--output-dir", type=Path, default=Path("runs/generalisation"))
     options = parser.parse_args()
     chosen = [
-        (task, variant)
-        for task in TASKS
-        for variant in variants(task)
-        if options.name in f"{task}-{variant}"
+        (task, training)
+        for task, agent in TASKS.items()
+        for training in TRAININGS[agent]
+        if options.name in f"{task}-{training}"
     ]
     if not chosen:
         parser.error(f"no agent has {options.name!r} in its name")
-    failed = False
-    for task, variant in chosen:
-        runs = [trained(task, variant, i, options.output_dir) for i in range(options.seeds)]
-        if missing := runs.count(None):
-            print(f"{task}, {variant}: {missing} trainings did not end", file=sys.stderr)
-            failed = True
+    failed = []
+    for task, training in chosen:
+        before = kept(task, training)
+        if before is not None and len(before.returns) >= options.seeds:
             continue
-        for suite in [options.suite] if options.suite else SUITES:
-            # DMC-GB2 has no levels for tasks of others.
-            if suite == "dmcgb2" and task not in DMC_TASKS:
-                continue
-            play(suite, task, variant, [made for made in runs if made], options.output_dir)
-    return int(failed)
+        folder = options.output_dir / f"revision-{REVISION}" / f"{task}-{training}"
+        runs = [folder / str(seed) for seed in range(options.seeds)]
+        for seed, made in enumerate(runs):
+            status = train(task, training, seed, made)
+            if status > 128 or status < 0:
+                print("stopped; the same command goes on", file=sys.stderr)
+                return status
+            if status:
+                break
+        if status or not play(task, training, runs, folder / SUITE):
+            failed.append(f"{task}-{training}")
+    if failed:
+        print(f"failed: {', '.join(failed)}", file=sys.stderr)
+    return bool(failed)
 
 
 if __name__ == "__main__":

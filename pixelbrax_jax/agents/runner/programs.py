@@ -42,6 +42,7 @@ class Runs:
         """Return the initial state; the runs have consecutive seeds."""
         return self._spread(self._init(seed, env_params), {})[0]
 
+    # Traced once for ``init`` and ``template``.
     @partial(jax.jit, static_argnums=0, inline=True)
     @under_default_flags
     def _init(self, seed: jax.Array, env_params: EnvParams) -> TrainState:

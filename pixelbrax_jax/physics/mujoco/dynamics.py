@@ -196,7 +196,7 @@ class Dynamics:
                     "engine='mujoco' computes on a CPU alone; for programs of other devices choose "
                     "engine='xla', or engine='auto'."
                 )
-            # By default NVIDIA's GPUs round what they multiply in matrix products to ten bits.
+            # Accelerators round what they multiply by default, a GPU to ten bits.
             with jax.default_matmul_precision("highest"):
                 return list(getattr(self.xla, method)(*options, *row))
 

@@ -1,4 +1,4 @@
-"""Small linear systems, in operations that a CPU does for a whole batch."""
+"""Small linear systems, in operations that a device does for a whole batch."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ import jax
 import jax.numpy as jnp
 
 LARGEST = 17
-"""Largest number of unknowns for which elimination is faster on a CPU than LAPACK per matrix."""
+"""Largest number of unknowns that a CPU eliminates, where LAPACK is slower, one matrix after the
+other, and that a GPU eliminates without a loop."""
 
 
 def solve(matrix: jax.Array, right: jax.Array) -> jax.Array:
     """Solve ``matrix @ x = right``, by elimination or by Cholesky's factors.
 
-    An NVIDIA GPU eliminates: it cannot capture a factorization in a CUDA graph, so the host would
+    An NVIDIA GPU eliminates, because XLA captures no factorization in a CUDA graph: the host would
     launch each one. A CPU eliminates up to ``LARGEST`` unknowns.
 
     ``matrix`` is (V, V) float32, symmetric and positive definite, so that no pivoting is needed;

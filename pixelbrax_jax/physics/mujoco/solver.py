@@ -195,7 +195,7 @@ def _rows(jacobian: jax.Array) -> int:
 
 
 def _over_rows(left: jax.Array, right: jax.Array) -> jax.Array:
-    """Return ``left.T @ right``; on a CPU some rows at a time, which it unrolls into sums."""
+    """Return ``left.T @ right``; on a CPU some rows at a time: XLA makes sums of short products."""
     rows = _rows(left)
 
     def add(total: jax.Array, pieces: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:

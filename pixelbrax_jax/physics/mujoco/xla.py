@@ -87,8 +87,8 @@ class Xla:
             )
 
         carry: Arrays = (qpos, qvel, act, qacc_warmstart, jnp.zeros(self._model.nsensordata))
-        unread = self._data(qpos, qvel)
-        carry += tuple(jnp.zeros_like(getattr(unread, name)) for name in self._fields)
+        blank = self._data(qpos, qvel)
+        carry += tuple(jnp.zeros_like(getattr(blank, name)) for name in self._fields)
         if num_steps == 1:
             carry = one(carry)
         else:

@@ -29,11 +29,16 @@ MUJOCO_STEPS = [
         **{"card": "H100", "num_starts": 4096},
     }
     for task in (
-        *("cartpole_swingup", "walker_walk", "cheetah_run"),
-        *("finger_spin", "reacher_easy", "hopper_hop"),
+        *("cartpole_swingup", "walker_walk", "cheetah_run", "finger_spin"),
+        *("reacher_easy", "hopper_hop", "humanoid_walk"),
     )
 ]
 """Steps of DM Control's tasks, by MuJoCo XLA."""
+# With starts that settle, and that are sampled until they are valid.
+MUJOCO_STEPS += [
+    {"task": task, "program": "state step", "num_envs": 1024, "card": "H100"}
+    for task in ("dmc_cheetah_run", "dmc_finger_spin")
+]
 
 
 @dataclass(frozen=True)

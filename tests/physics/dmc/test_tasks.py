@@ -165,10 +165,11 @@ def test_a_step_factorises_one_matrix_after_the_other(task):
     if dynamics.model.nv > LARGEST:
         assert count_factorised(step.jaxpr.jaxpr) > 1
         assert_in_turn(step.jaxpr.jaxpr)
-    elif is_supported(dynamics.model):
-        for platform, factorises in (("cpu", False), ("cuda", True)):
+    if is_supported(dynamics.model):
+        # XLA captures no factorization in a CUDA graph.
+        for platform in ("cuda", *(("cpu",) if dynamics.model.nv <= LARGEST else ())):
             program = step.lower(lowering_platforms=(platform,)).as_text()
-            assert bool(re.search("cholesky|potrf", program)) == factorises
+            assert not re.search("cholesky|potrf", program)
 
 
 def count_factorised(jaxpr):
