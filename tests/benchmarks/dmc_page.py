@@ -198,6 +198,8 @@ README = {
     ),
     "swingup": lambda: end("drqv2-dmc_cartpole_swingup-0"),
     "sparse": lambda: end("drqv2-dmc_cartpole_balance_sparse-0"),
+    "spin": lambda: end("drqv2-dmc_finger_spin-0"),
+    "spin-published": partial(published, "dmc_finger_spin"),
     "stand-published": partial(published, "dmc_walker_stand"),
     "walker-published": partial(published, "dmc_walker_walk"),
     "swingup-published": partial(published, "dmc_cartpole_swingup"),
