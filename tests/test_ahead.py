@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from pixelbrax_gym.bench.cases import AbsentError
 from tests.benchmarks.ahead import case, compiling, tables
 from tests.benchmarks.ahead.case import DUMP, PROGRAMS
 from tests.benchmarks.ahead.compiling import make_program
 from tests.benchmarks.ahead.hlo import kernels, longest_chain, loops, parse
+from tests.benchmarks.case import AbsentError
 
 PROGRAM = """HloModule jit_ahead, is_scheduled=true
 
@@ -93,6 +93,7 @@ def test_another_text_is_refused():
         parse("a poem")
 
 
+@pytest.mark.slow
 def test_the_programs_can_be_traced():
     for name in PROGRAMS:
         function, arguments = make_program(name, "inverted_pendulum", 2, backend="spring")

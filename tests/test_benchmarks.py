@@ -13,11 +13,11 @@ from types import SimpleNamespace
 import psutil
 import pytest
 
-from pixelbrax_gym.bench import adapters, cases, runner
-from pixelbrax_gym.bench.cases import AbsentError, Case
+from pixelbrax_gym.bench import adapters, throughput
 from pixelbrax_gym.cli import main as pixelbrax
 from tests.benchmarks import cases as all_cases
-from tests.benchmarks import run
+from tests.benchmarks import run, runner
+from tests.benchmarks.case import TASKS, AbsentError, Case
 from tests.benchmarks.cases import GROUPS
 from tests.benchmarks.packages import install_packages
 from tests.benchmarks.peers import install
@@ -186,7 +186,7 @@ def test_cpus_with_other_vectors_have_files_of_their_own(workers, tmp_path, monk
 
 @pytest.mark.skipif(os.name != "posix", reason="signals are those of POSIX")
 def test_a_benchmark_that_is_stopped_leaves_no_process_behind(tmp_path):
-    command = [sys.executable, "-m", "pixelbrax_gym.cli", "bench", "--output-dir", str(tmp_path)]
+    command = [sys.executable, "-m", "tests.benchmarks.run", "--output-dir", str(tmp_path)]
     stopped = subprocess.Popen(command, cwd=ROOT)
     parent = psutil.Process(stopped.pid)
     while not (left := parent.children(recursive=True)):
@@ -209,11 +209,12 @@ def test_what_is_misspelt_or_left_empty_is_refused(workers, capsys):
         run.main(["--task", "antt"])
     with pytest.raises(ValueError, match="Did you mean 'peers'"):
         run.main(["--only", "peer"])
-    with pytest.raises(SystemExit):
-        pixelbrax(["bench", "--task", "antt"])
-    assert "antt" in capsys.readouterr().err
-    assert pixelbrax(["bench", "--task", "humanoid"]) == 1
-    assert "no case fits" in capsys.readouterr().err
+    with pytest.raises(ValueError, match="no case fits"):
+        run.main(["--only", "renderer", "--task", "humanoid"])
+    assert pixelbrax(["bench", "--task", "antt"]) == 1
+    assert "Did you mean 'ant'" in capsys.readouterr().err
+    assert pixelbrax(["bench", "--num-envs", "0"]) == 1
+    assert "num_envs" in capsys.readouterr().err
 
 
 def test_the_page_has_every_table_and_right_ratios(workers, tmp_path, monkeypatch):
@@ -317,6 +318,7 @@ def test_what_takes_too_long_leaves_no_process(tmp_path):
     pytest.fail("the child lives")
 
 
+@pytest.mark.slow
 def test_a_real_case_runs_in_a_process_of_its_own():
     arguments = {"task": "inverted_pendulum", "num_envs": 2, "size": 16}
     outcome = runner.measure(Case("renderer", "throughput.renderer", arguments), 300.0)
@@ -354,23 +356,26 @@ def test_cases_have_names_of_their_own():
     assert len(set(keys)) == len(keys)
     asked = {
         (case.arguments["task"], case.arguments["num_envs"])
-        for case in cases.FULL["environments"].cases
+        for case in GROUPS["environments"].cases
         if case.arguments.get("obs_mode") == "pixels"
     }
-    assert asked == {(task, n) for task in cases.TASKS for n in (1, 10, 100, 1000, 4096, 8192)}
+    assert asked == {(task, n) for task in TASKS for n in (1, 10, 100, 1000, 4096, 8192)}
 
 
-def test_the_command_measures_this_machine_and_shows_the_page(workers, tmp_path, capsys):
-    asked, _ = workers
-    assert pixelbrax(["bench", "--output-dir", str(tmp_path)]) == 0
-    assert {measure.split(".")[0] for measure, _, _ in asked} == {"throughput", "adapters"}
-    shown = capsys.readouterr().out
-    assert (tmp_path / "cpu.md").read_text() in shown
-    count = len(asked)
-    assert pixelbrax(["bench", "--output-dir", str(tmp_path)]) == 0
-    assert len(asked) == count
-    assert pixelbrax(["bench", "--full", "--only", "adapters", "--output-dir", str(tmp_path)]) == 0
-    assert len(asked) == count + len(cases.FULL["adapters"].cases)
+def test_the_command_measures_this_machine(monkeypatch, tmp_path, capsys):
+    for measure, module in (("renderer", throughput), ("scan", throughput), ("compare", adapters)):
+        name = f"{module.__name__.rpartition('.')[2]}.{measure}"
+        monkeypatch.setattr(module, measure, lambda *_, name=name: ANSWERS[name])
+    file = tmp_path / "new" / "bench.json"
+    assert pixelbrax(["bench", "--num-envs", "7", "--output", str(file)]) == 0
+    page = re.sub(" +", " ", capsys.readouterr().out)
+    assert "ant, 7 environments, 84 x 84" in page
+    assert "| frames, from link poses | 800 |" in page
+    assert "| steps with images | 500 |" in page
+    assert "| JAX loop | next_step | 97.0 | 0.97 | 0.96 to 0.98 |" in page
+    kept = json.loads(file.read_text())
+    assert kept["adapters"] == ANSWERS["adapters.compare"]
+    assert kept["machine"]["versions"]["jax"]
 
 
 def test_adapters_that_are_not_installed_are_left_out(monkeypatch):

@@ -37,6 +37,15 @@ ADAPTERS = (
 """In the order of the columns in docs/options.md."""
 
 
+LONG = {
+    *("docs/agents/index.md", "docs/dataflow.md", "docs/gymnasium.md", "docs/renderer.md"),
+    *("docs/reproducibility.md", "docs/results.md", "docs/howto/brax-trainers.md"),
+    *("docs/howto/goals.md", "docs/howto/observations.md", "docs/howto/own-algorithm.md"),
+    *("docs/howto/own-task.md", "docs/howto/recipes.md"),
+}
+"""Pages whose code takes longer than that of where a reader begins."""
+
+
 @dataclass(frozen=True)
 class Block:
     """A fenced block of code; ``line`` is where its code begins."""
@@ -97,7 +106,9 @@ def _own_registries():
 
 
 @pytest.mark.usefixtures("_own_registries")
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name in LONG else ()) for name in NAMES]
+)
 def test_python_blocks_run(name, tmp_path, monkeypatch):
     blocks = [b for b in blocks_of((ROOT / name).read_text("utf-8")) if b.language == "python"]
     if not blocks:

@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import pytest
 
-from pixelbrax_gym.bench import runner
+from tests.benchmarks import runner
 from tests.benchmarks.ahead.case import MUJOCO_STEPS, AheadCase
 
 pytestmark = [pytest.mark.gpu_program, pytest.mark.timeout(900)]

@@ -156,6 +156,7 @@ def test_derivatives_are_those_without_flags():
     np.testing.assert_array_equal(gradient, expected)
 
 
+@pytest.mark.slow
 def test_brax_environments_of_64_bits_are_the_same_physics():
     from brax import envs
 

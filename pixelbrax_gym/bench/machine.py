@@ -46,9 +46,3 @@ def describe() -> dict[str, Any]:
         "versions": {name: installed_version(name) for name in PACKAGES},
         "xla_flags": os.environ.get("XLA_FLAGS", ""),
     }
-
-
-def file_stem(machine: dict[str, Any]) -> str:
-    """Return the stem of the result files: the platform, and the vector extension of a CPU."""
-    vectors: str = machine["vectors"] if machine["platform"] == "cpu" else ""
-    return "-".join(filter(None, (machine["platform"], vectors.lower().replace("-", ""))))

@@ -2,129 +2,93 @@
 
 from __future__ import annotations
 
-import signal
+import json
 import sys
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-from pixelbrax_gym.bench import runner
-from pixelbrax_gym.bench.cases import FULL, QUICK, Case, Group
-from pixelbrax_gym.bench.machine import file_stem
-from pixelbrax_gym.bench.report import Results
-from pixelbrax_gym.bench.tables import number
-from pixelbrax_gym.cli import CommandError, parse
-from pixelbrax_jax.stop_signals import handling
+from pixelbrax_gym.bench.tables import number, table
+from pixelbrax_gym.cli import parse
+from pixelbrax_jax.validation import check_choice, check_positive_int
+
+SECONDS = 15.0
+"""Duration of the comparison of adapters, without compilation."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """Measures renderer, environments and adapters on this machine, in two to three minutes.
+    """Measures renderer, environment and adapters of a task; a few minutes, mostly to compile."""
 
-    Writes JSON and a page of tables. A stopped run continues where it stopped.
-    """
-
-    full: bool = False
-    """Measures more tasks, batches and looks, which takes hours on a CPU."""
-    output_dir: Path = Path("runs/bench")
-    """Folder for the results."""
-    only: tuple[Literal["renderer", "environments", "adapters"], ...] = ()
-    """Measures only these parts; default: all."""
-    task: tuple[
-        Literal["inverted_pendulum", "halfcheetah", "walker2d", "ant", "humanoid"], ...
-    ] = ()
-    """Measures only cases of these tasks."""
-    max_envs: int | None = None
-    """Skips cases with more environments than this."""
-    again: bool = False
-    """Repeats cases that already have a result."""
-    timeout: float = 900.0
-    """Time limit of one case in seconds."""
-    list: bool = False
-    """Lists the cases and exits."""
+    task: str = "ant"
+    """Name of the task."""
+    num_envs: int = 100
+    """Number of environments."""
+    output: Path | None = None
+    """File for the results as JSON, too."""
 
 
 def run(arguments: Sequence[str]) -> int:
     """Run the command."""
     options = parse("bench", Options, arguments)
-    groups = FULL if options.full else QUICK
-    if options.full:
-        options = replace(options, output_dir=options.output_dir / "full")
-    return measure_groups(options, groups, options.only or list(groups))
+    from pixelbrax_jax.tasks import TASKS
+
+    check_choice("task", options.task, TASKS)
+    check_positive_int("num_envs", options.num_envs)
+    from pixelbrax_gym.bench import machine
+
+    found: dict[str, Any] = {
+        "machine": machine.describe(),
+        "task": options.task,
+        "num_envs": options.num_envs,
+    }
+    for name, measured in _measure(options.task, options.num_envs):
+        found[name] = measured
+        if options.output is not None:
+            options.output.parent.mkdir(parents=True, exist_ok=True)
+            options.output.write_text(json.dumps(found, indent=1) + "\n", "utf-8")
+    sys.stdout.write(_page(found))
+    return 0
 
 
-def measure_groups(options: Options, groups: Mapping[str, Group], chosen: Sequence[str]) -> int:
-    """Measure the chosen groups and print the paths of the results.
+def _measure(task: str, num_envs: int) -> Iterator[tuple[str, Any]]:
+    """Measure one part after the other, and say which."""
+    from pixelbrax_gym.bench import adapters, throughput
 
-    The exit status is 1 if a case failed, but 0 if it only ran out of memory or was absent.
-    """
-    cases = [case for name in chosen for case in groups[name].cases if _fits(case, options)]
-    if not cases:
-        raise ValueError("no case fits --task and --max-envs; --list shows all cases")
-    if options.list:
-        sys.stdout.write("".join(f"{case.key}\n" for case in cases))
-        return 0
-    # A process that outlives this one would disturb later measurements.
-    try:
-        with handling(_interrupt):
-            return _measure(cases, groups, options)
-    except KeyboardInterrupt as stopped:
-        stopped_by = stopped.args[0] if stopped.args else signal.SIGINT
-        name = signal.Signals(stopped_by).name
-        sys.stderr.write(f"\nstopped by {name}; run the same command again to continue\n")
-        return int(128 + stopped_by)
+    parts = {
+        "renderer": lambda: throughput.renderer(task, num_envs),
+        "state": lambda: throughput.scan(task, num_envs, "state"),
+        "pixels": lambda: throughput.scan(task, num_envs),
+        "adapters": lambda: adapters.compare(task, num_envs, SECONDS),
+    }
+    for part, (name, measure) in enumerate(parts.items(), 1):
+        sys.stderr.write(f"{part}/{len(parts)}  {name}: compiling and measuring\n")
+        yield name, measure()
 
 
-def _measure(cases: Sequence[Case], groups: Mapping[str, Group], options: Options) -> int:
-    """Measure the cases without a result on this machine; write each result, and the page."""
-    machine = runner.measure(Case("machine", "machine.describe"), 300.0)
-    if machine["status"] != "ok":
-        raise CommandError(machine["why"])
-    file = options.output_dir / f"{file_stem(machine['values'])}.json"
-    results = Results(file, machine["values"])
-    todo = [case for case in cases if options.again or not results.has(case)]
-    options.output_dir.mkdir(parents=True, exist_ok=True)
-    _say(f"{len(todo)} of {len(cases)} cases to measure; results in {file}\n")
-    failed = False
-    try:
-        for index, case in enumerate(todo, 1):
-            about = " ".join(f"{k}={v}" for k, v in case.arguments.items())
-            _say(f"{index}/{len(todo)}  {case.group} {about} ...")
-            outcome = runner.measure(case, options.timeout)
-            failed |= outcome["status"] == "failed"
-            results.add(case, outcome)
-            _say(f" {_in_words(outcome)} ({outcome['seconds']:.0f} s)\n")
-    finally:
-        if file.exists():
-            results.write_page(groups)
-    page = file.with_suffix(".md")
-    if groups is QUICK:
-        _say(f"\n{page.read_text('utf-8')}\n")
-    _say(f"Tables: {page.resolve()}\n")
-    return int(failed)
-
-
-def _fits(case: Case, options: Options) -> bool:
-    largest = max(case.arguments.get("sizes", [case.arguments.get("num_envs", 0)]))
-    few = options.max_envs is None or largest <= options.max_envs
-    return few and (not options.task or case.arguments.get("task") in options.task)
-
-
-def _interrupt(number: int, _frame: Any) -> None:
-    raise KeyboardInterrupt(number)
-
-
-def _in_words(outcome: dict[str, Any]) -> str:
-    if outcome["status"] != "ok":
-        return f"{outcome['status']}: {outcome['why'].strip().splitlines()[-1]}"
-    values = outcome["values"]
-    for name, unit in (("steps_per_second", "steps/s"), ("frames_per_second", "frames/s")):
-        if name in values:
-            return f"{number(values[name])} {unit}"
-    return "done"
-
-
-def _say(text: str) -> None:
-    sys.stdout.write(text)
-    sys.stdout.flush()
+def _page(found: dict[str, Any]) -> str:
+    """Return the tables, in Markdown."""
+    machine = found["machine"]
+    steps = {
+        "frames, from link poses": found["renderer"]["frames_per_second"],
+        "steps without images": found["state"]["steps_per_second"],
+        "steps with images": found["pixels"]["steps_per_second"],
+    }
+    through = [
+        (
+            row["adapter"],
+            row["autoreset_mode"],
+            number(row["steps_per_second"]),
+            f"{row['ratio']:.2f}",
+            " to ".join(f"{bound:.2f}" for bound in row["interval"]),
+        )
+        for row in found["adapters"]
+    ]
+    return (
+        f"{machine['device']} ({machine['processor']}, {machine['cores']} cores), "
+        f"{found['task']}, {found['num_envs']} environments, 84 x 84, three frames\n\n"
+        f"{table(('a compiled loop', 'per second'), [(k, number(v)) for k, v in steps.items()])}"
+        "\n\nAdapters, interleaved; ratios to the JAX loop of the same autoreset mode:\n\n"
+        f"{table(('adapter', 'autoreset', 'steps/s', 'ratio', 'interval'), through)}\n"
+    )

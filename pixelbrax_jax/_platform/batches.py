@@ -23,20 +23,18 @@ would be mapped into memory anew in every call."""
 Step = Callable[..., tuple[Any, jax.Array]]
 
 
-def step_rows(
-    step: Step, state: Any, rows: Any, shared: Any, *, last: bool = True
-) -> tuple[Any, jax.Array]:
+def step_rows(step: Step, state: Any, rows: Any, shared: Any) -> tuple[Any, jax.Array]:
     """Step every row of a batch, as ``jax.vmap(step, (0, 0, None))(state, rows, shared)``.
 
-    A CPU steps the rows in chunks; the results differ from those of ``jax.vmap`` by rounding.
-    ``step`` returns a row's next state, with the same tree, and a () float32. With ``last`` the
-    batch is the last axis of intermediate results on a CPU, see ``batch_last``.
+    A CPU steps the rows in chunks, which are the last axis of intermediate results, see
+    ``batch_last``; results differ from those of ``jax.vmap`` by rounding. ``step`` returns a row's
+    next state, with the same tree, and a () float32.
     """
     together = jax.vmap(step, in_axes=(0, 0, None))
     num_rows = len(jax.tree.leaves(state)[0])
     if num_rows == 1:
         return together(state, rows, shared)
-    in_chunks = partial(_step_chunks, step, last)
+    in_chunks = partial(_step_chunks, step)
     like = (state, jax.ShapeDtypeStruct((num_rows,), jnp.float32))
     moved: tuple[Any, jax.Array] = by_platform(
         (state, rows, shared), like, cpu=in_chunks, default=together
@@ -104,12 +102,9 @@ def one_run_after_the_other(function: Callable[..., Any]) -> Callable[..., Any]:
     return called
 
 
-def _step_chunks(
-    step: Step, last: bool, state: Any, rows: Any, shared: Any
-) -> tuple[Any, jax.Array]:
+def _step_chunks(step: Step, state: Any, rows: Any, shared: Any) -> tuple[Any, jax.Array]:
     num_rows = len(jax.tree.leaves(state)[0])
-    batch = batch_last if last else jax.vmap
-    step_chunk = batch(step, in_axes=(0, 0, None))
+    step_chunk = batch_last(step, in_axes=(0, 0, None))
     size = chunk_size(num_rows)
     if size == num_rows:
         return step_chunk(state, rows, shared)

@@ -142,8 +142,8 @@ class VectorPixelEnv:
             key, action, own_params = own
             return self.env.advance(sim, key, action, rows.join(own_params, shared))
 
-        own, last = (state.key, action, rows.own), self.env.physics.batch_last
-        sim, reward = step_rows(advance, state.sim, own, rows.shared, last=last)
+        own = state.key, action, rows.own
+        sim, reward = step_rows(advance, state.sim, own, rows.shared)
         state = state.replace(sim=sim)
         if self.autoreset_mode == "next_step":
             state = state.replace(sim=self._reset_rows(state, ended, sim.episode + 1, rows))

@@ -67,7 +67,6 @@ class Physics(abc.ABC):
             convex hull of the mesh.
         look: lights, sky and ground of the model, used as looks ``default`` and ``dmc-plain``; see
             ``detailed_look``.
-        batch_last: whether a CPU is faster with the environments as last axis of a batch.
         compiler_options: XLA options for fast programs on a CPU.
     """
 
@@ -84,7 +83,6 @@ class Physics(abc.ABC):
     followed_link: int = 0
     hull_errors: Mapping[str, float] = MappingProxyType({})
     look: Look | None = None
-    batch_last: bool = True
     compiler_options: Mapping[str, Any] = MappingProxyType({})
 
     @abc.abstractmethod

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import jax
@@ -58,6 +58,11 @@ def ball_envs() -> VectorPixelEnv:
     return VectorPixelEnv(PixelEnv(Ball(), **OPTIONS), SMALL["num_envs"])
 
 
+@cache
+def _first_state(algorithm: Algorithm, seed: int) -> TrainState:
+    return algorithm.init(jax.random.key(seed), PARAMS)
+
+
 @dataclass(frozen=True)
 class Agent:
     """An algorithm, the parts of which are compiled once for equal ones."""
@@ -77,7 +82,7 @@ class Agent:
         return self.algorithm.auxiliary(state)
 
     def init(self, seed: int = 0) -> TrainState:
-        return self.algorithm.init(jax.random.key(seed), PARAMS)
+        return _first_state(self.algorithm, seed)
 
     def run(self, state: TrainState, iterations: int) -> tuple[TrainState, dict[str, Any]]:
         """As ``train_function`` does; the metrics are the last ones of either phase."""

@@ -61,6 +61,7 @@ def test_noise_follows_its_schedule():
     np.testing.assert_allclose(found, [0.8, 0.5, 0.2, 0.2], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_actor_learns_in_every_second_update_of_a_lower_precision():
     agent = small_agent(DrQv2, policy_delay=2, critic="c51", bfloat16=True, layer_norm=True)
     state, facts = agent.run(agent.init(), 2)

@@ -106,7 +106,8 @@ class Terminal:
         os.close(self._keys)
 
 
-@pytest.mark.parametrize("goes_on", [False, pytest.param(True, marks=slow)])
+@slow
+@pytest.mark.parametrize("goes_on", [False, True])
 def test_ctrl_c_reaches_the_reader_of_the_lines_too(tmp_path, request, goes_on):
     run, status = tmp_path / "run", tmp_path / "status"
     line = shlex.join(command("ppo", run, OPTIONS)).replace("--no-progress", "--progress")

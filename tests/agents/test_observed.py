@@ -38,7 +38,10 @@ def agent(kind, options):
     return kind(config, VectorPixelEnv(ball, config.num_envs))
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=() if n == "depth of two" else pytest.mark.slow) for n in CASES],
+)
 def test_an_iteration_changes_every_network(name, tmp_path):
     options, params, shape = CASES[name]
     ppo = agent(PPO, options)
@@ -111,6 +114,7 @@ def test_settings_say_what_they_need():
         PPO(ppo.config.replace(obs_mode="depth"), ppo.envs)
 
 
+@pytest.mark.slow
 def test_a_run_is_stored_and_continues(tmp_path):
     options = {"obs_mode": "depth", "camera": ("default", "top"), "episode_length": 8}
     env = EnvConfig(task="inverted_pendulum", **OPTIONS, **options)

@@ -180,6 +180,7 @@ def test_a_bar_that_cannot_be_drawn_is_told_once(monkeypatch):
     assert told == ["the progress bar cannot be drawn: Broken pipe; the run continues without it"]
 
 
+@pytest.mark.slow
 def test_a_run_without_a_reader_is_the_same(tmp_path, monkeypatch):
     def ppo():
         return PPO(PPOConfig(**SMALL), ball_envs())

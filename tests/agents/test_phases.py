@@ -29,7 +29,9 @@ ROLLOUTS = PHASIC["num_policy_phases"]
 PPG_AGENT, DCPG_AGENT, DECOUPLED = (AGENTS[name] for name in ("ppg", "dcpg", "decoupled"))
 
 
-@pytest.fixture(params=["ppg", "dcpg", "decoupled"])
+@pytest.fixture(
+    params=[pytest.param("ppg", marks=pytest.mark.slow), "dcpg", "decoupled"],
+)
 def agent(request):
     return AGENTS[request.param]
 
@@ -100,6 +102,7 @@ def test_steps_that_teach_nothing_change_no_auxiliary_phase(agent):
     assert not same(other.networks["actor"], expected.networks["actor"])
 
 
+@pytest.mark.slow
 def test_dcpg_s_value_stays_where_it_was_while_the_policy_learns():
     agent = small_agent(DCPG, anneal=False, update_epochs=16, value_distill_coef=100.0)
     before = agent.init(2)

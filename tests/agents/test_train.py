@@ -82,12 +82,17 @@ def whole(tmp_path_factory):
     return run(ppg(), PARAMS, options(folder)), folder
 
 
+@pytest.fixture(autouse=True)
+def _other_runs_export_no_policy(whole, monkeypatch):
+    monkeypatch.setattr(train, "save_policy", lambda *args, **options: None)
+
+
 def without_clock(record):
     clock = ("seconds", "speed/steps_per_second")
     return {name: value for name, value in record.items() if name not in clock}
 
 
-@pytest.mark.parametrize("stopped_by", [None, signal.SIGINT, signal.SIGUSR1])
+@pytest.mark.parametrize("stopped_by", [pytest.param(None, marks=pytest.mark.slow), signal.SIGINT])
 def test_a_resumed_run_is_the_same_to_the_bit(whole, tmp_path, monkeypatch, stopped_by):
     outcome, folder = whole
     lines = []
@@ -213,6 +218,7 @@ def test_the_best_and_the_latest_are_kept(tmp_path):
     again.close()
 
 
+@pytest.mark.slow
 def test_only_evaluations_score_where_there_are_any(tmp_path):
     each = options(tmp_path, num_evals=2, eval_episodes=1, checkpoint_every=PER_ITERATION)
     run(ppg(), PARAMS, replace(each, keep_checkpoints=9), splits=SPLITS)
@@ -273,6 +279,7 @@ def test_losses_that_are_not_finite_stop_the_run(tmp_path, monkeypatch):
     assert latest_steps(tmp_path / "checkpoints") == 4 * PER_ITERATION
 
 
+@pytest.mark.slow
 def test_training_stays_one_iteration_ahead_of_the_device(tmp_path, monkeypatch):
     """Were it further ahead, Ctrl-C would wait for all that has been asked for."""
     algorithm = ppg(12)
@@ -377,6 +384,7 @@ def test_episodes_count_equally_whichever_iteration_they_ended_in():
     assert "episode/return" not in summarize(records[2:])
 
 
+@pytest.mark.slow
 def test_seeds_of_one_program_are_those_of_their_own(tmp_path, monkeypatch):
     # Before rounding has grown.
     after(monkeypatch, 4, lambda _: signal.raise_signal(signal.SIGTERM))

@@ -116,7 +116,9 @@ def test_it_shows_the_states_of_our_physics():
     np.testing.assert_allclose(track.starts[:4], expected, rtol=1e-5)
 
 
-@pytest.mark.parametrize("task", ["dmc_cartpole_swingup", "dmc_walker_walk"])
+@pytest.mark.parametrize(
+    "task", ["dmc_cartpole_swingup", pytest.param("dmc_walker_walk", marks=pytest.mark.slow)]
+)
 def test_returns_in_dm_control_are_ours(task):
     simulator = suite_env(task)
     env, params = make(task, obs_mode="state", action_repeat=2, episode_length=41)

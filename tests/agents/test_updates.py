@@ -92,6 +92,7 @@ def test_ppg_s_actor_keeps_its_value_head_until_the_auxiliary_phase():
     assert same(state.networks["actor"]["params"]["value"], learned)
 
 
+@pytest.mark.slow
 def test_ppg_s_passes_of_the_value_alone_leave_the_policy_alone():
     longer = small_agent(PPG, value_epochs=3)
     state = PPG_AGENT.init()

@@ -1,4 +1,4 @@
-"""What is measured besides ``pixelbrax bench --full``: others, several devices, start-up."""
+"""What is measured: ourselves, others, several devices, start-up, compiled programs."""
 
 from __future__ import annotations
 
@@ -9,19 +9,18 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from pixelbrax_gym.bench import runner
-from pixelbrax_gym.bench.cases import FULL, TASKS, Case, Group
-from pixelbrax_gym.bench.tables import interleaved
 from pixelbrax_jax.processor import num_cores
 from pixelbrax_jax.tasks import DMC_TASKS
-from tests.benchmarks import tables
+from tests.benchmarks import runner, tables
 from tests.benchmarks.ahead import tables as compiled
 from tests.benchmarks.ahead.case import MUJOCO_STEPS, PROGRAMS, AheadCase
 from tests.benchmarks.ahead.targets import CARDS
+from tests.benchmarks.case import TASKS, Case, Group
 from tests.benchmarks.original import ORIGINAL
 from tests.benchmarks.peers.install import peer_python
 
 HERE = "tests.benchmarks"
+BATCHES = (1, 10, 100, 1000, 4096, 8192)
 DM_CONTROL = {
     "halfcheetah": "cheetah",
     "walker2d": "walker",
@@ -55,6 +54,16 @@ class DevicesCase(Case):
         return {"XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {flag}".strip()}
 
 
+def environments() -> Iterator[Case]:
+    """Steps with and without pixels, and frames alone, of every task and batch."""
+    for task in TASKS:
+        for num_envs in BATCHES:
+            where = {"task": task, "num_envs": num_envs}
+            for obs_mode in ("state", "pixels"):
+                yield Case("environments", "throughput.scan", where | {"obs_mode": obs_mode})
+            yield Case("environments", "throughput.renderer", where)
+
+
 def peers() -> Iterator[Case]:
     """Others and ourselves, one after the other; all hand NumPy arrays to Python."""
     for task in TASKS:
@@ -82,7 +91,17 @@ def dmc() -> Iterator[Case]:
 
 
 GROUPS = {
-    "renderer": FULL["renderer"],
+    "renderer": Group(
+        [
+            Case("renderer", "throughput.renderer", {"task": "ant", "num_envs": 256, **options})
+            for options in (
+                *({}, {"look": "original"}, {"shadows": True}, {"size": 64}),
+                {"renderer": "reference", "num_envs": 8},
+            )
+        ],
+        tables.renderer,
+        "From link poses to packed pixels, without physics.",
+    ),
     "startup": Group(
         [
             Case("startup", "startup.first_frame", {"task": "ant", "cache": cache}, HERE)
@@ -92,13 +111,22 @@ GROUPS = {
         "16 environments behind Gymnasium; one sample each. `gymnasium` and PixelBrax are imported "
         "first, JAX and Brax when the environment is made.",
     ),
-    "adapters": FULL["adapters"],
+    "adapters": Group(
+        [
+            Case("adapters", "adapters.compare", {"task": task, "num_envs": num_envs})
+            for task, num_envs in (("ant", 256), ("ant", 1), *((task, 1000) for task in TASKS))
+        ],
+        tables.interleaved("num_envs", "autoreset_mode", "adapter"),
+        "The ratio is relative to the JAX loop with the same autoreset mode, which waits for each "
+        "step. It is a median over rounds with a 95 % bootstrap interval. In each round every "
+        "adapter runs 8 to 100 steps in the same process.",
+    ),
     "distractors": Group(
         [
             Case("distractors", "distractors.compare", {"task": task, "num_envs": num_envs}, HERE)
             for task, num_envs in (("ant", 256), ("ant", 1024), *((task, 1000) for task in TASKS))
         ],
-        interleaved("num_envs", "distractors"),
+        tables.interleaved("num_envs", "distractors"),
         "With a bank of 60 clips of 70 frames. Ratios are to the speed without: medians over "
         "rounds, in which all take a turn of 1 to 100 steps in one process, with bootstrap "
         "intervals of 95 %.",
@@ -154,12 +182,16 @@ GROUPS = {
             Case("batches", "batches.compare", {"task": task, "sizes": (100, 10, 1000)}, HERE)
             for task in TASKS
         ],
-        interleaved("num_envs"),
+        tables.interleaved("num_envs"),
         "A compiled loop over steps. Ratios are to the first line of a task: medians over rounds, "
         "in which all take a turn of 16,000 environment steps in one process, with bootstrap "
         "intervals of 95 %.",
     ),
-    "environments": FULL["environments"],
+    "environments": Group(
+        list(environments()),
+        tables.environments,
+        "A compiled loop over steps that returns no observations.",
+    ),
     "gpu-program": Group(
         [
             AheadCase(

@@ -9,9 +9,10 @@ from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
 
-from pixelbrax_gym.bench.tables import find, number, table
+from pixelbrax_gym.bench.tables import number, table
 from pixelbrax_jax.tasks import DMC_TASKS
 from tests.benchmarks import tables
+from tests.benchmarks.tables import find
 
 FOLDER = Path(__file__).parents[2] / "docs" / "dmc"
 

@@ -16,11 +16,18 @@ from dataclasses import fields
 from pathlib import Path
 
 import pixelbrax_jax as pb
-from pixelbrax_gym.bench import report
 from pixelbrax_gym.bench.tables import table
 from pixelbrax_gym.cli import _leaderboard as leaderboard
 from pixelbrax_jax.tasks import BRAX_TASKS
-from tests.benchmarks import dmc_page, generalisation, gym_page, performance, results, task_pages
+from tests.benchmarks import (
+    dmc_page,
+    generalisation,
+    gym_page,
+    performance,
+    report,
+    results,
+    task_pages,
+)
 from tests.benchmarks.cases import GROUPS
 from tests.benchmarks.pages import Figures, filled
 

@@ -7,7 +7,7 @@ import sys
 from functools import cache
 from pathlib import Path
 
-from pixelbrax_gym.bench.cases import AbsentError
+from tests.benchmarks.case import AbsentError
 
 
 def install_packages(folder: Path, packages: tuple[str, ...], *commands: tuple[str, ...]) -> None:

@@ -8,12 +8,13 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from pixelbrax_gym.bench.cases import TASKS
-from pixelbrax_gym.bench.tables import cell, find, number, ratio, table, title, value
+from pixelbrax_gym.bench.tables import number, table
 from tests.benchmarks.ahead import tables as compiled
 from tests.benchmarks.ahead.case import MUJOCO_STEPS, PROGRAMS
 from tests.benchmarks.ahead.targets import LAUNCH_SECONDS
+from tests.benchmarks.case import TASKS
 from tests.benchmarks.original import ORIGINAL
+from tests.benchmarks.tables import cell, find, ratio, title, value
 
 DOCS = Path(__file__).parents[2] / "docs"
 LEFT_OUT = {

@@ -10,8 +10,8 @@ from typing import Any
 import matplotlib
 import numpy as np
 
-from pixelbrax_gym.bench.tables import title
 from tests.benchmarks.results import return_at
+from tests.benchmarks.tables import title
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

@@ -8,13 +8,13 @@ from typing import Any
 
 import jax
 
-from pixelbrax_gym.bench.cases import ABSENT
 from pixelbrax_gym.bench.throughput import compiled, rate
 from pixelbrax_jax.agents.config import make_env
 from pixelbrax_jax.agents.on_policy.ppo import PPO
 from pixelbrax_jax.agents.presets import preset
 from pixelbrax_jax.agents.runner.devices import replicate, state_shardings
 from pixelbrax_jax.envs.sharded import ShardedVectorEnv, make_env_mesh
+from tests.benchmarks.case import ABSENT
 
 
 def training(task: str, num_devices: int, cores: int, num_envs: int) -> dict[str, Any]:

@@ -70,6 +70,7 @@ def test_every_episode_and_environment_is_another(runs):
     places = info["camera"][first][:, 1]
     assert len(places) > 24
     assert len(np.unique(places)) == len(places)
+    assert len(np.unique(info["color"][0])) == info["color"][0].size
 
 
 def test_neighbors_do_not_matter(runs):
@@ -115,9 +116,8 @@ def test_an_early_time_limit_does_not_move_the_video():
     assert int(state.sim.time_limit_offset) == 0
 
 
-def test_order_of_giving_does_not_matter(runs):
-    reordered = rollout(ALL[::-1])
-    np.testing.assert_array_equal(reordered.obs["pixels"], runs[0].obs["pixels"])
+def test_order_of_giving_does_not_matter():
+    assert Chain(ALL[::-1]) == Chain(ALL)
 
 
 def test_what_cannot_work_together_is_refused():

@@ -7,10 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pixelbrax_jax import VectorPixelEnv, distractors
-from pixelbrax_jax.envs.pixel_env import PixelEnv
-from tests.distractors.conftest import SIZE, episode, walk
-from tests.envs.toy import PARAMS, Ball
+from pixelbrax_jax import distractors
+from tests.distractors.conftest import episode, walk
+from tests.envs.toy import PARAMS
 
 KEYS = jax.vmap(jax.random.key)(jnp.arange(20_000))
 
@@ -170,9 +169,3 @@ def test_plain_planes_are_no_ground():
     changed = color.change_params(shift, PARAMS.replace(geoms=geoms))
     expected = PARAMS.look.ground_rgb + shift[1]
     np.testing.assert_allclose(changed.look.ground_rgb, expected, atol=1e-6)
-
-
-def test_environments_differ():
-    env = VectorPixelEnv(PixelEnv(Ball(), **SIZE, distractors=(distractors.Color(),)), 8)
-    _, timestep = env.reset(jax.random.key(0), PARAMS)
-    assert len(np.unique(timestep.info["color"])) == 24

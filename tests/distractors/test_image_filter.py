@@ -25,14 +25,14 @@ def clean():
     return images(None)
 
 
-@pytest.mark.parametrize("contrast", [0.0, 0.5])
+@pytest.mark.parametrize("contrast", [pytest.param(0.0, marks=pytest.mark.slow), 0.5])
 def test_contrast_moves_colors_towards_grey(clean, contrast):
     expected = 127.5 + contrast * (clean - 127.5)
     # Both images are rounded.
     assert np.abs(images(ImageFilter(contrast=contrast)) - expected).max() <= 1.0
 
 
-@pytest.mark.parametrize("blur", [0.02, 0.1])
+@pytest.mark.parametrize("blur", [pytest.param(0.02, marks=pytest.mark.slow), 0.1])
 def test_blur_is_a_mean_with_gaussian_weights(clean, blur):
     scale = blur * clean.shape[1]
     reach = int(np.ceil(3 * scale))

@@ -37,6 +37,7 @@ def largest():
     return rollout(8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_envs", [1, 4])
 def test_environment_does_not_depend_on_the_batch(largest, num_envs):
     large_state, large = largest

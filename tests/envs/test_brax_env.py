@@ -245,6 +245,7 @@ def test_the_lost_function_of_jax_replicates():
     )
 
 
+@pytest.mark.slow
 def test_ppo_trains_from_pixels_and_goes_on_from_a_checkpoint(tmp_path):
     # Brax warns when it is imported before PixelBrax, which knows the warning.
     from brax.training.agents.ppo import networks_vision

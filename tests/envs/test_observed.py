@@ -51,7 +51,12 @@ def test_every_part_is_that_of_the_rendered_frame():
 
 
 @pytest.mark.parametrize(
-    ("obs_mode", "params"), [("depth", PARAMS), (ALL, TWO), ("segmentation", TWO)]
+    ("obs_mode", "params"),
+    [
+        pytest.param("depth", PARAMS, marks=pytest.mark.slow),
+        (ALL, TWO),
+        pytest.param("segmentation", TWO, marks=pytest.mark.slow),
+    ],
 )
 def test_the_rules_of_environments_hold(obs_mode, params):
     num_cameras = 2 if params is TWO else 1
@@ -68,7 +73,7 @@ def test_the_rules_of_environments_hold(obs_mode, params):
     assert found == {name: every[name] for name in found}
 
 
-@pytest.mark.parametrize("mode", ["next_step", "same_step"])
+@pytest.mark.parametrize("mode", ["next_step", pytest.param("same_step", marks=pytest.mark.slow)])
 def test_two_cameras_see_what_two_environments_see(mode):
     def episodes(num_cameras, params):
         env = PixelEnv(Ball(), obs_mode=ALL, num_cameras=num_cameras, **SIZE)

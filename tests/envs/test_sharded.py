@@ -23,17 +23,15 @@ actions = jax.random.uniform(jax.random.key(1), (8, NUM_ENVS, 1), minval=-1.0, m
 
 def rollout(venv):
     state, timestep = venv.reset(jax.random.key(0), params)
-    steps = [timestep]
+    steps, program = [timestep], jax.jit(venv.step).lower(state, actions[0], params).compile()
     for action in actions:
-        state, timestep = venv.step(state, action, params)
+        state, timestep = program(state, action, params)
         steps.append(timestep)
-    return state, steps
+    return state, steps, program.as_text()
 
-spread = ShardedVectorEnv(env, NUM_ENVS, make_env_mesh(2))
-state, steps = rollout(spread)
-_, alone = rollout(pb.VectorPixelEnv(env, NUM_ENVS))
+state, steps, text = rollout(ShardedVectorEnv(env, NUM_ENVS, make_env_mesh(2)))
+_, alone, _ = rollout(pb.VectorPixelEnv(env, NUM_ENVS))
 bytes_of = lambda tree, size: sum(size(leaf) for leaf in jax.tree.leaves(tree))
-text = jax.jit(spread.step).lower(state, actions[0], params).compile().as_text()
 far = max(
     float(np.abs(np.asarray(a.obs["state"]) - np.asarray(b.obs["state"])).max())
     for a, b in zip(steps, alone)

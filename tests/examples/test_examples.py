@@ -76,6 +76,7 @@ def test_sb3_ppo(tmp_path):
     assert (tmp_path / "agent.zip").exists()
 
 
+@pytest.mark.slow
 def test_render_tasks(tmp_path):
     arguments = ["--output-dir", str(tmp_path), "--num-frames", "4", "--only", "reacher"]
     load("render_tasks").main(arguments)
@@ -103,6 +104,7 @@ def test_render_tasks_of_dm_control(tmp_path, monkeypatch):
     assert np.abs(moving[:, :, :120].astype(int) - moving[:, :, 124:]).mean() > 1
 
 
+@pytest.mark.slow
 def test_skrl_ppo(tmp_path):
     agent = load("skrl_ppo").main(
         ["--output-dir", str(tmp_path), "--num-envs", "4", "--timesteps", "64"]
@@ -120,6 +122,7 @@ def test_agents_learn(name, tmp_path):
     assert figures["eval_return_mean"] >= 500
 
 
+@pytest.mark.slow
 def test_render_distractors(tmp_path):
     presets = ["none", "video-hard", "dcs-hard"]
     load("render_distractors").main(

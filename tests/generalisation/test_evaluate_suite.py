@@ -78,6 +78,7 @@ def test_policies_of_all_libraries_have_equal_returns(tmp_path):
     assert evaluate(of_torch, output="torch").returns["policy"] == found
 
 
+@pytest.mark.slow
 def test_episodes_are_those_of_the_command(runs, capsys, tmp_path):
     runs["a"] = [agent(seed=0), agent(lambda obs: -of_jax(obs), seed=1)]
     where = ["--clips", "procedural", "--output-dir", tmp_path]

@@ -103,6 +103,7 @@ def test_a_stopped_recording_continues(policy, tmp_path):
     assert (tmp_path / "cut" / "0" / "part-0.parquet").stat().st_mtime_ns == before
 
 
+@pytest.mark.slow
 def test_the_command_records_agents_and_random_actions(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(dataset, "load", lambda options, folder: agent())
     where = ["--suite", "tiny", "--level", "painted", "--num-envs", "3"]

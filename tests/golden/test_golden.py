@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pixelbrax_jax.tasks import GYM_TASKS
 from tests.golden.images import TASKS, draw, kept
 
 ROUNDING = 2
@@ -20,7 +21,9 @@ def fraction_changed(one: np.ndarray, other: np.ndarray) -> float:
     return float((difference > ROUNDING).mean())
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize(
+    "task", [pytest.param(t, marks=pytest.mark.slow if t in GYM_TASKS else ()) for t in TASKS]
+)
 def test_images_are_those_that_were_accepted(task):
     image, golden = draw(task), kept(task)
     assert image.shape == golden.shape

@@ -87,6 +87,7 @@ def test_a_reader_that_has_gone_is_no_error():
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.slow
 def test_programs_are_kept_by_default_and_it_is_said_once(tmp_path):
     """In a home folder of its own: the folder, the line, and how to keep none."""
     code = "import sys; from pixelbrax_gym.cli import main; sys.exit(main(sys.argv[1:]))"

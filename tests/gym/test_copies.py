@@ -114,6 +114,7 @@ def test_equal_environments_after_a_pickle(task):
     jax.tree.map(np.testing.assert_array_equal, restored, params)
 
 
+@pytest.mark.slow
 def test_another_process_goes_on(tmp_path):
     env = gymnasium.make_vec(
         "PixelBrax/InvertedPendulum-v0", num_envs=2, height=12, width=12, obs_mode="both"

@@ -32,7 +32,7 @@ def among_slow(tasks):
 
 
 EVERY_TASK = among_slow(pixelbrax_jax.list_envs(suite="dmc"))
-ONE_OF_EVERY_DOMAIN = among_slow({row.domain: task for task, row in DMC_TASKS.items()}.values())
+ONE_OF_EVERY_DOMAIN = tuple({row.domain: task for task, row in DMC_TASKS.items()}.values())
 
 
 @pytest.mark.parametrize("task", EVERY_TASK)
@@ -47,6 +47,7 @@ def test_checkers_of_single_environments(task):
     check_sb3_env(env)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", ONE_OF_EVERY_DOMAIN)
 def test_checker_of_vector_environments(task):
     check_vector(task, "next_step")
@@ -75,6 +76,7 @@ def check_vector(task, mode):
 # Programs of these two are the same.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", ONE_OF_EVERY_DOMAIN)
 def test_checker_of_torchrl(task):
     env = pixelbrax_gym.TorchRLEnv(task, 2, obs_mode="both", **SIZE)
@@ -82,6 +84,7 @@ def test_checker_of_torchrl(task):
     env.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", ONE_OF_EVERY_DOMAIN)
 def test_stable_baselines_vector_environments(task):
     env = pixelbrax_gym.SB3VecEnv(task, 2, obs_mode="both", episode_length=3, **SIZE)
@@ -102,6 +105,7 @@ def test_stable_baselines_vector_environments(task):
     env.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", ONE_OF_EVERY_DOMAIN)
 def test_distractors_change_pixels_alone(task):
     """The same episodes, to rounding: other options make another program."""

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from tests.compilations import counted
-from tests.gym.adapters import ADAPTERS, as_bytes
+from tests.gym.adapters import as_bytes
 from tests.gym.test_same_everywhere import ADAPTERS_AND_JAX
 
 
@@ -34,26 +34,6 @@ def test_writing_to_results_changes_nothing_later(name):
         assert as_bytes(returned) == as_bytes(clean.call()[1])
     spoil(returned)
     assert as_bytes(dirty.reset(seed=7)) == as_bytes(clean.reset(seed=7))
-
-
-@pytest.mark.parametrize("name", sorted(set(ADAPTERS) - {"single"}))
-def test_one_end_leaves_the_others_alone(name):
-    rows = []
-    # Environment 1 ends again and again in one run and lives on in the other.
-    for push in (1.0, 0.0):
-        adapter = ADAPTERS[name](episode_length=100)
-        events = adapter.first(adapter.reset())
-        for _ in range(45):
-            events += adapter.call(np.array([[0.1], [push], [-0.1]], np.float32))[0]
-        rows.append([[event for event in events if event.row == row] for row in range(3)])
-    busy, lazy = rows
-    assert sum(event.terminated for event in busy[1]) >= 2
-    assert not any(event.terminated for event in lazy[1])
-    for row in (0, 2):
-        shared = min(len(busy[row]), len(lazy[row]))
-        assert shared > 30
-        for one, other in zip(busy[row][:shared], lazy[row][:shared], strict=True):
-            assert as_bytes(one) == as_bytes(other)
 
 
 @pytest.mark.parametrize("name", ADAPTERS_AND_JAX)

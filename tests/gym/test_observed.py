@@ -35,7 +35,14 @@ def test_gymnasiums_checker(options):
     check_env(gymnasium.make(ID, **(SMALL | options)).unwrapped, skip_render_check=True)
 
 
-@pytest.mark.parametrize("mode", ["next_step", "same_step", "disabled"])
+@pytest.mark.parametrize(
+    "mode",
+    [
+        pytest.param("next_step", marks=pytest.mark.slow),
+        "same_step",
+        pytest.param("disabled", marks=pytest.mark.slow),
+    ],
+)
 def test_our_checker_of_vector_environments(make_vector, mode):
     env = make_vector(autoreset_mode=mode, **(SMALL | CASES[1]))
     pixelbrax_gym.check_vector_env(env, num_steps=10)
@@ -120,7 +127,7 @@ def test_images_are_the_buffers_that_jax_computed(make_vector, output):
         np.testing.assert_array_equal(np.asarray(part), kept[name])
 
 
-@pytest.mark.parametrize("num_envs", [3, 33])
+@pytest.mark.parametrize("num_envs", [3, pytest.param(33, marks=pytest.mark.slow)])
 def test_states_and_copies_continue(num_envs):
     env = gymnasium.make_vec(ID, num_envs=num_envs, **(SMALL | CASES[1]))
     env.reset(seed=0)

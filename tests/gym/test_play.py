@@ -23,6 +23,7 @@ def _no_display(monkeypatch):
         monkeypatch.delenv(name, raising=False)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_no_display")
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere there is always a display")
 def test_without_a_display_it_becomes_a_gif(tmp_path, monkeypatch, capsys):

@@ -216,14 +216,6 @@ def test_seeds(make_vector):
     np.testing.assert_array_equal(env.reset(seed=[6, None, None])[0][0], first[2])
 
 
-def test_number_of_environments_does_not_matter(make_vector):
-    few, many = make_vector(2, obs_mode="state"), make_vector(7, obs_mode="state")
-    few.reset(seed=1), many.reset(seed=1)
-    for _ in range(12):
-        left, right = few.step(ACTIONS[[0, 1]]), many.step(ACTIONS[[0, 1, 2, 2, 2, 2, 2]])
-        np.testing.assert_allclose(left[0], right[0][:2], rtol=1e-6)
-
-
 def test_non_finite_actions_on_the_device_end_the_episode(make_vector):
     env = make_vector(output="jax")
     env.reset(seed=0)

@@ -126,6 +126,7 @@ def test_episodes_are_the_environments(physics):
     np.testing.assert_allclose(xpos[:, 2, 2], heights, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_it_is_a_task_like_others(physics):
     pb.register("own_slider", lambda: physics)
     env, params = pb.make("own_slider", height=16, width=16, obs_mode="both", camera="aside")

@@ -143,11 +143,11 @@ FUNCTIONS = {
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
-@pytest.mark.parametrize("size", [1, 3, 5, 16])
+@pytest.mark.parametrize("size", [1, 5])
 def test_results_are_those_of_vmap(name, size):
+    fn = FUNCTIONS[name]
     x = jax.random.normal(jax.random.key(size), (size, 3))
-    expected = jax.vmap(FUNCTIONS[name])(x)
-    actual = batch_last(FUNCTIONS[name], (0,))(x)
+    expected, actual = jax.jit(lambda x: (jax.vmap(fn)(x), batch_last(fn, (0,))(x)))(x)
     for a, b in zip(jax.tree.leaves(actual), jax.tree.leaves(expected), strict=True):
         assert a.shape == b.shape
         assert a.dtype == b.dtype

@@ -47,7 +47,10 @@ def compare(model: mujoco.MjModel, batch, shown: list[int], renderer: str) -> No
 
 
 @pytest.mark.parametrize("renderer", RENDERERS)
-@pytest.mark.parametrize("task", BRAX_TASKS)
+@pytest.mark.parametrize(
+    "task",
+    [pytest.param(t, marks=() if t in ("ant", "pusher") else pytest.mark.slow) for t in BRAX_TASKS],
+)
 def test_task_at_random_poses(task, renderer):
     _, params = pixelbrax_jax.make(task)
     name = {"halfcheetah": "half_cheetah"}.get(task, task)

@@ -64,9 +64,9 @@ def test_every_kind_of_geom_the_sky_and_shadows_are_in_the_check():
     ("plane", "value", "told"),
     [
         ("r", 2.0, "1 of 1920 pixels differ from those of renderer='fused', colors by up to"),
-        ("g", float("nan"), "1 of 1920 pixels"),
+        pytest.param("g", float("nan"), "1 of 1920 pixels", marks=pytest.mark.slow),
         ("depth", 0.5, "depth by up to"),
-        ("seg", 77, "1 of 1920 pixels"),
+        pytest.param("seg", 77, "1 of 1920 pixels", marks=pytest.mark.slow),
     ],
 )
 def test_one_wrong_pixel_is_refused(plane, value, told):

@@ -77,7 +77,7 @@ def test_pixels_are_spread_over_the_cores(program):
     assert 'outer_dimension_partitions":["' in drawing[0]
 
 
-@pytest.mark.parametrize("shadows", [False, True])
+@pytest.mark.parametrize("shadows", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_every_shape_and_light_is_in_the_one_fusion(shadows):
     """A root or a quotient that two operations read would be kept as an image of its own."""
     scene = random_strip(0)

@@ -101,6 +101,7 @@ def test_matches_finite_differences_inside_geoms(program, directional, what):
     assert checked > SIZE
 
 
+@pytest.mark.slow
 def test_planes_that_end_and_lamps_have_derivatives(program, directional):
     rng, checked = np.random.default_rng(0), 0
     for seed in range(2):
@@ -126,7 +127,10 @@ def test_planes_that_end_and_lamps_have_derivatives(program, directional):
     assert checked > 200
 
 
-@pytest.mark.parametrize(("look", "shadows"), [("default", True), ("original", False)])
+@pytest.mark.parametrize(
+    ("look", "shadows"),
+    [("default", True), pytest.param("original", False, marks=pytest.mark.slow)],
+)
 def test_reverse_mode_is_finite_everywhere(look, shadows):
     def loss(scene):
         values, _ = colors_and_depth(scene)
@@ -151,12 +155,17 @@ def test_finite_where_rays_run_along_axes_and_faces(kind):
         frame = render(scene, 9, 9)
         return jnp.sum(frame.r) + jnp.sum(jnp.where(frame.seg >= 0, frame.depth, 0.0))
 
-    value, gradient = jax.value_and_grad(loss)(scene)
+    value, gradient = jax.jit(jax.value_and_grad(loss))(scene)
     assert bool(jnp.isfinite(value))
     assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(gradient))
 
 
 def test_segmentation_has_no_derivative():
     scene = jax.tree.map(jnp.asarray, scenes.random_scene(0))
-    _, tangent = jax.jvp(lambda s: render(s, 4, 4).seg, (scene,), (zeros_like(scene),))
+
+    @jax.jit
+    def derivative(scene):
+        return jax.jvp(lambda s: render(s, 4, 4).seg, (scene,), (zeros_like(scene),))[1]
+
+    tangent = derivative(scene)
     assert tangent.dtype == jax.dtypes.float0

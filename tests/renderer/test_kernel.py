@@ -76,7 +76,11 @@ def assert_same_pictures(task, options):
 
 @pytest.mark.parametrize(
     ("task", "look"),
-    [("ant", "default"), ("hopper", "all three"), ("reacher", "dmc, shadows")],
+    [
+        ("ant", "default"),
+        pytest.param("hopper", "all three", marks=pytest.mark.slow),
+        pytest.param("reacher", "dmc, shadows", marks=pytest.mark.slow),
+    ],
 )
 def test_it_draws_what_the_plain_one_draws(task, look):
     assert_same_pictures(task, LOOKS[look])
@@ -142,17 +146,7 @@ def test_depth_and_geoms_are_those_of_the_plain_one(size, lamps):
         np.testing.assert_allclose(getattr(other, name), getattr(plain, name), atol=2e-3)
 
 
-def test_every_primitive():
-    scene = scenes.random_scene(2)
-    plain, other = (
-        jax.jit(render, static_argnums=(1, 2, 3))(scene, HEIGHT, WIDTH, name)
-        for name in ("fused", "pallas")
-    )
-    assert len(np.unique(plain.seg)) >= 5
-    np.testing.assert_array_equal(other.seg, plain.seg)
-    np.testing.assert_allclose(other.depth, plain.depth, rtol=1e-5)
-
-
+@pytest.mark.slow
 def test_many_geoms():
     """More than a word has bits."""
     count, rng = 70, np.random.default_rng(0)
@@ -237,6 +231,7 @@ def test_it_has_the_derivative_of_the_plain_one():
     np.testing.assert_allclose(other, one, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_rewards_may_be_differentiated_beside_an_image():
     size = {"height": HEIGHT, "width": WIDTH}
     env, params = pb.make("inverted_pendulum", renderer="pallas", **size)

@@ -119,6 +119,7 @@ def test_renderers_agree_with_all_lights_and_shadows(seed, mirror):
         assert (off[same] > 2 / 255).mean() < (0.006 if mirror is None else 0.008)
 
 
+@pytest.mark.slow
 def test_gradients_are_finite():
     scene = scene_of(
         FLOOR, BALL, look=LOOK.replace(reflectance=jnp.float32(0.2)), mirror=0,

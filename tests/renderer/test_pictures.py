@@ -29,6 +29,7 @@ def rgb(frame) -> np.ndarray:
 
 
 class TestAnalyticFacts:
+    @pytest.mark.slow
     def test_sphere_depth_and_silhouette(self, draw):
         radius, distance, fovy, size = 0.5, 3.0, 40.0, 65
         scene = scenes.one_geom(GeomKind.SPHERE, (radius, 0, 0), (0.0, -distance, 0.0), fovy=fovy)
@@ -39,6 +40,7 @@ class TestAnalyticFacts:
         cone = np.tan(np.arcsin(radius / distance)) / np.tan(np.deg2rad(fovy / 2)) * size / 2
         assert int((frame.seg == 0).sum()) == pytest.approx(np.pi * cone**2, rel=0.02)
 
+    @pytest.mark.slow
     def test_box_covers_a_rectangle(self, draw):
         scene = scenes.one_geom(GeomKind.BOX, (0.5, 0.2, 0.25), (0.0, -2.2, 0.0), fovy=60.0)
         seg = np.asarray(draw(scene, 60, 60, "fused").seg) == 0
@@ -61,6 +63,7 @@ class TestAnalyticFacts:
         assert (np.asarray(frame.seg)[~below] == -1).all()
         assert (np.asarray(frame.depth)[~below] == FAR).all()
 
+    @pytest.mark.slow
     def test_frames_are_upright_and_not_mirrored(self, draw):
         # Seen from -y with z up, +x is right.
         for pos, half in (((0.5, 0, 0), np.s_[:, 24:]), ((0, 0, 0.5), np.s_[:24, :])):

@@ -21,7 +21,13 @@ def rgb(frame):
 
 @pytest.mark.usefixtures("interpreted")
 @pytest.mark.parametrize(
-    ("renderer", "times"), [("fused", 2), ("fused", 3), ("reference", 2), ("pallas", 2)]
+    ("renderer", "times"),
+    [
+        ("fused", 2),
+        pytest.param("fused", 3, marks=pytest.mark.slow),
+        pytest.param("reference", 2, marks=pytest.mark.slow),
+        ("pallas", 2),
+    ],
 )
 def test_colors_are_means_of_a_larger_image(renderer, times):
     small = render(SCENE, HEIGHT, WIDTH, renderer, samples=times**2)
@@ -44,6 +50,7 @@ def test_bands_and_packed_images_have_samples_too():
     assert np.abs(levels[0] - levels[1]).max() <= 1
 
 
+@pytest.mark.slow
 def test_the_gradient_is_the_mean_of_gradients():
     def brightness(ambient, height, width, samples):
         scene = SCENE.replace(look=SCENE.look.replace(ambient=ambient))

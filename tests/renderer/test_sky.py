@@ -146,6 +146,7 @@ def test_cameras_that_do_not_turn_look_the_texture_up_once():
     assert "f32[7,25,3]" not in program
 
 
+@pytest.mark.slow
 def test_gradients_with_a_texture_are_finite():
     look = make_look("dmc").replace(sky_texture=jnp.asarray(texture_of(4)))
     scene = scene_of(FAR_AWAY, look=look, camera=from_above(0.0, FOVY))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any
 
 import jax
 import numpy as np
@@ -17,38 +17,11 @@ from pixelbrax_jax.compilation import jit
 from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.generalisation.suites import EPISODES
-from pixelbrax_jax.types import EnvParams, EnvState, PhysicsState, Timestep
-
-
-class Simulator(Protocol):
-    """Another simulator of the task, for one environment.
-
-    Attributes:
-        qpos: joint positions (Q,), in MuJoCo's order.
-        qvel: joint velocities (V,), in MuJoCo's order.
-    """
-
-    @property
-    def qpos(self) -> np.ndarray: ...  # noqa: D102
-
-    @property
-    def qvel(self) -> np.ndarray: ...  # noqa: D102
-
-    def start(self, state: PhysicsState) -> None:
-        """Start an episode in a state of our physics."""
-
-    def step(self, action: np.ndarray) -> float:
-        """Advance by one control step under an (A,) action in [-1, 1]; return the reward."""
-
-    def observe(self) -> np.ndarray:
-        """Return the observation of the simulator's state, (S,) float32."""
-
-    def render(self) -> np.ndarray:
-        """Draw the state: (height, width, 3) uint8."""
+from pixelbrax_jax.types import EnvParams, EnvState, Timestep
 
 
 def play_in(
-    simulator: Simulator,
+    simulator: Any,
     player: Player,
     networks: Networks,
     env: PixelEnv,
@@ -61,10 +34,11 @@ def play_in(
 ) -> Result:
     """Play the episodes of an ``Evaluator`` in another simulator, with mean actions.
 
-    They have the same initial states, time limit, action repeat and frame stack. With ``physics``
-    false the simulator shows every state of our physics instead of computing its own; with
-    ``picture`` false we show every state of its physics. ``env`` has neither distractors nor
-    ``obs_mode="both"``; with ``"state"`` the policy sees the simulator's observation.
+    ``simulator`` is like ``physics.dmc.suite.SuiteEnv``, for one environment. The episodes have the
+    same initial states, time limit, action repeat and frame stack. With ``physics`` false the
+    simulator shows every state of our physics instead of computing its own; with ``picture`` false
+    we show every state of its physics. ``env`` has neither distractors nor ``obs_mode="both"``;
+    with ``"state"`` the policy sees the simulator's observation.
     """
     acting = {name: networks[name] for name in player.acting}
     bare = replace(env, obs_mode="state")

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
-from pixelbrax_gym.bench.cases import AbsentError, Case
 from pixelbrax_jax.cache import cache_folder
 from tests.benchmarks.ahead.targets import TPU_ENVIRON
+from tests.benchmarks.case import AbsentError, Case
 from tests.benchmarks.packages import install_packages
 
 DUMP = "PIXELBRAX_PROGRAMS_DUMP"

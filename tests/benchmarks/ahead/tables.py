@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Container, Iterator
 from itertools import compress
 
-from pixelbrax_gym.bench.tables import Row, number, succeeded, table, title
+from pixelbrax_gym.bench.tables import number, table
+from tests.benchmarks.case import Row
+from tests.benchmarks.tables import succeeded, title
 
 
 def gpu(rows: list[Row], left_out: Container[str] = ()) -> str:

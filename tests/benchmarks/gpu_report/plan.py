@@ -8,8 +8,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from pixelbrax_gym.bench.cases import Case
 from pixelbrax_jax.tasks import TASKS
+from tests.benchmarks.case import Case
 
 HERE = "tests.benchmarks.gpu_report"
 

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 
-from pixelbrax_gym.bench.tables import Row, succeeded, title
+from tests.benchmarks.case import Row
 from tests.benchmarks.plots import row_of_panels
+from tests.benchmarks.tables import succeeded, title
 
 
 def draw(rows: Sequence[Row], folder: Path) -> list[Path]:

@@ -14,8 +14,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pixelbrax_gym.bench.cases import AbsentError
 from pixelbrax_jax.processor import num_cores
+from tests.benchmarks.case import AbsentError
 
 FOLDER = "PIXELBRAX_REPORT_FOLDER"
 """Variable with the folder for what programs write."""

@@ -6,9 +6,9 @@ import json
 from collections.abc import Callable
 from typing import Any
 
-from pixelbrax_gym.bench.cases import ABSENT, AbsentError
 from pixelbrax_gym.bench.throughput import rate
 from tests.benchmarks import scene
+from tests.benchmarks.case import ABSENT, AbsentError
 from tests.benchmarks.gpu_report.programs import run_program
 
 Measure = Callable[[float], dict[str, Any]]

@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from pixelbrax_gym.bench.cases import Case
+from tests.benchmarks.case import Case
 
 MACHINE = "machine"
 FINAL = ("ok", "out of memory")

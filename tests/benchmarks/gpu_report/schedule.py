@@ -13,10 +13,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any
 
-from pixelbrax_gym.bench.cases import AbsentError
-from pixelbrax_gym.bench.runner import outcome_of
+from tests.benchmarks.case import AbsentError
 from tests.benchmarks.gpu_report.plan import Timed
 from tests.benchmarks.gpu_report.worker import READY, RESULT
+from tests.benchmarks.runner import outcome_of
 
 PATIENCE = 300.0
 """Seconds that the others wait for a case that compiles."""

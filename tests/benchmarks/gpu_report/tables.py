@@ -5,19 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from pixelbrax_gym.bench import report
-from pixelbrax_gym.bench.cases import Group
-from pixelbrax_gym.bench.tables import (
-    Row,
-    cell,
-    interleaved,
-    number,
-    ratio,
-    succeeded,
-    table,
-    title,
-)
+from pixelbrax_gym.bench.tables import number, table
+from tests.benchmarks import report
+from tests.benchmarks.case import Group, Row
 from tests.benchmarks.gpu_report.plan import HOST_LOOPS, Timed
+from tests.benchmarks.tables import cell, interleaved, ratio, succeeded, title
 
 TIMES = (30, 60, 120, 240)
 """Seconds of training at which tables have the return."""

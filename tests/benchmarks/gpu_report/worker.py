@@ -18,8 +18,8 @@ import threading
 import time
 from contextlib import suppress
 
-from pixelbrax_gym.bench.cases import ABSENT, AbsentError
-from pixelbrax_gym.bench.runner import peak_bytes
+from tests.benchmarks.case import ABSENT, AbsentError
+from tests.benchmarks.runner import peak_bytes
 
 READY, RESULT = "READY ", "RESULT "
 

@@ -84,7 +84,7 @@ def mujocos(model, qpos, qvel, function):
         ("elliptic", 3, jax.vmap),
         pytest.param("elliptic", 3, last, marks=pytest.mark.slow),
         pytest.param("elliptic", 4, jax.vmap, marks=pytest.mark.slow),
-        ("elliptic", 4, last),
+        pytest.param("elliptic", 4, last, marks=pytest.mark.slow),
         pytest.param("elliptic", 6, jax.vmap, marks=pytest.mark.slow),
         pytest.param("elliptic", 6, last, marks=pytest.mark.slow),
     ],

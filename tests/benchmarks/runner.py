@@ -1,4 +1,4 @@
-"""Run cases in processes of their own: ``python -m pixelbrax_gym.bench.runner FUNCTION JSON``."""
+"""Run cases in processes of their own: ``python -m tests.benchmarks.runner FUNCTION JSON``."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
-from pixelbrax_gym.bench.cases import ABSENT, AbsentError, Case
+from tests.benchmarks.case import ABSENT, AbsentError, Case
 
 OUT_OF_MEMORY = (
     "resource_exhausted",

@@ -9,8 +9,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from pixelbrax_gym.bench.cases import Case, Group
-from pixelbrax_gym.bench.tables import Row, table
+from pixelbrax_gym.bench.tables import table
+from tests.benchmarks.case import Case, Group, Row
 
 _HEADING = (
     "# Measurements",
