@@ -9,7 +9,11 @@ from tests.benchmarks.figures import BENCHMARKS, PAGES, ROOT, page_of
 from tests.benchmarks.pages import filled, names
 
 
-@pytest.mark.parametrize("name", PAGES)
+@pytest.mark.parametrize(
+    # Its figures take the physics of all tasks.
+    "name",
+    [pytest.param(n, marks=pytest.mark.slow if n == "docs/tasks.md" else ()) for n in PAGES],
+)
 def test_a_page_shows_what_is_kept(name):
     text = (ROOT / name).read_text("utf-8")
     assert names(text) == set(PAGES[name])

@@ -11,6 +11,7 @@ import pytest
 
 from pixelbrax_gym.cli import main
 from pixelbrax_gym.cli.train import parse
+from pixelbrax_jax import registry
 from pixelbrax_jax.agents.config import describe
 from pixelbrax_jax.agents.presets import PRESETS, TASK_SETTINGS, preset
 from pixelbrax_jax.agents.runner import train
@@ -23,6 +24,10 @@ from tests.benchmarks.experiments import (
     is_made,
     kept_at,
 )
+from tests.envs.toy import PARAMS, Ball
+
+BALL = "ball_of_commands"
+registry.register(BALL, Ball, camera=PARAMS.rig)
 
 TINY = (
     *("--task", "inverted_pendulum", "--height", "18", "--width", "18", "--frame-stack", "1"),
@@ -188,7 +193,7 @@ def test_a_run_is_evaluated_and_recorded(tmp_path, capsys):
     folder = str(tmp_path / "run")
     # A critic that sees the state: in the video there are pixels alone.
     line = ["train", "ppo", *TINY, "--output-dir", folder, "--num-evals", "1", "--state-critic"]
-    assert main([*line, "--episode-length", "9"]) == 0
+    assert main([*line, "--task", BALL, "--episode-length", "9"]) == 0
     told = capsys.readouterr().err
     assert "compiling" in told
     assert "clean: return" in told

@@ -81,6 +81,7 @@ def test_neighbors_do_not_matter(runs):
         np.testing.assert_allclose(few.info[name], runs[0].info[name][:, :3], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_other_modes_begin_the_same_episodes(runs):
     other = rollout(ALL, "same_step")
 
@@ -117,7 +118,7 @@ def test_an_early_time_limit_does_not_move_the_video():
 
 
 def test_order_of_giving_does_not_matter():
-    assert Chain(ALL[::-1]) == Chain(ALL)
+    assert Chain(ALL[::-1]).links == Chain(ALL).links
 
 
 def test_what_cannot_work_together_is_refused():

@@ -10,12 +10,17 @@ import sys
 import pytest
 
 SCRIPT = """
-import json, re
+import json, re, sys
 import jax, numpy as np
 import pixelbrax_jax as pb
 from pixelbrax_jax.envs.sharded import ShardedVectorEnv, make_env_mesh
 
-env, params = pb.make("inverted_pendulum", height=16, width=16, frame_stack=2, obs_mode="both")
+from tests.envs.toy import PARAMS, Ball
+
+if sys.argv[1] == "toy":
+    env, params = pb.PixelEnv(Ball(), height=16, width=16, frame_stack=2, obs_mode="both"), PARAMS
+else:
+    env, params = pb.make(sys.argv[1], height=16, width=16, frame_stack=2, obs_mode="both")
 NUM_ENVS = 4
 # Rows of parameters go where their environments are.
 params = params.replace(episode_length=np.arange(NUM_ENVS, dtype=np.int32) % 5 + 3)
@@ -54,12 +59,14 @@ print(json.dumps({
 """
 
 
-@pytest.fixture(scope="module")
-def told():
+@pytest.fixture(
+    scope="module", params=["toy", pytest.param("inverted_pendulum", marks=pytest.mark.slow)]
+)
+def told(request):
     # Without the tests' own flags, which turn optimisation off.
     flags = "--xla_force_host_platform_device_count=2"
     done = subprocess.run(
-        [sys.executable, "-c", SCRIPT],
+        [sys.executable, "-c", SCRIPT, request.param],
         env=os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"},
         capture_output=True,
         text=True,

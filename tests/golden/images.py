@@ -35,16 +35,21 @@ DMC_MODELS = {
 TASKS = (*BRAX_TASKS, *DMC_MODELS.values(), *GYM_TASKS)
 
 
-def draw(task: str) -> np.ndarray:
-    """Draw a task from its cameras in its looks, in a pose that MuJoCo computes.
+def suite_of(task: str) -> str:
+    return "brax" if task in BRAX_TASKS else "dmc" if task in DMC_TASKS else "gym"
+
+
+def draw(task: str, *looks: str) -> np.ndarray:
+    """Draw a task from its cameras in some or all of its looks, in a pose that MuJoCo computes.
 
     Returns:
         (size looks, size cameras, 3) uint8.
     """
-    suite = "brax" if task in BRAX_TASKS else "dmc" if task in DMC_TASKS else "gym"
+    suite = suite_of(task)
     env, params = pb.make(task, obs_mode="state")
     rigs = list(pb.named_rigs(task).values()) if suite == "brax" else [params.rig]
-    looks = [pb.make(task, obs_mode="state", look=look)[1].look for look in LOOKS[suite]]
+    looks = looks or LOOKS[suite]
+    worn = [pb.make(task, obs_mode="state", look=look)[1].look for look in looks]
     xpos, xquat = pose(env.physics)
     size = SIZE[suite]
 
@@ -53,7 +58,7 @@ def draw(task: str) -> np.ndarray:
         frame = render(place(params.geoms, rig, look, xpos, xquat), size, size)
         return jax.numpy.stack([frame.r, frame.g, frame.b], axis=-1)
 
-    rows = [np.concatenate([image(rig, look) for rig in rigs], axis=1) for look in looks]
+    rows = [np.concatenate([image(rig, look) for rig in rigs], axis=1) for look in worn]
     return np.round(255 * np.clip(np.concatenate(rows), 0, 1)).astype(np.uint8)
 
 
@@ -72,9 +77,12 @@ def pose(physics: pb.Physics) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(xpos, np.float32), np.asarray(xquat, np.float32)
 
 
-def kept(task: str) -> np.ndarray:
-    """Return a task's images as they were last accepted."""
-    return np.asarray(Image.open(FOLDER / f"{task}.png").convert("RGB"))
+def kept(task: str, look: str | None = None) -> np.ndarray:
+    """Return a task's images as they were last accepted, of one look or of all."""
+    images = np.asarray(Image.open(FOLDER / f"{task}.png").convert("RGB"))
+    suite = suite_of(task)
+    row = LOOKS[suite].index(look) if look else 0
+    return images[row * SIZE[suite] :][: SIZE[suite]] if look else images
 
 
 def main() -> None:

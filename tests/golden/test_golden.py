@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pixelbrax_jax.tasks import GYM_TASKS
-from tests.golden.images import TASKS, draw, kept
+from tests.golden.images import LOOKS, TASKS, draw, kept, suite_of
 
 ROUNDING = 2
 """Of 255: a color computed in another order of operations is rounded to a neighbor."""
@@ -21,11 +20,19 @@ def fraction_changed(one: np.ndarray, other: np.ndarray) -> float:
     return float((difference > ROUNDING).mean())
 
 
-@pytest.mark.parametrize(
-    "task", [pytest.param(t, marks=pytest.mark.slow if t in GYM_TASKS else ()) for t in TASKS]
-)
-def test_images_are_those_that_were_accepted(task):
-    image, golden = draw(task), kept(task)
+QUICK = {"brax": "default", "dmc": "dmc"}
+"""Looks that `make test` draws, by suite."""
+
+CASES = [
+    pytest.param(task, look, marks=() if QUICK.get(suite_of(task)) == look else pytest.mark.slow)
+    for task in TASKS
+    for look in LOOKS[suite_of(task)]
+]
+
+
+@pytest.mark.parametrize(("task", "look"), CASES)
+def test_images_are_those_that_were_accepted(task, look):
+    image, golden = draw(task, look), kept(task, look)
     assert image.shape == golden.shape
     assert fraction_changed(image, golden) <= EDGES
 

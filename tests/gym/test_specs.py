@@ -27,7 +27,7 @@ until_truncated = partial(steps_until_truncated, at_most=3000)
     ("options", "expected"),
     [
         ({"max_episode_steps": 1200}, 1200),
-        ({"max_episode_steps": 1200, "action_repeat": 2}, 1200),
+        pytest.param({"max_episode_steps": 1200, "action_repeat": 2}, 1200, marks=pytest.mark.slow),
         ({"max_episode_steps": 700, "action_repeat": 2}, 700),
         ({"max_episode_steps": 1200, "episode_length": 9}, 9),
         ({"action_repeat": 3}, 334),

@@ -198,6 +198,7 @@ make_physics("reacher", backend="mjx")
 """
 
 
+@pytest.mark.slow
 def test_nothing_is_printed_logged_or_warned(tmp_path):
     """Half cheetah's deprecated setting would make MuJoCo write a log file here."""
     done = subprocess.run(

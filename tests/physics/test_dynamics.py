@@ -43,9 +43,8 @@ def play(physics, num_envs, num_steps=5):
     return jax.device_get(jax.jit(jax.vmap(of_one))(keys))
 
 
-@pytest.mark.parametrize(
-    "task", [pytest.param(t, marks=() if t == TASK else pytest.mark.slow) for t in OF_EACH_DOMAIN]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("task", OF_EACH_DOMAIN)
 def test_both_engines_take_the_same_step(task):
     ours, theirs = (make_physics(task, engine=engine) for engine in ("mujoco", "xla"))
     assert ours != theirs

@@ -65,7 +65,7 @@ def test_every_kind_of_geom_the_sky_and_shadows_are_in_the_check():
     [
         ("r", 2.0, "1 of 1920 pixels differ from those of renderer='fused', colors by up to"),
         pytest.param("g", float("nan"), "1 of 1920 pixels", marks=pytest.mark.slow),
-        ("depth", 0.5, "depth by up to"),
+        pytest.param("depth", 0.5, "depth by up to", marks=pytest.mark.slow),
         pytest.param("seg", 77, "1 of 1920 pixels", marks=pytest.mark.slow),
     ],
 )

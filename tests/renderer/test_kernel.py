@@ -122,7 +122,7 @@ def test_it_draws_all_images_of_an_observation(images):
 @pytest.mark.parametrize(
     ("size", "lamps"),
     [
-        ((HEIGHT, WIDTH), 2),
+        pytest.param((HEIGHT, WIDTH), 2, marks=pytest.mark.slow),
         pytest.param((HEIGHT, WIDTH), 0, marks=pytest.mark.slow),
         ((1, 1), 0),
         pytest.param((1, 1), 2, marks=pytest.mark.slow),

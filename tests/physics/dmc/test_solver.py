@@ -81,7 +81,7 @@ def mujocos(model, qpos, qvel, function):
         pytest.param("pyramidal", 1, last, marks=pytest.mark.slow),
         pytest.param("pyramidal", 3, jax.vmap, marks=pytest.mark.slow),
         ("pyramidal", 3, last),
-        ("elliptic", 3, jax.vmap),
+        pytest.param("elliptic", 3, jax.vmap, marks=pytest.mark.slow),
         pytest.param("elliptic", 3, last, marks=pytest.mark.slow),
         pytest.param("elliptic", 4, jax.vmap, marks=pytest.mark.slow),
         pytest.param("elliptic", 4, last, marks=pytest.mark.slow),
