@@ -1,4 +1,4 @@
-"""Trains agents with and without distractors, and plays DMC-GB2 with them.
+"""Trains agents with and without distractors, and plays suites of levels with them.
 
     python -m tests.benchmarks.generalisation --seeds 1              all of one seed, half a day
     python -m tests.benchmarks.generalisation --seeds 1 ball_in_cup  those with this in their names
@@ -15,6 +15,7 @@ import math
 import shutil
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 from pixelbrax_gym.bench.tables import table
@@ -22,12 +23,13 @@ from pixelbrax_gym.generalisation.scores import RETURNS, SHEET, Row, Scores
 from tests.benchmarks.experiments import DOCS, EPISODES, REVISION, run
 
 KEPT = DOCS / "benchmarks" / "generalisation"
-SUITE = "dmcgb2"
+SUITES = ("dmcgb2", "axes")
 TASKS = {
     "dmc_ball_in_cup_catch": "ppo",
     "dmc_cartpole_swingup": "drqv2",
     "dmc_finger_spin": "drqv2",
     "dmc_walker_walk": "drqv2",
+    "halfcheetah": "ppo",
 }
 """The agent of each task, with its preset `cpu`."""
 DISTRACTED = {
@@ -42,14 +44,19 @@ TRAININGS = {
 """Options by agent and by what it is trained with."""
 
 
-def kept_at(task: str, training: str) -> Path:
+def suites_of(task: str) -> tuple[str, ...]:
+    """The suites to play; DMC-GB2 has levels for tasks of DM Control alone."""
+    return tuple(suite for suite in SUITES if suite != "dmcgb2" or task.startswith("dmc_"))
+
+
+def kept_at(task: str, training: str, suite: str) -> Path:
     """The file with the returns of all seeds."""
-    return KEPT / f"{task}-{training}.json"
+    return KEPT / f"{task}-{training}-{suite}.json"
 
 
-def kept(task: str, training: str) -> Scores | None:
+def kept(task: str, training: str, suite: str) -> Scores | None:
     """The returns of all seeds, if there are any."""
-    path = kept_at(task, training)
+    path = kept_at(task, training, suite)
     return Scores(**json.loads(path.read_text("utf-8"))) if path.exists() else None
 
 
@@ -61,10 +68,10 @@ def train(task: str, training: str, seed: int, folder: Path) -> int:
     return run(command, folder, math.inf)
 
 
-def play(task: str, training: str, runs: list[Path], folder: Path) -> bool:
-    """Play the levels that have not been played, and keep all returns of these runs."""
+def play(task: str, training: str, suite: str, runs: list[Path], folder: Path) -> bool:
+    """Play the levels of a suite that have not been played, and keep all returns of these runs."""
     command = ["nice", "-n", "19", sys.executable, "-m", "pixelbrax_gym.cli", "evaluate"]
-    command += [*map(str, runs), "--suite", SUITE, "--clips", "procedural"]
+    command += [*map(str, runs), "--suite", suite, "--clips", "procedural"]
     command += ["--output-dir", str(folder)]
     if subprocess.run(command, check=False, stdout=subprocess.DEVNULL).returncode:
         return False
@@ -76,16 +83,16 @@ def play(task: str, training: str, runs: list[Path], folder: Path) -> bool:
         for seed, made in enumerate(runs)
     }
     KEPT.mkdir(parents=True, exist_ok=True)
-    kept_at(task, training).write_text(json.dumps(found) + "\n", "utf-8")
-    shutil.copyfile(folder / SHEET, KEPT / f"{task}.png")
+    kept_at(task, training, suite).write_text(json.dumps(found) + "\n", "utf-8")
+    shutil.copyfile(folder / SHEET, KEPT / f"{task}-{suite}.png")
     return True
 
 
-def page() -> str:
+def page(suite: str) -> str:
     """A table for each task, a column for each training, in Markdown."""
     parts = []
     for task, agent in TASKS.items():
-        scores = {name: found for name in TRAININGS[agent] if (found := kept(task, name))}
+        scores = {name: found for name in TRAININGS[agent] if (found := kept(task, name, suite))}
         if not scores:
             continue
         columns = {f"{name} ({len(found.returns)})": found.rows() for name, found in scores.items()}
@@ -99,7 +106,7 @@ def _cell(row: Row) -> str:
     return f"{row.mean:.0f}{spread}"
 
 
-FIGURES = {SUITE: page}
+FIGURES = {suite: partial(page, suite) for suite in SUITES}
 
 
 def main() -> int:
@@ -121,8 +128,13 @@ def main() -> int:
         parser.error(f"no agent has {options.name!r} in its name")
     failed = []
     for task, training in chosen:
-        before = kept(task, training)
-        if before is not None and len(before.returns) >= options.seeds:
+        missing = [
+            suite
+            for suite in suites_of(task)
+            if (before := kept(task, training, suite)) is None
+            or len(before.returns) < options.seeds
+        ]
+        if not missing:
             continue
         folder = options.output_dir / f"revision-{REVISION}" / f"{task}-{training}"
         runs = [folder / str(seed) for seed in range(options.seeds)]
@@ -133,7 +145,10 @@ def main() -> int:
                 return status
             if status:
                 break
-        if status or not play(task, training, runs, folder / SUITE):
+        played = not status and all(
+            play(task, training, suite, runs, folder / suite) for suite in missing
+        )
+        if not played:
             failed.append(f"{task}-{training}")
     if failed:
         print(f"failed: {', '.join(failed)}", file=sys.stderr)
