@@ -160,17 +160,18 @@ def _end(runs: list[Entry]) -> str:
     """Return the last returns, and after how many frames."""
     ends = [run["frames"][-1] / 1e6 for run in runs]
     frames = dict.fromkeys(f"{end:.1f}" for end in (min(ends), max(ends)))
-    return f"{_middle([run['return'][-1] for run in runs])} at {' to '.join(frames)}M"
+    return f"{middle([run['return'][-1] for run in runs])} at {' to '.join(frames)}M"
 
 
 def _shown(runs: list[Entry], clock: str, when: float) -> str:
-    return _middle([x for run in runs if not math.isnan(x := return_at(run, clock, when))])
+    return middle([x for run in runs if not math.isnan(x := return_at(run, clock, when))])
 
 
-def _middle(scores: list[float]) -> str:
+def middle(scores: list[float]) -> str:
+    """Return the interquartile mean, and of several scores their range."""
     if not scores:
         return ""
-    # The interquartile mean, as in rliable (arXiv 2108.13264).
+    # As in rliable (arXiv 2108.13264).
     middle = f"{trim_mean(scores, 0.25):.0f}"
     if len(scores) == 1:
         return middle

@@ -10,6 +10,7 @@ from operator import itemgetter
 from pathlib import Path
 
 from pixelbrax_gym.bench.tables import number, table
+from pixelbrax_gym.cli import _leaderboard as leaderboard
 from pixelbrax_jax.tasks import DMC_TASKS
 from tests.benchmarks import tables
 from tests.benchmarks.tables import find
@@ -169,20 +170,48 @@ ALL = {"speed": speed, "physics": physics}
 LEADERBOARD = FOLDER.parent / "leaderboard"
 
 
-def of_leaderboard(file: str) -> dict:
-    """A file of the leaderboard."""
-    return json.loads((LEADERBOARD / file).read_text("utf-8"))
+AGENTS = {"ppo": "PPO", "drqv2": "DrQ-v2"}
 
 
-def end(name: str, key: str = "return", unit: float = 1.0) -> str:
-    """The last return of a run, or its frames or seconds."""
-    return f"{of_leaderboard(f'{name}.json')[key][-1] / unit:.0f}"
+def learned_tasks() -> list[tuple[str, str, list[dict]]]:
+    """The leaderboard's tasks of DM Control and agents, with their runs."""
+    groups: dict[tuple[str, str], list[dict]] = {}
+    for run in leaderboard.read(LEADERBOARD):
+        if run["task"] in DMC_TASKS:
+            groups.setdefault((run["task"], run["agent"]), []).append(run)
+    return [(task, agent, runs) for (task, agent), runs in sorted(groups.items())]
 
 
-def published(task: str) -> str:
-    """DrQ-v2's published return of a task at 500k frames."""
-    returns = of_leaderboard("published.json")["agents"]["DrQ-v2"]["returns"]
-    return f"{returns[task]['500000']:.0f}"
+def minutes(runs: list[dict]) -> float:
+    """The time of the training, of the run that was disturbed least."""
+    return min(run["seconds"][-1] for run in runs) / 60.0
+
+
+def learned() -> str:
+    """What agents earn at the end, beside DrQ-v2's published means, in Markdown."""
+    file = LEADERBOARD / leaderboard.PUBLISHED
+    published = json.loads(file.read_text("utf-8"))["agents"]["DrQ-v2"]["returns"]
+    lines = [
+        [
+            f"`{task}`",
+            AGENTS[agent],
+            len(runs),
+            leaderboard.middle([run["return"][-1] for run in runs]),
+            f"{max(run['frames'][-1] for run in runs) / 1e6:.1f}M",
+            f"{minutes(runs):.0f}",
+            f"{published[task]['500000']:.0f}",
+            f"{published[task]['1000000']:.0f}",
+        ]
+        for task, agent, runs in learned_tasks()
+    ]
+    heads = ["task", "agent", "seeds", "return", "frames", "minutes on one core"]
+    return table([*heads, "DrQ-v2, published, 0.5M", "1M"], lines)
+
+
+def training_minutes() -> str:
+    """Minutes of training, over these tasks."""
+    taken = [minutes(runs) for *_, runs in learned_tasks()]
+    return f"{min(taken):.0f} to {max(taken):.0f}"
 
 
 README = {
@@ -190,19 +219,6 @@ README = {
     "cheetah-ratio": lambda: f"{ratios()['dmc_cheetah_run']:.0f}",
     "slowest": lambda: named(next(iter(ratios()))),
     "fastest": lambda: named(next(reversed(ratios()))),
-    "reacher": lambda: end("ppo-dmc_reacher_easy-0"),
-    "cup": lambda: end("ppo-dmc_ball_in_cup_catch-0"),
-    "stand": lambda: end("drqv2-dmc_walker_stand-0"),
-    "walker": lambda: end("drqv2-dmc_walker_walk-0"),
-    "drqv2-minutes": lambda: max(
-        (end(path.stem, "seconds", 60.0) for path in LEADERBOARD.glob("drqv2-dmc_*.json")), key=int
-    ),
-    "swingup": lambda: end("drqv2-dmc_cartpole_swingup-0"),
-    "sparse": lambda: end("drqv2-dmc_cartpole_balance_sparse-0"),
-    "spin": lambda: end("drqv2-dmc_finger_spin-0"),
-    "spin-published": partial(published, "dmc_finger_spin"),
-    "stand-published": partial(published, "dmc_walker_stand"),
-    "walker-published": partial(published, "dmc_walker_walk"),
-    "swingup-published": partial(published, "dmc_cartpole_swingup"),
-    "sparse-published": partial(published, "dmc_cartpole_balance_sparse"),
+    "minutes": training_minutes,
+    "learned": learned,
 }
