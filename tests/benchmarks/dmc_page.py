@@ -204,8 +204,8 @@ def learned() -> str:
         ]
         for task, agent, runs in learned_tasks()
     ]
-    heads = ["task", "agent", "seeds", "return", "frames", "minutes on one core"]
-    return table([*heads, "DrQ-v2, published, 0.5M", "1M"], lines)
+    heads = ["task", "agent", "seeds", "return", "frames", "minutes"]
+    return table([*heads, "published, 0.5M", "1M"], lines)
 
 
 def training_minutes() -> str:
