@@ -158,9 +158,11 @@ _CPU_MUJOCO_TASKS: dict[str, dict[str, Any]] = {
         "update_epochs": 3,
         "total_steps": 6_000_000,
     },
+    # With less noise at first, one of two seeds reaches half of the targets alone.
     "dmc_reacher_easy": {
         "action_repeat": 4,
         "gamma": 0.97,
+        "initial_std": 1.0,
         "update_epochs": 3,
         "total_steps": 3_000_000,
     },
