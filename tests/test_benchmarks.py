@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 from types import SimpleNamespace
 
+import jax
 import psutil
 import pytest
 
@@ -363,19 +364,35 @@ def test_cases_have_names_of_their_own():
 
 
 def test_the_command_measures_this_machine(monkeypatch, tmp_path, capsys):
-    for measure, module in (("renderer", throughput), ("scan", throughput), ("compare", adapters)):
-        name = f"{module.__name__.rpartition('.')[2]}.{measure}"
-        monkeypatch.setattr(module, measure, lambda *_, name=name: ANSWERS[name])
+    calls = {"state": 50.0, "pixels": 20.0}
+
+    def scan(task, num_envs, obs_mode="pixels"):
+        assert (task, num_envs) == ("reacher", 7)
+        return {"speed": {"median": calls[obs_mode]}}
+
+    monkeypatch.setattr(throughput, "renderer", lambda *_: {"speed": {"median": 90.0}})
+    monkeypatch.setattr(throughput, "scan", scan)
+    monkeypatch.setattr(adapters, "compare", lambda *_: ANSWERS["adapters.compare"])
     file = tmp_path / "new" / "bench.json"
-    assert pixelbrax(["bench", "--num-envs", "7", "--output", str(file)]) == 0
+    line = ["bench", "--task", "reacher", "--num-envs", "7", "--output", str(file)]
+    assert pixelbrax(line) == 0
     page = re.sub(" +", " ", capsys.readouterr().out)
-    assert "ant, 7 environments, 84 x 84" in page
-    assert "| frames, from link poses | 800 |" in page
-    assert "| steps with images | 500 |" in page
+    assert "reacher, 7 environments, 84 x 84" in page
+    assert "frames, from link poses 630 a second" in page
+    assert "steps without images, a compiled loop 350 a second" in page
+    assert "steps with images, a compiled loop 140 a second" in page
     assert "| JAX loop | next_step | 97.0 | 0.97 | 0.96 to 0.98 |" in page
     kept = json.loads(file.read_text())
+    assert (kept["state_steps_per_second"], kept["steps_per_second"]) == (350, 140)
     assert kept["adapters"] == ANSWERS["adapters.compare"]
     assert kept["machine"]["versions"]["jax"]
+
+    def too_large(*_):
+        raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: 9 GB")
+
+    monkeypatch.setattr(throughput, "renderer", too_large)
+    assert pixelbrax(["bench"]) == 1
+    assert "9 GB; if memory ran out, lower --num-envs" in capsys.readouterr().err
 
 
 def test_adapters_that_are_not_installed_are_left_out(monkeypatch):

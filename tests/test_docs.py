@@ -38,7 +38,7 @@ ADAPTERS = (
 
 
 LONG = {
-    *("docs/agents/index.md", "docs/dataflow.md", "docs/gymnasium.md", "docs/renderer.md"),
+    *("docs/agents/index.md", "docs/dataflow.md", "docs/renderer.md"),
     *("docs/reproducibility.md", "docs/results.md", "docs/howto/brax-trainers.md"),
     *("docs/howto/goals.md", "docs/howto/observations.md", "docs/howto/own-algorithm.md"),
     *("docs/howto/own-task.md", "docs/howto/recipes.md"),

@@ -172,7 +172,7 @@ def middle(scores: list[float]) -> str:
     if not scores:
         return ""
     # As in rliable (arXiv 2108.13264).
-    middle = f"{trim_mean(scores, 0.25):.0f}"
+    mean = f"{trim_mean(scores, 0.25):.0f}"
     if len(scores) == 1:
-        return middle
-    return f"{middle} ({min(scores):.0f} to {max(scores):.0f})"
+        return mean
+    return f"{mean} ({min(scores):.0f} to {max(scores):.0f})"

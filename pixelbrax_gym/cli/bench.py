@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from pixelbrax_gym.bench.tables import number, table
-from pixelbrax_gym.cli import parse
+from pixelbrax_gym.cli import CommandError, parse
 from pixelbrax_jax.validation import check_choice, check_positive_int
 
 SECONDS = 15.0
@@ -32,50 +33,48 @@ class Options:
 def run(arguments: Sequence[str]) -> int:
     """Run the command."""
     options = parse("bench", Options, arguments)
+    # JAX and PyTorch take turns on the same cores.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    import jax
+
     from pixelbrax_jax.tasks import TASKS
 
     check_choice("task", options.task, TASKS)
     check_positive_int("num_envs", options.num_envs)
-    from pixelbrax_gym.bench import machine
-
-    found: dict[str, Any] = {
-        "machine": machine.describe(),
-        "task": options.task,
-        "num_envs": options.num_envs,
-    }
-    for name, measured in _measure(options.task, options.num_envs):
-        found[name] = measured
-        if options.output is not None:
-            options.output.parent.mkdir(parents=True, exist_ok=True)
-            options.output.write_text(json.dumps(found, indent=1) + "\n", "utf-8")
-    sys.stdout.write(_page(found))
+    if options.output is not None:
+        options.output.parent.mkdir(parents=True, exist_ok=True)
+        options.output.touch()
+    try:
+        _measure(options)
+    except jax.errors.JaxRuntimeError as error:
+        raise CommandError(f"{error}; if memory ran out, lower --num-envs") from error
     return 0
 
 
-def _measure(task: str, num_envs: int) -> Iterator[tuple[str, Any]]:
-    """Measure one part after the other, and say which."""
-    from pixelbrax_gym.bench import adapters, throughput
+def _measure(options: Options) -> None:
+    """Measure one part after the other; print and write each as soon as it is known."""
+    from pixelbrax_gym.bench import adapters, machine, throughput
 
-    parts = {
-        "renderer": lambda: throughput.renderer(task, num_envs),
-        "state": lambda: throughput.scan(task, num_envs, "state"),
-        "pixels": lambda: throughput.scan(task, num_envs),
-        "adapters": lambda: adapters.compare(task, num_envs, SECONDS),
+    task, num_envs = options.task, options.num_envs
+    here = machine.describe()
+    _say(
+        f"{here['device']} ({here['processor']}, {here['cores']} cores), {task}, "
+        f"{num_envs} environments, 84 x 84, three frames\n"
+    )
+    found: dict[str, Any] = {"machine": here, "task": task, "num_envs": num_envs}
+    loops: dict[str, tuple[str, Callable[..., dict[str, Any]], tuple[str, ...]]] = {
+        "frames": ("frames, from link poses", throughput.renderer, ()),
+        "state_steps": ("steps without images, a compiled loop", throughput.scan, ("state",)),
+        "steps": ("steps with images, a compiled loop", throughput.scan, ()),
     }
-    for part, (name, measure) in enumerate(parts.items(), 1):
-        sys.stderr.write(f"{part}/{len(parts)}  {name}: compiling and measuring\n")
-        yield name, measure()
-
-
-def _page(found: dict[str, Any]) -> str:
-    """Return the tables, in Markdown."""
-    machine = found["machine"]
-    steps = {
-        "frames, from link poses": found["renderer"]["frames_per_second"],
-        "steps without images": found["state"]["steps_per_second"],
-        "steps with images": found["pixels"]["steps_per_second"],
-    }
-    through = [
+    for key, (name, measure, more) in loops.items():
+        per_second = num_envs * measure(task, num_envs, *more)["speed"]["median"]
+        found[f"{key}_per_second"] = per_second
+        _write(options.output, found)
+        _say(f"{name:<40}{number(per_second):>9} a second")
+    found["adapters"] = adapters.compare(task, num_envs, SECONDS)
+    _write(options.output, found)
+    lines = [
         (
             row["adapter"],
             row["autoreset_mode"],
@@ -85,10 +84,15 @@ def _page(found: dict[str, Any]) -> str:
         )
         for row in found["adapters"]
     ]
-    return (
-        f"{machine['device']} ({machine['processor']}, {machine['cores']} cores), "
-        f"{found['task']}, {found['num_envs']} environments, 84 x 84, three frames\n\n"
-        f"{table(('a compiled loop', 'per second'), [(k, number(v)) for k, v in steps.items()])}"
-        "\n\nAdapters, interleaved; ratios to the JAX loop of the same autoreset mode:\n\n"
-        f"{table(('adapter', 'autoreset', 'steps/s', 'ratio', 'interval'), through)}\n"
-    )
+    _say("\nAdapters, interleaved; ratios to the JAX loop of the same autoreset mode:\n")
+    _say(table(("adapter", "autoreset", "steps/s", "ratio", "interval"), lines))
+
+
+def _write(file: Path | None, found: dict[str, Any]) -> None:
+    if file is not None:
+        file.write_text(json.dumps(found, indent=1) + "\n", "utf-8")
+
+
+def _say(text: str) -> None:
+    sys.stdout.write(f"{text}\n")
+    sys.stdout.flush()

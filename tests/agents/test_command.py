@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import signal
 from pathlib import Path
+from types import SimpleNamespace
 
 import imageio.v3 as imageio
 import jax
@@ -27,13 +29,17 @@ from tests.benchmarks.experiments import (
 from tests.envs.toy import PARAMS, Ball
 
 BALL = "ball_of_commands"
-registry.register(BALL, Ball, camera=PARAMS.rig)
 
 TINY = (
     *("--task", "inverted_pendulum", "--height", "18", "--width", "18", "--frame-stack", "1"),
     *("--encoder", "small", "--num-envs", "2", "--num-steps", "4", "--num-minibatches", "2"),
     *("--update-epochs", "1", "--total-steps", "16", "--no-progress"),
 )
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _ball_of_commands():
+    registry.register(BALL, Ball, camera=PARAMS.rig)
 
 
 @pytest.mark.parametrize(
@@ -173,6 +179,11 @@ def test_stopped_at_once_it_says_what_is_left(monkeypatch, capsys, tmp_path):
     (tmp_path / "checkpoints" / "64" / "about" / "metadata").touch()
     assert main(line) == 130
     assert "the checkpoint of 64 steps with --resume latest" in capsys.readouterr().err
+
+
+def test_the_exit_status_tells_the_signal_that_stopped_it(monkeypatch, tmp_path):
+    monkeypatch.setattr(train, "train", lambda *_: SimpleNamespace(signal=signal.SIGTERM))
+    assert main(["train", "ppo", *TINY, "--output-dir", str(tmp_path)]) == 128 + signal.SIGTERM
 
 
 @pytest.mark.parametrize("given", ["--coordinator h:1 --num-processes 2", "--process-id 1"])

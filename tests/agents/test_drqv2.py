@@ -17,6 +17,7 @@ from pixelbrax_jax.agents.runner.trained import save_policy
 from pixelbrax_jax.policy import load_policy
 from tests.agents.small import DRQV2, PARAMS, ball_envs, same, small_agent
 
+# One update in each iteration, from the second one on.
 LATE = small_agent(
     DrQv2,
     learning_starts=64,
@@ -26,13 +27,13 @@ LATE = small_agent(
     initial_std=0.8,
     final_std=0.2,
 )
-"""One update in each iteration, from the third one on."""
+KEY = jax.random.key(0)
 
 
 @pytest.mark.slow
 def test_the_same_key_gives_the_same_run_and_another_another():
     first, facts = DRQV2.run(DRQV2.init(), 3)
-    second, more_facts = DRQV2.run(DRQV2.init(), 3)
+    second, more_facts = DRQV2.run(DRQV2.algorithm.init(KEY, PARAMS), 3)
     assert same(first, second)
     assert same(facts, more_facts)
     other, _ = DRQV2.run(DRQV2.init(1), 3)
@@ -83,7 +84,7 @@ def test_the_actor_learns_in_every_second_update_of_a_lower_precision():
 def test_no_turn_of_the_learning_loop_copies_the_replay():
     agent = small_agent(DrQv2, buffer_size=640)
     iterate = jax.jit(lambda state: agent.algorithm.iterate(state, PARAMS), donate_argnums=0)
-    program = iterate.lower(jax.eval_shape(agent.init)).compile().as_text()
+    program = iterate.lower(jax.eval_shape(agent.algorithm.init, KEY, PARAMS)).compile().as_text()
     frames = r"u8\[4,160,18,18,3\]\S* copy\("
     assert re.search(r"u8\[4,160,18,18,3\]", program)
     assert not re.search(frames, program)

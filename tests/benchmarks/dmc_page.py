@@ -171,13 +171,16 @@ LEADERBOARD = FOLDER.parent / "leaderboard"
 
 
 AGENTS = {"ppo": "PPO", "drqv2": "DrQ-v2"}
+"""Agents of this repository, with their presets `cpu`."""
+MARKS = ("500000", "1000000")
+"""Frames of published returns."""
 
 
 def learned_tasks() -> list[tuple[str, str, list[dict]]]:
     """The leaderboard's tasks of DM Control and agents, with their runs."""
     groups: dict[tuple[str, str], list[dict]] = {}
     for run in leaderboard.read(LEADERBOARD):
-        if run["task"] in DMC_TASKS:
+        if run["task"] in DMC_TASKS and run["agent"] in AGENTS:
             groups.setdefault((run["task"], run["agent"]), []).append(run)
     return [(task, agent, runs) for (task, agent), runs in sorted(groups.items())]
 
@@ -199,8 +202,7 @@ def learned() -> str:
             leaderboard.middle([run["return"][-1] for run in runs]),
             f"{max(run['frames'][-1] for run in runs) / 1e6:.1f}M",
             f"{minutes(runs):.0f}",
-            f"{published[task]['500000']:.0f}",
-            f"{published[task]['1000000']:.0f}",
+            *(f"{published[task][n]:.0f}" if task in published else "" for n in MARKS),
         ]
         for task, agent, runs in learned_tasks()
     ]
@@ -209,9 +211,9 @@ def learned() -> str:
 
 
 def training_minutes() -> str:
-    """Minutes of training, over these tasks."""
+    """How many tasks these are, and minutes of training over them."""
     taken = [minutes(runs) for *_, runs in learned_tasks()]
-    return f"{min(taken):.0f} to {max(taken):.0f}"
+    return f"{len(taken)} tasks of DM Control take {min(taken):.0f} to {max(taken):.0f} minutes"
 
 
 README = {

@@ -145,11 +145,11 @@ def main() -> int:
                 return status
             if status:
                 break
-        played = not status and all(
-            play(task, training, suite, runs, folder / suite) for suite in missing
-        )
-        if not played:
-            failed.append(f"{task}-{training}")
+        failed += [
+            f"{task}-{training}-{suite}"
+            for suite in missing
+            if status or not play(task, training, suite, runs, folder / suite)
+        ]
     if failed:
         print(f"failed: {', '.join(failed)}", file=sys.stderr)
     return bool(failed)

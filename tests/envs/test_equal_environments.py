@@ -6,6 +6,7 @@ import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import pixelbrax_gym
 import pixelbrax_jax as pb
@@ -14,10 +15,14 @@ from tests.compilations import counted
 from tests.envs.toy import PARAMS, Ball
 
 TASK = "ball_of_equals"
-pb.register(TASK, Ball, camera=PARAMS.rig)
-ID = pixelbrax_gym.register(TASK)
 SIZE = {"height": 12, "width": 12, "frame_stack": 1}
 ACTION = jnp.zeros(1)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def gymnasium_id():
+    pb.register(TASK, Ball, camera=PARAMS.rig)
+    return pixelbrax_gym.register(TASK)
 
 
 def use(env: pb.PixelEnv, params: pb.EnvParams, seed: int = 0) -> None:
@@ -61,9 +66,9 @@ def test_the_counter_sees_a_compilation():
     assert any("backend_compile" in event for event in events)
 
 
-def test_adapters_share_programs():
+def test_adapters_share_programs(gymnasium_id):
     def play(**options):
-        env = gymnasium.make_vec(ID, num_envs=2, **SIZE, **options)
+        env = gymnasium.make_vec(gymnasium_id, num_envs=2, **SIZE, **options)
         env.reset(seed=0)
         env.step(np.zeros((2, 1), np.float32))
 

@@ -6,8 +6,11 @@ import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
+
+ROOT = Path(__file__).parents[2]
 
 SCRIPT = """
 import json, re, sys
@@ -68,6 +71,7 @@ def told(request):
     done = subprocess.run(
         [sys.executable, "-c", SCRIPT, request.param],
         env=os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"},
+        cwd=ROOT,
         capture_output=True,
         text=True,
         check=False,

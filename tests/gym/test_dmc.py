@@ -84,8 +84,7 @@ def test_checker_of_torchrl(task):
     env.close()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("task", ONE_OF_EVERY_DOMAIN)
+@pytest.mark.parametrize("task", among_slow(ONE_OF_EVERY_DOMAIN))
 def test_stable_baselines_vector_environments(task):
     env = pixelbrax_gym.SB3VecEnv(task, 2, obs_mode="both", episode_length=3, **SIZE)
     env.seed(0)

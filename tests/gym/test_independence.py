@@ -1,4 +1,4 @@
-"""Environments are reached neither by their neighbors nor by what a caller does to results."""
+"""What a caller does to results reaches no environment."""
 
 from __future__ import annotations
 
