@@ -97,13 +97,25 @@ def page(suite: str) -> str:
             continue
         columns = {f"{name} ({len(found.returns)})": found.rows() for name, found in scores.items()}
         lines = [[rows[0].level, *map(_cell, rows)] for rows in zip(*columns.values(), strict=True)]
-        parts.append(f"**`{task}`**, {agent}\n\n{table(('level', *columns), lines)}")
+        head = "level"
+        if suite == "axes":
+            head, lines = "axis", _one_row_an_axis(columns)
+        parts.append(f"**`{task}`**, {agent}\n\n{table((head, *columns), lines)}")
     return "\n\n".join(parts)
 
 
 def _cell(row: Row) -> str:
     spread = "" if math.isnan(row.standard_error) else f" ± {row.standard_error:.0f}"
     return f"{row.mean:.0f}{spread}"
+
+
+def _one_row_an_axis(columns: dict[str, list[Row]]) -> list[list[str]]:
+    """Means of an axis' sizes, the smallest first, in one cell."""
+    axes: dict[str, list[list[str]]] = {}
+    for rows in zip(*columns.values(), strict=True):
+        axis = rows[0].level.rstrip("-123").replace("-", " ")
+        axes.setdefault(axis, []).append([f"{row.mean:.0f}" for row in rows])
+    return [[axis, *map(", ".join, zip(*sizes, strict=True))] for axis, sizes in axes.items()]
 
 
 FIGURES = {suite: partial(page, suite) for suite in SUITES}
