@@ -213,7 +213,9 @@ def learned() -> str:
 def training_minutes() -> str:
     """How many tasks these are, and minutes of training over them."""
     taken = [minutes(runs) for *_, runs in learned_tasks()]
-    return f"{len(taken)} tasks of DM Control take {min(taken):.0f} to {max(taken):.0f} minutes"
+    return (
+        f"{min(taken):.0f} to {max(taken):.0f} minutes on each of {len(taken)} tasks of DM Control"
+    )
 
 
 README = {
