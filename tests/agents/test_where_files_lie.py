@@ -52,7 +52,7 @@ def home(tmp_path, monkeypatch):
         ("my_tusks:my_ball", "there is no module 'my_tusks' for task 'my_tusks:my_ball'"),
         ("my_tusks:my_ball", "Did you mean 'my_tasks'?"),
         ("my_tasks.more:my_ball", "there is no module 'my_tasks.more'"),
-        ("my_tasks:my_bell", "registers no task 'my_bell'; registered tasks: my_ball"),
+        ("my_tasks:my_bell", "registers no task 'my_bell'; registered tasks: "),
         ("my_tasks:ant", "registers no task 'ant'"),
         ("my_tasks.py:my_ball", "there is no module 'my_tasks.py'"),
         ("my-tasks:my_ball", "must be NAME or MODULE:NAME"),
