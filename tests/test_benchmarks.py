@@ -368,9 +368,9 @@ def test_the_command_measures_this_machine(monkeypatch, tmp_path, capsys):
 
     def scan(task, num_envs, obs_mode="pixels"):
         assert (task, num_envs) == ("reacher", 7)
-        return {"speed": {"median": calls[obs_mode]}}
+        return {"steps_per_second": num_envs * calls[obs_mode]}
 
-    monkeypatch.setattr(throughput, "renderer", lambda *_: {"speed": {"median": 90.0}})
+    monkeypatch.setattr(throughput, "renderer", lambda *_: {"frames_per_second": 630.0})
     monkeypatch.setattr(throughput, "scan", scan)
     monkeypatch.setattr(adapters, "compare", lambda *_: ANSWERS["adapters.compare"])
     file = tmp_path / "new" / "bench.json"
@@ -381,7 +381,7 @@ def test_the_command_measures_this_machine(monkeypatch, tmp_path, capsys):
     assert "frames, from link poses 630 a second" in page
     assert "steps without images, a compiled loop 350 a second" in page
     assert "steps with images, a compiled loop 140 a second" in page
-    assert "| JAX loop | next_step | 97.0 | 0.97 | 0.96 to 0.98 |" in page
+    assert "| JAX loop | next_step | 97.0 | 0.97 | 0.96 to 0.98 | 5 |" in page
     kept = json.loads(file.read_text())
     assert (kept["state_steps_per_second"], kept["steps_per_second"]) == (350, 140)
     assert kept["adapters"] == ANSWERS["adapters.compare"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 
@@ -24,3 +24,17 @@ def number(value: float | None) -> str:
         return "0"
     digits = 2 - math.floor(math.log10(abs(value)))
     return f"{round(value, digits):,.{max(0, digits)}f}"
+
+
+COMPARED = ("steps/s", "ratio", "interval", "rounds")
+"""Heads of ``compared``."""
+
+
+def compared(values: Mapping[str, Any]) -> list[str]:
+    """Format a result of ``adapters.compare_speeds``."""
+    return [
+        number(values["steps_per_second"]),
+        f"{values['ratio']:.2f}",
+        " to ".join(f"{bound:.2f}" for bound in values["interval"]),
+        str(values["runs"]),
+    ]

@@ -120,6 +120,20 @@ def read(folder: str | Path) -> list[Entry]:
     return [json.loads(f.read_text("utf-8")) for f in files if f.name != PUBLISHED]
 
 
+def read_by_agent(folder: str | Path) -> dict[tuple[str, str], list[Entry]]:
+    """Read the entries of each task and agent."""
+    groups: dict[tuple[str, str], list[Entry]] = {}
+    for one in read(folder):
+        groups.setdefault((one["task"], one["agent"]), []).append(one)
+    return groups
+
+
+def read_published(folder: str | Path) -> dict[str, Any]:
+    """Read published returns by agent; none without the file."""
+    file = Path(folder) / PUBLISHED
+    return json.loads(file.read_text("utf-8"))["agents"] if file.exists() else {}
+
+
 def return_at(of: Entry, clock: str, when: float) -> float:
     """Return an entry's return at a number of ``"frames"`` or ``"seconds"``; NaN beyond its end.
 
@@ -134,11 +148,7 @@ def return_at(of: Entry, clock: str, when: float) -> float:
 
 def page(folder: str | Path) -> str:
     """Return the table of a folder's entries in Markdown, a row for each task and agent."""
-    groups: dict[tuple[str, str], list[Entry]] = {}
-    for one in read(folder):
-        groups.setdefault((one["task"], one["agent"]), []).append(one)
-    file = Path(folder) / PUBLISHED
-    published = json.loads(file.read_text("utf-8"))["agents"] if file.exists() else {}
+    groups, published = read_by_agent(folder), read_published(folder)
     heads = ["task", "agent", "seeds", *(f"{minutes} min" for minutes in MINUTES)]
     heads += [f"{frames // 1000:,}k frames" for frames in FRAMES] + ["end"]
     lines = []

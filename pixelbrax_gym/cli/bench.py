@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pixelbrax_gym.bench.tables import number, table
+from pixelbrax_gym.bench.tables import COMPARED, compared, number, table
 from pixelbrax_gym.cli import CommandError, parse
 from pixelbrax_jax.validation import check_choice, check_positive_int
 
@@ -62,30 +62,26 @@ def _measure(options: Options) -> None:
         f"{num_envs} environments, 84 x 84, three frames\n"
     )
     found: dict[str, Any] = {"machine": here, "task": task, "num_envs": num_envs}
-    loops: dict[str, tuple[str, Callable[..., dict[str, Any]], tuple[str, ...]]] = {
-        "frames": ("frames, from link poses", throughput.renderer, ()),
-        "state_steps": ("steps without images, a compiled loop", throughput.scan, ("state",)),
-        "steps": ("steps with images, a compiled loop", throughput.scan, ()),
+    frames, steps = "frames_per_second", "steps_per_second"
+    loops: dict[str, tuple[str, str, Callable[..., dict[str, Any]], tuple[str, ...]]] = {
+        frames: ("frames, from link poses", frames, throughput.renderer, ()),
+        f"state_{steps}": (
+            "steps without images, a compiled loop",
+            steps,
+            throughput.scan,
+            ("state",),
+        ),
+        steps: ("steps with images, a compiled loop", steps, throughput.scan, ()),
     }
-    for key, (name, measure, more) in loops.items():
-        per_second = num_envs * measure(task, num_envs, *more)["speed"]["median"]
-        found[f"{key}_per_second"] = per_second
+    for key, (name, value, measure, more) in loops.items():
+        found[key] = measure(task, num_envs, *more)[value]
         _write(options.output, found)
-        _say(f"{name:<40}{number(per_second):>9} a second")
+        _say(f"{name:<40}{number(found[key]):>9} a second")
     found["adapters"] = adapters.compare(task, num_envs, SECONDS)
     _write(options.output, found)
-    lines = [
-        (
-            row["adapter"],
-            row["autoreset_mode"],
-            number(row["steps_per_second"]),
-            f"{row['ratio']:.2f}",
-            " to ".join(f"{bound:.2f}" for bound in row["interval"]),
-        )
-        for row in found["adapters"]
-    ]
+    lines = [(row["adapter"], row["autoreset_mode"], *compared(row)) for row in found["adapters"]]
     _say("\nAdapters, interleaved; ratios to the JAX loop of the same autoreset mode:\n")
-    _say(table(("adapter", "autoreset", "steps/s", "ratio", "interval"), lines))
+    _say(table(("adapter", "autoreset", *COMPARED), lines))
 
 
 def _write(file: Path | None, found: dict[str, Any]) -> None:

@@ -149,7 +149,7 @@ def test_nohup_stays_in_force_and_nobody_need_read_the_lines(whole, tmp_path):
 @slow
 @pytest.mark.parametrize(
     "names",
-    [["SIGUSR1"], ["SIGTERM", "SIGHUP", "SIGINT", "SIGTERM"]],
+    [["SIGUSR1"], ["SIGUSR2"], ["SIGXCPU"], ["SIGTERM", "SIGHUP", "SIGINT", "SIGTERM"]],
     ids=lambda names: "-".join(names),
 )
 def test_what_a_scheduler_sends_stops_a_run_once(whole, tmp_path, names):

@@ -35,10 +35,16 @@ def choose(pixels, state, key):
     return action, Decision(action, None, pixels)
 
 
-CASES = {"one frame": (1, 0), "three frames, shifted": (3, 2)}
+CASES = {"one frame": (1, 0), "three frames": (3, 0), "three frames, shifted": (3, 2)}
 
 
-@pytest.fixture(scope="module", params=CASES.values(), ids=CASES)
+@pytest.fixture(
+    scope="module",
+    params=[
+        pytest.param(case, id=name, marks=pytest.mark.slow if name == "three frames" else ())
+        for name, case in CASES.items()
+    ],
+)
 def played(request):
     """Two rollouts, one after the other."""
     stack, shift = request.param

@@ -83,10 +83,8 @@ def whole(tmp_path_factory):
 
 
 @pytest.fixture(autouse=True)
-def _exports_no_policy(request, monkeypatch):
-    """Other runs than ``whole``, which has one when it is wanted."""
-    if "whole" in request.fixturenames:
-        request.getfixturevalue("whole")
+def _exports_no_policy(monkeypatch):
+    """Runs but ``whole``, which is made before, as its scope is wider."""
     monkeypatch.setattr(train, "save_policy", lambda algorithm, networks, path: path.touch())
 
 
@@ -95,7 +93,14 @@ def without_clock(record):
     return {name: value for name, value in record.items() if name not in clock}
 
 
-@pytest.mark.parametrize("stopped_by", [pytest.param(None, marks=pytest.mark.slow), signal.SIGINT])
+@pytest.mark.parametrize(
+    "stopped_by",
+    [
+        pytest.param(None, marks=pytest.mark.slow),
+        signal.SIGINT,
+        pytest.param(signal.SIGUSR1, marks=pytest.mark.slow),
+    ],
+)
 def test_a_resumed_run_is_the_same_to_the_bit(whole, tmp_path, monkeypatch, stopped_by):
     outcome, folder = whole
     lines = []

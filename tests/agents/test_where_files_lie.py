@@ -32,7 +32,7 @@ SETTINGS = (
 @pytest.fixture
 def home(tmp_path, monkeypatch):
     """The current folder, which has the module ``my_tasks``."""
-    monkeypatch.setattr(registry, "_OWN_TASKS", dict(registry._OWN_TASKS))
+    monkeypatch.setattr(registry, "_OWN_TASKS", {})
     monkeypatch.setattr(sys, "path", [path for path in sys.path if path])
     monkeypatch.setenv("PIXELBRAX_CACHE", str(tmp_path / "cache"))
     (tmp_path / "my_tasks.py").write_text(MODULE)
@@ -52,7 +52,7 @@ def home(tmp_path, monkeypatch):
         ("my_tusks:my_ball", "there is no module 'my_tusks' for task 'my_tusks:my_ball'"),
         ("my_tusks:my_ball", "Did you mean 'my_tasks'?"),
         ("my_tasks.more:my_ball", "there is no module 'my_tasks.more'"),
-        ("my_tasks:my_bell", "registers no task 'my_bell'; registered tasks: "),
+        ("my_tasks:my_bell", "registers no task 'my_bell'; registered tasks: my_ball"),
         ("my_tasks:ant", "registers no task 'ant'"),
         ("my_tasks.py:my_ball", "there is no module 'my_tasks.py'"),
         ("my-tasks:my_ball", "must be NAME or MODULE:NAME"),

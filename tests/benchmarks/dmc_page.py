@@ -178,11 +178,11 @@ MARKS = ("500000", "1000000")
 
 def learned_tasks() -> list[tuple[str, str, list[dict]]]:
     """The leaderboard's tasks of DM Control and agents, with their runs."""
-    groups: dict[tuple[str, str], list[dict]] = {}
-    for run in leaderboard.read(LEADERBOARD):
-        if run["task"] in DMC_TASKS and run["agent"] in AGENTS:
-            groups.setdefault((run["task"], run["agent"]), []).append(run)
-    return [(task, agent, runs) for (task, agent), runs in sorted(groups.items())]
+    return [
+        (task, agent, runs)
+        for (task, agent), runs in sorted(leaderboard.read_by_agent(LEADERBOARD).items())
+        if task in DMC_TASKS and agent in AGENTS
+    ]
 
 
 def minutes(runs: list[dict]) -> float:
@@ -192,8 +192,7 @@ def minutes(runs: list[dict]) -> float:
 
 def learned() -> str:
     """What agents earn at the end, beside DrQ-v2's published means, in Markdown."""
-    file = LEADERBOARD / leaderboard.PUBLISHED
-    published = json.loads(file.read_text("utf-8"))["agents"]["DrQ-v2"]["returns"]
+    published = leaderboard.read_published(LEADERBOARD)["DrQ-v2"]["returns"]
     lines = [
         [
             f"`{task}`",

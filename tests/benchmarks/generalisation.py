@@ -20,6 +20,7 @@ from pathlib import Path
 
 from pixelbrax_gym.bench.tables import table
 from pixelbrax_gym.generalisation.scores import RETURNS, SHEET, Row, Scores
+from pixelbrax_jax.tasks import DMC_TASKS
 from tests.benchmarks.experiments import DOCS, EPISODES, REVISION, run
 
 KEPT = DOCS / "benchmarks" / "generalisation"
@@ -46,7 +47,7 @@ TRAININGS = {
 
 def suites_of(task: str) -> tuple[str, ...]:
     """The suites to play; DMC-GB2 has levels for tasks of DM Control alone."""
-    return tuple(suite for suite in SUITES if suite != "dmcgb2" or task.startswith("dmc_"))
+    return tuple(suite for suite in SUITES if suite != "dmcgb2" or task in DMC_TASKS)
 
 
 def kept_at(task: str, training: str, suite: str) -> Path:

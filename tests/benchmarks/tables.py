@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from pixelbrax_gym.bench.tables import number, table
+from pixelbrax_gym.bench.tables import COMPARED, compared, number, table
 from pixelbrax_jax.tasks import TASKS
 from tests.benchmarks.case import TASKS as MEASURED
 from tests.benchmarks.case import Row
@@ -111,17 +111,14 @@ def interleaved(*columns: str) -> Callable[[list[Row]], str]:
             [
                 title(row["arguments"]["task"]),
                 *({**row["arguments"], **values}[column] for column in columns),
-                number(values["steps_per_second"]),
-                f"{values['ratio']:.2f}",
-                " to ".join(f"{bound:.2f}" for bound in values["interval"]),
-                values["runs"],
+                *compared(values),
             ]
             for row in succeeded(rows)
             for values in row["values"]
         ]
         names = {"num_envs": "environments", "autoreset_mode": "autoreset"}
         heads = ("task", *(names.get(column, column) for column in columns))
-        return table((*heads, "steps/s", "ratio", "interval", "rounds"), lines)
+        return table((*heads, *COMPARED), lines)
 
     return draw
 

@@ -121,6 +121,12 @@ def test_order_of_giving_does_not_matter():
     assert Chain(ALL[::-1]).links == Chain(ALL).links
 
 
+@pytest.mark.slow
+def test_images_do_not_depend_on_the_order_of_giving(runs):
+    reordered = rollout(ALL[::-1])
+    np.testing.assert_array_equal(reordered.obs["pixels"], runs[0].obs["pixels"])
+
+
 def test_what_cannot_work_together_is_refused():
     class Nameless(distractors.Distractor):
         pass

@@ -51,7 +51,10 @@ def test_an_overlay_covers_everything():
             np.testing.assert_allclose(plane, expected, atol=1e-6)
 
 
-@pytest.mark.parametrize(("ground_alpha", "alpha"), [(0.3, 0.4), (0.0, 0.0)])
+@pytest.mark.parametrize(
+    ("ground_alpha", "alpha"),
+    [pytest.param(1.0, 1.0, marks=pytest.mark.slow), (0.3, 0.4), (0.0, 0.0)],
+)
 def test_a_background_leaves_the_agent_alone(ground_alpha, alpha):
     video = episode(distractors.Video(ground_alpha=ground_alpha, alpha=alpha), 5)
     clean = episode(None, 5)

@@ -68,7 +68,9 @@ def test_obs_modes_show_the_same_episode():
     np.testing.assert_array_equal(steps["both"]["state"], steps["state"])
 
 
-@pytest.mark.parametrize(("height", "width"), [(1, 1), (40, 24)])
+@pytest.mark.parametrize(
+    ("height", "width"), [(1, 1), pytest.param(7, 13, marks=pytest.mark.slow), (40, 24)]
+)
 def test_any_size(height, width):
     env = make(height=height, width=width, frame_stack=1)
     state, timestep = env.reset(jax.random.key(0), PARAMS)
@@ -102,7 +104,7 @@ def test_termination_at_the_time_limit_is_no_truncation():
     assert not timestep.truncated
 
 
-@pytest.mark.parametrize("action_repeat", [1, 3])
+@pytest.mark.parametrize("action_repeat", [1, pytest.param(2, marks=pytest.mark.slow), 3])
 def test_action_repeat_sums_rewards_until_the_end(action_repeat):
     env = make(obs_mode="state", action_repeat=action_repeat)
     assert env.dt == pytest.approx(0.1 * action_repeat)
@@ -265,7 +267,9 @@ class TestMake:
 
 
 class TestCheckEnv:
-    @pytest.mark.parametrize("mode", ["pixels", pytest.param("state", marks=pytest.mark.slow)])
+    @pytest.mark.parametrize(
+        "mode", ["pixels", *(pytest.param(m, marks=pytest.mark.slow) for m in ("state", "both"))]
+    )
     def test_accepts_a_good_task(self, mode):
         check_env(make(obs_mode=mode, frame_stack=2), PARAMS)
 

@@ -40,7 +40,7 @@ def test_our_own_checker(task):
     pixelbrax_jax.check_env(*pixelbrax_jax.make(task, obs_mode="both", **SIZE))
 
 
-@pytest.mark.parametrize("task", among_slow(ONE_OF_EVERY_DOMAIN))
+@pytest.mark.parametrize("task", EVERY_TASK)
 def test_checkers_of_single_environments(task):
     env = gymnasium.make(TASKS[task].gymnasium_id, **SIZE, **RENDER).unwrapped
     check_gymnasium_env(env)

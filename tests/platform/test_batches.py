@@ -55,7 +55,7 @@ def test_only_a_cpu_has_a_loop_over_chunks(platform, loops):
 
 
 @pytest.mark.parametrize("num_rows", [1, 6, 7])
-@pytest.mark.parametrize("rays", [10, 100])
+@pytest.mark.parametrize("rays", [4, 10, 21, 100])
 def test_images_in_turns_are_those_of_all_together(num_rows, rays, monkeypatch):
     monkeypatch.setattr(batches, "_RAYS", 21)
     keys = jax.random.split(jax.random.key(0), num_rows)

@@ -143,7 +143,10 @@ FUNCTIONS = {
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
-@pytest.mark.parametrize("size", [1, 5])
+@pytest.mark.parametrize(
+    "size",
+    [1, pytest.param(3, marks=pytest.mark.slow), 5, pytest.param(16, marks=pytest.mark.slow)],
+)
 def test_results_are_those_of_vmap(name, size):
     fn = FUNCTIONS[name]
     x = jax.random.normal(jax.random.key(size), (size, 3))

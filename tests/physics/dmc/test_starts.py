@@ -12,7 +12,7 @@ from scipy.stats import ks_2samp
 
 import pixelbrax_jax as pb
 
-NUM_STARTS = 256
+NUM_STARTS = 512
 
 
 def make(num_starts, task="dmc_cheetah_run", **options):
@@ -28,15 +28,15 @@ def first_states(num_starts, num_envs, task="dmc_cheetah_run"):
 
 
 def test_episodes_begin_with_one_of_them():
-    drawn = np.unique(first_states(NUM_STARTS, 1024).obs, axis=0)
+    drawn = np.unique(first_states(NUM_STARTS, 2048).obs, axis=0)
     assert 0.95 * NUM_STARTS < len(drawn) <= NUM_STARTS
-    for known, fresh in zip(drawn.T, first_states(0, 1024).obs.T, strict=True):
+    for known, fresh in zip(drawn.T, first_states(0, 2048).obs.T, strict=True):
         assert ks_2samp(known, fresh).pvalue > 1e-3
 
 
 def test_an_environment_draws_the_same_whatever_the_number_of_them():
     np.testing.assert_array_equal(
-        first_states(NUM_STARTS, 1024).obs[:3], first_states(NUM_STARTS, 3).obs
+        first_states(NUM_STARTS, 2048).obs[:3], first_states(NUM_STARTS, 3).obs
     )
 
 
