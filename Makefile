@@ -17,7 +17,7 @@ WORKERS := -n 2 --dist worksteal
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-all test-slow test-newest test-oldest test-gpu test-programs test-clients gpu-report lint format bench golden docs docs-serve clean
+.PHONY: help demo test test-all test-slow test-optimized test-newest test-oldest test-gpu test-programs test-clients gpu-report lint format bench golden docs docs-serve clean
 
 help: ## show this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1|/' | \
@@ -25,6 +25,9 @@ help: ## show this list
 
 demo: $(VENV)/.installed-demo ## train a PyTorch agent from pixels; results in runs/demo
 	$(RUN) examples/train_inverted_pendulum.py --output-dir runs/demo $(ARGS)
+
+# Tests of what compilation could change.
+OPTIMIZED := tests/golden tests/renderer tests/physics tests/envs
 
 # Tests of what needs no torch.
 TORCHLESS := tests/renderer tests/distractors tests/envs tests/physics tests/scene tests/agents \
@@ -42,16 +45,19 @@ test: $(VENV)/.installed-dev ## run the tests that take minutes at most
 	$(RUN) -m pytest $(WORKERS) -m "not slow and not gpu and not gpu_program" $(ARGS)
 
 # One after the other, to the last, whatever fails.
-LANES := test-slow test-newest test-oldest test-clients test-programs
+LANES := test-slow test-optimized test-newest test-oldest test-clients test-programs
 
-test-all: ## run everything else that needs no GPU: slow, newest and oldest releases, clients, programs
+test-all: ## run everything else that needs no GPU: slow, optimised, newest and oldest releases, clients, programs
 	@failed=""; for lane in $(LANES); do began=$$(date +%s); \
 		$(MAKE) --no-print-directory $$lane || failed="$$failed $$lane"; \
 		echo "$$lane took $$(( $$(date +%s) - began )) s"; done; \
 		test -z "$$failed" || { echo "failed:$$failed"; exit 1; }
 
 test-slow: $(VENV)/.installed-dev ## run the tests that take longer
-	PIXELBRAX_TESTS_OPTIMIZE=1 $(RUN) -m pytest $(WORKERS) -m "slow and not gpu" $(ARGS)
+	$(RUN) -m pytest $(WORKERS) -m "slow and not gpu" $(ARGS)
+
+test-optimized: $(VENV)/.installed-dev ## compile as users do: images, physics, and that equal seeds give equal bits
+	PIXELBRAX_TESTS_OPTIMIZE=1 $(RUN) -m pytest $(WORKERS) -m "not slow and not gpu" $(OPTIMIZED) $(ARGS)
 
 test-newest: .venv-newest/.installed ## run those that need no torch with the newest releases
 	.venv-newest/bin/python -m pytest $(WORKERS) -m "$(SPEED) and not gpu" $(TORCHLESS) $(ARGS)

@@ -16,7 +16,7 @@ os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".jax_cache"))
 os.environ.setdefault("JAX_COMPILATION_CACHE_MAX_SIZE", str(2**30))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
-# `make test-slow` compiles as users do.
+# `make test-optimized` compiles as users do.
 os.environ["XLA_FLAGS"] = " ".join(
     [
         xla_flags(optimize=os.environ.get("PIXELBRAX_TESTS_OPTIMIZE") == "1"),

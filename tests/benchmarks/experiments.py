@@ -197,7 +197,7 @@ def offer(task: str, folder: Path, kept: dict) -> None:
     PRETRAINED.mkdir(exist_ok=True)
     shutil.copyfile(folder / "policy.jax", PRETRAINED / f"{task}.jax")
     names = ["task", "backend", "reward_preset"]
-    names += ["height", "width", "samples", "frame_stack", "action_repeat"]
+    names += ["height", "width", "samples", "frame_stack", "action_repeat", "look"]
     written = {
         "return": last["clean/return"],
         "standard_error": last["clean/standard_error"],

@@ -75,8 +75,8 @@ class Dynamics:
     """A model's dynamics, for one environment.
 
     With ``engine="auto"`` MuJoCo's own engine computes programs lowered for a CPU, in float64, and
-    MuJoCo XLA all others, in float32; it also steps small models on a CPU. Another name in
-    ``options.ENGINES`` chooses one for all.
+    MuJoCo XLA all others, in float32; on a CPU it also steps models with ``prefers_xla``. Another
+    name in ``options.ENGINES`` chooses one for all.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class Dynamics:
         posed: mujoco.MjModel,
         *,
         engine: str = "auto",
-        is_small: bool = False,
+        prefers_xla: bool = False,
         reads_forces: bool = False,
         starts_with_forces: bool = False,
         out_of_reach: Iterable[str] = (),
@@ -95,7 +95,7 @@ class Dynamics:
         """Take a model and the same ``with_poses``. For the rest see ``Formulas``."""
         self.model = model
         self.engine = engine
-        self._steps_by_xla = engine == "auto" and is_small
+        self._steps_by_xla = engine == "auto" and prefers_xla
         self._target_body = model.body(target_body).id if target_body else None
         self._xla_options: dict[str, Any] = {
             "reads_forces": reads_forces,

@@ -165,7 +165,7 @@ class Formulas:
         target_body: name of the body, fixed to the world, that it moves; empty for none.
         reads_forces: whether observations use sensors of forces or accelerations.
         starts_with_forces: whether these sensors are not 0 in an initial state.
-        is_small: whether a CPU steps the model faster by MuJoCo XLA.
+        prefers_xla: whether MuJoCo XLA steps the model faster on a CPU, so that "auto" takes it.
         out_of_reach: names of the geoms that never touch anything, which MuJoCo XLA then skips.
         reads: fields of ``MjData`` that the formulas see as MuJoCo leaves them after its last step,
             which computes them before it moves, as Gymnasium's do.
@@ -184,6 +184,6 @@ class Formulas:
     target_body: str = ""
     reads_forces: bool = False
     starts_with_forces: bool = False
-    is_small: bool = False
+    prefers_xla: bool = False
     out_of_reach: tuple[str, ...] = ()
     reads: tuple[str, ...] = ()

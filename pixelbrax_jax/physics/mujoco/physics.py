@@ -96,7 +96,7 @@ class MujocoPhysics(GuardedPhysics):
             posed,
             engine=engine,
             reads_forces=formulas.reads_forces,
-            is_small=formulas.is_small,
+            prefers_xla=formulas.prefers_xla,
             starts_with_forces=formulas.starts_with_forces,
             out_of_reach=formulas.out_of_reach,
             target_body=formulas.target_body,

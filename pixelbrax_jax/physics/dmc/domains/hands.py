@@ -228,7 +228,7 @@ def _reward_manipulator(seen: Snapshot) -> jax.Array:
 
 
 _finger = partial(
-    Formulas, substeps=2, out_of_reach=_OUT_OF_REACH, reads_forces=True, is_small=True
+    Formulas, substeps=2, out_of_reach=_OUT_OF_REACH, reads_forces=True, prefers_xla=True
 )
 
 
@@ -238,9 +238,7 @@ def _turn(radius: float) -> Formulas:
 
 
 TASKS = {
-    "dmc_ball_in_cup_catch": Formulas(
-        _start_cup, observe_joints, _reward_cup, substeps=10, is_small=True
-    ),
+    "dmc_ball_in_cup_catch": Formulas(_start_cup, observe_joints, _reward_cup, substeps=10),
     "dmc_finger_spin": _finger(start_free_of_contact, _observe_spin, _reward_spin, edit=_edit_spin),
     "dmc_finger_turn_easy": _turn(0.07),
     "dmc_finger_turn_hard": _turn(0.03),

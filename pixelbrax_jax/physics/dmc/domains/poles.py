@@ -103,7 +103,7 @@ def _reward_pendulum(seen: Snapshot) -> jax.Array:
 
 def _acrobot(margin: float) -> Formulas:
     return Formulas(
-        _start_anywhere, _observe_acrobot, partial(_reward_acrobot, margin=margin), is_small=True
+        _start_anywhere, _observe_acrobot, partial(_reward_acrobot, margin=margin), prefers_xla=True
     )
 
 
@@ -111,18 +111,18 @@ TASKS = {
     "dmc_acrobot_swingup": _acrobot(1.0),
     "dmc_acrobot_swingup_sparse": _acrobot(0.0),
     "dmc_cartpole_balance": Formulas(
-        _start_upright, _observe_cartpole, _reward_cartpole, is_small=True
+        _start_upright, _observe_cartpole, _reward_cartpole, prefers_xla=True
     ),
     "dmc_cartpole_balance_sparse": Formulas(
-        _start_upright, _observe_cartpole, _reward_cartpole_sparse, is_small=True
+        _start_upright, _observe_cartpole, _reward_cartpole_sparse, prefers_xla=True
     ),
     "dmc_cartpole_swingup": Formulas(
-        _start_hanging, _observe_cartpole, _reward_cartpole, is_small=True
+        _start_hanging, _observe_cartpole, _reward_cartpole, prefers_xla=True
     ),
     "dmc_cartpole_swingup_sparse": Formulas(
-        _start_hanging, _observe_cartpole, _reward_cartpole_sparse, is_small=True
+        _start_hanging, _observe_cartpole, _reward_cartpole_sparse, prefers_xla=True
     ),
     "dmc_pendulum_swingup": Formulas(
-        _start_anywhere, _observe_pendulum, _reward_pendulum, is_small=True
+        _start_anywhere, _observe_pendulum, _reward_pendulum, prefers_xla=True
     ),
 }

@@ -195,7 +195,7 @@ def _reacher(radius: float) -> Formulas:
         _reward_reacher,
         edit=edit,
         movable=("target",),
-        is_small=True,
+        prefers_xla=True,
     )
 
 
@@ -207,7 +207,6 @@ def _swimmer(num_bodies: int) -> Formulas:
         substeps=15,
         options={"num_bodies": num_bodies},
         movable=("target", "target_light"),
-        is_small=num_bodies < 10,
     )
 
 
@@ -218,7 +217,6 @@ TASKS = {
         _reward_fish_upright,
         substeps=10,
         edit=_hide_target,
-        is_small=True,
     ),
     "dmc_fish_swim": Formulas(
         _start_fish_swim,
@@ -226,10 +224,9 @@ TASKS = {
         _reward_fish_swim,
         substeps=10,
         movable=("target",),
-        is_small=True,
     ),
     "dmc_point_mass_easy": Formulas(
-        start_anywhere, observe_joints, _reward_point_mass, is_small=True
+        start_anywhere, observe_joints, _reward_point_mass, prefers_xla=True
     ),
     "dmc_reacher_easy": _reacher(0.05),
     "dmc_reacher_hard": _reacher(0.015),
