@@ -166,7 +166,7 @@ def _compare(draw: Draw) -> KernelCheck:
 
 
 def _scene(eye: jax.Array) -> Scene:
-    """Return one of each kind of geom on the ground, with light and shadows, seen from ``eye``."""
+    """Return one of each kind of geom on ground that reflects, with light and shadows."""
     kinds = tuple(GeomKind)
     angles = jnp.linspace(0.3, 1.2, len(kinds))
     axes = jnp.array([[0.0, 0.0, 0.0]] + [[0.6, 0.0, 0.8]] * (len(kinds) - 1))
@@ -188,6 +188,7 @@ def _scene(eye: jax.Array) -> Scene:
         rgb=jnp.linspace(0.1, 0.9, 3 * len(kinds)).reshape(-1, 3),
         num_planes=tuple(len(planes) if kind == GeomKind.MESH else 0 for kind in kinds),
         planes=planes,
+        mirror=kinds.index(GeomKind.PLANE),
     )
     lamp = Lamp(
         link=-1,
@@ -210,6 +211,7 @@ def _scene(eye: jax.Array) -> Scene:
         sky=jnp.array([[0.8, 0.8, 0.9], [0.2, 0.4, 0.8]]),
         ground_rgb=jnp.array([[0.3, 0.4, 0.5], [0.6, 0.6, 0.5]]),
         ground_pitch=jnp.float32(1.0),
+        reflectance=jnp.float32(0.2),
         lamps=(lamp,),
     )
     return Scene(

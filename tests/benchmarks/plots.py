@@ -109,10 +109,9 @@ def speed(file: Path) -> None:
 
     The picture is named as the file.
     """
-    # Other files beside the results have no cases.
     rows = [
         row
-        for row in json.loads(file.read_text("utf-8")).get("cases", {}).values()
+        for row in json.loads(file.read_text("utf-8"))["cases"].values()
         if row["group"] == "environments" and row["status"] == "ok"
     ]
     tasks = list(dict.fromkeys(row["arguments"]["task"] for row in rows))

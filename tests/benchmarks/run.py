@@ -77,8 +77,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         name = signal.Signals(stopped_by).name
         sys.stderr.write(f"\nstopped by {name}; run the same command again to continue\n")
         status = int(128 + stopped_by)
-    for file in options.output_dir.glob("*.json"):
-        plots.speed(file)
     return status
 
 
@@ -104,6 +102,7 @@ def _measure(cases: Sequence[Case], options: Options) -> int:
     finally:
         if file.exists():
             results.write_page(GROUPS)
+            plots.speed(file)
     _say(f"Tables: {file.with_suffix('.md').resolve()}\n")
     return int(failed)
 

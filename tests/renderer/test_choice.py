@@ -41,23 +41,30 @@ def test_the_images_of_the_check_are_far_from_rounding():
     assert not choice.compare(partial(moved, by=0.05)).passed
 
 
-def test_every_kind_of_geom_the_sky_and_shadows_are_in_the_check():
+def test_every_kind_of_geom_the_sky_shadows_and_a_reflection_are_in_the_check():
     shown = {}
 
     def seen(scene, height, width):
         frame = plain(scene, height, width)
-        shadows = plain(scene.replace(look=scene.look.replace(shadows=False)), height, width)
+
+        def changes(**look):
+            other = plain(scene.replace(look=scene.look.replace(**look)), height, width)
+            return jnp.abs(frame.r - other.r) > 0.05
+
         jax.debug.callback(
-            lambda seg, dark: shown.update(seg=set(np.unique(seg)), dark=dark.any()),
+            lambda seg, *changed: shown.update(
+                seg=set(np.unique(seg)), changed=[where.any() for where in changed]
+            ),
             frame.seg,
-            jnp.abs(frame.r - shadows.r) > 0.05,
+            changes(shadows=False),
+            changes(reflectance=None),
         )
         return frame
 
     choice.compare(seen)
     jax.effects_barrier()
     assert shown["seg"] == set(range(-1, len(pb.GeomKind)))
-    assert shown["dark"]
+    assert shown["changed"] == [True, True]
 
 
 @pytest.mark.parametrize(
