@@ -1,4 +1,4 @@
-"""A task's model and our view of it, for other renderers."""
+"""A task's model with our camera, for other renderers."""
 
 from __future__ import annotations
 
@@ -15,11 +15,10 @@ from pixelbrax_jax.scene.place import place
 
 
 def describe(task: str) -> dict[str, Any]:
-    """The MJCF that Brax loads, and where our camera stands at the start of an episode.
+    """The model that Brax loads, with our camera at the start of an episode as its only one.
 
     Returns:
-        ``xml``; ``pos`` (3,) metres and ``quat`` (4,) of the camera in the world frame; ``fovy``
-        in degrees; ``qpos``, the joints' positions then.
+        ``xml``, MJCF; ``qpos``, the joints' positions then.
     """
     file = Path(brax.envs.__file__).parent / "assets" / f"{_FILES.get(task, task)}.xml"
     env, params = pb.make(task)
@@ -28,13 +27,17 @@ def describe(task: str) -> dict[str, Any]:
     scene = place(params.geoms, params.rig, params.look, physics.xpos, physics.xquat)
     quat = np.zeros(4)
     mujoco.mju_mat2Quat(quat, np.asarray(scene.camera.xmat, np.float64).ravel())
-    return {
-        "xml": file.read_text(),
-        "pos": np.asarray(scene.camera.pos).tolist(),
-        "quat": quat.tolist(),
-        "fovy": float(scene.camera.fovy),
-        "qpos": np.asarray(physics.engine.pipeline.q).tolist(),
-    }
+    spec = mujoco.MjSpec.from_file(str(file))
+    for camera in list(spec.cameras):
+        spec.delete(camera)
+    spec.worldbody.add_camera(
+        name="pixelbrax",
+        pos=np.asarray(scene.camera.pos),
+        quat=quat,
+        fovy=float(scene.camera.fovy),
+    )
+    spec.compile()
+    return {"xml": spec.to_xml(), "qpos": np.asarray(physics.engine.pipeline.q).tolist()}
 
 
 _FILES = {"halfcheetah": "half_cheetah"}

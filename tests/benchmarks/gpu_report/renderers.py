@@ -24,13 +24,7 @@ def mjx(task: str, num_envs: int, size: int) -> Measure:
     if not warp.WARP_INSTALLED:
         raise AbsentError('mjx.render needs warp-lang: pip install "mujoco-mjx[warp]"')
     view = scene.describe(task)
-    spec = mujoco.MjSpec.from_string(view["xml"])
-    for camera in list(spec.cameras):
-        spec.delete(camera)
-    spec.worldbody.add_camera(
-        name="pixelbrax", pos=view["pos"], quat=view["quat"], fovy=view["fovy"]
-    )
-    model = spec.compile()
+    model = mujoco.MjModel.from_xml_string(view["xml"])
     on_device = mjx.put_model(model, impl="warp")
     context = mjx.create_render_context(
         model, nworld=num_envs, cam_res=(size, size), render_rgb=True, render_depth=False,

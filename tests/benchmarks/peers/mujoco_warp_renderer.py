@@ -33,13 +33,7 @@ def prepare(scene: dict[str, Any], num_envs: int, size: int) -> Any:
         print(f"its wheel does not run here: {error}", file=sys.stderr)
         sys.exit(3)
 
-    spec = mujoco.MjSpec.from_string(scene["xml"])
-    for camera in list(spec.cameras):
-        spec.delete(camera)
-    spec.worldbody.add_camera(
-        name="pixelbrax", pos=scene["pos"], quat=scene["quat"], fovy=scene["fovy"]
-    )
-    model = spec.compile()
+    model = mujoco.MjModel.from_xml_string(scene["xml"])
     data = mujoco.MjData(model)
     data.qpos[:] = scene["qpos"]
     mujoco.mj_forward(model, data)
