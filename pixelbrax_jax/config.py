@@ -45,7 +45,7 @@ class ProgramConfig:
     """Content of an observation: ``pixels``, ``depth``, ``segmentation``, ``state`` (nothing is
     rendered), several joined by ``+`` such as ``pixels+depth``, or ``both``, pixels and state."""
     action_repeat: int = 1
-    """Control steps per environment step. Only the last one is rendered."""
+    """Control steps per environment step. Rewards are summed; only the last one is rendered."""
     renderer: str = "auto"
     """``auto`` chooses the fastest renderer for the device, ``fused`` runs on all devices,
     ``pallas`` is a kernel for NVIDIA GPUs (``auto`` takes it there if it passes a check), and

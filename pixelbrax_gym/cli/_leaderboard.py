@@ -135,13 +135,14 @@ def read_published(folder: str | Path) -> dict[str, Any]:
 
 
 def return_at(of: Entry, clock: str, when: float) -> float:
-    """Return an entry's return at a number of ``"frames"`` or ``"seconds"``; NaN beyond its end.
+    """Return an entry's return at a number of ``"frames"`` or ``"seconds"``, or NaN.
 
-    It is interpolated between evaluations; before the first one it is that of the first.
+    It is interpolated between evaluations, and unknown before the first one. After its end a run
+    has no return at more frames, but at later times its last one.
     """
     times = of[clock]
     # Iterations end a little before a round number.
-    if when > 1.02 * times[-1]:
+    if when < 0.98 * times[0] or (clock == "frames" and when > 1.02 * times[-1]):
         return math.nan
     return float(np.interp(when, times, of["return"]))
 
@@ -174,7 +175,9 @@ def _end(runs: list[Entry]) -> str:
 
 
 def _shown(runs: list[Entry], clock: str, when: float) -> str:
-    return middle([x for run in runs if not math.isnan(x := return_at(run, clock, when))])
+    found = [return_at(run, clock, when) for run in runs]
+    # Of some runs alone it would not compare with the other columns.
+    return "" if any(map(math.isnan, found)) else middle(found)
 
 
 def middle(scores: list[float]) -> str:

@@ -206,7 +206,7 @@ def learned() -> str:
         for task, agent, runs in learned_tasks()
     ]
     heads = ["task", "agent", "seeds", "return", "frames", "minutes"]
-    return table([*heads, "published, 0.5M", "1M"], lines)
+    return table([*heads, "published, 0.5M", "published, 1M"], lines)
 
 
 def training_minutes() -> str:

@@ -61,9 +61,18 @@ def test_returns_between_evaluations_are_interpolated(tmp_path):
     leaderboard(make_run(tmp_path / "run"), "--folder", tmp_path)
     (one,) = read(tmp_path)
     assert return_at(one, "seconds", 25.0) == 30.0
-    assert return_at(one, "frames", 500) == 10.0
+    assert return_at(one, "frames", 990) == 10.0
     assert return_at(one, "frames", 3050) == 40.0
+
+
+def test_before_the_first_evaluation_and_after_the_end(tmp_path):
+    leaderboard(make_run(tmp_path / "run"), "--folder", tmp_path)
+    (one,) = read(tmp_path)
+    assert math.isnan(return_at(one, "frames", 500))
+    assert math.isnan(return_at(one, "seconds", 5.0))
+    # More frames would have changed the policy; an hour after its end it is the same.
     assert math.isnan(return_at(one, "frames", 3100))
+    assert return_at(one, "seconds", 3600.0) == 40.0
 
 
 def test_the_table_has_a_row_for_each_task_and_agent(tmp_path, capsys):
@@ -80,8 +89,8 @@ def test_the_table_has_a_row_for_each_task_and_agent(tmp_path, capsys):
         [cell.strip() for cell in line.split("|")[1:-1]]
         for line in capsys.readouterr().out.splitlines()
     )
-    # 100,000 frames take 1,000 seconds.
-    assert ours == ["`ant`", "PPO, mine", "4", "2 (1 to 100)", "2 (1 to 100)", "", *ours[6:]]
+    # The first evaluation is after 500 seconds, the end after 1,000.
+    assert ours == ["`ant`", "PPO, mine", "4", "", "2 (1 to 100)", "2 (1 to 100)", *ours[6:]]
     assert ours[6:] == ["2 (1 to 100)", "", "", "2 (1 to 100) at 0.1M"]
     assert theirs == ["`ant`", "Other, published", "5", "", "", "", "", "7", "", ""]
 
