@@ -4,8 +4,8 @@
 
 draws both with the same states, 84 x 84 pixels and each task's usual camera, and writes
 docs/images/dmc/beside.png, the suite's on the left, and docs/dmc/pictures.json: mean absolute
-differences of color in units of 1/255, of all pixels, of the sky, the ground and all else, with the
-rays per pixel of ``--samples``. It needs the package ``dm_control`` and a library of EGL (Debian's
+differences of color in units of 1/255, of all pixels, of the sky, the ground and all else. With
+``--samples 4`` it writes docs/dmc/pictures-4.json alone. It needs the package ``dm_control`` and a library of EGL (Debian's
 ``libegl1``); ``MUJOCO_GL=osmesa`` draws the same with ``libosmesa6``.
 """
 
@@ -124,9 +124,10 @@ def main() -> None:
         pairs[name] = np.concatenate([drawn["theirs"][1], gap, drawn["ours"][1]], axis=1)
     if set(chosen) == set(CASES):
         (DOCS / "dmc").mkdir(exist_ok=True)
-        (DOCS / "images" / "dmc").mkdir(parents=True, exist_ok=True)
+        command = "MUJOCO_GL=egl python -m tests.benchmarks.suite_pictures"
+        some = options.samples > 1
         kept = {
-            "command": "MUJOCO_GL=egl python -m tests.benchmarks.suite_pictures",
+            "command": f"{command} --samples {options.samples}" if some else command,
             "mujoco": mujoco.__version__,
             "pixels": SIZE,
             "states": STATES,
@@ -134,8 +135,11 @@ def main() -> None:
             "mean_absolute_difference_of_255": report,
         }
         text = json.dumps(kept, indent=2) + "\n"
-        (DOCS / "dmc" / "pictures.json").write_text(text, "utf-8")
-        sheet(pairs).save(DOCS / "images" / "dmc" / "beside.png", optimize=True)
+        stem = f"pictures-{options.samples}" if some else "pictures"
+        (DOCS / "dmc" / f"{stem}.json").write_text(text, "utf-8")
+        if not some:
+            (DOCS / "images" / "dmc").mkdir(parents=True, exist_ok=True)
+            sheet(pairs).save(DOCS / "images" / "dmc" / "beside.png", optimize=True)
     else:
         sheet(pairs).save("beside.png")
 
