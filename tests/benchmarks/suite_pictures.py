@@ -5,8 +5,8 @@
 draws both with the same states, 84 x 84 pixels and each task's usual camera, and writes
 docs/images/dmc/beside.png, the suite's on the left, and docs/dmc/pictures.json: mean absolute
 differences of color in units of 1/255, of all pixels, of the sky, the ground and all else. With
-``--samples 4`` it writes docs/dmc/pictures-4.json alone. It needs the package ``dm_control`` and a library of EGL (Debian's
-``libegl1``); ``MUJOCO_GL=osmesa`` draws the same with ``libosmesa6``.
+``--samples 4`` it writes docs/dmc/pictures-4.json alone. It needs the package ``dm_control`` and a
+library of EGL (Debian's ``libegl1``); ``MUJOCO_GL=osmesa`` draws the same with ``libosmesa6``.
 """
 
 from __future__ import annotations
