@@ -55,11 +55,13 @@ def by_platform(
 
     forms = {"cpu": cpu, "cuda": cuda, "tpu": tpu}
     named = {name: flat(form) for name, form in forms.items() if form is not None}
-    results = _primitive.bind(
-        *map(jnp.asarray, leaves),
-        forms=_Forms(flat(default), named, no_derivative),
-        shapes=tuple((x.shape, x.dtype) for x in shapes),
-    )
+    arrays, of = map(jnp.asarray, leaves), _Forms(flat(default), named, no_derivative)
+    if getattr(jax.config, "jax_debug_key_reuse", False):
+        # The check takes keys as used by what it does not know.
+        results = _by_jax(*arrays, forms=of)
+    else:
+        kept = tuple((x.shape, x.dtype) for x in shapes)
+        results = _primitive.bind(*arrays, forms=of, shapes=kept)
     return jax.tree.unflatten(result_tree, results)
 
 

@@ -86,3 +86,12 @@ def test_forms_are_traced_under_the_flags_of_all_programs():
 def test_a_form_with_other_results_is_an_error():
     with pytest.raises(AssertionError, match="in place of"):
         jax.jit(lambda x: by_platform((x,), x, default=lambda x: x[:2]))(jnp.zeros(3))
+
+
+def test_a_key_is_used_only_by_a_form_that_draws_with_it():
+    def both(key):
+        one = by_platform((key,), jnp.int32(0), default=lambda key: jnp.int32(1))
+        return one + jax.random.randint(key, (), 0, 9)
+
+    with jax.debug_key_reuse(True):
+        assert jax.jit(both)(jax.random.key(0)) == both(jax.random.key(0))
