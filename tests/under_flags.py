@@ -25,6 +25,8 @@ SIZE = {"height": 16, "width": 16}
 TASK = "inverted_pendulum"
 NUM_STEPS = 3
 KEY = jax.eval_shape(lambda: jax.random.key(0, impl="threefry2x32"))
+_KERNEL = contextlib.ExitStack()
+"""Keeps the kernel interpreted until the process ends."""
 
 
 def digest(tree: Any) -> str:
@@ -48,7 +50,7 @@ def make(name: str) -> tuple[Any, Any]:
     if renderer == "pallas":
         from tests.renderer.interpreted import interpreted_kernel
 
-        interpreted_kernel().__enter__()  # until the process ends
+        _KERNEL.enter_context(interpreted_kernel())
     task, *distractors = name.split(",")
     options = SIZE | {"distractors": tuple(distractors), "renderer": renderer or "auto"}
     if any("video" in link or "dcs" in link for link in distractors):
