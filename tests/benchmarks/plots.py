@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -72,19 +73,21 @@ def _legend(axes: plt.Axes, panels: Iterable[plt.Axes], fontsize: int) -> None:
 
 
 def leaderboard(entries: list[dict], published: dict[str, dict], path: Path) -> None:
-    """Return of the mean action: over minutes above, over frames below, a column for each task.
+    """Return of the mean action, two panels for each task: over minutes, below it over frames.
 
     Each agent has a color, each seed a line; dots are published returns.
     """
     tasks, agents = (sorted({one[key] for one in entries}) for key in ("task", "agent"))
-    size = (1 + 2.6 * len(tasks), 5)
-    figure, panels = plt.subplots(2, len(tasks), figsize=size, layout="constrained", squeeze=False)
-    for row, (clock, unit, label) in zip(
-        panels, [("seconds", 60, "minutes of training"), ("frames", 1000, "thousand frames")],
-        strict=True,
-    ):  # fmt: skip
-        row[0].set_ylabel("return")
-        for axes, task in zip(row, tasks, strict=True):
+    columns = min(4, len(tasks))
+    rows = 2 * math.ceil(len(tasks) / columns)
+    size = (1 + 2.6 * columns, 2.5 * rows)
+    figure, panels = plt.subplots(rows, columns, figsize=size, layout="constrained", squeeze=False)
+    for axes in panels.flat:
+        axes.set_visible(False)
+    clocks = (("seconds", 60, "minutes of training"), ("frames", 1000, "thousand frames"))
+    for place, task in enumerate(tasks):
+        for below, (clock, unit, label) in enumerate(clocks):
+            axes = panels[place // columns * 2 + below, place % columns]
             for one in entries:
                 if one["task"] == task:
                     color = f"C{agents.index(one['agent'])}"
@@ -96,7 +99,7 @@ def leaderboard(entries: list[dict], published: dict[str, dict], path: Path) -> 
                     points = [(int(at) / unit, mean) for at, mean in found.items()]
                     style = {"color": f"C{number}", "label": f"{agent}, published"}
                     axes.plot(*zip(*points, strict=True), "o", **style)
-            axes.set(xlabel=label, title=title(task))
+            axes.set(xlabel=label, ylabel="return", title=title(task), visible=True)
             axes.grid(alpha=0.3)
             if task.startswith("dmc_"):
                 axes.set_ylim(0, 1050)
