@@ -141,7 +141,7 @@ def return_at(of: Entry, clock: str, when: float) -> float:
     has no return at more frames, but at later times its last one.
     """
     times = of[clock]
-    # Iterations end a little before a round number.
+    # Iterations end near a round number.
     if when < 0.98 * times[0] or (clock == "frames" and when > 1.02 * times[-1]):
         return math.nan
     return float(np.interp(when, times, of["return"]))
@@ -182,8 +182,6 @@ def _shown(runs: list[Entry], clock: str, when: float) -> str:
 
 def middle(scores: list[float]) -> str:
     """Return the interquartile mean, and of several scores their range."""
-    if not scores:
-        return ""
     # As in rliable (arXiv 2108.13264).
     mean = f"{trim_mean(scores, 0.25):.0f}"
     if len(scores) == 1:

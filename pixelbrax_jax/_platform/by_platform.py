@@ -55,14 +55,20 @@ def by_platform(
 
     forms = {"cpu": cpu, "cuda": cuda, "tpu": tpu}
     named = {name: flat(form) for name, form in forms.items() if form is not None}
-    arrays, of = map(jnp.asarray, leaves), _Forms(flat(default), named, no_derivative)
-    if getattr(jax.config, "jax_debug_key_reuse", False):
-        # The check takes keys as used by what it does not know.
-        results = _by_jax(*arrays, forms=of)
+    arrays = [jnp.asarray(x) for x in leaves]
+    all_forms = _Forms(flat(default), named, no_derivative)
+    if getattr(jax.config, "jax_debug_key_reuse", False) and any(map(_is_key, arrays)):
+        # The check takes a key as used by a primitive that it does not know.
+        results = _by_jax(*arrays, forms=all_forms)
     else:
-        kept = tuple((x.shape, x.dtype) for x in shapes)
-        results = _primitive.bind(*arrays, forms=of, shapes=kept)
+        results = _primitive.bind(
+            *arrays, forms=all_forms, shapes=tuple((x.shape, x.dtype) for x in shapes)
+        )
     return jax.tree.unflatten(result_tree, results)
+
+
+def _is_key(array: jax.Array) -> bool:
+    return jnp.issubdtype(array.dtype, jax.dtypes.prng_key)
 
 
 class Traced(NamedTuple):

@@ -179,7 +179,7 @@ def record(folder: Path, arguments: list[str]) -> dict:
 def offer(task: str, folder: Path, kept: dict) -> None:
     """Put a finished run's policy into the package if it is the best of its task so far.
 
-    Returns by other rewards compare with none of the preset's.
+    Returns by other rewards, or from other looks, compare with none of the preset's.
     """
     about = PRETRAINED / f"{task}.json"
     if "evaluations" in kept:
@@ -187,11 +187,12 @@ def offer(task: str, folder: Path, kept: dict) -> None:
     else:
         names = {"clean/return": "return", "clean/standard_error": "standard_error"}
         last = {name: kept[key][-1] for name, key in (names | {"steps": "frames"}).items()}
-    reward = preset(kept["algorithm"], "cpu", task).env.reward_preset
-    if kept["config"]["reward_preset"] != reward:
+    env = preset(kept["algorithm"], "cpu", task).env
+    wanted = {"reward_preset": env.reward_preset, "look": env.look}
+    if not wanted.items() <= kept["config"].items():
         return
     before = json.loads(about.read_text()) if about.exists() else None
-    comparable = before and before["env_options"]["reward_preset"] == reward
+    comparable = before and wanted.items() <= before["config"].items()
     if comparable and last["clean/return"] <= before["return"]:
         return
     PRETRAINED.mkdir(exist_ok=True)

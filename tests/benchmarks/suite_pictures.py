@@ -124,10 +124,12 @@ def main() -> None:
         pairs[name] = np.concatenate([drawn["theirs"][1], gap, drawn["ours"][1]], axis=1)
     if set(chosen) == set(CASES):
         (DOCS / "dmc").mkdir(exist_ok=True)
-        command = "MUJOCO_GL=egl python -m tests.benchmarks.suite_pictures"
-        some = options.samples > 1
+        command, stem = "MUJOCO_GL=egl python -m tests.benchmarks.suite_pictures", "pictures"
+        if supersampled := options.samples > 1:
+            command += f" --samples {options.samples}"
+            stem += f"-{options.samples}"
         kept = {
-            "command": f"{command} --samples {options.samples}" if some else command,
+            "command": command,
             "mujoco": mujoco.__version__,
             "pixels": SIZE,
             "states": STATES,
@@ -135,9 +137,8 @@ def main() -> None:
             "mean_absolute_difference_of_255": report,
         }
         text = json.dumps(kept, indent=2) + "\n"
-        stem = f"pictures-{options.samples}" if some else "pictures"
         (DOCS / "dmc" / f"{stem}.json").write_text(text, "utf-8")
-        if not some:
+        if not supersampled:
             (DOCS / "images" / "dmc").mkdir(parents=True, exist_ok=True)
             sheet(pairs).save(DOCS / "images" / "dmc" / "beside.png", optimize=True)
     else:

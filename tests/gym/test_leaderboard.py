@@ -95,6 +95,15 @@ def test_the_table_has_a_row_for_each_task_and_agent(tmp_path, capsys):
     assert theirs == ["`ant`", "Other, published", "5", "", "", "", "", "7", "", ""]
 
 
+def test_a_cell_has_all_seeds_or_none(tmp_path, capsys):
+    for seed, returns in enumerate(((1.0, 3.0), (1.0, 3.0, 5.0, 7.0, 9.0))):
+        run = make_run(tmp_path / str(seed), seed=seed, returns=returns, every=100_000)
+        assert leaderboard(run, "--folder", tmp_path / "board") == 0
+    row = capsys.readouterr().out.splitlines()[-1].split("|")
+    # 200,000 frames take 33 minutes, and the first evaluation is after 17.
+    assert [cell.strip() for cell in row[4:10]] == ["", "", "3 (3 to 3)", "1 (1 to 1)", "", ""]
+
+
 def test_another_run_is_not_overwritten(tmp_path, capsys):
     first, second = (make_run(tmp_path / str(i), returns=(i, i)) for i in (1, 2))
     assert leaderboard(first, "--folder", tmp_path / "board") == 0

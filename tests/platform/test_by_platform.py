@@ -1,5 +1,7 @@
 """A program traces the form of its platform, and no other."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -89,9 +91,14 @@ def test_a_form_with_other_results_is_an_error():
 
 
 def test_a_key_is_used_only_by_a_form_that_draws_with_it():
-    def both(key):
-        one = by_platform((key,), jnp.int32(0), default=lambda key: jnp.int32(1))
-        return one + jax.random.randint(key, (), 0, 9)
+    def draw(key):
+        return jax.random.randint(key, (), 0, 9)
+
+    def twice(key, form):
+        return by_platform((key,), jnp.int32(0), default=form) + draw(key)
 
     with jax.debug_key_reuse(True):
-        assert jax.jit(both)(jax.random.key(0)) == both(jax.random.key(0))
+        one = jax.jit(partial(twice, form=lambda key: jnp.int32(1)))(jax.random.key(0))
+        assert one == 1 + draw(jax.random.key(0))
+        with pytest.raises(jax.errors.KeyReuseError):
+            jax.jit(partial(twice, form=draw))(jax.random.key(0))

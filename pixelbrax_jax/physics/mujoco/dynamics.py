@@ -75,8 +75,8 @@ class Dynamics:
     """A model's dynamics, for one environment.
 
     With ``engine="auto"`` MuJoCo's own engine computes programs lowered for a CPU, in float64, and
-    MuJoCo XLA all others, in float32; on a CPU it also steps models with ``prefers_xla``. Another
-    name in ``options.ENGINES`` chooses one for all.
+    MuJoCo XLA all others, in float32. With ``prefers_xla`` MuJoCo XLA takes the steps on a CPU,
+    too. Another name in ``options.ENGINES`` chooses one for all.
     """
 
     def __init__(
