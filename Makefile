@@ -27,7 +27,7 @@ demo: $(VENV)/.installed-demo ## train a PyTorch agent from pixels; results in r
 	$(RUN) examples/train_inverted_pendulum.py --output-dir runs/demo $(ARGS)
 
 # Tests of what compilation could change.
-OPTIMIZED := tests/golden tests/renderer tests/physics tests/envs
+OPTIMIZED := tests/golden tests/renderer tests/physics tests/envs tests/agents/test_updates.py tests/agents/test_drqv2.py
 
 # Tests of what needs no torch.
 TORCHLESS := tests/renderer tests/distractors tests/envs tests/physics tests/scene tests/agents \
@@ -56,7 +56,7 @@ test-all: ## run everything else that needs no GPU: slow, optimised, newest and 
 test-slow: $(VENV)/.installed-dev ## run the tests that take longer
 	$(RUN) -m pytest $(WORKERS) -m "slow and not gpu" $(ARGS)
 
-test-optimized: $(VENV)/.installed-dev ## compile as users do: images, physics, and that equal seeds give equal bits
+test-optimized: $(VENV)/.installed-dev ## compile as users do: images, physics, environments, equal seeds of training
 	PIXELBRAX_TESTS_OPTIMIZE=1 $(RUN) -m pytest $(WORKERS) -m "not slow and not gpu" $(OPTIMIZED) $(ARGS)
 
 test-newest: .venv-newest/.installed ## run those that need no torch with the newest releases
