@@ -128,6 +128,7 @@ def _compare(
             env.task,
             camera=str(env.camera) if picture else "default",
             size=(env.height, env.width) if picture else None,
+            samples=env.samples,
         )
     except (ImportError, ValueError) as error:
         fix = " --in dm_control_physics takes our picture instead." if picture else ""
