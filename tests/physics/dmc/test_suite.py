@@ -17,9 +17,15 @@ from tests.physics.dmc import oracle
 pytestmark = pytest.mark.usefixtures("dm_control")
 
 
-def started(task: str, size: tuple[int, int] | None = None):
+opengl = pytest.mark.skipif(
+    os.environ.get("MUJOCO_GL") not in ("egl", "osmesa"),
+    reason="MUJOCO_GL names no renderer without a window; egl and osmesa are such",
+)
+
+
+def started(task: str, **options):
     """DM Control's environment in an initial state of its own, and ours started in that state."""
-    theirs, env = oracle.load(task, seed=1), SuiteEnv(task, size=size)
+    theirs, env = oracle.load(task, seed=1), SuiteEnv(task, **options)
     seen = oracle.record(theirs, theirs.reset())
     env.start(SimpleNamespace(engine=SimpleNamespace(**seen)))
     return theirs, env, seen
@@ -41,15 +47,24 @@ def test_an_episode_starts_and_goes_on_as_dm_controls_own(task):
         np.testing.assert_allclose(env.observe(), oracle.flatten(timestep.observation), **close)
 
 
+@opengl
 @pytest.mark.parametrize("task", ["dmc_swimmer_swimmer6", "dmc_quadruped_walk"])
 def test_the_picture_is_dm_controls(task):
-    if os.environ.get("MUJOCO_GL") not in ("egl", "osmesa"):
-        pytest.skip("MUJOCO_GL names no renderer without a window; egl and osmesa are such")
     theirs, env, _ = started(task, size=(24, 36))
     image = env.render()
     assert image.shape == (24, 36, 3)
     camera = 2 if "quadruped" in task else 0
     np.testing.assert_array_equal(image, theirs.physics.render(24, 36, camera_id=camera))
+    env.close()
+
+
+@opengl
+def test_samples_are_means_of_a_larger_picture():
+    theirs, env, _ = started("dmc_cartpole_swingup", size=(24, 36), samples=9)
+    large = theirs.physics.render(72, 108, camera_id=0).astype(float)
+    rows = sum(large[i::3] for i in range(3))
+    means = sum(rows[:, i::3] for i in range(3)) / 9
+    np.testing.assert_array_equal(env.render(), np.floor(means + 0.5))
     env.close()
 
 
