@@ -182,7 +182,7 @@ _CPU_MUJOCO_TASKS: dict[str, dict[str, Any]] = {
 }
 # In 32 x 32 pixels the pole moves by less than a pixel in two control steps. PlaNet's and DrQ's
 # action repeat of 8 makes its velocity visible; the updates are as many as elsewhere. A policy that
-# never saw the stars and the reflection of dm_control's picture loses a fifth of its return there.
+# never saw the stars and the reflection of dm_control's picture loses much of its return there.
 _CPU_CARTPOLE = {"look": "dmc", "action_repeat": 8, "replay_ratio": 1.0, "std_steps": 20_000}
 _CPU_SHARES = {"ppo": 1.0, "ppg": 0.7, "dcpg": 0.6}
 """Number of steps relative to PPO, whose updates are faster."""
