@@ -108,7 +108,7 @@ def peers() -> str:
         theirs = find(rows, measure, **arguments)
         both = value(ours, "steps_per_second"), value(theirs, "steps_per_second")
         lines.append([who, cell(theirs, "steps_per_second"), ratio(*both)])
-    return table(("who", "steps per second", "PixelBrax is faster by"), lines)
+    return table(("who", "steps per second", "PixelBrax, times as fast"), lines)
 
 
 def comparison(group: str, column: str, names: dict[str, str], counts: tuple[int, ...]) -> str:

@@ -183,7 +183,7 @@ def dmc(rows: list[Row]) -> str:
         "task",
         "PixelBrax, steps/s",
         "dm_control, steps/s",
-        "faster by",
+        "times as fast",
         "first frame, s",
         "with programs kept, s",
     )
@@ -218,7 +218,7 @@ def peers(rows: list[Row]) -> str:
         "environments",
         "control step, ms",
         "steps/s",
-        "PixelBrax at 256 is faster by",
+        "PixelBrax at 256, times as fast",
         "OpenGL",
     )
     environments = table(heads, lines)
