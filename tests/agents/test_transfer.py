@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from typing import Any
 
 import jax
@@ -19,6 +18,7 @@ from pixelbrax_jax.agents.runner.evaluate import Evaluator, Result, paired
 from pixelbrax_jax.agents.runner.trained import Pretrained, Trained
 from pixelbrax_jax.agents.runner.transfer import play_in
 from tests.envs.toy import Ball, limited
+from tests.opengl import need_opengl
 from tests.physics.dmc import oracle  # noqa: F401  # no OpenGL, unless one is chosen
 
 EPISODES = 3
@@ -160,8 +160,7 @@ def test_our_picture_of_dm_controls_physics_is_the_same(monkeypatch, capsys):
 
 def test_dm_controls_picture(monkeypatch, capsys):
     pytest.importorskip("dm_control.suite", exc_type=ImportError)
-    if os.environ.get("MUJOCO_GL") not in ("egl", "osmesa"):
-        pytest.skip("MUJOCO_GL names no renderer without a window; egl and osmesa are such")
+    need_opengl()
     is_loaded(monkeypatch, lambda pixels: jnp.ones((len(pixels), 1)), look="original")
     for where in ("dm_control_picture", "dm_control"):
         assert main([*LINE, where]) == 0

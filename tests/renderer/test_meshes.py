@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -19,6 +18,7 @@ from pixelbrax_jax.renderer.base import render
 from pixelbrax_jax.scene.place import place
 from pixelbrax_jax.spatial import look_at, make_rig
 from pixelbrax_jax.types import FAR
+from tests.opengl import need_opengl
 from tests.renderer import scenes
 from tests.renderer.mujoco_rays import cast_rays
 from tests.renderer.test_lamps import LAMP
@@ -151,8 +151,7 @@ def opengl(model: mujoco.MjModel, data: mujoco.MjData, eye, target, size: int):
     camera.lookat[:], camera.distance = target, np.linalg.norm(way)
     camera.azimuth = np.rad2deg(np.arctan2(way[1], way[0]))
     camera.elevation = np.rad2deg(np.arcsin(way[2] / camera.distance))
-    if os.environ.get("MUJOCO_GL") not in ("egl", "osmesa"):
-        pytest.skip("MUJOCO_GL names no renderer without a window; egl and osmesa are such")
+    need_opengl()
     with mujoco.Renderer(model, size, size) as renderer:
         option = mujoco.MjvOption()
         option.sitegroup[:] = 0

@@ -12,15 +12,10 @@ import pytest
 
 from pixelbrax_jax.physics.dmc.suite import SuiteEnv
 from pixelbrax_jax.tasks import DMC_TASKS
+from tests.opengl import need_opengl
 from tests.physics.dmc import oracle
 
 pytestmark = pytest.mark.usefixtures("dm_control")
-
-
-opengl = pytest.mark.skipif(
-    os.environ.get("MUJOCO_GL") not in ("egl", "osmesa"),
-    reason="MUJOCO_GL names no renderer without a window; egl and osmesa are such",
-)
 
 
 def started(task: str, **options):
@@ -47,9 +42,9 @@ def test_an_episode_starts_and_goes_on_as_dm_controls_own(task):
         np.testing.assert_allclose(env.observe(), oracle.flatten(timestep.observation), **close)
 
 
-@opengl
 @pytest.mark.parametrize("task", ["dmc_swimmer_swimmer6", "dmc_quadruped_walk"])
 def test_the_picture_is_dm_controls(task):
+    need_opengl()
     theirs, env, _ = started(task, size=(24, 36))
     image = env.render()
     assert image.shape == (24, 36, 3)
@@ -58,8 +53,8 @@ def test_the_picture_is_dm_controls(task):
     env.close()
 
 
-@opengl
 def test_samples_are_means_of_a_larger_picture():
+    need_opengl()
     theirs, env, _ = started("dmc_cartpole_swingup", size=(24, 36), samples=9)
     large = theirs.physics.render(72, 108, camera_id=0).astype(float)
     rows = sum(large[i::3] for i in range(3))
