@@ -182,8 +182,12 @@ _CPU_MUJOCO_TASKS: dict[str, dict[str, Any]] = {
 }
 # In 32 x 32 pixels the pole moves by less than a pixel in two control steps. PlaNet's and DrQ's
 # action repeat of 8 makes its velocity visible; the updates are as many as elsewhere. A policy that
-# never saw the stars and the reflection of dm_control's picture loses much of its return there.
+# never saw the stars and the reflection of dm_control's picture loses return there.
 _CPU_CARTPOLE = {"look": "dmc", "action_repeat": 8, "replay_ratio": 1.0, "std_steps": 20_000}
+_CPU_DRQV2_TASKS: dict[str, dict[str, Any]] = {
+    f"dmc_cartpole_{goal}": _CPU_CARTPOLE
+    for goal in ("balance", "balance_sparse", "swingup", "swingup_sparse")
+} | {"dmc_finger_spin": {"look": "dmc"}}
 _CPU_SHARES = {"ppo": 1.0, "ppg": 0.7, "dcpg": 0.6}
 """Number of steps relative to PPO, whose updates are faster."""
 
@@ -224,12 +228,7 @@ TASK_SETTINGS: dict[str, dict[str, dict[str, dict[str, Any]]]] = {
         | (_CPU_MUJOCO_TASKS if algorithm == "ppo" else {})
         for algorithm, share in _CPU_SHARES.items()
     }
-    | {
-        "drqv2": {
-            f"dmc_cartpole_{goal}": _CPU_CARTPOLE
-            for goal in ("balance", "balance_sparse", "swingup", "swingup_sparse")
-        }
-    },
+    | {"drqv2": _CPU_DRQV2_TASKS},
     "drqv2": {
         "drqv2": {
             f"dmc_{task}": {"total_steps": total, "std_steps": over} | _drqv2_settings(task)
