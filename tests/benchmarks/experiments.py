@@ -59,7 +59,12 @@ TIMED = (
     *TASKS,
 )
 """Tasks of the leaderboard."""
-DISTRACTED = ("halfcheetah", "walker2d")
+DISTRACTED = {
+    "halfcheetah": ("video", "color"),
+    "walker2d": ("video", "color"),
+    "ant": ("video",),
+    "humanoid": ("video",),
+}
 DISTRACTORS = {
     "video": ("--distractors", "paper-video", "--clips", "procedural"),
     "color": ("--distractors", "paper-color"),
@@ -98,10 +103,11 @@ def experiments() -> dict[str, list[str]]:
     for times, name in ((4, "long-slow"), (8, "longest-slow")):
         longer("halfcheetah", times, "--learning-rate", "3e-4", name=name)
     for seed in range(2):
-        for task in DISTRACTED:
-            for name, options in DISTRACTORS.items():
+        for task, names in DISTRACTED.items():
+            for name in names:
                 for algorithm in ALGORITHMS:
-                    add(algorithm, task, seed, *options, "--num-evals", "1", name=name)
+                    more = (*DISTRACTORS[name], "--num-evals", "1")
+                    add(algorithm, task, seed, *more, name=name)
     for seed in range(2):
         for algorithm in ALGORITHMS:
             more = ("--reward-preset", "brax", "--num-evals", "3")
