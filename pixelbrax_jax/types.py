@@ -19,8 +19,7 @@ import numpy as np
 from flax import struct
 
 FAR = float(np.finfo(np.float32).max)
-"""Depth in metres where the ray hits nothing: the largest float32. Infinity would be an error under
-``jax_debug_infs``."""
+"""Depth in metres of nothing; infinity would be an error under ``jax_debug_infs``."""
 
 
 class GeomKind(IntEnum):
@@ -74,12 +73,17 @@ class String(struct.PyTreeNode):
         link: (2,) static, indices of the links that hold its ends, -1 for the world.
         ends: (2, 3), its ends in the frames of these links.
         length: (), length of the slack string; ends that are farther apart stretch it.
+        limits: (2,) static, lengths beyond which its color turns to ``taut_rgb``, (3,), by the
+            impedance of MuJoCo's ``solimp``, (5,); all static. Empty if it never does.
     """
 
     geoms: tuple[int, ...] = struct.field(pytree_node=False)
     link: tuple[int, int] = struct.field(pytree_node=False)
     ends: jax.Array
     length: jax.Array
+    limits: tuple[float, ...] = struct.field(pytree_node=False, default=())
+    solimp: tuple[float, ...] = struct.field(pytree_node=False, default=())
+    taut_rgb: tuple[float, ...] = struct.field(pytree_node=False, default=())
 
 
 class Geoms(struct.PyTreeNode):

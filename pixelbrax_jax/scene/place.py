@@ -1,4 +1,7 @@
-"""Scenes from the poses of links, with strings: straight if stretched, else catenaries."""
+"""Scenes from the poses of links, with strings: straight if stretched, else catenaries.
+
+A string beyond its limit shows so by its color, as in MuJoCo's renderer.
+"""
 
 from __future__ import annotations
 
@@ -42,6 +45,13 @@ def place(geoms: Geoms, rig: CameraRig, look: Look, xpos: jax.Array, xquat: jax.
         centers, axes, half = _pieces(string, jnp.stack(ends), len(rows))
         pos, xmat = pos.at[rows].set(centers), xmat.at[rows].set(axes)
         geoms = geoms.replace(size=jnp.asarray(geoms.size).at[rows, 1].set(half))
+        if string.limits:
+            row = geoms.material[string.geoms[0]]
+            way = ends[1] - ends[0]
+            share = impedance(string, jnp.sqrt(jnp.maximum(jnp.sum(way * way), 1e-12)))
+            rgb = jnp.asarray(geoms.rgb)
+            color = (1.0 - share) * rgb[row] + share * jnp.array(string.taut_rgb, jnp.float32)
+            geoms = geoms.replace(rgb=rgb.at[row].set(color))
     lamps = tuple(
         lamp.replace(pos=lamp.pos + xpos[lamp.link]) if lamp.link >= 0 else lamp
         for lamp in look.lamps
@@ -50,6 +60,24 @@ def place(geoms: Geoms, rig: CameraRig, look: Look, xpos: jax.Array, xquat: jax.
     # A rig never turns, so this does not depend on the links.
     turned = None if look.sky_texture is None else look_at(rig.eye, rig.target, rig.up)
     return Scene(geoms, pos, xmat, aim(rig, xpos), look, sky_xmat=turned)
+
+
+def impedance(string: String, length: jax.Array) -> jax.Array:
+    """Return () the impedance of a string's limit at a length () in metres, 0 within its limits.
+
+    MuJoCo computes it of how far the length exceeds the limit ("Solver parameters" in its
+    documentation): it grows from the first number of ``solimp`` to the second over the width, by
+    two powers that meet at the midpoint.
+    """
+    least, greatest, width, midpoint, power = string.solimp
+    low, high = string.limits
+    beyond = jnp.maximum(low - length, length - high)
+    x = jnp.clip(beyond / width, 0.0, 1.0)
+    below = x**power / midpoint ** (power - 1.0)
+    above = 1.0 - (1.0 - x) ** power / (1.0 - midpoint) ** (power - 1.0)
+    value = least + jnp.where(x <= midpoint, below, above) * (greatest - least)
+    # While a string hangs MuJoCo does not show its margin.
+    return jnp.where((beyond > 0.0) & (length >= string.length), value, 0.0)
 
 
 def _pieces(string: String, ends: jax.Array, num: int) -> tuple[jax.Array, jax.Array, jax.Array]:

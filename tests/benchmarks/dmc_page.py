@@ -8,6 +8,7 @@ from functools import cache, partial
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
+from statistics import median
 
 from pixelbrax_gym.bench.tables import number, table
 from pixelbrax_gym.cli import _leaderboard as leaderboard
@@ -152,8 +153,30 @@ def transfer() -> str:
     return table(["policy", "episodes", "here", "in dm_control", "difference"], lines)
 
 
+COMPARED = {
+    "ours, theirs": "PixelBrax and dm_control",
+    "ours, single": "the same, dm_control without multisampling",
+    "ours with 4 rays, theirs": "PixelBrax with `samples=4` and dm_control",
+    "single, theirs": "dm_control without and with multisampling",
+    "picked, theirs": "colors at its own four sample positions, and multisampled by dm_control",
+}
+
+
+def pictures() -> str:
+    """How far pictures of DM Control are from OpenGL's, in Markdown: median and range of models."""
+    kept = json.loads((FOLDER / "pictures.json").read_text("utf-8"))
+    lines = []
+    for pair, name in COMPARED.items():
+        found = kept["mean_absolute_difference_of_255"][pair].values()
+        areas = ([model[area] for model in found] for area in ("all", "else"))
+        texts = (f"{median(area):.1f} ({min(area):.1f} to {max(area):.1f})" for area in areas)
+        lines.append([name, *texts])
+    return table(["mean difference of a color, of 255", "image", "bodies"], lines)
+
+
 FIGURES = {
     "transfer": transfer,
+    "pictures": pictures,
     "tasks": tasks,
     "least": lambda: named(next(iter(ratios()))),
     "most": lambda: named(next(reversed(ratios()))),

@@ -4,9 +4,9 @@
 
 draws both with the same states, 84 x 84 pixels and each task's usual camera, and writes
 docs/images/dmc/beside.png, the suite's on the left, and docs/dmc/pictures.json: mean absolute
-differences of color in units of 1/255, of all pixels, of the sky, the ground and all else. With
-``--samples 4`` it writes docs/dmc/pictures-4.json alone. It needs the package ``dm_control`` and a
-library of EGL (Debian's ``libegl1``); ``MUJOCO_GL=osmesa`` draws the same with ``libosmesa6``.
+differences of color in units of 1/255, of all pixels, of the sky, the ground and all else, for the
+``COMPARED`` pairs of pictures. It needs the package ``dm_control`` and a library of EGL (Debian's
+``libegl1``); ``MUJOCO_GL=osmesa`` draws the same with ``libosmesa6``.
 """
 
 from __future__ import annotations
@@ -14,7 +14,10 @@ from __future__ import annotations
 import argparse
 import json
 import math
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax
 import mujoco
@@ -43,50 +46,92 @@ CASES = {
 """What is shown: domain, task, camera, and what moves by an edit of the model."""
 
 
-def pictures(
-    domain: str, task: str, camera: int, movable: tuple[str, ...], samples: int = 1
-) -> dict[str, list]:
+COMPARED = {
+    "ours, theirs": "here and in the suite, whose OpenGL multisamples (4 samples)",
+    "ours, single": "here and in OpenGL without multisampling",
+    "ours with 4 rays, theirs": "here with samples=4 and in the suite",
+    "single, theirs": "OpenGL without and with multisampling",
+    "picked, theirs": "OpenGL without multisampling at its own sample positions, and with it",
+}
+SUPERSAMPLED = 4
+POSITIONS = ((2, 0), (0, 1), (3, 2), (1, 3))
+"""OpenGL's four sample positions in a pixel, (x, y) from its top left corner in quarters of it."""
+
+
+def pictures(domain: str, task: str, camera: int, movable: tuple[str, ...]) -> dict[str, list]:
     """Draw states of an episode of random actions.
 
     Returns:
-        Lists of ``theirs`` and ``ours``, (84, 84, 3) uint8, and of ``area``, (84, 84) int: 0 sky,
-        1 ground, 2 else.
+        Lists of the pictures in ``COMPARED``, (84, 84, 3) float or uint8, and of ``area``,
+        (84, 84) int: 0 sky, 1 ground, 2 else.
     """
+    single = _theirs(domain, task, camera, SIZE, multisamples=0)
+    large = _theirs(domain, task, camera, SUPERSAMPLED * SIZE, multisamples=0)
+    return {
+        **_ours(domain, task, camera, movable),
+        "theirs": _theirs(domain, task, camera, SIZE),
+        "single": single,
+        "picked": [
+            np.mean([image[y::SUPERSAMPLED, x::SUPERSAMPLED] for x, y in POSITIONS], axis=0)
+            for image in large
+        ],
+    }
+
+
+def _states(domain: str, task: str, multisamples: int | None = None) -> Iterator[Any]:
+    """Yield dm_control's physics in each of the states."""
     from dm_control import suite
 
     environment = suite.load(domain, task, task_kwargs={"random": 1})
-    environment.reset()
     physics, rng = environment.physics, np.random.default_rng(1)
-    own = suite_models.of(domain, physics.model.ptr, camera, movable)
-    scene = own.scene
-    pixel = 2.0 * float(np.tan(np.deg2rad(scene.rig.fovy) / 2.0)) / (SIZE * math.isqrt(samples))
-    look = detailed(own.model, scene.look, pixel)
-
-    @jax.jit
-    def draw(xpos: jax.Array, xquat: jax.Array) -> Frame:
-        placed = place(scene.geoms, scene.rig, look, xpos, xquat)
-        return render(placed, SIZE, SIZE, samples=samples)
-
-    drawn: dict[str, list] = {"theirs": [], "ours": [], "area": []}
+    if multisamples is not None:
+        physics.model.vis.quality.offsamples = multisamples
+    environment.reset()
     for state in range(STATES):
         if state:
             for _ in range(20):
                 environment.step(rng.uniform(-1, 1, environment.action_spec().shape))
         mujoco.mj_forward(physics.model.ptr, physics.data.ptr)
-        frame = draw(*own.links(physics.data.ptr))
-        image = np.stack([frame.r, frame.g, frame.b], axis=-1)
-        drawn["ours"].append(np.floor(image * 255 + 0.5).astype(np.uint8))
-        drawn["theirs"].append(physics.render(SIZE, SIZE, camera_id=camera))
-        seen, ground = np.asarray(frame.seg) >= 0, np.asarray(frame.ground)
-        drawn["area"].append(np.where(ground, 1, np.where(seen, 2, 0)))
+        yield physics
     environment.close()
+
+
+def _theirs(
+    domain: str, task: str, camera: int, size: int, multisamples: int | None = None
+) -> list[np.ndarray]:
+    states = _states(domain, task, multisamples)
+    return [physics.render(size, size, camera_id=camera) for physics in states]
+
+
+def _ours(domain: str, task: str, camera: int, movable: tuple[str, ...]) -> dict[str, list]:
+    drawn: dict[str, list] = {"ours": [], "ours with 4 rays": [], "area": []}
+    for samples, name in ((1, "ours"), (4, "ours with 4 rays")):
+        draw = None
+        for physics in _states(domain, task):
+            if draw is None:
+                own = suite_models.of(domain, physics.model.ptr, camera, movable)
+                draw = jax.jit(partial(_render, own, samples))
+            frame = draw(*own.links(physics.data.ptr))
+            image = np.stack([frame.r, frame.g, frame.b], axis=-1)
+            drawn[name].append(np.floor(image * 255 + 0.5).astype(np.uint8))
+            if samples == 1:
+                seen, ground = np.asarray(frame.seg) >= 0, np.asarray(frame.ground)
+                drawn["area"].append(np.where(ground, 1, np.where(seen, 2, 0)))
     return drawn
 
 
-def differences(drawn: dict[str, list]) -> dict[str, float | None]:
+def _render(own: Any, samples: int, xpos: jax.Array, xquat: jax.Array) -> Frame:
+    scene = own.scene
+    pixel = 2.0 * float(np.tan(np.deg2rad(scene.rig.fovy) / 2.0)) / (SIZE * math.isqrt(samples))
+    look = detailed(own.model, scene.look, pixel)
+    placed = place(scene.geoms, scene.rig, look, xpos, xquat)
+    return render(placed, SIZE, SIZE, samples=samples)
+
+
+def differences(drawn: dict[str, list], pair: str) -> dict[str, float | None]:
     """Return mean absolute differences by area, in units of 1/255; None where there is none."""
-    ours, theirs = (np.stack(drawn[side]).astype(int) for side in ("ours", "theirs"))
-    difference, area = np.abs(ours - theirs).mean(axis=-1), np.stack(drawn["area"])
+    one, other = (np.stack(drawn[name]).astype(float) for name in pair.split(", "))
+    difference, area = np.abs(one - other).mean(axis=-1), np.stack(drawn["area"])
     masks = {"all": area >= 0, "sky": area == 0, "ground": area == 1, "else": area == 2}
     return {
         name: round(float(difference[mask].mean()), 2) if mask.any() else None
@@ -112,35 +157,30 @@ def main() -> None:
     """Compare some models, or all; files are written for all."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("cases", nargs="*", default=list(CASES), metavar="case")
-    parser.add_argument("--samples", type=int, default=1, help="rays per pixel")
-    options = parser.parse_args()
-    chosen = options.cases
-    report, pairs = {}, {}
+    chosen = parser.parse_args().cases
+    report: dict[str, dict] = {pair: {} for pair in COMPARED}
+    pairs = {}
     for name in chosen:
-        drawn = pictures(*CASES[name], options.samples)
-        report[name] = differences(drawn)
-        print(f"{name:24} {report[name]}", flush=True)
+        drawn = pictures(*CASES[name])
+        for pair, rows in report.items():
+            rows[name] = differences(drawn, pair)
+            print(f"{name:24} {pair:24} {rows[name]}", flush=True)
         gap = np.full((SIZE, 2, 3), 255, np.uint8)
         pairs[name] = np.concatenate([drawn["theirs"][1], gap, drawn["ours"][1]], axis=1)
     if set(chosen) == set(CASES):
         (DOCS / "dmc").mkdir(exist_ok=True)
-        command, stem = "MUJOCO_GL=egl python -m tests.benchmarks.suite_pictures", "pictures"
-        if supersampled := options.samples > 1:
-            command += f" --samples {options.samples}"
-            stem += f"-{options.samples}"
         kept = {
-            "command": command,
+            "command": "MUJOCO_GL=egl python -m tests.benchmarks.suite_pictures",
             "mujoco": mujoco.__version__,
             "pixels": SIZE,
             "states": STATES,
-            "samples": options.samples,
+            "compared": COMPARED,
             "mean_absolute_difference_of_255": report,
         }
         text = json.dumps(kept, indent=2) + "\n"
-        (DOCS / "dmc" / f"{stem}.json").write_text(text, "utf-8")
-        if not supersampled:
-            (DOCS / "images" / "dmc").mkdir(parents=True, exist_ok=True)
-            sheet(pairs).save(DOCS / "images" / "dmc" / "beside.png", optimize=True)
+        (DOCS / "dmc" / "pictures.json").write_text(text, "utf-8")
+        (DOCS / "images" / "dmc").mkdir(parents=True, exist_ok=True)
+        sheet(pairs).save(DOCS / "images" / "dmc" / "beside.png", optimize=True)
     else:
         sheet(pairs).save("beside.png")
 

@@ -6,8 +6,10 @@ import mujoco
 import numpy as np
 import pytest
 
+from pixelbrax_jax import make_rig
 from pixelbrax_jax.physics.mujoco.lighting import detailed
 from pixelbrax_jax.physics.mujoco.scene import read_scene, tracked_body
+from pixelbrax_jax.scene.place import place
 from pixelbrax_jax.types import GeomKind
 
 MODEL = """
@@ -201,3 +203,53 @@ def test_what_only_the_detailed_look_shows():
     assert look.sky_texture.shape == (6, 50, 50, 3)
     assert (look.opengl, look.shininess) == (True, 64)
     assert look.lamps == scene.look.lamps
+
+
+ROPE = """<mujoco>
+  <worldbody>
+    <site name="hook" pos="0 0 1"/>
+    <body name="ball">
+      <joint type="slide" axis="1 0 0"/><geom name="ball" size=".01" rgba=".5 .5 .5 1"/>
+      <site name="ring" pos="0 0 1"/>
+    </body>
+  </worldbody>
+  <tendon>
+    <spatial name="rope" {more}><site site="hook"/><site site="ring"/></spatial>
+  </tendon>
+</mujoco>"""
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        'limited="true" range="0 .3"',
+        'limited="true" range=".1 .3" margin=".02"',
+        'limited="true" range="0 .3" margin=".02" solimplimit=".2 .8 .1 .3 3"',
+        'limited="true" range="0 .3" solimplimit="0 1 .1 1 1"',
+        'limited="true" range="0 .3" rgba=".5 .5 .4 1"',
+        'range="0 .3" limited="false"',
+    ],
+)
+def test_a_tendon_beyond_its_limit_has_mujocos_color(more):
+    model = mujoco.MjModel.from_xml_string(ROPE.format(more=more))
+    data, read = mujoco.MjData(model), read_scene(model)
+    drawn, shown = mujoco.MjvScene(model, 100), []
+    for distance in (0.05, 0.0999, 0.11, 0.2, 0.285, 0.2999, 0.3001, 0.3005, 0.31, 0.35, 0.5):
+        data.qpos[0] = distance
+        mujoco.mj_forward(model, data)
+        views = mujoco.MjvOption(), mujoco.MjvPerturb(), mujoco.MjvCamera()
+        mujoco.mjv_updateScene(model, data, *views, int(mujoco.mjtCatBit.mjCAT_ALL), drawn)
+        kinds = [geom.objtype for geom in drawn.geoms[: drawn.ngeom]]
+        theirs = drawn.geoms[kinds.index(int(mujoco.mjtObj.mjOBJ_TENDON))].rgba[:3]
+        poses = np.float32(data.xpos[1:]), np.float32(data.xquat[1:])
+        geoms = place(read.geoms, make_rig((0, -1, 0), (0, 0, 0), 45.0), read.look, *poses).geoms
+        (string,) = geoms.strings
+        colors = np.asarray(geoms.rgb)[np.array(geoms.material)]
+        np.testing.assert_allclose(
+            colors[list(string.geoms)], np.tile(theirs, (len(string.geoms), 1)), atol=2e-3
+        )
+        ball = geoms.name.index("ball")
+        np.testing.assert_allclose(colors[ball], 0.5, err_msg="it shares the string's color")
+        shown.append(tuple(np.round(theirs, 6)))
+    turns = 'rgba="' not in more and 'limited="true"' in more
+    assert (len(set(shown)) > 1) == turns

@@ -17,14 +17,15 @@ from pixelbrax_jax.validation import check_choice
 # MuJoCo's viewer shows these groups by default.
 VISIBLE_GROUPS = (0, 1, 2)
 
-_DEFAULT_RGBA = np.array([0.5, 0.5, 0.5, 1.0], np.float32)
+DEFAULT_RGBA = np.array([0.5, 0.5, 0.5, 1.0], np.float32)
 
 
 class Shape(NamedTuple):
     """One visible shape; fields as in ``Geoms``, with its color and its material's name.
 
     ``row`` is its place among the model's geoms or sites. ``planes`` are the (K, 4) half-spaces of
-    a mesh, as in ``Geoms``, and ``error`` how far they leave its convex hull, in metres.
+    a mesh, as in ``Geoms``, and ``error`` how far they leave its convex hull, in metres. Shapes
+    with different ``owner`` share no color.
     """
 
     kind: GeomKind
@@ -41,15 +42,16 @@ class Shape(NamedTuple):
     row: int = -1
     planes: np.ndarray | None = None
     error: float = 0.0
+    owner: str = ""
 
 
 def as_geoms(shapes: Sequence[Shape]) -> Geoms:
     """Return shapes as ``Geoms``; equal colors share a material, except planes with other kinds."""
-    materials: dict[tuple[bool, tuple[float, ...]], str] = {}
+    materials: dict[tuple[bool, str, tuple[float, ...]], str] = {}
     keys = []
     for shape in shapes:
         rgb = tuple(np.asarray(shape.rgb, np.float32).tolist())
-        keys.append((shape.kind == GeomKind.PLANE, rgb))
+        keys.append((shape.kind == GeomKind.PLANE, shape.owner, rgb))
         materials.setdefault(keys[-1], shape.material)
     rows = list(materials)
     planes = [shape.planes for shape in shapes if shape.planes is not None]
@@ -66,7 +68,7 @@ def as_geoms(shapes: Sequence[Shape]) -> Geoms:
         size=stack(shape.size for shape in shapes),
         pos=stack(shape.pos for shape in shapes),
         quat=stack(shape.quat for shape in shapes),
-        rgb=stack(rgb for _, rgb in rows),
+        rgb=stack(rgb for *_, rgb in rows),
         bounded=tuple(shape.bounded for shape in shapes),
         patterned=tuple(shape.patterned for shape in shapes),
         textured=tuple(shape.textured for shape in shapes),
@@ -212,4 +214,4 @@ def _check_kinds(model: mujoco.MjModel, groups: Collection[int]) -> None:
 
 def resolve_rgba(model: mujoco.MjModel, own: np.ndarray, material: int) -> np.ndarray:
     """Return (4,) float32: the material's color if the element has MuJoCo's default rgba."""
-    return model.mat_rgba[material] if material >= 0 and (own == _DEFAULT_RGBA).all() else own
+    return model.mat_rgba[material] if material >= 0 and (own == DEFAULT_RGBA).all() else own

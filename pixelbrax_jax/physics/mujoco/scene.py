@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pixelbrax_jax.physics.mujoco.geometry import (
+    DEFAULT_RGBA,
     VISIBLE_GROUPS,
     Shape,
     as_geoms,
@@ -41,6 +42,8 @@ _PIECES = 6
 """Capsules of a hanging string."""
 
 _SITE = int(mujoco.mjtWrap.mjWRAP_SITE)
+_SOLIMP = (1e-4, 1e-4, 1e-15, 1e-4, 1.0), (1 - 1e-4, 1 - 1e-4, np.inf, 1 - 1e-4, np.inf)
+"""Between these MuJoCo holds a limit's ``solimp``."""
 _JOINT = int(mujoco.mjtWrap.mjWRAP_JOINT)
 
 
@@ -141,6 +144,7 @@ def _strings(model: mujoco.MjModel, first_geom: int) -> tuple[list[Shape], list[
             )
         sites = model.wrap_objid[first : first + count]
         slack = float(model.tendon_range[tendon, 1]) if _hangs(model, tendon) else 0.0
+        limit = _limit(model, tendon)
         pieces = 1 if slack == 0.0 else _PIECES
         for k, pair in enumerate(pairwise(sites)):
             start = first_geom + len(shapes)
@@ -154,6 +158,7 @@ def _strings(model: mujoco.MjModel, first_geom: int) -> tuple[list[Shape], list[
                     quat=np.array([1.0, 0.0, 0.0, 0.0]),
                     rgb=tuple(rgba[:3]),
                     material=material_name(model, model.tendon_matid[tendon]),
+                    owner=name if limit else "",
                 )
                 for piece in range(pieces)
             ]
@@ -164,9 +169,28 @@ def _strings(model: mujoco.MjModel, first_geom: int) -> tuple[list[Shape], list[
                     link=(a, b),
                     ends=jnp.asarray(model.site_pos[list(pair)], jnp.float32),
                     length=jnp.float32(slack),
+                    **limit,
                 )
             )
     return shapes, strings
+
+
+def _limit(model: mujoco.MjModel, tendon: int) -> dict[str, tuple[float, ...]]:
+    """Return the limit that MuJoCo shows: of a tendon without a color of its own.
+
+    Only tendons between two sites, the length of whose string is their own.
+    """
+    own = model.tendon_matid[tendon] >= 0 or (model.tendon_rgba[tendon] != DEFAULT_RGBA).any()
+    if own or not model.tendon_limited[tendon] or model.tendon_num[tendon] != 2:
+        return {}
+    margin = float(model.tendon_margin[tendon])
+    low, high = map(float, model.tendon_range[tendon])
+    solimp = np.clip(model.tendon_solimp_lim[tendon], *_SOLIMP)
+    return {
+        "limits": (low + margin, high - margin),
+        "solimp": tuple(map(float, solimp)),
+        "taut_rgb": tuple(map(float, model.vis.rgba.constraint[:3])),
+    }
 
 
 def _hangs(model: mujoco.MjModel, tendon: int) -> bool:
