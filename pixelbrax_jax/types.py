@@ -18,8 +18,7 @@ import jax
 import numpy as np
 from flax import struct
 
-FAR = float(np.finfo(np.float32).max)
-"""Depth in metres of nothing; infinity would be an error under ``jax_debug_infs``."""
+FAR = float(np.finfo(np.float32).max)  # metres, the sky; jax_debug_infs forbids infinity
 
 
 class GeomKind(IntEnum):
@@ -183,8 +182,7 @@ class Camera(struct.PyTreeNode):
 
     Attributes:
         pos: (3,).
-        xmat: (3, 3), columns are the camera's right, up and back directions; it looks along
-            minus its third column, as MuJoCo's and OpenGL's cameras do.
+        xmat: (3, 3), columns are its right, up and back directions, as in MuJoCo and OpenGL.
         fovy: (), vertical field of view.
     """
 
@@ -257,8 +255,8 @@ class Look(struct.PyTreeNode):
 
     Attributes:
         ground: static, ``"checker"`` or ``"grid"`` (thin dark lines), the pattern of planes that
-            are ground. It starts at the corner of finite planes and in the middle of infinite ones.
-        shadows: static, whether geoms cast shadows (without diffuse and specular light).
+            are ground, from the corner of finite planes, the middle of infinite ones.
+        shadows: static, whether geoms cast shadows.
         shininess: static positive int, the exponent.
         light: (3,), world direction TO the light, any length but 0; None for no such light.
         ambient, diffuse, specular, highlight: () coefficients.
@@ -266,6 +264,7 @@ class Look(struct.PyTreeNode):
             one is straight below.
         ground_rgb: (2, 3), colors of the two checker tiles, or of tile and line.
         ground_pitch: (), metres, edge of a tile or distance between lines.
+        ground_mark: (), in pitches, how far the second color reaches over every other tile edge.
         headlight: (), coefficient of diffuse light from the camera; None for none.
         headlight_highlight: (), its coefficient of highlights, with ``opengl``; None for none.
         lamps: spot lights.
@@ -294,6 +293,7 @@ class Look(struct.PyTreeNode):
     headlight_highlight: jax.Array | None = None
     reflectance: jax.Array | None = None
     opengl: bool = struct.field(pytree_node=False, default=False)
+    ground_mark: jax.Array | None = None
 
 
 class Scene(struct.PyTreeNode):
@@ -305,8 +305,8 @@ class Scene(struct.PyTreeNode):
         xmat: (G, 3, 3), geom orientations; columns are the geom's axes.
         camera: the viewpoint.
         look: light, sky and ground.
-        sky_xmat: (3, 3), the camera's orientation for the sky's texture, None for that of the
-            camera. A batch with one orientation reads the texture once for all.
+        sky_xmat: (3, 3), the camera's orientation for the sky's texture, so that a batch with one
+            orientation reads the texture once for all; None for that of the camera.
     """
 
     geoms: Geoms

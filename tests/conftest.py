@@ -38,8 +38,8 @@ gc.set_threshold(200_000, 20, 50)
 
 MAX_MAPS = 45_000
 """Memory maps of this process beyond which compiled programs are forgotten."""
-MAX_BYTES = 5 * 10**9
-"""Memory of this process beyond which they are forgotten, too."""
+MAX_BYTES = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 4
+"""Memory of this process beyond which they are forgotten, too. There are two workers."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -185,6 +185,7 @@ def test_cpus_with_other_vectors_have_files_of_their_own(workers, tmp_path, monk
     assert "a processor, 2 cores" in page_of(tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="signals are those of POSIX")
 def test_a_benchmark_that_is_stopped_leaves_no_process_behind(tmp_path):
     command = [sys.executable, "-m", "tests.benchmarks.run", "--output-dir", str(tmp_path)]

@@ -10,9 +10,9 @@ from tests.benchmarks.pages import filled, names
 
 
 @pytest.mark.parametrize(
-    # Its figures take the physics of all tasks.
+    # The figures of pages about tasks take the physics of all of them.
     "name",
-    [pytest.param(n, marks=pytest.mark.slow if n == "docs/tasks.md" else ()) for n in PAGES],
+    [pytest.param(n, marks=pytest.mark.slow if n.startswith("docs/tasks") else ()) for n in PAGES],
 )
 def test_a_page_shows_what_is_kept(name):
     text = (ROOT / name).read_text("utf-8")

@@ -157,7 +157,7 @@ def test_failures_have_their_reasons(monkeypatch):
     memory = Fake("speeds", "memory", {}, script="raise MemoryError('out of memory')")
     slow = fake("slow", wait=60)
     long = replace(fake("long", measure=60), seconds=0.2)
-    found = run([broken, absent, memory, slow, long], patience=5.0)
+    found = run([broken, absent, memory, slow, long], patience=2.0)
     status = {name: outcome["status"] for name, outcome in found.items()}
     assert status == {
         "broken": "failed", "absent": "absent", "memory": "out of memory", "slow": "failed",

@@ -16,8 +16,8 @@ _TWO_OR_THREE = "2 or 3"
 _NAMES: dict[tuple[int | str, ...], str] = {
     (): """
         episode_length rig.fovy geoms.strings.length look.ambient look.diffuse look.specular
-        look.highlight look.ground_pitch look.headlight look.lamps.cos_cutoff look.lamps.diffuse
-        look.lamps.highlight look.headlight_highlight look.reflectance
+        look.highlight look.ground_pitch look.ground_mark look.headlight look.lamps.cos_cutoff
+        look.lamps.diffuse look.lamps.highlight look.headlight_highlight look.reflectance
     """,
     (2,): " ".join(f"dynamics.{name}" for name in DynamicsRanges.__annotations__),
     (3,): "rig.track rig.eye rig.target rig.up look.light look.lamps.pos look.lamps.axis",

@@ -316,4 +316,4 @@ def _ground_fraction(
         upward.append(above)
     if view.look.opengl:
         widths = [step * opengl.footprint(across, upward)] * 2
-    return shading.second_color_fraction(view.look.ground, *coords, *widths), place
+    return shading.second_color_fraction(view.look, *coords, *widths), place

@@ -376,7 +376,7 @@ def _ground_color(scene: Scene, g: int, rays: jax.Array, height: int) -> jax.Arr
     coords /= look.ground_pitch
     footprint = footprint / look.ground_pitch
     fraction = shading.second_color_fraction(
-        look.ground, coords[..., 0], coords[..., 1], footprint[..., 0], footprint[..., 1]
+        look, coords[..., 0], coords[..., 1], footprint[..., 0], footprint[..., 1]
     )
     first, second = look.ground_rgb[0], look.ground_rgb[1]
     return first + fraction[..., None] * (second - first)

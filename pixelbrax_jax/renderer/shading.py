@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -139,8 +140,19 @@ def _line_integral(x: jax.Array) -> jax.Array:
     return LINE_WIDTH * whole + at_most(x - whole, LINE_WIDTH)
 
 
+def _marked_wave_integral(x: jax.Array, mark: jax.Array) -> jax.Array:
+    """Return the integral of the same wave with zeros at less than ``mark`` from whole numbers."""
+    return at_least(_square_wave_integral(x) - mark, 0.0)
+
+
+def _between_marks_integral(x: jax.Array, mark: jax.Array) -> jax.Array:
+    """Return the integral of 0 at less than ``mark`` from whole numbers, and 1 elsewhere."""
+    whole = jnp.floor(x)
+    return whole * (1.0 - 2.0 * mark) + between(0.0, x - whole - mark, 1.0 - 2.0 * mark)
+
+
 def second_color_fraction(
-    pattern: str, x: jax.Array, y: jax.Array, width_x: jax.Array, width_y: jax.Array
+    look: Look, x: jax.Array, y: jax.Array, width_x: jax.Array, width_y: jax.Array
 ) -> jax.Array:
     """Return the fraction of the ground's second color in a pixel, in [0, 1].
 
@@ -149,6 +161,15 @@ def second_color_fraction(
     extents of the ground that the pixel sees. The mean over this rectangle is exact, so nothing
     flickers.
     """
+    pattern = look.ground
+    if pattern == "checker" and look.ground_mark is not None:
+        # Between the marks tiles are the first color where both waves have one sign.
+        first: Any = 0.0
+        for function in (_between_marks_integral, _marked_wave_integral):
+            integral = partial(function, mark=0.5 * look.ground_mark)
+            of_x = _average(integral, 0.5 * x, 0.5 * width_x)
+            first += 0.5 * of_x * _average(integral, 0.5 * y, 0.5 * width_y)
+        return 1.0 - first
     if pattern == "checker":
         # A checker is the product of two waves with a period of two tiles.
         wave_x = _average(_square_wave_integral, 0.5 * x, 0.5 * width_x)

@@ -45,7 +45,7 @@ def place(geoms: Geoms, rig: CameraRig, look: Look, xpos: jax.Array, xquat: jax.
         centers, axes, half = _pieces(string, jnp.stack(ends), len(rows))
         pos, xmat = pos.at[rows].set(centers), xmat.at[rows].set(axes)
         geoms = geoms.replace(size=jnp.asarray(geoms.size).at[rows, 1].set(half))
-        if string.limits:
+        if string.limits and look.opengl:
             row = geoms.material[string.geoms[0]]
             way = ends[1] - ends[0]
             share = impedance(string, jnp.sqrt(jnp.maximum(jnp.sum(way * way), 1e-12)))

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from pixelbrax_jax.agents.off_policy.drqv2 import DrQv2
+from pixelbrax_jax.agents.runner.devices import check_memory
 from pixelbrax_jax.agents.runner.settings import RunConfig
 from pixelbrax_jax.agents.runner.train import run
 from pixelbrax_jax.agents.runner.trained import save_policy
@@ -122,7 +123,8 @@ def test_a_replay_that_does_not_fit_beside_the_state_is_told_with_the_largest(tm
         run(DrQv2(config, ball_envs()), PARAMS, options)
     largest = int(re.findall(r"buffer_size=(\d+)", str(info.value))[-1])
     assert 32 <= largest < 640
-    run(DrQv2(config.replace(buffer_size=largest), ball_envs()), PARAMS, options)
+    fitting = DrQv2(config.replace(buffer_size=largest), ball_envs())
+    check_memory(fitting, jax.eval_shape(fitting.init, KEY, PARAMS), report=lambda line: None)
 
 
 @pytest.mark.slow

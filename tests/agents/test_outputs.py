@@ -29,7 +29,7 @@ from pixelbrax_jax.agents.runner.metrics import AppendedFile, open_metrics, read
 from pixelbrax_jax.agents.runner.progress import Bar
 from pixelbrax_jax.agents.runner.settings import RunConfig
 from pixelbrax_jax.agents.runner.train import run
-from tests.agents.small import ABOUT, PARAMS, SMALL, ball_envs, same
+from tests.agents.small import ABOUT, PARAMS, SMALL, ball_envs, same, with_iterate
 
 PER_ITERATION = SMALL["num_envs"] * SMALL["num_steps"]
 
@@ -210,7 +210,14 @@ def test_a_policy_that_cannot_be_written_costs_no_checkpoint(tmp_path, monkeypat
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(train, "save_policy", full)
-    algorithm = PPO(PPOConfig(**SMALL), ball_envs())
+    small = PPO(PPOConfig(**SMALL), ball_envs())
+    algorithm = with_iterate(
+        small,
+        lambda state, env_params: (
+            state.replace(iteration=state.iteration + 1),
+            {"episode/count": jnp.float32(0.0)},
+        ),
+    )
     with pytest.raises(OSError, match=r"policy.jax: No space left.*160 steps is complete"):
         run(algorithm, PARAMS, RunConfig(str(tmp_path), progress=False))
     assert latest_steps(tmp_path / "checkpoints") == 5 * PER_ITERATION

@@ -121,7 +121,8 @@ def test_it_shows_the_states_of_our_physics():
 )
 def test_returns_in_dm_control_are_ours(task):
     simulator = suite_env(task)
-    env, params = make(task, obs_mode="state", action_repeat=2, episode_length=41)
+    options = {"obs_mode": "state", "action_repeat": 2, "episode_length": 41}
+    env, params = make(task, engine="mujoco", **options)
     size = env.action_size
     agent = player(lambda obs: jnp.tile(waver(obs), (1, size)))
     options = {"num_episodes": EPISODES}

@@ -158,7 +158,7 @@ COMPARED = {
     "ours, single": "the same, dm_control without multisampling",
     "ours with 4 rays, theirs": "PixelBrax with `samples=4` and dm_control",
     "single, theirs": "dm_control without and with multisampling",
-    "picked, theirs": "colors at its own four sample positions, and multisampled by dm_control",
+    "picked, theirs": "dm_control's own colors at its four samples, averaged, and multisampling",
 }
 
 
@@ -208,9 +208,14 @@ def learned_tasks() -> list[tuple[str, str, list[dict]]]:
     ]
 
 
-def minutes(runs: list[dict]) -> float:
-    """The time of the training, of the run that was disturbed least."""
-    return min(run["seconds"][-1] for run in runs) / 60.0
+def minutes(runs: list[dict]) -> list[float]:
+    """Times of training, from the run that was disturbed least."""
+    return sorted(run["seconds"][-1] / 60.0 for run in runs)
+
+
+def span(numbers: list[float]) -> str:
+    """The first and the last number, once if they are alike."""
+    return " to ".join(dict.fromkeys(f"{number:.0f}" for number in (numbers[0], numbers[-1])))
 
 
 def learned() -> str:
@@ -223,7 +228,7 @@ def learned() -> str:
             len(runs),
             leaderboard.middle([run["return"][-1] for run in runs]),
             f"{max(run['frames'][-1] for run in runs) / 1e6:.1f}M",
-            f"{minutes(runs):.0f}",
+            span(minutes(runs)),
             *(f"{published[task][n]:.0f}" if task in published else "" for n in MARKS),
         ]
         for task, agent, runs in learned_tasks()
@@ -234,13 +239,20 @@ def learned() -> str:
 
 def training_minutes() -> str:
     """How many tasks these are, and minutes of training over them."""
-    taken = [minutes(runs) for *_, runs in learned_tasks()]
-    return (
-        f"{min(taken):.0f} to {max(taken):.0f} minutes on each of {len(taken)} tasks of DM Control"
-    )
+    tasks = learned_tasks()
+    taken = minutes([run for *_, runs in tasks for run in runs])
+    return f"{span(taken)} minutes on each of {len(tasks)} tasks of DM Control"
+
+
+def picture() -> str:
+    """The median of models of how far their pictures are from dm_control's."""
+    kept = json.loads((FOLDER / "pictures.json").read_text("utf-8"))
+    found = kept["mean_absolute_difference_of_255"]["ours, theirs"].values()
+    return f"{median(model['all'] for model in found):.1f}"
 
 
 README = {
+    "picture": picture,
     "cheetah": lambda: number(speeds("dmc_cheetah_run")[0]),
     "cheetah-ratio": lambda: f"{ratios()['dmc_cheetah_run']:.0f}",
     "slowest": lambda: named(next(iter(ratios()))),

@@ -73,6 +73,7 @@ def test_every_episode_and_environment_is_another(runs):
     assert len(np.unique(info["color"][0])) == info["color"][0].size
 
 
+@pytest.mark.slow
 def test_neighbors_do_not_matter(runs):
     few = rollout(ALL, num_envs=3)
     for name in ("video_clip", "video_frame"):

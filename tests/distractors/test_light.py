@@ -84,7 +84,7 @@ def test_an_episode_keeps_its_light_and_no_change_is_none():
 
 def test_the_lights_of_a_model_and_of_several_cameras_turn():
     options = {"height": 12, "width": 12, "camera": ("fixed", "top"), "distractors": "light"}
-    env, params = pb.make("dmc_cartpole_swingup", **options)
+    env, params = pb.make("dmc_cartpole_swingup", engine="mujoco", **options)
     state, _ = env.reset(jax.random.key(0), params)
     look = env.chain.change_params(state.sim.distractor_state, params).look
     assert (look.lamps[0].pos != params.look.lamps[0].pos).all()

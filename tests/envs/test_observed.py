@@ -107,7 +107,7 @@ def test_depth_and_segmentation_are_those_of_mujocos_rays():
     size = 24
     env, params = pb.make(
         "dmc_cartpole_swingup", height=size, width=size, frame_stack=1,
-        obs_mode="depth+segmentation", camera=("fixed", "side"),
+        obs_mode="depth+segmentation", camera=("fixed", "side"), engine="mujoco",
     )  # fmt: skip
     qpos = np.array([0.4, 2.5])
     state, timestep = env.from_qpos(qpos, None, jax.random.key(0), params)

@@ -22,7 +22,7 @@ pytest.importorskip("dm_control", reason="the tasks' models come with pixelbrax[
 
 SIZE = {"height": 36, "width": 36}  # Stable-Baselines3 warns of smaller ones
 RENDER = {"render_mode": "rgb_array", "render_height": 8, "render_width": 8}
-FAST = "dmc_pendulum_swingup"
+FAST = "dmc_ball_in_cup_catch"
 """The task whose programs compile soonest."""
 
 

@@ -37,13 +37,8 @@ def check_task(name):
     check_env(gymnasium.make(f"PixelBrax/{name}-v0", **options).unwrapped)
 
 
-@pytest.mark.parametrize("name", ["InvertedPendulum"])
-def test_gymnasiums_checker_on_a_task(name):
-    check_task(name)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("name", sorted(set(TASKS) - {"InvertedPendulum"}))
+@pytest.mark.parametrize("name", sorted(TASKS))
 def test_gymnasiums_checker_on_every_task(name):
     check_task(name)
 

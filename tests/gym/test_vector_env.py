@@ -52,10 +52,6 @@ def check_task(name, mode):
     check_vector_env(env, num_steps=15)
 
 
-def test_checker_is_content_with_a_task():
-    check_task("InvertedPendulum", "next_step")
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "mode"),

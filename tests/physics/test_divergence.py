@@ -25,7 +25,7 @@ def assert_diverged(state, last):
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("task", ["walker2d", "swimmer"])
+@pytest.mark.parametrize("task", ["walker2d", pytest.param("swimmer", marks=pytest.mark.slow)])
 def test_bad_action_ends_the_episode(task, bad, program):
     compiled = program(task)
     good = np.zeros(compiled.physics.action_size, np.float32)

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from pixelbrax_jax import make_rig
+from pixelbrax_jax import make_look, make_rig
 from pixelbrax_jax.physics.mujoco.lighting import detailed
 from pixelbrax_jax.physics.mujoco.scene import read_scene, tracked_body
 from pixelbrax_jax.scene.place import place
@@ -162,6 +162,7 @@ def test_ground_and_sky_come_from_the_textures(scene):
     np.testing.assert_allclose(look.ground_rgb, [[0.2, 0.4, 0.6], [0.8, 0.6, 0.4]], atol=2e-3)
     # Two repeats a metre of MuJoCo's uniform texture, which is 2 m and has two tiles.
     assert look.ground_pitch == pytest.approx(0.5)
+    assert look.ground_mark is None
     horizon, above, below = look.sky
     np.testing.assert_allclose(horizon, [0.2, 0.3, 0.4], atol=0.03)
     assert (above > horizon + 0.1).all()
@@ -203,6 +204,9 @@ def test_what_only_the_detailed_look_shows():
     assert look.sky_texture.shape == (6, 50, 50, 3)
     assert (look.opengl, look.shininess) == (True, 64)
     assert look.lamps == scene.look.lamps
+    assert look.ground_mark is None, "red is not the second color"
+    marked = mujoco.MjModel.from_xml_string(MODEL.replace('markrgb="1 0 0"', 'markrgb=".8 .6 .4"'))
+    assert detailed(marked, None, 0.04).ground_mark == np.float32(2 / 40)
 
 
 ROPE = """<mujoco>
@@ -232,7 +236,8 @@ ROPE = """<mujoco>
 )
 def test_a_tendon_beyond_its_limit_has_mujocos_color(more):
     model = mujoco.MjModel.from_xml_string(ROPE.format(more=more))
-    data, read = mujoco.MjData(model), read_scene(model)
+    data, geoms = mujoco.MjData(model), read_scene(model).geoms
+    rig, look = make_rig((0, -1, 0), (0, 0, 0), 45.0), make_look("default")
     drawn, shown = mujoco.MjvScene(model, 100), []
     for distance in (0.05, 0.0999, 0.11, 0.2, 0.285, 0.2999, 0.3001, 0.3005, 0.31, 0.35, 0.5):
         data.qpos[0] = distance
@@ -242,9 +247,10 @@ def test_a_tendon_beyond_its_limit_has_mujocos_color(more):
         kinds = [geom.objtype for geom in drawn.geoms[: drawn.ngeom]]
         theirs = drawn.geoms[kinds.index(int(mujoco.mjtObj.mjOBJ_TENDON))].rgba[:3]
         poses = np.float32(data.xpos[1:]), np.float32(data.xquat[1:])
-        geoms = place(read.geoms, make_rig((0, -1, 0), (0, 0, 0), 45.0), read.look, *poses).geoms
+        assert place(geoms, rig, look, *poses).geoms.rgb is geoms.rgb, "a detail of look='dmc'"
+        placed = place(geoms, rig, look.replace(opengl=True), *poses).geoms
         (string,) = geoms.strings
-        colors = np.asarray(geoms.rgb)[np.array(geoms.material)]
+        colors = np.asarray(placed.rgb)[np.array(geoms.material)]
         np.testing.assert_allclose(
             colors[list(string.geoms)], np.tile(theirs, (len(string.geoms), 1)), atol=2e-3
         )

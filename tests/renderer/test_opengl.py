@@ -35,6 +35,7 @@ LOOK = make_look("dmc").replace(
     ground_rgb=jnp.full((2, 3), 0.5),
     shininess=64,
     opengl=True,
+    ground_mark=jnp.float32(0.05),
 )
 
 

@@ -124,18 +124,24 @@ def test_shadow_darkens_the_ground_and_nothing_else(draw):
 
 
 class TestGround:
-    @pytest.mark.parametrize("pattern", ["checker", "grid"])
-    def test_share_is_the_mean_over_the_window(self, pattern):
+    @pytest.mark.parametrize(
+        ("pattern", "mark"),
+        [("checker", None), ("checker", 0.01), ("checker", 0.2), ("grid", None)],
+    )
+    def test_share_is_the_mean_over_the_window(self, pattern, mark):
         rng = np.random.default_rng(0)
+        look = make_look("default").replace(ground=pattern, ground_mark=mark)
         x, y = rng.uniform(-3, 3, (2, 20))
         width_x, width_y = rng.uniform(0.05, 3, (2, 20))
-        share = shading.second_color_fraction(pattern, x, y, width_x, width_y)
+        share = shading.second_color_fraction(look, x, y, width_x, width_y)
         steps = (np.arange(400) + 0.5) / 400 - 0.5
         for k in range(20):
             px = (x[k] + width_x[k] * steps)[:, None]
             py = (y[k] + width_y[k] * steps)[None, :]
             if pattern == "checker":
                 second = (np.floor(px) + np.floor(py)) % 2 == 1
+                for along in (px, py) if mark else ():
+                    second |= np.abs(along - 2 * np.round(along / 2)) < mark
             else:
                 second = (px % 1 < shading.LINE_WIDTH) | (py % 1 < shading.LINE_WIDTH)
             assert share[k] == pytest.approx(second.mean(), abs=0.01)

@@ -26,7 +26,7 @@ def rgb(frame):
         ("fused", 2),
         pytest.param("fused", 3, marks=pytest.mark.slow),
         pytest.param("reference", 2, marks=pytest.mark.slow),
-        ("pallas", 2),
+        pytest.param("pallas", 2, marks=pytest.mark.slow),
     ],
 )
 def test_colors_are_means_of_a_larger_image(renderer, times):

@@ -82,6 +82,7 @@ def detailed(model: mujoco.MjModel, look: Look | None, pixel: float) -> Look:
         headlight_highlight=f32(_SPECULAR * headlight.specular.mean()) if shines else None,
         reflectance=f32(model.mat_reflectance[model.geom_matid[mirror]]) if mirror >= 0 else None,
         sky_texture=sky_texture(model, np.asarray(look.sky), pixel),
+        ground_mark=_ground_mark(model),
     )
 
 
@@ -179,12 +180,26 @@ def texture_of(model: mujoco.MjModel, geom: int) -> int:
 
 def _ground(model: mujoco.MjModel) -> tuple[Any, Any]:
     """Return pitch and colors of the first checkered plane; a texture has two tiles per edge."""
-    for geom in range(model.ngeom):
-        colors = checker(model, geom) if model.geom_type[geom] == 0 else None
-        if colors is not None:
-            material = int(model.geom_matid[geom])
-            repeat = float(model.mat_texrepeat[material, 0])
-            if not model.mat_texuniform[material]:
-                repeat /= max(float(model.geom_size[geom, 0]), 1e-6)
-            return f32(1.0 / repeat), f32(colors)
-    return f32(1.0), f32([[0.1, 0.2, 0.3], [0.2, 0.3, 0.4]])
+    if (geom := _checkered(model)) is None:
+        return f32(1.0), f32([[0.1, 0.2, 0.3], [0.2, 0.3, 0.4]])
+    material = int(model.geom_matid[geom])
+    repeat = float(model.mat_texrepeat[material, 0])
+    if not model.mat_texuniform[material]:
+        repeat /= max(float(model.geom_size[geom, 0]), 1e-6)
+    return f32(1.0 / repeat), f32(checker(model, geom))
+
+
+def _ground_mark(model: mujoco.MjModel) -> Any:
+    """Return ``Look.ground_mark`` of textures whose outermost texels have the second color."""
+    if (geom := _checkered(model)) is None:
+        return None
+    pixels = texture_pixels(model, texture_of(model, geom))
+    rows, columns = pixels.shape[:2]
+    second = pixels[rows // 4, 3 * columns // 4]
+    edges = pixels[0], pixels[-1], pixels[:, 0], pixels[:, -1]
+    return f32(2.0 / columns) if all((edge == second).all() for edge in edges) else None
+
+
+def _checkered(model: mujoco.MjModel) -> int | None:
+    planes = map(int, np.flatnonzero(model.geom_type == _PLANE))
+    return next((geom for geom in planes if checker(model, geom) is not None), None)

@@ -30,7 +30,7 @@ EACH = [
     pytest.param(
         task,
         marks=()
-        if task == "dmc_cartpole_swingup"
+        if task == "dmc_ball_in_cup_catch"
         else [pytest.mark.slow, pytest.mark.timeout(1800)],
     )
     for task in DMC_TASKS
