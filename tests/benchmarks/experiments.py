@@ -185,7 +185,7 @@ def record(folder: Path, arguments: list[str]) -> dict:
 def offer(task: str, folder: Path, kept: dict) -> None:
     """Put a finished run's policy into the package if it is the best of its task so far.
 
-    Returns by other rewards, or from other looks, compare with none of the preset's.
+    Returns by other rewards, or from other images, compare with none of the preset's.
     """
     about = PRETRAINED / f"{task}.json"
     if "evaluations" in kept:
@@ -194,7 +194,7 @@ def offer(task: str, folder: Path, kept: dict) -> None:
         names = {"clean/return": "return", "clean/standard_error": "standard_error"}
         last = {name: kept[key][-1] for name, key in (names | {"steps": "frames"}).items()}
     env = preset(kept["algorithm"], "cpu", task).env
-    wanted = {"reward_preset": env.reward_preset, "look": env.look}
+    wanted = {name: getattr(env, name) for name in ("reward_preset", "look", "samples")}
     if not wanted.items() <= kept["config"].items():
         return
     before = json.loads(about.read_text()) if about.exists() else None

@@ -21,9 +21,10 @@ from tests.gym.test_vector_env import MODES
 pytest.importorskip("dm_control", reason="the tasks' models come with pixelbrax[dmc]")
 
 SIZE = {"height": 36, "width": 36}  # Stable-Baselines3 warns of smaller ones
+ENV = SIZE | {"engine": "mujoco"}  # MuJoCo XLA compiles for longer
 RENDER = {"render_mode": "rgb_array", "render_height": 8, "render_width": 8}
 FAST = "dmc_ball_in_cup_catch"
-"""The task whose programs compile soonest."""
+"""The task that stays among the fast tests."""
 
 
 def among_slow(tasks):
@@ -37,12 +38,12 @@ ONE_OF_EVERY_DOMAIN = tuple({row.domain: task for task, row in DMC_TASKS.items()
 
 @pytest.mark.parametrize("task", EVERY_TASK)
 def test_our_own_checker(task):
-    pixelbrax_jax.check_env(*pixelbrax_jax.make(task, obs_mode="both", **SIZE))
+    pixelbrax_jax.check_env(*pixelbrax_jax.make(task, obs_mode="both", **ENV))
 
 
 @pytest.mark.parametrize("task", EVERY_TASK)
 def test_checkers_of_single_environments(task):
-    env = gymnasium.make(TASKS[task].gymnasium_id, **SIZE, **RENDER).unwrapped
+    env = gymnasium.make(TASKS[task].gymnasium_id, **ENV, **RENDER).unwrapped
     check_gymnasium_env(env)
     check_sb3_env(env)
 
@@ -67,7 +68,7 @@ def check_vector(task, mode):
         obs_mode="both",  # at this size a reset may move less than a pixel
         max_episode_steps=6,
         autoreset_mode=mode,
-        **SIZE,
+        **ENV,
         **RENDER,
     )
     pixelbrax_gym.check_vector_env(env, num_steps=15)
@@ -79,14 +80,14 @@ def check_vector(task, mode):
 @pytest.mark.slow
 @pytest.mark.parametrize("task", ONE_OF_EVERY_DOMAIN)
 def test_checker_of_torchrl(task):
-    env = pixelbrax_gym.TorchRLEnv(task, 2, obs_mode="both", **SIZE)
+    env = pixelbrax_gym.TorchRLEnv(task, 2, obs_mode="both", **ENV)
     check_env_specs(env)
     env.close()
 
 
 @pytest.mark.parametrize("task", among_slow(ONE_OF_EVERY_DOMAIN))
 def test_stable_baselines_vector_environments(task):
-    env = pixelbrax_gym.SB3VecEnv(task, 2, obs_mode="both", episode_length=3, **SIZE)
+    env = pixelbrax_gym.SB3VecEnv(task, 2, obs_mode="both", episode_length=3, **ENV)
     env.seed(0)
     draw = np.random.default_rng(0)
     first = env.reset()
@@ -108,7 +109,7 @@ def test_stable_baselines_vector_environments(task):
 @pytest.mark.parametrize("task", ONE_OF_EVERY_DOMAIN)
 def test_distractors_change_pixels_alone(task):
     """The same episodes, to rounding: other options make another program."""
-    options = {"num_envs": 2, "obs_mode": "both", "output": "torch", **SIZE}
+    options = {"num_envs": 2, "obs_mode": "both", "output": "torch", **ENV}
     make = functools.partial(gymnasium.make_vec, TASKS[task].gymnasium_id, **options)
     plain = make()
     chain = ("video", "color", "camera")
