@@ -82,12 +82,30 @@ def peers() -> Iterator[Case]:
 
 def dmc() -> Iterator[Case]:
     """Every task of the DM Control Suite, of ours and of dm_control, which draws without a GPU."""
-    for task, row in DMC_TASKS.items():
+    for task in DMC_TASKS:
         yield Case("dmc", "dmc.pixels", {"task": task, "num_envs": 128}, HERE)
-        where = {"task": task, "domain": row.domain, "goal": row.task, "processes": 0}
-        # The camera that the field takes; the quadruped is out of the sight of its first one.
-        where |= {"camera": 2 if row.domain == "quadruped" else 0, "seconds": 1.0}
-        yield PeerCase("dmc", "peers.dm_control_envs", where)
+        yield dm_control("dmc", task)
+
+
+def dm_control(group: str, task: str) -> Case:
+    """The task in dm_control, in this process."""
+    row = DMC_TASKS[task]
+    where = {"task": task, "domain": row.domain, "goal": row.task, "processes": 0}
+    # The camera that the field takes; the quadruped is out of the sight of its first one.
+    where |= {"camera": 2 if row.domain == "quadruped" else 0, "seconds": 1.0}
+    return PeerCase(group, "peers.dm_control_envs", where)
+
+
+LOOKED_AT = ("cartpole_swingup", "cheetah_run", "walker_walk", "humanoid_walk", "quadruped_walk")
+
+
+def looks() -> Iterator[Case]:
+    """Some of these tasks with the default look, with DM Control's whole picture, and there."""
+    for task in (f"dmc_{name}" for name in (*LOOKED_AT, "manipulator_bring_ball")):
+        for look in ("dmc-plain", "dmc"):
+            where = {"task": task, "num_envs": 128, "look": look}
+            yield Case("dmc-look", "dmc.with_look", where, HERE)
+        yield dm_control("dmc-look", task)
 
 
 GROUPS = {
@@ -157,6 +175,11 @@ GROUPS = {
         "OpenGL, which a GPU would speed up. To the first frame: from the start of a Python "
         "process to the end of the first step of 128 environments, one sample, with an empty "
         "compilation cache and with one that such a process has filled.",
+    ),
+    "dmc-look": Group(
+        list(looks()),
+        tables.looks,
+        "As `dmc`, with the default look and with the whole picture of DM Control.",
     ),
     "devices": Group(
         [

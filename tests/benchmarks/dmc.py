@@ -31,19 +31,29 @@ def pixels(task: str, num_envs: int) -> dict[str, Any]:
     }
 
 
-def _process(task: str, num_envs: int, what: str, environ: dict[str, str]) -> dict[str, Any]:
-    arguments = [TASKS[task].gymnasium_id, str(num_envs), what, str(time.time())]
+def with_look(task: str, num_envs: int, look: str) -> dict[str, Any]:
+    """Measure the same with a look; steps a second alone."""
+    with tempfile.TemporaryDirectory() as folder:
+        speed = _process(task, num_envs, "measure", with_cache(folder), look)["speed"]
+    return {"steps_per_second": num_envs * speed["median"], "speed": speed}
+
+
+def _process(
+    task: str, num_envs: int, what: str, environ: dict[str, str], look: str = "default"
+) -> dict[str, Any]:
+    arguments = [TASKS[task].gymnasium_id, str(num_envs), what, str(time.time()), look]
     return last_line(["-m", __name__, *arguments], environ)
 
 
 def main() -> None:
     """Start, step once, and measure if asked to."""
     name, num_envs, what, started = sys.argv[1], int(sys.argv[2]), sys.argv[3], float(sys.argv[4])
+    look = sys.argv[5]
     import gymnasium
 
     import pixelbrax_gym  # noqa: F401  # registers the ids
 
-    envs = gymnasium.make_vec(name, num_envs=num_envs, output="numpy")
+    envs = gymnasium.make_vec(name, num_envs=num_envs, output="numpy", look=look)
     envs.reset(seed=0)
     low, high = envs.action_space.low, envs.action_space.high
     draw = np.random.default_rng(0)

@@ -19,19 +19,24 @@ from tests.benchmarks.tables import find
 FOLDER = Path(__file__).parents[2] / "docs" / "dmc"
 
 
-def rows() -> list[dict]:
+def rows(group: str = "dmc") -> list[dict]:
     """Outcomes beside dm_control, of the machine that was measured last."""
     files = sorted(FOLDER.glob("cpu-*.json"))
     kept = [json.loads(file.read_text("utf-8")) for file in files]
     cases = max(
         (k["cases"] for k in kept), key=lambda found: max(c["date"] for c in found.values())
     )
-    return [row for row in cases.values() if row["group"] == "dmc"]
+    return [row for row in cases.values() if row["group"] == group]
 
 
 def speed() -> str:
     """Each task beside dm_control, in Markdown."""
     return tables.dmc(rows())
+
+
+def looks() -> str:
+    """Some tasks with the whole picture beside dm_control, in Markdown."""
+    return tables.looks(rows("dmc-look"))
 
 
 def tasks() -> str:
@@ -187,7 +192,7 @@ FIGURES = {
     "states": states,
     "part": part,
 }
-ALL = {"speed": speed, "physics": physics}
+ALL = {"speed": speed, "looks": looks, "physics": physics}
 
 
 LEADERBOARD = FOLDER.parent / "leaderboard"

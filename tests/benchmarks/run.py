@@ -27,7 +27,7 @@ from tests.benchmarks.case import TASKS, Case
 from tests.benchmarks.cases import GROUPS
 from tests.benchmarks.report import Results
 
-ON_REQUEST = ("peers", "dmc", "gpu-program", "tpu-program")
+ON_REQUEST = ("peers", "dmc", "dmc-look", "gpu-program", "tpu-program")
 """They need what is not installed with the tests: OpenGL, other simulators, compilers."""
 
 

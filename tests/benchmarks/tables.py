@@ -190,6 +190,19 @@ def dmc(rows: list[Row]) -> str:
     return f"{table(heads, lines)}\n\n{_peer_versions(rows)}"
 
 
+def looks(rows: list[Row]) -> str:
+    lines = []
+    for task in dict.fromkeys(row["arguments"]["task"] for row in rows):
+        ours = [find(rows, "dmc.with_look", task=task, look=look) for look in ("dmc-plain", "dmc")]
+        plain, whole = (value(row, "steps_per_second") for row in ours)
+        theirs = find(rows, "peers.dm_control_envs", task=task)
+        speeds = [cell(row, "steps_per_second") for row in (*ours, theirs)]
+        faster = ratio(whole, value(theirs, "steps_per_second"))
+        lines.append([f"`{task}`", *speeds, ratio(whole, plain), faster])
+    heads = ["task", "default look", '`look="dmc"`', "dm_control", "dmc / default", "times as fast"]
+    return f"{table(heads, lines)}\n\n{_peer_versions(rows)}"
+
+
 def peers(rows: list[Row]) -> str:
     lines = []
     for task in MEASURED:
