@@ -10,11 +10,7 @@ from pathlib import Path
 
 
 def cache_folder(given: str | Path | None = None) -> Path:
-    """Return the given folder, else ``$PIXELBRAX_CACHE``, else ``~/.cache/pixelbrax``.
-
-    Raises:
-        FileNotFoundError: the home folder is needed but unknown; the message has the fix.
-    """
+    """Return the given folder, else ``$PIXELBRAX_CACHE``, else ``~/.cache/pixelbrax``."""
     named = given or os.environ.get("PIXELBRAX_CACHE")
     if named:
         return in_home(Path(named))
@@ -51,12 +47,8 @@ _FOLDER, _SHORTEST = "JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMP
 def keep_programs() -> Path | None:
     """Keep compiled programs in the cache folder, for later processes; imports no JAX.
 
-    There is a folder for each kind of CPU, because a program may use instructions that another CPU
-    lacks. Nothing is deleted by itself.
-
-    Returns:
-        The folder; None if JAX was told of another, or the environment has
-        ``PIXELBRAX_KEEP_PROGRAMS=0``.
+    Returns the folder for this kind of CPU, because a program may use instructions that another
+    lacks; None if JAX was told of another or the environment forbids it. Nothing is ever deleted.
     """
     jax = sys.modules.get("jax")
     told = jax.config.jax_compilation_cache_dir if jax else os.environ.get(_FOLDER)

@@ -183,10 +183,6 @@ def env_config(
 
     Fields that a subclass of ``EnvConfig`` adds are ignored. ``also_allowed`` are the caller's
     other options, for the message about an unknown one.
-
-    Raises:
-        TypeError: an option is unknown; the message lists all options and the nearest name.
-        ValueError: an option is out of range; the message says what is allowed.
     """
     names = [name for name in ENV_OPTIONS if name != "task"]
     check_options(options, [*names, *also_allowed])

@@ -19,13 +19,7 @@ _VARIABLE = "IMAGEIO_FFMPEG_EXE"
 
 
 def find_ffmpeg() -> str:
-    """Return the path of the FFmpeg program.
-
-    Raises:
-        ImportError: imageio-ffmpeg, which includes it, is not installed.
-        OSError: no FFmpeg runs on this machine, or ``IMAGEIO_FFMPEG_EXE`` is not a program; the
-            message has the fix.
-    """
+    """Return the path of the FFmpeg program, or raise ImportError or OSError with the fix."""
     import imageio_ffmpeg
 
     try:
@@ -55,8 +49,7 @@ def check_ffmpeg() -> None:
 def encoder(path: Path, fps: float) -> Iterator[Callable[[np.ndarray], None]]:
     """Return a function that writes a frame to an MP4 file in H.264, 4:2:0, as all players support.
 
-    An odd side gets its last row or column twice. Raises OSError with the reason if FFmpeg could
-    not write the file, and the errors of ``find_ffmpeg``.
+    An odd side gets its last row or column twice. OSError has the reason of a failure.
     """
     # Each PPM has its own size. The codec is explicit: an FFmpeg without it would choose one that
     # few players support.
@@ -122,8 +115,7 @@ def complaint(log: str) -> str:
 def declared_frames(path: Path, log: str) -> tuple[int, bool]:
     """Return about how many frames a video file declares, 0 if none, given the log of ``decode``.
 
-    The second result is whether the number comes from the length of the whole file, whose sound may
-    be longer than its video.
+    The second result is whether that is the length of the file, whose sound may be longer.
     """
     source, count = _source(log), _frames_of_avi(path)
     duration = re.search(r"Duration: (\d+):(\d+):([\d.]+)", source)

@@ -9,11 +9,7 @@ import jax
 
 
 def check_fits(what: str, num_bytes: float) -> None:
-    """Raise MemoryError if ``what``, options and their values, exceeds main memory.
-
-    This finds mistyped numbers early. The allocation itself fails if the device or other programs
-    leave too little room.
-    """
+    """Raise MemoryError if ``what``, options and values, exceeds main memory, to find typos."""
     limit = _main_memory()
     if num_bytes > limit:
         raise MemoryError(

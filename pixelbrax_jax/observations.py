@@ -8,13 +8,7 @@ from pixelbrax_jax.validation import check_choice
 
 
 class Image(NamedTuple):
-    """An image of an observation.
-
-    Attributes:
-        channels: channels of a frame, for each camera.
-        dtype: dtype of the observation.
-        drawn: dtype that the renderer draws, with all channels of a pixel in one number.
-    """
+    """An image: channels per camera, dtype, and dtype as drawn, all channels in one number."""
 
     channels: int
     dtype: str
@@ -36,11 +30,7 @@ MAX_DEPTH = 100.0
 
 
 def check_obs_mode(value: object) -> str:
-    """Return an ``obs_mode`` with its parts in the order of ``PARTS``; "both" for pixels and state.
-
-    Raises:
-        ValueError: a part is unknown or given twice; the message has all of them.
-    """
+    """Return an ``obs_mode`` with its parts ordered like ``PARTS``; "both" for pixels and state."""
     parts = value.split("+") if isinstance(value, str) else []
     if len(parts) < 2:
         check_choice("obs_mode", value, ("both", *PARTS))

@@ -30,13 +30,10 @@ _NAMES = {cls: name for name, cls in _TYPES.items()}
 
 
 def to_plain(value: Any) -> Any:
-    """Convert an option's value to JSON types.
+    """Convert an option's value to JSON types; a bank of clips or a local class is a ValueError.
 
     A camera, look or distractor becomes a dictionary with its fields and its ``"type"``: a name, or
     ``"module:Class"`` for a class of your own. Every option also takes such a dictionary.
-
-    Raises:
-        ValueError: JSON cannot represent the value, such as a bank of clips or a local class.
     """
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
@@ -60,14 +57,7 @@ def to_plain(value: Any) -> Any:
 
 
 def from_plain(value: Any) -> Any:
-    """Convert a dictionary of ``to_plain``, or each one of a list, to its object.
-
-    Other values are returned unchanged.
-
-    Raises:
-        ValueError: the type is missing or unknown; the message lists the types.
-        TypeError: a field is unknown; the message lists the fields.
-    """
+    """Convert a dictionary of ``to_plain``, or each one of a list, to its object; keep the rest."""
     if isinstance(value, (tuple, list)):
         return tuple(map(from_plain, value))
     if not isinstance(value, Mapping):

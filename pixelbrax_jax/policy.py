@@ -53,9 +53,6 @@ def read_pretrained(name: str) -> dict[str, Any]:
     The keys are ``algorithm``, ``config`` (training settings), ``env_options``, ``command``,
     ``steps`` (control steps of training), ``return``, ``standard_error`` and ``episodes`` of the
     evaluation, and ``versions`` of the packages.
-
-    Raises:
-        ValueError: no policy has this name.
     """
     check_choice("pretrained policy", name, list_pretrained())
     about: dict[str, Any] = json.loads((FOLDER / f"{name}.json").read_text("utf-8"))

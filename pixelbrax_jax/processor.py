@@ -16,11 +16,7 @@ def num_cores() -> int:
 
 
 def describe_cpu() -> dict[str, Any]:
-    """Return the processor's description without starting JAX.
-
-    ``family``, ``model`` and ``vectors`` tell apart generations that share a name in virtual
-    machines.
-    """
+    """Describe the processor, without JAX; in virtual machines different ones share a name."""
     entries: dict[str, str] = {}
     if (cpuinfo := Path("/proc/cpuinfo")).exists():
         for line in reversed(cpuinfo.read_text().splitlines()):

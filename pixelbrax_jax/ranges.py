@@ -27,10 +27,6 @@ def check_ranges(option: str, value: Any) -> str:
     """Return ranges as text, ``"friction=0.5:2.0,gravity=0.8"``, sorted by name.
 
     ``value`` is such a text, or a mapping from names to a multiplier or to the lowest and highest.
-
-    Raises:
-        TypeError: it is neither.
-        ValueError: a name is unknown, or the numbers are not positive, finite and in order.
     """
     return ",".join(
         f"{name}={low!r}" + (f":{high!r}" if high != low else "")

@@ -63,14 +63,7 @@ def register(
 
 @default_flags()
 def make_physics(task: str, **options: Any) -> Physics:
-    """Make the physics of a task with options of its suite. Equal arguments give equal objects.
-
-    Raises:
-        ValueError: the task is unknown, or does not take such an option.
-        ImportError: the package with the task's models is not installed; the message has the
-            command that installs it.
-        TypeError: the registered function does not return a ``Physics``.
-    """
+    """Make the physics of a task with options of its suite. Equal arguments give equal objects."""
     check_choice("task", task, list_envs(), meant=_meant(task))
     own = _OWN_TASKS.get(task)
     suite = next((suite for suite in SUITES.values() if task in suite.tasks), None)
@@ -95,12 +88,7 @@ def registered_camera(task: str) -> CameraRig | Camera | None:
 
 
 def find_task(task: str) -> str:
-    """Return the name of a task; for ``module:name``, first import the module that registers it.
-
-    Raises:
-        ValueError: the module's name is invalid, or the module registers no such task.
-        ImportError: the module cannot be imported.
-    """
+    """Return the name of a task; for ``module:name``, first import the module that registers it."""
     if not isinstance(task, str) or ":" not in task or task in list_envs():
         return task
     module, _, name = task.partition(":")

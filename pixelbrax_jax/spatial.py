@@ -1,7 +1,4 @@
-"""Rotations, frames and camera rigs in float32.
-
-Quaternions are ``(w, x, y, z)``, as in MuJoCo and Brax.
-"""
+"""Rotations, frames and camera rigs in float32; quaternions are MuJoCo's, ``(w, x, y, z)``."""
 
 from __future__ import annotations
 
@@ -74,10 +71,7 @@ def unit(vector: jax.Array) -> jax.Array:
 
 
 def look_at(eye: jax.Array, target: jax.Array, up: jax.Array) -> jax.Array:
-    """Return the orientation (3, 3) of a camera: columns are its right, up and back directions.
-
-    ``eye`` and ``target`` (3,) are in metres; ``up`` (3,) is not parallel to the view.
-    """
+    """Return the (3, 3) orientation of a camera: right, up, back; the view is not along ``up``."""
     back = unit(eye - target)
     right = unit(jnp.cross(up, back))
     return jnp.stack([right, jnp.cross(back, right), back], axis=-1)

@@ -22,13 +22,10 @@ _APART = 1.0
 
 
 class StopRequest:
-    """Records the signal that asks the process to stop.
+    """Records the number of the first ``signal`` that asks the process to stop; 0 before it.
 
-    The first signal is only recorded. A second Ctrl-C raises ``KeyboardInterrupt``; other signals
-    never do, because closing terminals and schedulers send several of them for one request.
-
-    Attributes:
-        signal: number of the first signal; 0 before there is one.
+    A second Ctrl-C raises ``KeyboardInterrupt``; other signals never do, because closing terminals
+    and schedulers send several of them for one request.
     """
 
     def __init__(self, report: Callable[[str], object]) -> None:

@@ -16,13 +16,9 @@ from pixelbrax_jax.physics.task import Task
 
 @dataclass(frozen=True, eq=False)
 class Suite:
-    """Tasks that one engine simulates.
+    """Tasks by name that one engine simulates, and the names of options that only they take.
 
-    Attributes:
-        title: name of the suite in messages.
-        tasks: tasks by name.
-        loader: module with ``make_physics(task, **options)``.
-        options: names of the options that only these tasks take.
+    ``loader`` is the module with ``make_physics(task, **options)``.
     """
 
     title: str

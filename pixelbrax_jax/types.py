@@ -24,8 +24,7 @@ FAR = float(np.finfo(np.float32).max)  # metres, the sky; jax_debug_infs forbids
 class GeomKind(IntEnum):
     """Shapes that the renderer supports, one row each, starting with MuJoCo's number (``mjtGeom``).
 
-    All but the plane are convex. ``renderer.intersect`` and ``renderer.reference`` have the
-    formulas.
+    All but the plane are convex; ``renderer.intersect`` and ``renderer.reference`` have formulas.
 
     Attributes:
         num_sizes: number of entries of a geom's size that are used.

@@ -42,12 +42,9 @@ _ADVICE = {
 def check_choice(
     what: str, value: object, allowed: Iterable[str], *, meant: str | None = None
 ) -> str:
-    """Return ``value`` if it is one of ``allowed``.
+    """Return ``value`` if it is one of ``allowed``; else raise a ValueError with the nearest name.
 
     ``what`` names the option in the message; ``meant`` replaces the nearest name as suggestion.
-
-    Raises:
-        ValueError: it is not; the message has the value, the nearest name and all allowed ones.
     """
     names = sorted(allowed)
     if isinstance(value, str) and value in names:
@@ -59,11 +56,9 @@ def check_choice(
 
 
 def check_options(given: Iterable[str], allowed: Iterable[str]) -> None:
-    """Check that keyword arguments are known.
+    """Raise a TypeError with the nearest name if a keyword argument is unknown.
 
-    Raises:
-        TypeError: one is unknown; the message has all allowed names and the nearest one. It starts
-            like Python's own message, which some libraries parse to find the known options.
+    Its message starts like Python's own, which some libraries parse to find the known options.
     """
     names = sorted(allowed)
     for name in given:

@@ -24,21 +24,10 @@ NO_WRITER = f"a video needs imageio-ffmpeg and Pillow; try: {install_extra('vide
 
 
 def write_frames(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> Path:
-    """Write frames to a video file as they arrive; return its path.
+    """Write frames, (H, W, 3) uint8 of one size, to a video file as they arrive; return its path.
 
-    An MP4 repeats the last row or column of an odd side. After an error or Ctrl-C the file keeps
-    the frames before it.
-
-    Args:
-        path: the file, ``.mp4`` or ``.gif`` (which loops forever); folders are created.
-        frames: (H, W, 3) uint8 each, all of one size.
-        fps: frames per second.
-
-    Raises:
-        ValueError: the suffix is unknown, ``fps`` is not positive, there are no frames, a frame has
-            another shape or dtype, or a GIF would show one image for more than 655 s.
-        ImportError: imageio-ffmpeg or Pillow is not installed; the message has the fix.
-        OSError: the file cannot be written; with the reason.
+    The file is an ``.mp4``, which repeats the last row or column of an odd side, or a ``.gif``,
+    which loops forever. Folders are created. After an error or Ctrl-C the earlier frames are kept.
     """
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:

@@ -157,10 +157,7 @@ def split_obs(obs: Any) -> tuple[Any, Any]:
 
 
 def shifted(pixels: jax.Array, shift: jax.Array, at_most: int) -> jax.Array:
-    """Shift (N, H, W, C) images by (N, 2) pixels down and right (Yarats et al., arXiv 2004.13649).
-
-    Edges repeat. ``at_most`` is a static bound of the shifts.
-    """
+    """Shift (N, H, W, C) images by (N, 2) pixels, with repeated edges (arXiv 2004.13649)."""
     if not at_most:
         return pixels
     height, width = pixels.shape[1:3]

@@ -72,11 +72,7 @@ State = TypeVar("State", bound=TrainState)
 
 
 def env_axes(tree: Any) -> Any:
-    """Replace each leaf of a dataclass by its environment axis, or -1 if it has none.
-
-    Raises:
-        TypeError: a field is not declared.
-    """
+    """Replace each leaf of a dataclass with declared fields by its environment axis, or -1."""
     found = {}
     for field in fields(tree):
         if _AXES not in field.metadata:

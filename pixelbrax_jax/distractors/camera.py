@@ -26,11 +26,9 @@ class CameraState(struct.PyTreeNode):
 
     Attributes:
         radius: () float32, ratio of the distances.
-        azimuth: () float32, radians about the world's z axis.
-        polar: () float32, radians from the world's z axis.
-        roll: () float32, radians about the viewing axis.
+        azimuth, polar: () float32, radians about and from the world's z axis.
+        roll, roll_velocity: () float32, radians about the viewing axis, and those per frame.
         velocity: (3,) float32, metres per frame.
-        roll_velocity: () float32, radians per frame.
     """
 
     radius: jax.Array

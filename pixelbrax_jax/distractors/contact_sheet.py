@@ -21,13 +21,7 @@ _WIDTH, _TEXT = 1200, 16
 
 
 def check_image(path: str) -> None:
-    """Check that an image can be saved under a name, before clips are read.
-
-    Raises:
-        ValueError: its suffix is unknown.
-        FileNotFoundError: the folder does not exist.
-        ImportError: Pillow is missing; the message has the fix.
-    """
+    """Check that an image can be saved under a name, before clips are read."""
     suffix, folder = Path(path).suffix.lower(), Path(path).absolute().parent
     if suffix not in pillow().registered_extensions():
         raise ValueError(f"a contact sheet must be a .png, .jpg or .webp image, got {path!r}.")

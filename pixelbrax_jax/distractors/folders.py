@@ -63,12 +63,6 @@ def find(folder: Path, split: str) -> tuple[list[Source], str]:
     files, or folders of images, in subfolders named like the splits; without subfolders all are in
     split ``"all"``. If there is only one split and its name is not that of a test, ``"train"`` also
     selects it. Clips are in the order of the split file, else by name.
-
-    Raises:
-        FileNotFoundError: the folder, a split file or a listed clip is missing; the message has the
-            expected layout.
-        PermissionError: the folder or a subfolder cannot be read.
-        ValueError: the split is unknown or has no clips.
     """
     if folder.is_file():
         raise FileNotFoundError(f"clips must be a folder, but {folder} is a file; give its folder.")

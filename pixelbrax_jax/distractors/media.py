@@ -33,12 +33,6 @@ def read_clip(
     Images are rotated by their EXIF orientation, videos by their display matrix. 16 bits become 8,
     floats in [0, 1] become 0 to 255, and transparent pixels are blended with black. ``check_count``
     is called with the number of frames so far, and may raise.
-
-    Raises:
-        ValueError: a file cannot be read; the message has the file, the reason and the fix.
-        OSError: a file cannot be opened, or FFmpeg is not found; the message has the fix.
-        MemoryError: a file is too large for this machine's memory, or ``check_count`` raises it.
-        ImportError: Pillow or imageio-ffmpeg is missing; the message has the fix.
     """
     if not source.is_video:
         check_count(len(source.files))

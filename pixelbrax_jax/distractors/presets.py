@@ -23,8 +23,7 @@ _GROUND_ALPHA = {
     "dmc_walker": 1.0,
     "dmc_cheetah": 1.0,
 }
-"""The Distracting Control Suite's values (0 for reacher, 1 for walker and cheetah); for other tasks
-by domain."""
+"""The Distracting Control Suite's values; those of DM Control's tasks are by domain."""
 
 _OTHER_GROUND_ALPHA = 0.3
 

@@ -9,12 +9,7 @@ import jax.numpy as jnp
 
 
 def check_action(action: Any, shape: tuple[int, ...]) -> jax.Array:
-    """Return floating-point actions of the given shape as an array.
-
-    Raises:
-        ValueError: they have another shape.
-        TypeError: they are not floating point.
-    """
+    """Return floating-point actions of the given shape as an array; raise for anything else."""
     action = jnp.asarray(action)
     if action.shape != shape:
         raise ValueError(f"action must have shape {shape}, got {action.shape}.")

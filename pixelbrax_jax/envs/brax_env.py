@@ -21,8 +21,7 @@ PIXELS = "pixels/view_0"
 """Name of the image in an observation; Brax treats entries named ``pixels/...`` as images."""
 
 _LEVEL = np.float32(1 / 255)
-"""1 / 255. Pixels are multiplied with it, because XLA may round a division by a constant
-differently."""
+"""Pixels are multiplied with it, because XLA may round a division by a constant differently."""
 
 _NO_LIMIT = 2**31 - 1
 """More control steps than any episode has."""
@@ -33,7 +32,6 @@ class BraxEnv(Env):
 
     As in Brax, the environment has no time limit: ``done`` is the task's termination, and Brax's
     ``EpisodeWrapper`` counts calls of ``step`` and sets ``info["truncation"]`` at the trainer's
-    ``episode_length``. The pixel environment's limit, in calls, is the attribute
     ``episode_length``. Repeat actions with ``action_repeat`` of the pixel environment: Brax's
     renders frames that nobody sees, and continues after a termination.
 

@@ -68,10 +68,7 @@ class ParamRows:
 
 
 def split_params(params: EnvParams, num_envs: int) -> ParamRows:
-    """Split parameters whose arrays have the shapes of ``EnvParams`` or a leading axis N.
-
-    Other shapes raise a ValueError with the array's name.
-    """
+    """Split parameters whose arrays have the shapes of ``EnvParams`` or a leading axis N."""
     found, tree = jax.tree_util.tree_flatten_with_path(params)
     geoms = params.geoms
     sizes = {"G": len(geoms.kind), "M": max(geoms.material, default=-1) + 1}

@@ -254,10 +254,7 @@ class PixelEnv(ProgramConfig):
         height: int | None = None,
         width: int | None = None,
     ) -> jax.Array:
-        """Render a state to (height, width, 3) uint8, rounded like an observation.
-
-        With several cameras, the first one's view.
-        """
+        """Render a state like ``render``, but to (height, width, 3) uint8, as in an observation."""
         height, width = self._size(height, width)
         return unpack(self.draw(state.sim, params, height, width))
 

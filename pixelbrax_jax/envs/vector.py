@@ -128,8 +128,7 @@ class VectorPixelEnv:
         """Step all environments under actions (N, A) float, clipped to [-1, 1], and reset some.
 
         Returns:
-            The next states and timesteps; ``info`` is that of ``PixelEnv.step``, and in mode
-            ``"same_step"`` also has ``final_obs`` and ``final_info``.
+            The next states and timesteps; ``info`` is that of ``PixelEnv.step`` and of the mode.
 
         Raises:
             ValueError: ``action`` or an array of ``params`` has another shape.

@@ -34,10 +34,7 @@ class Change:
 
 @dataclass(frozen=True)
 class Rotation(Change):
-    """Turns the camera about its viewing axis, by one of 100 angles that are evenly spaced.
-
-    They are in [-``degrees``, ``degrees``), one for each episode.
-    """
+    """Turns the camera about its viewing axis by one of 100 angles, evenly in +- ``degrees``."""
 
     degrees: float
 
@@ -52,13 +49,9 @@ class Rotation(Change):
 class Shift(Change):
     """Turns the camera so that the body moves towards the border of the image.
 
-    The angles about the camera's up axis (y) and right axis (x) are one of 100 points on the border
-    of a rectangle, 25 on each side from one corner on, one for each episode. The turn about y is
-    applied after that about x.
-
-    Attributes:
-        y: degrees, least and greatest angle about the camera's up axis.
-        x: degrees, those about its right axis.
+    The angles about the camera's up axis (y) and right axis (x), degrees, are one of 100 points on
+    the border of the rectangle of these ranges, 25 on each side from one corner on. The turn about
+    y is applied after that about x.
     """
 
     y: tuple[float, float]
@@ -102,10 +95,7 @@ class LightIntensity(Change):
 
 @dataclass(frozen=True)
 class LightColor(Change):
-    """Multiplies red, green and blue of all light by factors on [1 - ``amount``, 1 + ``amount``].
-
-    See ``distractors.light.color_lights``.
-    """
+    """Multiplies red, green and blue of all light by factors on 1 +- ``amount``, sampled."""
 
     amount: float
 
@@ -133,12 +123,7 @@ class BodyColor(Change):
 
 @dataclass(frozen=True)
 class Radius(Change):
-    """Multiplies the radius of geoms in the image; physics and rewards keep theirs.
-
-    Attributes:
-        factor: positive.
-        names: starts of the names of the geoms.
-    """
+    """Multiplies radii in the image, not in physics, of geoms whose names start with ``names``."""
 
     factor: float
     names: tuple[str, ...]
@@ -183,10 +168,7 @@ def _map_cameras(params: EnvParams, function: Callable[[CameraRig], CameraRig]) 
 
 
 def turned(rig: CameraRig, axis: jax.Array, angle: jax.Array) -> CameraRig:
-    """Return a rig turned at its place by radians about an axis in the camera's frame.
-
-    The axis (3,) has unit length. The camera's orientation R becomes R times the rotation.
-    """
+    """Return a rig turned at its place by radians about a unit axis (3,) in the camera's frame."""
     away = jnp.asarray(rig.eye - rig.target)
     right, up, back = spatial.look_at(jnp.asarray(rig.eye), rig.target, rig.up).T
     quat = spatial.axis_angle(axis, angle)

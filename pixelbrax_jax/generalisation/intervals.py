@@ -10,13 +10,10 @@ _RESAMPLES = 10_000
 def interquartile_mean(scores: np.ndarray) -> tuple[float, float, float]:
     """Compute the interquartile mean of scores, and its 95 % stratified bootstrap interval.
 
-    Scores are (R,) of R runs, or (S, R) of the runs in each of S strata, such as tasks or levels.
+    Scores are (R,) of at least 2 runs, or (S, R) of the runs in each of S strata, such as tasks.
     The mean is that of the middle half of all scores, without a quarter, rounded down, at each end.
     Each resample draws R runs of each stratum with replacement. Recommended for few runs by
     Agarwal et al., arXiv 2108.13264.
-
-    Raises:
-        ValueError: there are fewer than 2 runs.
     """
     from scipy import stats
 

@@ -45,10 +45,8 @@ _WHERE = (
 class LevelEnv:
     """One level, ready to be played.
 
-    Attributes:
-        level: the row of the suite.
-        env: the environment, with the distractors that act within an episode.
-        params: the parameters; some arrays have a leading axis, a row for each episode.
+    ``env`` has the distractors that act within an episode; some arrays of ``params`` have a row for
+    each episode.
     """
 
     level: Level
@@ -98,24 +96,12 @@ def make_levels(
     report: Callable[[str], object] = lambda _: None,
     only: str | None = None,
 ) -> Levels:
-    """Make the levels of a suite for a task with these options.
+    """Make the levels of a suite for a task with these options, or ``only`` one as it is among all.
 
     Distractors, clips, split and dynamics of ``config`` are left out. Episode i of every level
     starts from the same state, that of the key ``fold_in(key(EPISODES), i)``. Parameters that a
-    level draws for it have a key that no training has.
-
-    Args:
-        config: the task and how it is seen.
-        suite: a name of ``SUITES``.
-        episodes: number E of episodes, rows of the parameters.
-        clips: folder of the clips, or ``procedural``.
-        report: takes lines about replaced clips.
-        only: the only level to make, as it is among all.
-
-    Raises:
-        ValueError: the suite or level is unknown, the suite has no levels for the task, a level
-            cannot be made for it, or clips are given without video.
-        FileNotFoundError: clips are missing; the message says where to get them.
+    level draws for it have a key that no training has. ``clips`` is a folder or ``procedural``;
+    ``report`` takes lines about replaced clips.
     """
     if config.obs_mode == "state":
         raise ValueError("a suite changes the image, but obs_mode='state' shows none; take pixels.")

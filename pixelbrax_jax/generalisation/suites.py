@@ -50,8 +50,7 @@ class Level:
 class Suite:
     """A suite: levels of a task, the first of them clean, and default number of episodes of each.
 
-    ``source`` says where its levels are from. ``levels`` raises a ValueError for tasks without
-    them.
+    ``source`` says where its levels are from; ``levels`` raises a ValueError if a task has none.
     """
 
     levels: Callable[[str], tuple[Level, ...]]
@@ -227,9 +226,5 @@ SUITES = {
 
 
 def levels_of(suite: str, task: str) -> tuple[Level, ...]:
-    """Return the levels of a suite for a task, the first of them clean.
-
-    Raises:
-        ValueError: the suite is unknown, or has no levels for the task.
-    """
+    """Return the levels of a suite for a task, the first of them clean."""
     return SUITES[check_choice("suite", suite, SUITES)].levels(task)

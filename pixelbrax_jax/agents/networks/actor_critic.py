@@ -32,15 +32,11 @@ class ActorOutput(struct.PyTreeNode):
 class Actor(nn.Module):
     """An encoder with a policy head and an optional value head.
 
-    Policies:
-
     * ``"gaussian"``: the mean is linear in the features. Each action has one log standard
-      deviation, clipped to [-5, 2]. The environment clips the action.
+      deviation, clipped to [-5, 2], which is that of ``initial_std`` at first.
     * ``"tanh_gaussian"``: the same, but the action is the ``tanh`` of the sample.
     * ``"deacrep"`` (Lyu et al.'s code for arXiv 2502.00021): the mean is ``tanh`` of a linear
       layer, the standard deviation ``softplus`` of another one, clipped to [-10, 2], plus 0.001.
-
-    ``initial_std`` applies to the first two.
     """
 
     encoder: str
@@ -90,10 +86,7 @@ class Critic(nn.Module):
 
 @dataclass(frozen=True)
 class ActorCritic:
-    """An actor and a separate critic, or an actor with a value head.
-
-    ``detach_value`` stops gradients of the actor's value head at the encoder.
-    """
+    """An actor with critic or value head; ``detach_value`` stops its gradients at the encoder."""
 
     actor_module: Actor
     critic_module: Critic | None = None

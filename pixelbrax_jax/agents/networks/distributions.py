@@ -10,10 +10,9 @@ _LOG_2PI = 1.8378770664093453
 
 
 class Normal(struct.PyTreeNode):
-    """Independent normal distributions of unclipped actions.
+    """Independent normal distributions of actions before ``action`` and the environment's clipping.
 
-    The environment receives ``action(unclipped)`` and clips it to [-1, 1]. Probabilities refer to
-    the unclipped action, because those of a clipped action would bias the gradient.
+    Probabilities refer to these actions, because those of clipped ones would bias the gradient.
 
     Attributes:
         mean, std: (..., A) float32.
@@ -33,11 +32,7 @@ class Normal(struct.PyTreeNode):
         return jnp.tanh(unclipped) if self.squash else unclipped
 
     def log_prob(self, unclipped: jax.Array) -> jax.Array:
-        """Return the (...) log density of ``action(unclipped)``.
-
-        For ``a = tanh(u)`` it is ``log N(u) - sum 2 (log 2 - u - softplus(-2 u))``, with a stable
-        form of ``log(1 - tanh^2 u)`` (Haarnoja et al., arXiv 1801.01290, appendix C).
-        """
+        """Return the (...) log density of ``action(unclipped)``."""
         scaled = (unclipped - self.mean) / self.std
         log_prob = -0.5 * scaled**2 - jnp.log(self.std) - 0.5 * _LOG_2PI
         if self.squash:
@@ -52,15 +47,11 @@ class Normal(struct.PyTreeNode):
         return entropy
 
     def kl_to(self, new: Normal) -> jax.Array:
-        """Return the (...) Kullback-Leibler divergence KL(self || new) in nats.
-
-        ``sum [log(s_n / s_o) + (s_o^2 + (m_o - m_n)^2) / (2 s_n^2) - 1/2]``, with or without
-        ``tanh`` on both sides.
-        """
+        """Return the (...) divergence KL(self || new) in nats, equal with and without ``tanh``."""
         distance = (self.std**2 + (self.mean - new.mean) ** 2) / (2.0 * new.std**2)
         return (jnp.log(new.std) - jnp.log(self.std) + distance - 0.5).sum(-1)
 
 
 def _log_slope(unclipped: jax.Array) -> jax.Array:
-    """Return ``log(1 - tanh^2 u)`` of each coordinate."""
+    """Return ``log(1 - tanh^2 u)``, in the stable form of arXiv 1801.01290, appendix C."""
     return 2.0 * (jnp.log(2.0) - unclipped - jax.nn.softplus(-2.0 * unclipped))

@@ -25,21 +25,14 @@ Before = Callable[[jax.Array], jax.Array]
 
 
 def scaled(pixels: jax.Array) -> jax.Array:
-    """Scale uint8 pixels, or float32 depths in metres, to float32 in [0, 1] for an encoder.
-
-    A depth d becomes ``1 / (1 + d)``, which is near 0 for the sky.
-    """
+    """Scale uint8 pixels to float32 in [0, 1]; a depth of d metres becomes ``1 / (1 + d)``."""
     if pixels.dtype == jnp.float32:
         return 1.0 / (1.0 + pixels)
     return pixels.astype(jnp.float32) / 255.0
 
 
 def centered(pixels: jax.Array) -> jax.Array:
-    """Scale pixels to [-0.5, 0.5].
-
-    Positive inputs give all weights of a filter gradients of the same sign, and large steps then
-    turn most filters off.
-    """
+    """Scale pixels to [-0.5, 0.5]: with positive inputs large steps would turn most filters off."""
     return scaled(pixels) - 0.5
 
 
@@ -50,10 +43,7 @@ def _unchanged(x: jax.Array) -> jax.Array:
 def convolve(
     x: jax.Array, kernel: jax.Array, stride: int, pads: Pads, before: Before = _unchanged
 ) -> jax.Array:
-    """Cross-correlate (B, H, W, C) with (h, w, C, D); on a CPU matrix products are faster.
-
-    ``before`` changes each number of ``x`` first.
-    """
+    """Cross-correlate ``before(x)``, (B, H, W, C), with (h, w, C, D)."""
 
     def native(x: jax.Array, kernel: jax.Array) -> jax.Array:
         x = before(x).astype(kernel.dtype)
@@ -61,6 +51,7 @@ def convolve(
             x, kernel, (stride, stride), pads, dimension_numbers=("NHWC", "HWIO", "NHWC")
         )
 
+    # On a CPU matrix products are faster.
     products = partial(_as_products, stride=stride, pads=pads, before=before)
     result: jax.Array = jax.lax.platform_dependent(x, kernel, cpu=products, default=native)
     return result
@@ -143,14 +134,11 @@ def max_pool(x: jax.Array) -> jax.Array:
 
 
 def orthogonal(gain: float) -> Initializer:
-    """Return an initialiser of orthogonal weights.
-
-    Under ``jax.vmap`` the weights are sampled one by one, because the batched QR decomposition of
-    jaxlib 0.10 can deadlock on a CPU with few cores.
-    """
+    """Return an initialiser of orthogonal weights."""
     initializer = nn.initializers.orthogonal(gain)
 
     def sample(key: jax.Array, shape: tuple[int, ...], dtype: Any = jnp.float32) -> jax.Array:
+        # The batched QR decomposition of jaxlib 0.10 can deadlock on a CPU with few cores.
         one_by_one = jax.custom_batching.sequential_vmap(lambda key: initializer(key, shape, dtype))
         matrix: jax.Array = one_by_one(key)
         return matrix
@@ -181,13 +169,9 @@ class Impala(nn.Module):
 
 
 class Stack(nn.Module):
-    """Convolutions without padding, and a dense layer.
+    """Unpadded convolutions of ``before(pixels)``, and a dense layer that ``relu`` follows.
 
-    Attributes:
-        layers: the convolutions.
-        features: number of features F.
-        before: what changes pixels first.
-        bounded: whether features are normalised and pass ``tanh`` instead of ``relu``.
+    ``bounded`` features are normalised and pass ``tanh`` instead.
     """
 
     layers: Layers

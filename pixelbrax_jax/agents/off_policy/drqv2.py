@@ -39,10 +39,7 @@ from pixelbrax_jax.types import EnvParams
 
 
 class OffPolicyState(TrainState):
-    """The state of an off-policy algorithm; checkpoints skip the replay.
-
-    ``target`` is the averaged critic.
-    """
+    """The state of a run, with the averaged critic ``target``; checkpoints skip the replay."""
 
     target: Any = without_envs()
     replay: Replay = as_declared(kept=False)

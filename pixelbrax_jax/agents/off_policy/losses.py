@@ -12,10 +12,9 @@ LARGEST_ACTION = 1.0 - 1e-6
 
 
 def noisy(action: jax.Array, std: Any, key: jax.Array, clip: float | None = None) -> jax.Array:
-    """Add normal noise to (B, A) actions and clip the result to [-1, 1].
+    """Add normal noise, within +- ``clip``, to (B, A) actions, and clip the result to [-1, 1].
 
-    ``clip`` bounds the noise. The gradient passes the bounds of the action (the truncated normal
-    of DrQ-v2's code, arXiv 2107.09645).
+    The gradient passes the bounds (the truncated normal of DrQ-v2's code, arXiv 2107.09645).
     """
     noise = std * jax.random.normal(key, action.shape)
     if clip is not None:
@@ -31,16 +30,10 @@ def atoms(v_min: float, v_max: float, num_atoms: int) -> jax.Array:
 
 
 def projected(probabilities: jax.Array, values: jax.Array, support: jax.Array) -> jax.Array:
-    """Project distributions onto a support (C51; Bellemare et al., arXiv 1707.06887).
+    """Project (..., M) probabilities onto (M,) atoms (C51; Bellemare et al., arXiv 1707.06887).
 
-    Args:
-        probabilities: (..., M) of the values.
-        values: (..., M), clipped to the support's range.
-        support: (M,) equally spaced atoms.
-
-    Returns:
-        (..., M) probabilities of the atoms. Each value gives its probability to the two atoms
-        beside it, so that the mean stays.
+    Each of (..., M) values, clipped to the atoms' range, gives its probability to the two equally
+    spaced atoms beside it, so that the mean stays.
     """
     spacing = support[1] - support[0]
     values = jnp.clip(values, support[0], support[-1])

@@ -83,10 +83,7 @@ class Replay(struct.PyTreeNode):
         return jnp.minimum(self.count, self.slots) * self.reward.shape[0]
 
     def add(self, rollout: Rollout) -> Replay:
-        """Replace the oldest steps by those of a rollout, whose ``choice`` is the action.
-
-        The number of slots is a multiple of the rollout's T, so a rollout never wraps around.
-        """
+        """Replace the oldest steps by a rollout's; it never wraps around, because T divides C."""
         first = self.count % self.slots
 
         def put(rows: jax.Array, new: jax.Array) -> jax.Array:
@@ -106,11 +103,10 @@ class Replay(struct.PyTreeNode):
     def sample(
         self, key: jax.Array, batch_size: int, stack: int, n_step: int, gamma: float
     ) -> Batch:
-        """Sample transitions uniformly, with replacement.
+        """Sample uniformly, with replacement, transitions that K - 1 steps precede and n follow.
 
         The environments form gcd(N, B) groups, each of which gives equally many transitions, so
-        that devices share a batch equally. The first step of a transition has K - 1 stored steps
-        before it and n after it.
+        that devices share a batch equally.
         """
         num_envs = self.reward.shape[0]
         groups = math.gcd(num_envs, batch_size)
@@ -124,10 +120,7 @@ class Replay(struct.PyTreeNode):
     def transitions(
         self, env: jax.Array, time: jax.Array, stack: int, n_step: int, gamma: float
     ) -> Batch:
-        """Return the transitions that begin at (G, B / G) int32 times.
-
-        ``env`` is the index of the environment within each of G groups of N / G environments.
-        """
+        """Return the transitions from (G, B / G) int32 times, ``env`` counted in each group."""
         groups = env.shape[0]
 
         def rows(values: jax.Array, time: jax.Array) -> jax.Array:
@@ -164,11 +157,10 @@ class Replay(struct.PyTreeNode):
 def n_step_return(
     reward: jax.Array, terminated: jax.Array, truncated: jax.Array, gamma: float
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return the (B,) rewards, discounts and int32 lengths of (B, n) steps.
+    """Return the (B,) rewards, discounts and int32 lengths of (B, n) steps, as in ``Batch``.
 
-    Steps after the end of an episode do not count. With m steps, the return is the sum of
-    ``gamma^k r_k`` for k < m, and the discount of the value after them ``gamma^m``, or 0 after a
-    termination; at a truncation the last observation's value counts.
+    Steps after the end of an episode do not count. At a truncation the value of the last
+    observation counts.
     """
     ended = terminated | truncated
     before = jnp.cumsum(ended, -1) - ended

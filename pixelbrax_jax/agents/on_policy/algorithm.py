@@ -36,10 +36,7 @@ Loss = Callable[[Networks, Batch, jax.Array], tuple[jax.Array, Metrics]]
 
 
 class OnPolicyState(TrainState):
-    """The state of an on-policy algorithm.
-
-    ``aux_opt_state`` and ``buffer`` belong to the auxiliary phase, and are None without one.
-    """
+    """The state of a run; ``aux_opt_state`` and ``buffer`` are None without an auxiliary phase."""
 
     aux_opt_state: Networks | None = without_envs()
     scaler: RewardScaler = as_declared()
@@ -79,10 +76,7 @@ class OnPolicy(Algorithm):
         """Learn from a rollout; ``state`` is the state after it."""
 
     def make_agent(self, *, shared: bool, has_value: bool, detach: bool = False) -> ActorCritic:
-        """Make an actor, with or without a value head, and a critic, separate or ``shared``.
-
-        ``detach`` stops gradients of a shared value at the encoder.
-        """
+        """Make actor and critic; ``detach`` stops gradients of a shared value at the encoder."""
         config = self.config
         size = self.envs.env.action_size
         actor = Actor(config.encoder, size, config.policy, config.initial_std, has_value)
@@ -229,10 +223,8 @@ def passes(
 
 
 def minibatch_times(key: jax.Array, num_steps: int, num_envs: int, parts: int) -> jax.Array:
-    """Sample a partition of T steps into M minibatches for each environment, (M, T / M, N) int32.
-
-    A minibatch has the same number of steps of each environment, so devices share it equally.
-    """
+    """Sample a partition of T steps into M minibatches by environment, (M, T / M, N) int32."""
+    # A minibatch has equally many steps of each environment, so devices share it equally.
     keys = jax.vmap(lambda i: jax.random.fold_in(key, i))(jnp.arange(num_envs))
     order = jax.vmap(lambda key: jax.random.permutation(key, num_steps), out_axes=1)(keys)
     return order.reshape(parts, num_steps // parts, num_envs)

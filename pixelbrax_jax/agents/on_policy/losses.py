@@ -135,11 +135,7 @@ def normalized(x: jax.Array, weight: jax.Array) -> jax.Array:
 def policy_loss(
     policy: Normal, batch: Batch, config: OnPolicyConfig, key: jax.Array
 ) -> tuple[jax.Array, Metrics]:
-    """Return PPO's clipped loss with entropy bonus (Schulman et al., arXiv 1707.06347).
-
-    ``- mean min(rho A, clip(rho, 1 - eps, 1 + eps) A) - c_H H`` with the ratio
-    ``rho = exp(log pi(a) - log pi_old(a))``. The key is for estimates of the entropy.
-    """
+    """Return PPO's clipped loss with entropy bonus (Schulman et al., arXiv 1707.06347)."""
     advantage = batch.advantage
     if config.normalize_advantage == "minibatch":
         advantage = normalized(advantage, batch.weight)

@@ -82,8 +82,7 @@ class Buffer(struct.PyTreeNode):
 class Chunk(NamedTuple):
     """B = N C samples: C consecutive steps of each of N environments, ordered by environment.
 
-    Shapes are those of ``Batch``. ``policy`` is the distribution of actions before the phase, and
-    ``num_steps`` is C.
+    Shapes are those of ``Batch``; ``policy`` is that before the phase, and ``num_steps`` is C.
     """
 
     pixels: jax.Array
@@ -97,11 +96,7 @@ class Chunk(NamedTuple):
 
 @dataclass(frozen=True)
 class Phasic(OnPolicy):
-    """An on-policy algorithm with an auxiliary phase; ``learn`` must call ``remember``.
-
-    The phase splits each rollout into chunks of consecutive steps. A minibatch has one chunk of
-    every environment.
-    """
+    """An on-policy algorithm with an auxiliary phase; ``learn`` must call ``remember``."""
 
     config: PhasicConfig
 

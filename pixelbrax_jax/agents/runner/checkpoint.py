@@ -61,11 +61,7 @@ def best_steps(folder: str | Path) -> int | None:
 
 
 def read_about(folder: str | Path, steps: int | None = None) -> dict[str, Any]:
-    """Read a checkpoint's algorithm, config, steps and score; ``steps=None`` means the latest.
-
-    Raises:
-        CheckpointError: there is no such checkpoint, or it has another format.
-    """
+    """Read a checkpoint's algorithm, config, steps and score; ``steps=None`` means the latest."""
     folder = Path(folder)
     known = all_steps(folder)
     if not known:
@@ -86,11 +82,7 @@ def read_about(folder: str | Path, steps: int | None = None) -> dict[str, Any]:
 
 
 def read_networks(folder: str | Path, template: Tree, steps: int | None = None) -> Tree:
-    """Read only the parameters; ``template`` has the same shapes, or is their ``jax.eval_shape``.
-
-    Raises:
-        CheckpointError: there is no such checkpoint, or its networks have other shapes.
-    """
+    """Read only the parameters; ``template`` has their shapes, or is their ``jax.eval_shape``."""
     steps = read_about(folder, steps)["steps"]
     return _read(Path(folder), steps, {"networks": template}, whole=False)["networks"]
 
@@ -113,10 +105,9 @@ class Checkpoints:
         minutes: float = 0.0,
         report: Report = silent,
     ) -> None:
-        """Create the folder, or raise a CheckpointError if it cannot be written.
+        """Create the folder; every checkpoint stores ``about``, the result of ``describe_run``.
 
-        Every checkpoint stores ``about``, the result of ``describe_run``. ``former`` has values of
-        settings that a stored run may lack. ``RunConfig`` describes the other options.
+        ``former`` has values of settings that a stored run may lack, ``RunConfig`` the others.
         """
         self.folder = Path(folder).absolute()
         self._about = {"format": FORMAT, **about, "versions": versions()}
@@ -155,9 +146,7 @@ class Checkpoints:
         return bool(self._every) and steps // self._every > self._last_steps // self._every
 
     def save(self, state: Any, steps: int, score: float | None, *, last: bool = False) -> None:
-        """Start to write a checkpoint of a pytree after ``steps`` control steps.
-
-        A higher ``score`` is better. With ``last`` it waits for the checkpoint.
+        """Start to write a checkpoint, and wait if it is the ``last``. A high ``score`` is good.
 
         Raises:
             CheckpointError: the last checkpoint cannot be written, or only some processes fail.
@@ -195,11 +184,7 @@ class Checkpoints:
             self._report(f"the checkpoint of {self._last_steps} steps is written")
 
     def restore(self, template: Tree) -> Tree:
-        """Restore the latest checkpoint; ``template`` is a state or its ``jax.eval_shape``.
-
-        Raises:
-            CheckpointError: the checkpoint has another format, other settings or other arrays.
-        """
+        """Restore the latest checkpoint; ``template`` is a state or its ``jax.eval_shape``."""
         about = read_about(self.folder)
         self._check(about)
         others = "; ".join(self.other_versions()) or "the versions are equal"

@@ -45,10 +45,7 @@ class Result:
 
 
 class Evaluator:
-    """Runs ``num_episodes`` complete episodes with mean actions, the same ones every time.
-
-    Episode i starts from ``fold_in(key(EPISODES), i)``.
-    """
+    """Runs whole episodes with mean actions, number i with ``fold_in(key(EPISODES), i)``."""
 
     def __init__(
         self, algorithm: Player, env: PixelEnv, env_params: EnvParams, *, num_episodes: int = 32
@@ -111,8 +108,7 @@ def paired(here: Result, there: Result) -> dict[str, float]:
     """Compare the returns of the same episodes in two places.
 
     ``difference`` is the mean of there minus here. For at least 2 episodes it has a standard error
-    and, by Student's t distribution, a 95 % interval from ``difference_low`` to
-    ``difference_high``.
+    and the bounds of a 95 % interval, by Student's t distribution.
     """
     from scipy import stats
 

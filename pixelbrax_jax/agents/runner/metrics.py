@@ -82,7 +82,6 @@ class _Output:
     """A destination of records, whose functions may raise.
 
     Attributes:
-        write: receives steps, seconds and the record.
         retries: whether ``write`` keeps failed records and retries them.
         failure: why records are missing, or empty.
         last: steps of the last record that was written.
@@ -211,8 +210,7 @@ def open_metrics(
 ) -> MetricsWriter:
     """Open ``metrics.jsonl``, TensorBoard's file and, with a project, Weights & Biases.
 
-    Writes ``config`` to ``config.json``, and drops records of an earlier attempt after
-    ``first_step``. Raises an OSError, or an ImportError if wandb is not installed.
+    Also writes ``config.json``, and drops records of an earlier attempt after ``first_step``.
     """
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "config.json").write_text(json.dumps(config, indent=2) + "\n", "utf-8")

@@ -29,9 +29,8 @@ def _env(runs: Runs) -> Any:
 class Runs:
     """``num_seeds`` runs of an algorithm; equal objects share compiled programs.
 
-    Several runs add a leading axis to states and metrics. An accelerator computes them in parallel,
-    a CPU one after another, because convolutions with one kernel per run are slow there (an
-    algorithm with ``vmaps_runs`` sees to that itself).
+    Several runs add a leading axis to states and metrics. Without ``vmaps_runs`` a CPU computes one
+    after another, because convolutions with one kernel per run are slow there.
     """
 
     algorithm: Algorithm

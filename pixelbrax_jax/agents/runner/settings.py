@@ -89,13 +89,10 @@ class RunConfig:
 def describe_run(
     algorithm: Algorithm, options: RunConfig, clips: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """Return all that affects the result of a run as JSON values: algorithm, settings, clips.
-
-    ``clips`` are digests. Those of procedural clips are not stored, because processors may render
-    single pixels differently.
-    """
+    """Return all that affects the result of a run as JSON values; ``clips`` are digests."""
     settings = describe(algorithm.config) | {name: getattr(options, name) for name in OF_RUNS}
     settings["clips"] = place_of(settings["clips"])
+    # Processors may render single pixels of procedural clips differently.
     made = settings["clips"] in (None, "procedural")
     return {
         "algorithm": algorithm.name,

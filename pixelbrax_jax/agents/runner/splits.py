@@ -17,8 +17,7 @@ from pixelbrax_jax.validation import check_choice
 SPLITS = ("clean", "train", "test")
 
 HELD_OUT = {"train": "test", "paper-train": "paper-test"}
-"""Test split of each training split. Other splits serve for both, with test clips from another
-folder."""
+"""Test split of each training split; others serve for both, with test clips of another folder."""
 
 CLEAN: dict[str, Any] = {
     "distractors": (),
@@ -61,8 +60,7 @@ def make_splits(
     training uses ``paper-train``; and ``test_dynamics``. It needs one of them.
 
     Without ``names`` it yields all available splits and reports the missing ones. ``shown`` are
-    ``clip_digests`` of the training's clips; None uses the clips of ``config``. Errors are those of
-    `make_split`.
+    ``clip_digests`` of the training's clips; None uses the clips of ``config``.
     """
     for name in names or splits_of(config):
         try:
@@ -83,8 +81,6 @@ def make_split(
     Raises:
         NoSplitError: ``train`` has other clips than the training, or ``test`` shares some or has
             none.
-        ValueError: the run has no such split.
-        FileNotFoundError: the folder of the clips is missing.
     """
     check_choice("split", name, SPLITS)
     names = splits_of(config)

@@ -100,8 +100,6 @@ def run(
     Raises:
         CheckpointError: checkpoints cannot be written, or the folder has another or a longer run.
         FileExistsError: the folder has a run, and ``options.resume`` is not ``"latest"``.
-        OSError: a log or the policy cannot be written.
-        MemoryError: state and frames do not fit into memory.
         TrainingDivergedError: a metric is not finite.
     """
     messages = Messages(report)

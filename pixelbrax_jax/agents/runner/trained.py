@@ -56,10 +56,9 @@ Player = Algorithm | Pretrained
 
 @dataclass(frozen=True)
 class Trained:
-    """The networks of a run at one checkpoint, or a policy of the package.
+    """The networks of a run after ``steps`` control steps, or a policy of the package.
 
-    ``steps`` are the control steps of the checkpoint. ``clips`` are digests of the training's
-    clips, or None if the run did not store them.
+    ``clips`` are digests of the training's clips, or None if the run did not store them.
     """
 
     algorithm: Player
@@ -79,14 +78,9 @@ def load_pretrained(name: str) -> Trained:
 def load_trained(
     folder: str | Path, *, steps: int | None = None, best: bool = False, run: int = 0
 ) -> Trained:
-    """Load a checkpoint from the output folder of a training run.
+    """Load a checkpoint from the folder of a training run: of ``steps``, the best or the latest.
 
-    ``steps`` are the control steps of the checkpoint, None for the latest. ``run`` is the index of
-    the run, from 0, if several were trained together.
-
-    Raises:
-        CheckpointError: there is no such checkpoint, or its algorithm is unknown.
-        ValueError: an option is out of range.
+    ``run`` is the index of the run, from 0, if several were trained together.
     """
     checkpoints = Path(folder) / "checkpoints"
     if best and steps is not None:
@@ -117,13 +111,9 @@ def num_runs(folder: str | Path) -> int:
 
 
 def with_clips(agent: Trained, clips: str | None) -> tuple[TrainConfig, Sequence[str] | None]:
-    """Return an agent's settings with other ``clips``, and digests of its training's clips.
+    """Return an agent's settings with other ``clips``, if any, and digests of its training's clips.
 
-    ``clips`` is a folder or ``"procedural"``; None keeps the training's. The digests are None if
-    they are neither stored nor computable, because the folder is missing.
-
-    Raises:
-        ValueError: clips are given, but the run has no video distractor.
+    The digests are None if they are neither stored nor computable, because the folder is missing.
     """
     config, shown = agent.algorithm.config, agent.clips
     if clips is None:
