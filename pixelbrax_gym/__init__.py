@@ -70,8 +70,7 @@ def register(task: str, id: str | None = None) -> str:  # noqa: A002  # Gymnasiu
 
 
 def _register(task: str, name: str) -> None:
-    # No `max_episode_steps`: the environments count control steps themselves, whereas Gymnasium's
-    # TimeLimit would count calls of step(), which are fewer with action repeat.
+    # No `max_episode_steps`: Gymnasium's TimeLimit would count calls of step(), not control steps.
     gym.register(
         id=name,
         entry_point=_ENV,

@@ -25,10 +25,8 @@ Array = jax.Array | np.ndarray
 class Packed(NamedTuple):
     """An ``EnvState`` as few arrays, because each argument of a program costs a fixed time.
 
-    Attributes:
-        frames: the images, with a leading axis N, as in the state.
-        rest: for few environments one (W,) uint32 array with the bits of all other parts; for many
-            the parts themselves, with keys as ``jax.random.key_data``.
+    ``frames`` are the images, with a leading axis N. ``rest`` is one (W,) uint32 array with the
+    bits of all else for few environments, else the parts, with keys as ``jax.random.key_data``.
     """
 
     frames: Any
@@ -38,12 +36,9 @@ class Packed(NamedTuple):
 class Stepped(NamedTuple):
     """The result of a program.
 
-    Attributes:
-        packed: the states.
-        ended: () or (N,) bool, whether a step has ended the episode.
-        outputs: arrays that may be handed out: ``obs``, ``reward``, ``terminated``, ``truncated``
-            and ``info`` of a ``Timestep``; for many environments also ``done``, (N,) bool, and
-            ``reported``, (N,) bool, the environments that ``info`` describes.
+    ``ended``, () or (N,) bool, tells whether a step has ended the episode. ``outputs`` may be
+    handed out: parts of a ``Timestep``, and for many environments ``done``, (N,) bool, and
+    ``reported``, (N,) bool, the environments that ``info`` describes.
     """
 
     packed: Packed
@@ -132,10 +127,7 @@ class Programs:
     def start(
         self, state: EnvState, params: EnvParams, packed: Packed | None, mask: Array | None
     ) -> Stepped:
-        """Continue from states where ``mask``, the others from ``packed``; or all from states.
-
-        For a single environment, ``state`` lacks the leading axis.
-        """
+        """Continue from ``state`` (a row if ``single``) where ``mask``, else from ``packed``."""
         if self.single:
             state = jax.tree.map(lambda x: x[None], state)
         if packed is not None and mask is not None:
@@ -266,10 +258,7 @@ def _from_data(data: jax.Array, like: Any) -> jax.Array:
 
 
 def _words(part: jax.Array) -> jax.Array:
-    """Return the bits of an array as (W,) uint32, one word per element of a narrow dtype.
-
-    The array may be the data of keys.
-    """
+    """Return the bits of an array as (W,) uint32, one word per element of a narrow dtype."""
     if part.dtype == bool:
         part = part.astype(jnp.uint8)
     bits = part.dtype.itemsize * 8

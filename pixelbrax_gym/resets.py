@@ -60,10 +60,7 @@ def spread_seeds(seed: Any, num_envs: int) -> list[int]:
 
 
 def read_options(options: Any, seed: Any, num_envs: int | None = None) -> dict[str, Any]:
-    """Return those of ``state`` and ``mask`` that are in the ``options`` of ``reset``.
-
-    ``num_envs`` is None for a single environment, which accepts no mask.
-    """
+    """Return ``state`` and ``mask`` in ``options`` of ``reset``; one environment has no mask."""
     if options is None:
         return {}
     if not isinstance(options, Mapping):

@@ -180,10 +180,7 @@ class StatefulEnv:
         return self._programs.state(self._latest.packed, self.params)
 
     def set_state(self, state: Any, mask: np.ndarray | None = None) -> dict[str, Any]:
-        """Continue from states where ``mask``, (N,) bool, or all; return outputs as ``reset`` does.
-
-        Arrays may be NumPy's. A single environment takes no mask.
-        """
+        """Continue from states where ``mask``, (N,) bool, or all; return outputs as ``reset``."""
         self._check_usable()
         self._programs.check_state(state, self.params)
         if mask is None:

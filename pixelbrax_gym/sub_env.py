@@ -14,8 +14,7 @@ from pixelbrax_jax.validation import suggest
 class SubEnv:
     """A stand-in for environment ``index`` of a ``GymnasiumVectorEnv`` or ``SB3VecEnv``.
 
-    It stores the attributes that are set on it; the environment itself ignores them. ``metadata``
-    and ``spec`` are those of ``owner``; the spaces are those of one environment.
+    It stores the attributes that are set on it; the environment itself ignores them.
     """
 
     def __init__(

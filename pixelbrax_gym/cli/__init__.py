@@ -101,11 +101,7 @@ def commands() -> list[str]:
 
 
 def parse(command: str, kind: type[Options], arguments: Sequence[str]) -> Options:
-    """Parse the arguments after a command's name into the dataclass ``kind``.
-
-    The docstring of ``kind`` describes the command, and each field is an option. Errors and help
-    end in a SystemExit.
-    """
+    """Parse arguments into the dataclass ``kind``, whose docstring and fields are the help."""
     import tyro
 
     return tyro.cli(kind, prog=f"pixelbrax {command}", args=arguments)

@@ -31,12 +31,7 @@ class AgentOptions:
 
 
 def load(options: AgentOptions, folder: str | None) -> Trained:
-    """Load the agent of a run's folder, or the pretrained one, that the options select.
-
-    Raises:
-        CommandError: its checkpoint is missing.
-        ValueError: both or none are given, or options do not fit.
-    """
+    """Load the agent of a run's folder, or the pretrained one, that the options select."""
     with needs_extra("train"):
         from pixelbrax_jax.agents.runner.checkpoint import CheckpointError
         from pixelbrax_jax.agents.runner.trained import load_pretrained, load_trained

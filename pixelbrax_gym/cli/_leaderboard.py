@@ -32,10 +32,6 @@ def entry(folder: str | Path, agent: str | None = None) -> Entry:
 
     Seconds are those of training: without evaluations, and without the compilation, which is the
     excess of the first iteration over the second.
-
-    Raises:
-        CheckpointError: the folder has no checkpoint.
-        ValueError: the run has too few evaluations, several seeds, distractors, or ``num_starts``.
     """
     folder = Path(folder)
     about = read_about(folder / "checkpoints")
@@ -92,17 +88,12 @@ def _clock(records: Iterable[Mapping[str, float]]) -> tuple[list[float], list[fl
 
 
 def file_name(of: Entry) -> str:
-    """Return the name of an entry's file."""
     agent = "".join(c if c.isalnum() else "-" for c in of["agent"].lower())
     return f"{agent}-{of['task']}-{of['seed']}.json"
 
 
 def add(of: Entry, folder: str | Path) -> Path:
-    """Write an entry into a folder; return its file.
-
-    Raises:
-        FileExistsError: the folder has another entry of this agent, task and seed.
-    """
+    """Write an entry into a folder that has no other of its name; return its file."""
     path = Path(folder) / file_name(of)
     if path.exists() and json.loads(path.read_text("utf-8")) != of:
         raise FileExistsError(
@@ -115,7 +106,6 @@ def add(of: Entry, folder: str | Path) -> Path:
 
 
 def read(folder: str | Path) -> list[Entry]:
-    """Read all entries of a folder."""
     files = sorted(Path(folder).glob("*.json"))
     return [json.loads(f.read_text("utf-8")) for f in files if f.name != PUBLISHED]
 

@@ -140,12 +140,7 @@ def record_pairs(
 
 
 class _Pairs:
-    """The environments of both views, which step under the same actions.
-
-    Attributes:
-        spaces: of an observation: one frame of each image, and the state.
-        action_space: of one environment.
-    """
+    """The environments of both views, stepped by the same actions; ``spaces`` are of one frame."""
 
     def __init__(
         self,
@@ -174,7 +169,6 @@ class _Pairs:
 
     @property
     def bytes_per_episode(self) -> int:
-        """Bytes of an episode's arrays."""
         parts = [np.zeros(x.shape, x.dtype).nbytes for x in self.spaces.values()]
         return (self._num_steps + 1) * sum(parts)
 

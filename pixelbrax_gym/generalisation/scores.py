@@ -34,19 +34,14 @@ Player = Callable[[LevelEnv], np.ndarray]
 
 @dataclass(frozen=True)
 class Row:
-    """A line of the table.
+    """A line of the table: of a level, or the last one of all levels but clean.
 
-    Attributes:
-        level: name of the level; the last row has all but clean.
-        runs: number of runs R, the seeds.
-        episodes: number of episodes E of each run and level.
-        mean: mean return; of several runs the interquartile mean over their mean returns, in the
-            last row over those of all levels.
-        low: lower end of its 95 % stratified bootstrap interval; NaN for one run.
-        high: upper end.
-        standard_error: of a run's mean over its episodes, averaged over runs; NaN for one episode
-            and for the last row.
-        ratio: ``mean`` over that of the level clean; NaN if that is not positive.
+    ``runs`` R are seeds, of E ``episodes`` for each level. ``mean`` is the mean return; of several
+    runs the interquartile mean over their mean returns, in the last row over those of all levels.
+    ``low`` and ``high`` are the ends of its 95 % stratified bootstrap interval, NaN for one run.
+    ``standard_error`` is that of a run's mean over its episodes, averaged over runs; NaN for one
+    episode and for the last row. ``ratio`` is ``mean`` over that of the level clean; NaN if that is
+    not positive.
     """
 
     level: str
@@ -61,14 +56,7 @@ class Row:
 
 @dataclass
 class Scores:
-    """The returns of a suite's episodes.
-
-    Attributes:
-        suite: name of the suite.
-        task: name of the task.
-        options: all else that decides the returns, as JSON has it.
-        returns: (E,) returns by run and level.
-    """
+    """The (E,) ``returns`` of a suite's episodes by run and level, and all that decides them."""
 
     suite: str
     task: str
@@ -137,11 +125,10 @@ def play(
     folder: str | PathLike[str] | None = None,
     report: Callable[[str], object] = lambda _: None,
 ) -> Scores:
-    """Play all levels with all runs and return the runs' scores.
+    """Play all levels with all runs; ``scores`` has the options and no returns.
 
-    ``scores`` has the options and no returns. The folder gets the contact sheet first and the
-    returns after each level; levels whose returns it has are not played again. Errors are those of
-    ``read``, and an ImportError without Pillow.
+    The folder gets the contact sheet first and the returns after each level; levels whose returns
+    it has are not played again.
     """
     path = None if folder is None else Path(folder)
     known: Returns = {}
@@ -170,11 +157,7 @@ def play(
 
 
 def read(scores: Scores, folder: Path) -> Returns:
-    """Read the returns in a folder's file, none if there is no file.
-
-    Raises:
-        ValueError: the file cannot be read, or is that of another suite, task or other options.
-    """
+    """Return the returns in a folder, if any; ValueError for those of another suite or options."""
     file = folder / RETURNS
     if not file.exists():
         return {}

@@ -70,7 +70,6 @@ class _UnstorableSpec(EnvSpec):
     """A spec with options that cannot be written as JSON."""
 
     def to_json(self) -> str:
-        """Raise a ValueError that names the options."""
         names = ", ".join(f"{name}={value!r:.60}" for name, value in _unstorable(self.kwargs))
         raise ValueError(
             f"the spec of {self.id} cannot be written as JSON because of {names}; give clips as a "

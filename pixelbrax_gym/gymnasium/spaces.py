@@ -18,7 +18,6 @@ class BroadcastBox(gymnasium.spaces.Box):
     """
 
     def __init__(self, low: float, high: float, shape: tuple[int, ...], dtype: Any) -> None:
-        """Build the space; all entries have the same bounds."""
         super().__init__(low, high, (1,), dtype)
         self._shape = tuple(shape)
         self.low_repr, self.high_repr = str(self.low[0]), str(self.high[0])
@@ -49,11 +48,7 @@ iterate.register(BroadcastBox, iterate.dispatch(gymnasium.spaces.Box))
 
 
 def observation_space(spec: Any, num_envs: int | None = None) -> gymnasium.Space:
-    """Return the space of an observation, batched if ``num_envs`` is given.
-
-    Pixels are a uint8 box in [0, 255], depth a float32 box in [0, 100], segmentation an int32 box
-    from -1, and state an unbounded float32 box; several are a ``Dict``.
-    """
+    """Return the space of an observation, a ``Dict`` of several; batched with ``num_envs``."""
     if isinstance(spec, dict):
         return gymnasium.spaces.Dict(
             {name: observation_space(part, num_envs) for name, part in spec.items()}

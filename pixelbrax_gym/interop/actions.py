@@ -16,13 +16,8 @@ def as_actions(action: Any, shape: tuple[int, ...], device: jax.Device) -> Any:
     """Check actions and convert them to float32 of ``shape``, (A,) or (N, A).
 
     ``action`` is a NumPy or JAX array, a torch tensor, or anything NumPy converts. The result
-    shares no memory that the caller can write to.
-
-    Raises:
-        TypeError: the action is not floating point.
-        ValueError: the shape or device is wrong, or host memory contains NaN. JAX arrays and GPU
-            tensors are not searched for NaN, which would wait for the device; their NaN ends the
-            episode with ``info["non_finite"]``.
+    shares no memory that the caller can write to. JAX arrays and GPU tensors are not searched for
+    NaN, which would wait for the device; it ends the episode with ``info["non_finite"]``.
     """
     if type(action).__module__.partition(".")[0] == "torch":
         from pixelbrax_gym.interop import dlpack

@@ -27,14 +27,7 @@ def to_torch(tree: Any) -> Any:
 
 
 def actions_to_jax(tensor: torch.Tensor, device: jax.Device) -> np.ndarray | jax.Array:
-    """Copy a tensor of actions to float32: a NumPy array from a CPU, else a JAX array.
-
-    The copy lets the caller overwrite the tensor while JAX computes in the background.
-
-    Raises:
-        TypeError: the tensor is sparse or not floating point.
-        ValueError: the tensor is on another device.
-    """
+    """Copy actions to float32, on a CPU by NumPy, so that the caller may overwrite the tensor."""
     if tensor.layout != torch.strided:
         raise TypeError(f"action must be a dense tensor, got {tensor.layout}; try .to_dense().")
     if not tensor.is_floating_point():

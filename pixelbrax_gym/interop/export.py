@@ -14,11 +14,7 @@ OUTPUTS = ("jax", "numpy", "torch")
 
 
 def exporter(output: str) -> Callable[[Any], Any]:
-    """Return a function that converts trees of JAX arrays that are not read again.
-
-    ``"numpy"`` gives writable arrays, without a copy on a CPU; ``"torch"`` gives tensors on the
-    environment's device; ``"jax"`` changes nothing.
-    """
+    """Return a function that converts trees of JAX arrays, which must not be read again."""
     check_choice("output", output, OUTPUTS)
     if output == "torch":
         from pixelbrax_gym.interop.dlpack import to_torch
@@ -28,10 +24,7 @@ def exporter(output: str) -> Callable[[Any], Any]:
 
 
 def to_numpy(tree: Any) -> Any:
-    """Convert the arrays of a tree to writable NumPy arrays.
-
-    Arrays on a CPU are not copied, so they must not be read again.
-    """
+    """Convert arrays that are not read again to writable NumPy arrays, without a copy on a CPU."""
     return jax.tree.map(_writable, tree)
 
 

@@ -29,7 +29,6 @@ class PixelSpec(UnboundedDiscrete, metaclass=_Itself):
         dtype: torch.dtype = torch.uint8,
         **kwargs: Any,
     ) -> None:
-        """Build the spec."""
         kind = "continuous" if dtype.is_floating_point else "discrete"
         TensorSpec.__init__(
             self,
@@ -52,10 +51,7 @@ class PixelSpec(UnboundedDiscrete, metaclass=_Itself):
 
 
 def entries(obs: Any, images: tuple[str, ...]) -> dict[str, Any]:
-    """Return the parts of an observation by TorchRL's names; a single part may be the first image.
-
-    The state is ``"observation"``.
-    """
+    """Return the parts of an observation by TorchRL's names; a lone part is image or state."""
     parts = obs if isinstance(obs, dict) else {(*images, "state")[0]: obs}
     return {"observation" if name == "state" else name: part for name, part in parts.items()}
 

@@ -13,8 +13,7 @@ from pixelbrax_jax._platform.by_platform import by_platform, traced_row
 from pixelbrax_jax._platform.interpreter import batch_last
 
 _CHUNK = 128
-"""Largest number of rows that a CPU computes together, to keep intermediate results in its
-caches."""
+"""Largest number of rows that a CPU computes together, to keep results in its caches."""
 
 _RAYS = 2**18
 """Number of rays, about, that a CPU computes together. More than 32 MB of intermediate results
@@ -45,8 +44,7 @@ def step_rows(step: Step, state: Any, rows: Any, shared: Any) -> tuple[Any, jax.
 def draw_rows(draw: Callable[..., Any], arguments: tuple[Any, ...], rays: int) -> Any:
     """Return ``jax.vmap(draw)(*arguments)``, the images of every row of a batch.
 
-    For images of ``rays`` with intermediate ones: a CPU draws only so many together that those stay
-    small. Some may be drawn twice.
+    A CPU draws few together, some twice, so that intermediate images of ``rays`` stay small.
     """
     num_rows = len(jax.tree.leaves(arguments)[0])
     size = -(-num_rows // -(-num_rows * rays // _RAYS))

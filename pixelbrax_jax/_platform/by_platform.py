@@ -32,16 +32,8 @@ def by_platform(
     ``jax.lax.platform_dependent`` traces all forms, and ``jax.vmap`` of it all of them again. Here
     the form of the platform is traced when the program is lowered, and all of them only for a
     derivative. So a form may not close over values of the program: they are arguments (``traced``
-    makes them such).
-
-    Args:
-        arguments: trees of arrays.
-        like: the tree of the results' shapes and dtypes.
-        default: the form for platforms without their own.
-        cpu: the form for CPUs.
-        cuda: the form for NVIDIA GPUs.
-        tpu: the form for TPUs.
-        no_derivative: why there is no derivative, the message of the error.
+    makes them such). ``like`` has the shapes and dtypes of the results; ``no_derivative`` is the
+    message of the error if there is no derivative.
     """
     leaves, tree = jax.tree.flatten(arguments)
     shapes, result_tree = jax.tree.flatten(like)
@@ -72,12 +64,10 @@ def _is_key(array: jax.Array) -> bool:
 
 
 class Traced(NamedTuple):
-    """A function that has been traced.
+    """A function that has been traced; ``like`` has its results' shapes and dtypes.
 
-    Attributes:
-        program: its program; the constants may be values of another one that is being traced.
-        compute: the function, of these constants and its arguments.
-        like: the tree of its results' shapes and dtypes.
+    ``compute`` takes the constants of ``program``, which may be values of another one that is being
+    traced, and the function's arguments.
     """
 
     program: core.ClosedJaxpr

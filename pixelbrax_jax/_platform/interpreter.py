@@ -20,7 +20,7 @@ _LANES = 16
 
 
 def batch_last(fn: Callable[..., Any], in_axes: Sequence[int | None]) -> Callable[..., Any]:
-    """Return ``jax.vmap(fn, in_axes)``, computed with the batch as last axis.
+    """Return ``jax.vmap(fn, in_axes)``, axes 0 or None, computed with the batch as last axis.
 
     ``jax.vmap`` puts it first, and XLA's innermost loops then run over vectors of three; here they
     run over environments. Results differ by rounding. ``jax.vmap`` computes what has no rule, such
@@ -30,8 +30,6 @@ def batch_last(fn: Callable[..., Any], in_axes: Sequence[int | None]) -> Callabl
 
     The rules read private parameters of JAX's primitives. If a release changes them, ``jax.vmap``
     computes all of ``fn``, with a RuntimeWarning and side effects possibly twice.
-
-    Raises ValueError if arguments have different numbers of rows. An argument's axis is 0 or None.
     """
 
     def rows_of(*args: Any) -> Any:
@@ -133,10 +131,7 @@ _CALLS = {"jit": "jaxpr", "closed_call": "call_jaxpr"}
 
 
 def _program(eqn: core.JaxprEqn) -> core.ClosedJaxpr | None:
-    """Return the program in an equation, to be inlined; of ``platform_dependent`` the CPU's form.
-
-    Only CPUs use this module.
-    """
+    """Return an equation's program, to be inlined; of ``platform_dependent`` that for CPUs."""
     if eqn.primitive.name in _CALLS:
         return eqn.params[_CALLS[eqn.primitive.name]]
     for platforms, branch in zip(

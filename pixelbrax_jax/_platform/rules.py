@@ -204,10 +204,7 @@ def _dot(eqn: core.JaxprEqn, inputs: Sequence[Operand], size: int) -> list[Any] 
     lengths = x.shape[: len(contracted[0])]
 
     def multiply(a: jax.Array, b: jax.Array, leading: tuple[int, ...]) -> jax.Array:
-        """Return products of entries, (*leading, *out.shape, size).
-
-        Axes of ``a`` and ``b`` are leading, batch, own, and rows if batched.
-        """
+        """Return (*leading, *out.shape, size) of axes leading, batch, own, and rows if batched."""
         shape = (*leading, *out.shape, size)
         shared = tuple(range(len(leading) + len(batch[0])))
         first, last = len(shared), len(shape) - 1

@@ -14,14 +14,11 @@ from pixelbrax_jax.types import CameraRig, Geoms, Look, PhysicsState
 
 
 class Kinematics(struct.PyTreeNode):
-    """Poses and velocities, the input of task formulas.
+    """Poses and velocities, float32, in MuJoCo's order, the input of task formulas.
 
-    Attributes:
-        q: (Q,) float32, joint positions in MuJoCo's order (metres, radians; a free joint is a
-            position and a quaternion).
-        qd: (V,) float32, joint velocities in MuJoCo's order, per second.
-        xpos: (L, 3) float32, metres, link origins in the world frame.
-        xquat: (L, 4) float32, unit, link orientations in the world frame.
+    ``q`` (Q,) are joint positions (metres, radians; a free joint is a position and a quaternion),
+    ``qd`` (V,) joint velocities, per second. ``xpos`` (L, 3), metres, and unit ``xquat`` (L, 4) are
+    the origins and orientations of links in the world frame.
     """
 
     q: jax.Array

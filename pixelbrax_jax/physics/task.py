@@ -13,13 +13,7 @@ Color = tuple[float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """One row of a suite's table.
-
-    Attributes:
-        name: name for ``make``.
-        gymnasium_id: id in Gymnasium.
-        summary: one sentence: the goal, and what ends an episode before the time limit.
-    """
+    """One row of a suite's table; ``summary`` names the goal, and what ends an episode early."""
 
     name: str
     gymnasium_id: str

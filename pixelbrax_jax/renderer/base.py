@@ -62,7 +62,7 @@ def render(
     num_rows: int | None = None,
     samples: int = 1,
 ) -> Frame:
-    """Render an image of the scene.
+    """Render an image of the scene, or a band of its rows.
 
     Colors and depth may be differentiated by all arrays of the scene: poses, sizes, colors, camera
     and light. The derivative is finite everywhere, and is that of the surface at the pixel's
@@ -80,13 +80,6 @@ def render(
         samples: rays per pixel, one of ``SAMPLES``: those of an image that is larger by its root.
             Colors are their means, each rounded to 10 bits; depth, ``seg`` and ``ground`` are those
             of the ray through the pixel's center.
-
-    Returns:
-        The frame, or its band of rows.
-
-    Raises:
-        ValueError: a size is below 1, ``samples`` is not allowed, or the renderer is unknown or not
-            supported.
     """
     for name, value in (("height", height), ("width", width)):
         if value < 1:

@@ -291,10 +291,7 @@ def _opengl_light(look: Look, surface: _Surface, ways: Ways, *, in_kernel: bool)
 def _ground_fraction(
     view: View, g: int, ray: Vector, t: jax.Array, plane: Solid
 ) -> tuple[jax.Array, Vector]:
-    """Return the fraction of the ground's second color where pixels see plane ``g`` at ``t``.
-
-    The second result is the place along the plane's x and y, in metres.
-    """
+    """Return the second color's fraction on plane ``g``, and the place along x and y in metres."""
     normal = plane.axes[2]
     slope = 1.0 / at_most(dot(ray, normal), -1e-7)
     inv_pitch = 1.0 / view.look.ground_pitch

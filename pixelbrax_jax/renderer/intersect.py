@@ -33,12 +33,9 @@ _FAR = 1e30
 
 
 class Hit(NamedTuple):
-    """The point where a ray enters a geom.
+    """The point where a ray enters a geom: ``t`` metres from the origin, NaN or negative for none.
 
-    Attributes:
-        t: distance from the origin, metres; NaN or negative for a missed geom.
-        normal_dot: ``normal_dot(v, ray_v)`` is the product of the outer unit normal and the vector
-            ``v``, given also the product ``ray_v`` of the ray and ``v``.
+    ``normal_dot(v, ray_v)`` is the outer unit normal times ``v``, given the ray times ``v``.
     """
 
     t: jax.Array

@@ -44,10 +44,7 @@ def draw(
     change: Callable[[Frame], jax.Array],
     images: tuple[str, ...] = ("pixels",),
 ) -> tuple[jax.Array, ...]:
-    """Render images, (height, width) each, without a derivative; see ``base.draw``.
-
-    ``pixels`` are ``change(frame)``, uint32.
-    """
+    """Render as ``base.draw``, without a derivative; ``pixels`` are ``change(frame)``, uint32."""
     plane: Any = jax.ShapeDtypeStruct((height, width), jnp.float32)
     seg, ground = plane.update(dtype=jnp.int32), plane.update(dtype=bool)
     by_pixel: PerPixel | None = None

@@ -46,12 +46,9 @@ class _NotPerPixelError(Exception):
 
 @dataclass
 class PerPixel:
-    """A pixelwise change of an image.
+    """A pixelwise change of an image of ``shape`` (H, W).
 
-    Attributes:
-        shape: (H, W).
-        numbers: () arrays that all pixels need.
-        images: (H, W) arrays of which a pixel needs its own entry.
+    All pixels need the () ``numbers``, and each its own entry of the (H, W) ``images``.
     """
 
     shape: tuple[int, ...]

@@ -157,10 +157,7 @@ def _in_shadow(scene: Scene, light: int, points: jax.Array, nearest: jax.Array) 
 
 
 def _reflection(scene: Scene, rays: jax.Array, until: jax.Array) -> jax.Array:
-    """Return the color that pixels get from a mirror at distance ``until``, (H, W, 3).
-
-    The mirror is passed by rays of a mirrored camera; see ``mirror.py``.
-    """
+    """Return the color that pixels get from a mirror at ``until``, (H, W, 3); see ``mirror.py``."""
     geoms, look, camera = scene.geoms, scene.look, scene.camera
     reflectance = jnp.asarray(look.reflectance)
     base, axis = scene.pos[geoms.mirror], scene.xmat[geoms.mirror][:, 2]

@@ -24,19 +24,13 @@ SHADOW_BIAS = 1e-3
 def gloss(n_l: jax.Array, n_z: jax.Array, light_z: Any, shininess: int) -> jax.Array:
     """Return Phong's ``max(r_z, 0) ** shininess`` for a viewer at infinity, see ``Look``.
 
-    The arguments are the products of normal and light, of normal and the camera's back axis, and of
-    light and that axis.
+    The arguments are the products of normal and light, and of either and the camera's back axis.
     """
     return at_least(2.0 * n_l * n_z - light_z, 0.0) ** shininess
 
 
 def beam(lamp: Lamp, pos: Vector, axis: Vector, points: Vector) -> tuple[Vector, Any, Any]:
-    """Return the light of a lamp at ``pos`` with direction ``axis`` at some points.
-
-    Returns:
-        Unit directions from the lamp to the points, one over their distances in metres, and the
-        lamp's strength there, in [0, 1].
-    """
+    """Return unit directions from a lamp to points, 1 / distance (metres), strength in [0, 1]."""
     away = [p - c for p, c in zip(points, pos, strict=True)]
     square = dot(away, away)
     # A select, because XLA would store a root that has several readers.

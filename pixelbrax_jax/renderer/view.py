@@ -30,8 +30,7 @@ class View(struct.PyTreeNode):
     """A scene in its camera's frame, with arrays in the scene's order, shapes and units.
 
     Attributes:
-        order: static, the geom of each rank; geoms of one material have neighboring ranks, so that
-            a material is a range of ranks.
+        order: static, the geom of each rank. Geoms of a material have neighboring ranks: a range.
         pos, xmat: centers and orientations.
         geoms: sizes and colors, without poses.
         look: light and lamps in the camera's frame.

@@ -13,8 +13,7 @@ from pixelbrax_jax.types import Camera, CameraRig, GeomKind, Geoms
 from pixelbrax_jax.validation import check_choice
 
 _DISTANT = 1000
-"""Radii of a sphere or capsule beyond which float32 moves its edge by some hundredths of a
-radius."""
+"""Radii of a sphere or capsule beyond which float32 moves its edge by hundredths of a radius."""
 
 
 _Direction = tuple[float, float, float]
@@ -24,15 +23,11 @@ _SIDES: Mapping[str, tuple[_Direction, _Direction]] = {
     "front": ((1.0, 0.0, 0.15), (0.0, 0.0, 1.0)),
     "top": ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0)),
 }
-"""Views of every task besides ``default``, with its target and distance: direction to the eye, up.
-"""
+"""Views of a task besides ``default``, with its target and distance: direction to the eye, up."""
 
 
 def with_sides(rigs: Mapping[str, CameraRig]) -> dict[str, CameraRig]:
-    """Return a task's ``default``, views from its sides, and its other rigs, which override them.
-
-    The sides are ``side``, ``front`` and ``top``.
-    """
+    """Return ``default``, ``side``, ``front`` and ``top``, and other rigs, which override them."""
     default = rigs["default"]
     distance = np.float32(np.linalg.norm(default.eye - default.target))
     sides = {}
@@ -46,12 +41,7 @@ def with_sides(rigs: Mapping[str, CameraRig]) -> dict[str, CameraRig]:
 def choose_rig(
     task: str, camera: str | CameraRig | Camera, rigs: Mapping[str, CameraRig]
 ) -> CameraRig:
-    """Return a rig by name, the given rig, or a rig for a fixed camera.
-
-    Raises:
-        ValueError: the task has no rig of that name.
-        TypeError: ``camera`` has another type.
-    """
+    """Return a rig by name, the given rig, or a rig for a fixed camera."""
     if isinstance(camera, CameraRig):
         return camera
     if isinstance(camera, Camera):

@@ -1,7 +1,4 @@
-"""Scenes from the poses of links, with strings: straight if stretched, else catenaries.
-
-A string beyond its limit shows so by its color, as in MuJoCo's renderer.
-"""
+"""Scenes from poses of links, with strings: straight or catenaries, colored beyond their limits."""
 
 from __future__ import annotations
 
@@ -22,8 +19,7 @@ _NEWTON_STEPS = 8
 def place(geoms: Geoms, rig: CameraRig, look: Look, xpos: jax.Array, xquat: jax.Array) -> Scene:
     """Move geoms and lamps with their links, hang the strings and aim the camera.
 
-    Link origins ``xpos`` (L, 3) float32 are in metres, and orientations ``xquat`` (L, 4) float32
-    are unit quaternions, both in the world frame.
+    Origins ``xpos`` (L, 3), metres, and unit ``xquat`` (L, 4) of links are in the world frame.
     """
     link = np.array(geoms.link, np.int32)
     if len(xpos):
@@ -83,9 +79,7 @@ def impedance(string: String, length: jax.Array) -> jax.Array:
 def _pieces(string: String, ends: jax.Array, num: int) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return ``num`` capsules that cover a string with ends (2, 3) in metres in the world frame.
 
-    Returns:
-        (num, 3) centers, (num, 3, 3) orientations whose third columns point along the string,
-        (num,) half lengths.
+    Centers are (num, 3), orientations, with z along the string, (num, 3, 3), half lengths (num,).
     """
     points = hang(ends, string.length, num)
     along = points[1:] - points[:-1]

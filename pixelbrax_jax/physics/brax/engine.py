@@ -218,8 +218,7 @@ class BraxPhysics(GuardedPhysics):
         tree: Any = jax.tree.structure(self._dtypes)
         if jax.tree.structure(carry) != tree:
             raise ValueError("step changes the tree of the environment's state")
-        # Brax writes Python numbers into some fields. With fixed dtypes a jitted step is not
-        # traced again for its own output.
+        # Brax writes Python numbers. With fixed dtypes a jitted step is not traced again.
         carry = jax.tree.map(_as_dtype, carry, self._dtypes)
         xpos, xquat = self._links(kinematics(brax_state.pipeline_state))
         return PhysicsState(

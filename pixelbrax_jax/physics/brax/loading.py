@@ -43,8 +43,7 @@ def make_physics(
     ``backend=None`` takes the task's default. ``reward_preset="paper"`` has the rewards of arXiv
     2502.00021 where they differ from the installed Brax's: walker2d's forward reward is ten times
     higher, the swimmer's reward is its distance from the origin, and humanoid, humanoidstandup,
-    inverted_pendulum and pusher take actions unscaled. Dynamics are the same. An unknown option
-    raises ValueError.
+    inverted_pendulum and pusher take actions unscaled. Dynamics are the same.
     """
     row = TASKS[task]
     check_choice("reward_preset", reward_preset, REWARD_PRESETS)

@@ -25,16 +25,9 @@ _DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
 class SuiteEnv:
     """An environment of ``dm_control.suite`` that starts where one of ours does.
 
-    Args:
-        task: name of a task of the DM Control Suite.
-        camera: ``default`` or a name of the model's cameras.
-        size: height and width of pictures; None for no pictures, which needs no OpenGL.
-        samples: a square number; pictures are drawn larger by its root, and averaged, as the option
-            ``samples`` of ours has it. OpenGL smooths edges besides.
-
-    Raises:
-        ValueError: the task or camera is unknown, or pictures are larger than the model's buffer.
-        ImportError: dm_control or its OpenGL, chosen by ``MUJOCO_GL``, does not work here.
+    ``size`` is height and width of pictures; None is for no pictures, which needs no OpenGL. They
+    are drawn larger by the root of ``samples``, a square number, and averaged, as the option
+    ``samples`` of ours has it; OpenGL, which ``MUJOCO_GL`` chooses, smooths edges besides.
     """
 
     def __init__(

@@ -1,7 +1,4 @@
-"""What MuJoCo, MuJoCo XLA and Brax print, warn of, and need of JAX.
-
-Importing it loads neither MuJoCo XLA nor Brax.
-"""
+"""What MuJoCo, MuJoCo XLA and Brax print, warn of and need of JAX, without loading the last two."""
 
 from __future__ import annotations
 

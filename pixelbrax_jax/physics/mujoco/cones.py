@@ -22,11 +22,9 @@ _NEGLECTED = 1e-5
 
 
 class Cones(NamedTuple):
-    """C contacts of k constraints each: the normal, then tangential ones.
+    """C contacts of k constraints each: the normal, then tangential ones; (C, k) float32 each.
 
-    Attributes:
-        stiffness: (C, k) float32, D of each constraint.
-        scale: (C, k) float32, mu, then friction; they make the elliptic cone round.
+    ``stiffness`` is D, and ``scale`` is mu, then friction, which make the elliptic cone round.
     """
 
     stiffness: jax.Array

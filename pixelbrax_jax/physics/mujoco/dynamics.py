@@ -26,18 +26,17 @@ if TYPE_CHECKING:
 
 
 class State(struct.PyTreeNode):
-    """The integration state: all that the next step depends on.
+    """The integration state: all that the next step depends on, float32.
 
     Attributes:
-        qpos: (Q,) float32, joint positions: metres, radians, unit quaternions.
-        qvel: (V,) float32, joint velocities, per second.
+        qpos: (Q,) joint positions: metres, radians, unit quaternions.
+        qvel: (V,) joint velocities, per second.
         act: activations of actuators with a state.
-        qacc_warmstart: (V,) float32, accelerations from which the solver starts.
-        ctrl: (A,) float32, the last controls, for rewards.
-        target: metres, this episode's target: (3,) float32; (7,) with a unit quaternion if it is a
-            body; (0,) for tasks without one.
-        multipliers: (5,) float32, of the dynamics in this episode; (0,) if nothing varies.
-        remembered: arrays, what the next reward compares with; (0,) float32 for most tasks.
+        qacc_warmstart: (V,) accelerations from which the solver starts.
+        ctrl: (A,) the last controls, for rewards.
+        target: metres, this episode's: (3,), (7,) with a body's unit quaternion, (0,) for none.
+        multipliers: (5,) of the dynamics in this episode; (0,) if nothing varies.
+        remembered: arrays, what the next reward compares with; (0,) for most tasks.
     """
 
     qpos: jax.Array
@@ -51,10 +50,7 @@ class State(struct.PyTreeNode):
 
 
 class Readings(struct.PyTreeNode):
-    """What MuJoCo computes from a state, by its names of ``MjData``; all float32.
-
-    Positions, velocities and their sensors are current; sensors of forces and accelerations are
-    from the start of the last physics step.
+    """What MuJoCo computes from a state, by its names of ``MjData``; float32; see ``Snapshot``.
 
     Attributes:
         xpos: (B, 3) metres, origins of all bodies, of the world first.
@@ -72,11 +68,10 @@ class Readings(struct.PyTreeNode):
 
 
 class Dynamics:
-    """A model's dynamics, for one environment.
+    """A model's dynamics, for one environment, by an engine of ``options.ENGINES``.
 
-    With ``engine="auto"`` MuJoCo's own engine computes programs lowered for a CPU, in float64, and
-    MuJoCo XLA all others, in float32. With ``prefers_xla`` MuJoCo XLA takes the steps on a CPU,
-    too. Another name in ``options.ENGINES`` chooses one for all.
+    With ``"auto"`` MuJoCo computes programs lowered for a CPU, in float64, and MuJoCo XLA all
+    others, in float32; with ``prefers_xla`` MuJoCo XLA takes the steps on a CPU, too.
     """
 
     def __init__(

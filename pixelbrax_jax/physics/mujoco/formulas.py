@@ -152,10 +152,6 @@ class Formulas:
     """Initial states, observation, reward and end of a task.
 
     Attributes:
-        start: samples an initial state from a key.
-        observe: returns the observation.
-        reward: returns the reward.
-        terminated: returns whether the episode ends.
         remember: returns what the next reward finds in ``State.remembered``.
         substeps: physics steps per control step.
         edit: changes the compiled model as DM Control's task does.
@@ -165,8 +161,8 @@ class Formulas:
         target_body: name of the body, fixed to the world, that it moves; empty for none.
         reads_forces: whether observations use sensors of forces or accelerations.
         starts_with_forces: whether these sensors are not 0 in an initial state.
-        prefers_xla: whether MuJoCo XLA steps the model faster on a CPU, so that "auto" takes it.
-        out_of_reach: names of the geoms that never touch anything, which MuJoCo XLA then skips.
+        prefers_xla: whether "auto" steps by MuJoCo XLA on a CPU, too, because it is faster.
+        out_of_reach: geoms that never touch anything, which MuJoCo XLA then skips.
         reads: fields of ``MjData`` that the formulas see as MuJoCo leaves them after its last step,
             which computes them before it moves, as Gymnasium's do.
     """

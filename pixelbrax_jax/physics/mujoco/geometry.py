@@ -93,18 +93,11 @@ def geom_shapes(
     """Return the geoms that MuJoCo's viewer shows, without textures, in the model's order.
 
     Geoms of hidden groups or with alpha 0 are left out; any other alpha is opaque. Planes are
-    infinite, and ground. Meshes are convex hulls of few faces, see ``hulls``.
+    infinite, and ground. Meshes are convex hulls of few faces, see ``hulls``. Link i is body i + 1.
 
-    Args:
-        model: a compiled model; link i is its body i + 1.
-        colors: replacements by geom name, red, green, blue in [0, 1].
-        drawn_radius: metres, by name of a sphere to render larger than it is, so that it is visible
-            in small images. Physics ignores it.
-        geom_groups: the visible groups.
-
-    Raises:
-        ValueError: a name or value in ``colors`` or ``drawn_radius`` is wrong, the renderer does
-            not support a visible geom, flex or skin, or nothing is visible.
+    ``colors`` replaces colors, red, green, blue in [0, 1], by geom name. ``drawn_radius``, metres
+    by name of a sphere, renders it larger than it is, so that it is visible in small images;
+    physics ignores it. A ValueError names what is wrong with them, or cannot be rendered.
     """
     kinds = [_kind_name(kind) for kind in model.geom_type]
     names = [model.geom(i).name or f"{kind}/{i}" for i, kind in enumerate(kinds)]

@@ -24,12 +24,10 @@ _EXACT = 1e-5
 
 
 class Hull(NamedTuple):
-    """A convex polytope around a mesh.
+    """A convex polytope around a mesh, in metres.
 
-    Attributes:
-        planes: (K, 4) float32, outer unit normals and distances from the origin in metres.
-        radius: metres, largest distance of a corner from the origin.
-        error: metres, largest distance of a corner from the mesh's convex hull.
+    ``planes`` (K, 4) float32 are outer unit normals and distances from the origin. ``radius`` and
+    ``error`` are a corner's largest distances from the origin and from the mesh's convex hull.
     """
 
     planes: np.ndarray
@@ -56,9 +54,6 @@ def enclose(points: np.ndarray, faces: int = FACES) -> Hull:
     A hull with no more facets is exact. Otherwise the first half-spaces are a box along the
     principal axes, and the facet is added that cuts deepest into the polytope, until there are
     enough. Points in a plane or on a line get a thickness of a thousandth of their extent.
-
-    Raises:
-        ValueError: ``faces`` is below 6, or the points are fewer than 2, not finite or all equal.
     """
     if faces < _BOX:
         raise ValueError(f"faces must be at least {_BOX}, the faces of a box, got {faces}.")

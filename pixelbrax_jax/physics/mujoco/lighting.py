@@ -68,10 +68,7 @@ def read_look(model: mujoco.MjModel) -> Look:
 
 
 def detailed(model: mujoco.MjModel, look: Look | None, pixel: float) -> Look:
-    """Return a look of ``read_look`` with all that MuJoCo's renderer draws.
-
-    ``pixel`` is the edge of a pixel at distance 1.
-    """
+    """Return a look with all that MuJoCo's renderer draws; see ``Physics.detailed_look``."""
     look = read_look(model) if look is None else look
     headlight = model.vis.headlight
     mirror = mirror_of(model)

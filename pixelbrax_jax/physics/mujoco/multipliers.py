@@ -62,16 +62,12 @@ class MultipliedModels:
     """Copies of a model, one for each row of multipliers."""
 
     def __init__(self, model: mujoco.MjModel):
-        """Take the model; copies are made when they are needed."""
         self._model = model
         self._copies: list[mujoco.MjModel] = []
         self._multipliers = np.empty((0, 0))
 
     def of_rows(self, multipliers: np.ndarray) -> list[mujoco.MjModel]:
-        """Return models for (N, 5) multipliers.
-
-        A row that equals that of the last call in its place costs nothing.
-        """
+        """Return models for (N, 5) multipliers; a row that is as in the last call costs nothing."""
         before, self._multipliers = self._multipliers, np.empty((0, 0))
         for i, row in enumerate(multipliers):
             if i == len(self._copies):

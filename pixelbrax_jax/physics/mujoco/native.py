@@ -69,10 +69,9 @@ class Native:
         """Advance ``qpos, qvel, act, qacc_warmstart, ctrl`` by at least one physics step.
 
         The sixth array has multipliers of the dynamics, or no columns. Fills the first four, the
-        change of ``qpos``, and ``xpos``, ``xquat`` and ``sensordata``. Positions, velocities and
-        their sensors are those after the last step; sensors of forces and accelerations those of
-        its start. The accelerations are those of the last step, from its velocities. Then it fills
-        the fields, as the last step and ``mj_rnePostConstraint`` leave them.
+        change of ``qpos``, and ``xpos``, ``xquat`` and ``sensordata``, for the times that
+        ``Snapshot`` states. The accelerations are those of the last step, from its velocities. Then
+        it fills the fields, as the last step and ``mj_rnePostConstraint`` leave them.
         """
         model = self._moving
         qpos, qvel, act, warmstart, ctrl, multipliers, *results = arrays
@@ -144,10 +143,7 @@ class Native:
     def first(
         self, qpos: np.ndarray, qvel: np.ndarray, multipliers: np.ndarray, *results: np.ndarray
     ) -> None:
-        """Compute what ``qpos`` and ``qvel`` say, with actuators off, as DM Control's resets do.
-
-        Fills ``xpos``, ``xquat``, ``sensordata`` and the fields, with ``cfrc_ext`` 0.
-        """
+        """Fill readings of ``qpos`` and ``qvel`` with actuators off, as DM Control's resets do."""
         xpos, xquat, sensordata, *fields = results
         parts = [np.zeros((len(qpos), 1)), qpos, qvel, np.zeros((len(qpos), self._moving.na))]
         first = np.concatenate(parts, 1, dtype=np.float64)

@@ -71,8 +71,7 @@ class MujocoPhysics(GuardedPhysics):
     ):
         """Compile the model, edited for the task, and read its scene; compile no program.
 
-        The default camera is the model's, or the first of ``rigs`` if it has none. For ``colors``
-        and ``geom_groups`` see ``read_scene``.
+        The default camera is the model's, or the first of ``rigs`` if it has none.
         """
         bare = without_textures(spec)
         model, simulated, posed = compile_model(spec), compile_model(bare), with_poses(bare)

@@ -50,17 +50,11 @@ _JOINT = int(mujoco.mjtWrap.mjWRAP_JOINT)
 class ModelScene(NamedTuple):
     """What to render, and from where.
 
-    Attributes:
-        geoms: geoms, visible sites (``site/<name>``) and the pieces of visible tendons
-            (``tendon/<name>/<piece>``).
-        rig: the chosen camera; None without one.
-        rigs: all cameras that can be rigs, by name.
-        look: the model's lights, sky and ground.
-        links: names of the links after those of the bodies, if the model needs them: ``camera/com``
-            at the center of mass of the subtree of ``tracked_body(model)``, and ``target`` for what
-            is movable and visible. Neither turns.
-        hull_errors: metres by name of a mesh geom: largest distance of the drawn shape from the
-            convex hull of the mesh.
+    ``geoms`` also has visible sites (``site/<name>``) and the pieces of visible tendons
+    (``tendon/<name>/<piece>``). ``links`` names the links after those of the bodies, if there are
+    any: ``camera/com`` at the center of mass of the subtree of ``tracked_body(model)``, and
+    ``target`` for what is movable and visible. Neither turns. ``rig`` is the chosen one of
+    ``rigs``; for ``hull_errors`` see ``Physics``.
     """
 
     geoms: Geoms

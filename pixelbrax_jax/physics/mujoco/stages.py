@@ -112,10 +112,7 @@ def _euler(model: Any, data: Any) -> Any:
 
 
 def _runge_kutta(model: Any, data: Any, compute: Callable[[Any], Any]) -> Any:
-    """Advance as ``mjx.rungekutta4`` does: the classical method of order 4.
-
-    ``compute`` is ``forward`` of the model; ``data`` has its results.
-    """
+    """Advance as ``mjx.rungekutta4`` does: ``compute`` is ``forward``, done for ``data``."""
     timestep = model.opt.timestep
     first, velocity = data, data.qvel
     weights, fractions = (1 / 6, 1 / 3, 1 / 3, 1 / 6), (0.5, 0.5, 1.0)

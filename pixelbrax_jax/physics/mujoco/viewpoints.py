@@ -39,8 +39,7 @@ def follows_tracked(model: mujoco.MjModel, body: int) -> bool:
 def followed_body(model: mujoco.MjModel) -> int:
     """Return the body that a view follows by default.
 
-    It is the first moving body of the first kinematic tree with an actuator (not a goal), else the
-    first moving body, else 0.
+    It is the first moving one of the first tree with an actuator (not a goal), else of all, else 0.
     """
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)

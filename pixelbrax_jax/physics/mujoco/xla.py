@@ -36,11 +36,7 @@ class Xla:
         reads: Sequence[str] = (),
         plain: bool = False,
     ):
-        """Put a compiled model on the device; compile nothing. For the rest see ``Formulas``.
-
-        ``plain`` takes MuJoCo XLA's own step, as models do that ``stages`` do not support.
-        A ValueError names what MuJoCo XLA does not simulate.
-        """
+        """Put a model on the device; ``plain`` takes MuJoCo XLA's own step. See ``Formulas``."""
         load_onto_own_device(mjx_io)
         check_simulated(model)
         self._model = model
