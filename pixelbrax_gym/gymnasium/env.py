@@ -54,9 +54,19 @@ class GymnasiumEnv(StatefulAdapter, gymnasium.Env):
     ) -> None:
         """Build the environment; the first ``reset`` compiles.
 
-        Arguments and errors are those of ``GymnasiumVectorEnv``, without ``num_envs`` and
-        ``autoreset_mode``. ``render_mode`` may also be ``"human"``, for a window; if pygame is
-        missing it raises an ImportError.
+        Args:
+            task: one of ``pixelbrax_jax.list_envs()``.
+            output: type of observations: ``"numpy"``, ``"torch"`` or ``"jax"`` arrays.
+            render_mode: None, ``"rgb_array"``, or ``"human"`` for a window.
+            render_height: height of ``render()`` in pixels.
+            render_width: width of ``render()`` in pixels.
+            max_episode_steps: time limit in calls of ``step``.
+            **options: other options of ``pixelbrax_jax.make``, such as ``camera``.
+
+        Raises:
+            TypeError: an option is unknown.
+            ValueError: an option is out of range.
+            ImportError: ``output`` or ``render_mode`` needs a package that is not installed.
         """
         if render_mode is not None:
             check_choice("render_mode", render_mode, RENDER_MODES)
@@ -83,12 +93,16 @@ class GymnasiumEnv(StatefulAdapter, gymnasium.Env):
     ) -> tuple[Any, dict[str, Any]]:
         """Start an episode; return the observation and the info of ``step``.
 
-        Errors are those of ``GymnasiumVectorEnv.reset``.
-
         Args:
             seed: s starts episode 0 of ``jax.random.key(s)``; None starts the next episode, or
                 samples a seed at the first reset.
             options: ``{"state": state}`` continues from a state of ``get_state``, without a seed.
+
+        Raises:
+            TypeError: ``seed`` is not an integer, ``options`` not a dict, or the state not an
+                ``EnvState``.
+            ValueError: ``seed`` is out of range or given with a state, the state does not fit this
+                environment, or another option is given.
         """
         given = read_options(options, seed)
         self._take_time_limit()
@@ -102,14 +116,20 @@ class GymnasiumEnv(StatefulAdapter, gymnasium.Env):
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Apply an action for ``action_repeat`` control steps.
 
-        The (A,) action, its errors and the info are as in ``GymnasiumVectorEnv.step``.
+        Args:
+            action: (A,) floating point, a NumPy array, torch tensor or JAX array; rounded to
+                float32 and clipped to [-1, 1].
 
         Returns:
-            Observation, reward, terminated, truncated and info: ``episode_return`` (float),
-            ``episode_length`` (int) and ``non_finite`` (bool).
+            Observation, reward, terminated, truncated and info: ``episode_return`` (float, sum of
+            the episode's rewards), ``episode_length`` (int, control steps) and ``non_finite``
+            (bool, the physics diverged and ended the episode).
 
         Raises:
             ResetNeeded: before the first reset, after ``close``, or when the episode has ended.
+            TypeError: the action is not floating point.
+            ValueError: the action's shape or device is wrong, or a NumPy array or CPU tensor
+                contains NaN; nothing is stepped then. NaN elsewhere ends the episode.
         """
         outputs = self._stateful.step(action)
         self._show()

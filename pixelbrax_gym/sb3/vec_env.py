@@ -46,14 +46,14 @@ class SB3VecEnv(VecEnv):
     """``num_envs`` copies of a pixel task, stepped together.
 
     Results are NumPy arrays, with autoreset in the same step. ``infos[i]`` has
-    ``TimeLimit.truncated``; where an episode ended it also has ``terminal_observation``, and
-    ``episode_return``, ``episode_length`` and ``non_finite`` as in a ``GymnasiumVectorEnv``. The
-    same seed gives the same episodes as there.
+    ``TimeLimit.truncated``; where an episode ended it also has ``terminal_observation``,
+    ``episode_return`` (sum of rewards), ``episode_length`` (control steps) and ``non_finite``
+    (the physics diverged and ended the episode).
 
     Observations share memory with JAX on a CPU and are copied from other devices. They may be
-    written to. ``get_attr``, ``set_attr`` and ``env_method`` address a ``SubEnv`` for each
-    environment. Methods raise ``ClosedEnvironmentError`` after ``close`` and ``RuntimeError`` in a
-    fork that cannot run JAX.
+    written to. The same seed gives the same episodes as in a ``GymnasiumVectorEnv``. ``get_attr``,
+    ``set_attr`` and ``env_method`` address a ``SubEnv`` for each environment. Methods raise
+    ``ClosedEnvironmentError`` after ``close`` and ``RuntimeError`` in a fork that cannot run JAX.
 
     Example:
         >>> env = VecMonitor(SB3VecEnv("inverted_pendulum", num_envs=64))
@@ -75,15 +75,26 @@ class SB3VecEnv(VecEnv):
     ) -> None:
         """Build the environments; the first ``reset`` compiles.
 
-        ``GymnasiumVectorEnv`` explains the other arguments and errors. With ``channels_first``
-        images are (3K, H, W), as a view, instead of (H, W, 3K), which Stable-Baselines3 transposes
-        itself. ``stagger`` spreads time limits evenly over the steps, because Stable-Baselines3
-        evaluates the value function once for each truncated environment: environment i's first
-        episode after a full reset is shorter by ``i / N`` of the limit.
+        Args:
+            task: one of ``pixelbrax_jax.list_envs()``.
+            num_envs: N, at least 1.
+            render_mode: None or ``"rgb_array"``.
+            render_height: height of ``render()`` in pixels.
+            render_width: width of ``render()`` in pixels.
+            channels_first: whether images are (3K, H, W), as a view, instead of (H, W, 3K), which
+                Stable-Baselines3 transposes itself.
+            stagger: whether to spread time limits evenly over the steps, because
+                Stable-Baselines3 evaluates the value function once for each truncated environment.
+                Environment i's first episode after a full reset is shorter by ``i / N`` of the
+                limit.
+            max_episode_steps: time limit in calls of ``step``; None keeps ``episode_length``,
+                1000 control steps by default.
+            **options: other options of ``pixelbrax_jax.make``, such as ``camera``.
 
         Raises:
-            ValueError: also if Stable-Baselines3 would read rows or columns as channels, because
-                there are at least as many channels.
+            TypeError: an option is unknown.
+            ValueError: an option is out of range, or Stable-Baselines3 would read rows or columns
+                as channels because there are at least as many channels.
         """
         if render_mode is not None:
             check_choice("render_mode", render_mode, ("rgb_array",))

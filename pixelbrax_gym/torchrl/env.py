@@ -43,9 +43,9 @@ class TorchRLEnv(EnvBase):
     ``ClosedEnvironmentError`` after ``close`` and ``RuntimeError`` in a fork that cannot run JAX.
 
     Attributes:
-        infos: tensors with leading axis N about the episodes of the last step: ``episode_return``,
-            ``episode_length`` and ``non_finite`` as in a ``GymnasiumVectorEnv``, and those of
-            distractors.
+        infos: tensors with leading axis N about the episodes of the last step:
+            ``episode_return`` (sum of rewards), ``episode_length`` (control steps),
+            ``non_finite`` (the physics diverged and ended the episode) and those of distractors.
 
     Example:
         >>> env = TorchRLEnv("ant", num_envs=256)
@@ -65,8 +65,18 @@ class TorchRLEnv(EnvBase):
     ) -> None:
         """Build the environments; the first ``reset`` compiles.
 
-        Tensors are on ``device``, None for JAX's default device, and copied to and from any other.
-        ``GymnasiumVectorEnv`` explains the other arguments and the errors.
+        Args:
+            task: one of ``pixelbrax_jax.list_envs()``.
+            num_envs: N, at least 1.
+            device: device of the tensors; None means JAX's default device. Tensors are copied to
+                and from any other device.
+            render_height: height of ``render()`` in pixels.
+            render_width: width of ``render()`` in pixels.
+            **options: other options of ``pixelbrax_jax.make``, such as ``camera``.
+
+        Raises:
+            TypeError: an option is unknown.
+            ValueError: an option is out of range.
         """
         check_not_forked()
         stateful = StatefulEnv(
@@ -213,6 +223,7 @@ class TorchRLEnv(EnvBase):
         return as_mask(what, given.reshape(self._num_envs), (self._num_envs,))
 
     def __repr__(self) -> str:
+        """Name the task, the number of environments and the device."""
         name = type(self).__name__
         return f"{name}({self._task!r}, num_envs={self._num_envs}, device={self.device})"
 
