@@ -68,8 +68,8 @@ def make_physics(task: str, **options: Any) -> Physics:
     own = _OWN_TASKS.get(task)
     suite = next((suite for suite in SUITES.values() if task in suite.tasks), None)
     for name, value in options.items():
-        if suite is None or name not in suite.options:
-            takers = [other.title for other in SUITES.values() if name in other.options]
+        if suite is None or not suite.takes(name):
+            takers = [other.title for other in SUITES.values() if other.takes(name)]
             fix = "leave it out" if own is None else "choose it where it was registered"
             raise ValueError(
                 f"{name}={value!r} is only for {' and '.join(takers) or 'no task'}, not for task "
@@ -78,7 +78,8 @@ def make_physics(task: str, **options: Any) -> Physics:
     if own is not None:
         return own[0]()
     assert suite is not None
-    physics: Physics = importlib.import_module(suite.loader).make_physics(task, **options)
+    loader = importlib.import_module(suite.loader)
+    physics: Physics = loader.load(task, suite.options(**options))
     return physics
 
 

@@ -18,13 +18,18 @@ from pixelbrax_jax.physics.task import Task
 class Suite:
     """Tasks by name that one engine simulates, and the names of options that only they take.
 
-    ``loader`` is the module with ``make_physics(task, **options)``.
+    ``loader`` is the module with ``load(task, options)``, and ``options`` the dataclass of the
+    options that only these tasks take.
     """
 
     title: str
     tasks: Mapping[str, Task]
     loader: str
-    options: tuple[str, ...] = ()
+    options: type[BraxOptions | MujocoOptions]
+
+    def takes(self, option: str) -> bool:
+        """Return whether the tasks have an option of this name."""
+        return option in {field.name for field in fields(self.options)}
 
 
 SUITES: Mapping[str, Suite] = MappingProxyType(
@@ -33,19 +38,19 @@ SUITES: Mapping[str, Suite] = MappingProxyType(
             "Brax's tasks",
             BRAX_TASKS,
             "pixelbrax_jax.physics.brax.loading",
-            tuple(option.name for option in fields(BraxOptions)),
+            BraxOptions,
         ),
         "dmc": Suite(
             "tasks of the DM Control Suite",
             DMC_TASKS,
             "pixelbrax_jax.physics.dmc.physics",
-            tuple(option.name for option in fields(MujocoOptions)),
+            MujocoOptions,
         ),
         "gym": Suite(
             "Gymnasium's MuJoCo tasks",
             GYM_TASKS,
             "pixelbrax_jax.physics.gym.physics",
-            tuple(option.name for option in fields(MujocoOptions)),
+            MujocoOptions,
         ),
     }
 )

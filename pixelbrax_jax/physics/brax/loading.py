@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from pixelbrax_jax.physics.base import Kinematics
 from pixelbrax_jax.physics.brax.engine import BraxPhysics
-from pixelbrax_jax.physics.brax.tasks import REWARD_PRESETS, TASKS, BraxTask
+from pixelbrax_jax.physics.brax.tasks import TASKS, BraxOptions, BraxTask
 from pixelbrax_jax.physics.divergence import Recipe
 from pixelbrax_jax.physics.mujoco.compatibility import (
     import_silenced,
@@ -35,10 +35,8 @@ def distance_swum(before: Kinematics, after: Kinematics, action: jax.Array) -> j
 _PAPER_REWARDS = {"distance_swum": distance_swum}
 
 
-def make_physics(
-    task: str, *, backend: str | None = None, reward_preset: str = "brax"
-) -> BraxPhysics:
-    """Make the physics of a Brax task. Equal arguments give equal objects.
+def load(task: str, options: BraxOptions) -> BraxPhysics:
+    """Load the physics of a Brax task. Equal arguments give equal objects.
 
     ``backend=None`` takes the task's default. ``reward_preset="paper"`` has the rewards of arXiv
     2502.00021 where they differ from the installed Brax's: walker2d's forward reward is ten times
@@ -46,10 +44,9 @@ def make_physics(
     inverted_pendulum and pusher take actions unscaled. Dynamics are the same.
     """
     row = TASKS[task]
-    check_choice("reward_preset", reward_preset, REWARD_PRESETS)
-    backend = row.default_backend if backend is None else backend
+    backend = row.default_backend if options.backend is None else options.backend
     check_choice(f"backend of task {task!r}", backend, row.backends)
-    return _load(task, backend, reward_preset)
+    return _load(task, backend, options.reward_preset)
 
 
 # Loading a model takes a second. A model that is loaded again equals the first one.

@@ -19,24 +19,18 @@ from pixelbrax_jax.spatial import make_rig
 from pixelbrax_jax.types import CameraRig
 
 
-def make_physics(task: str, *, engine: str = "auto", num_starts: int = 0) -> MujocoPhysics:
-    """Make the physics of a task in ``TASKS``. Equal arguments give equal objects."""
-    options = MujocoOptions(engine=engine, num_starts=num_starts)
-    return _load(task, options.engine, options.num_starts)
-
-
 # Loading a model takes a second. A model that is loaded again equals the first one.
 @lru_cache(maxsize=16)
-def _load(task: str, engine: str, num_starts: int) -> MujocoPhysics:
+def load(task: str, options: MujocoOptions) -> MujocoPhysics:
+    """Load the physics of a task in ``TASKS``. Equal arguments give equal objects."""
     spec = mujoco.MjSpec.from_file(str(_assets() / TASKS[task].model))
     return MujocoPhysics(
         FORMULAS[task],
         spec,
-        engine=engine,
-        num_starts=num_starts,
+        **vars(options),
         time_limit=TASKS[task].time_limit,
         rigs={"free": free_camera(TASKS[task], spec)},
-        identity=Recipe(_load, (task, engine, num_starts)),
+        identity=Recipe(load, (task, options)),
     )
 
 
