@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pixelbrax_jax import PixelEnv, VectorPixelEnv, compilation
+from pixelbrax_jax.flags import is_key
 from pixelbrax_jax.types import EnvParams, EnvState, Timestep
 
 _FEW = 32
@@ -243,16 +244,12 @@ def _with_offsets(state: EnvState, offsets: Array | None) -> EnvState:
     return state.replace(sim=state.sim.replace(time_limit_offset=offsets))
 
 
-def _is_key(part: Any) -> bool:
-    return jnp.issubdtype(part.dtype, jax.dtypes.prng_key)
-
-
 def _data(part: jax.Array) -> jax.Array:
-    return jax.random.key_data(part) if _is_key(part) else part
+    return jax.random.key_data(part) if is_key(part.dtype) else part
 
 
 def _from_data(data: jax.Array, like: Any) -> jax.Array:
-    if not _is_key(like):
+    if not is_key(like.dtype):
         return data
     return jax.random.wrap_key_data(data, impl=jax.random.key_impl(jnp.empty((), like.dtype)))
 
@@ -269,7 +266,7 @@ def _words(part: jax.Array) -> jax.Array:
 
 def _from_words(words: jax.Array, like: Any) -> jax.Array:
     """Invert ``_words`` for an array with the shape and dtype of ``like``."""
-    if _is_key(like):
+    if is_key(like.dtype):
         data = jax.eval_shape(jax.random.key_data, like)
         return _from_data(words.reshape(data.shape), like)
     if like.dtype == bool:

@@ -64,6 +64,11 @@ def under_default_flags(function: Callable[_P, _T]) -> Callable[_P, _T]:
     return call
 
 
+def is_key(dtype: Any) -> bool:
+    """Return whether the dtype is one of typed PRNG keys."""
+    return jnp.issubdtype(dtype, jax.dtypes.prng_key)
+
+
 def is_guarded(direction: str) -> bool:
     """Return whether ``jax.transfer_guard`` watches ``host_to_device`` or ``device_to_host``."""
     return getattr(jax.config, f"jax_transfer_guard_{direction}", None) is not None
@@ -74,7 +79,7 @@ def as_by_default(leaf: Any) -> Any:
     dtype = getattr(leaf, "dtype", None)
     if dtype is None:
         return leaf
-    if jnp.issubdtype(dtype, jax.dtypes.prng_key):
+    if is_key(dtype):
         if jax.random.key_impl(leaf) == PRNG:
             return leaf
         # JAX's other implementations hold a threefry key twice.

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax.extend import core
 from jax.interpreters import ad, batching, mlir
 
-from pixelbrax_jax.flags import default_flags
+from pixelbrax_jax.flags import default_flags, is_key
 
 _Form = Callable[..., Any]
 
@@ -49,7 +49,7 @@ def by_platform(
     named = {name: flat(form) for name, form in forms.items() if form is not None}
     arrays = [jnp.asarray(x) for x in leaves]
     all_forms = _Forms(flat(default), named, no_derivative)
-    if getattr(jax.config, "jax_debug_key_reuse", False) and any(map(_is_key, arrays)):
+    if getattr(jax.config, "jax_debug_key_reuse", False) and any(is_key(x.dtype) for x in arrays):
         # The check takes a key as used by a primitive that it does not know.
         results = _by_jax(*arrays, forms=all_forms)
     else:
@@ -57,10 +57,6 @@ def by_platform(
             *arrays, forms=all_forms, shapes=tuple((x.shape, x.dtype) for x in shapes)
         )
     return jax.tree.unflatten(result_tree, results)
-
-
-def _is_key(array: jax.Array) -> bool:
-    return jnp.issubdtype(array.dtype, jax.dtypes.prng_key)
 
 
 class Traced(NamedTuple):

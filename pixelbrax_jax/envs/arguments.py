@@ -7,6 +7,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from pixelbrax_jax.flags import is_key
+
 
 def check_action(action: Any, shape: tuple[int, ...]) -> jax.Array:
     """Return floating-point actions of the given shape as an array; raise for anything else."""
@@ -21,7 +23,7 @@ def check_action(action: Any, shape: tuple[int, ...]) -> jax.Array:
 def check_key(key: jax.Array, shape: tuple[int, ...] = ()) -> None:
     """Raise TypeError unless ``key`` has typed PRNG keys of the given shape."""
     is_array = isinstance(key, jax.Array)
-    if not (is_array and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)):
+    if not (is_array and is_key(key.dtype)):
         # Not the type of an array, which is a tracer under jit.
         got = f"{key.dtype}{list(key.shape)}" if is_array else type(key).__name__
         raise TypeError(

@@ -10,6 +10,7 @@ import numpy as np
 
 from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.envs.vector import VectorPixelEnv
+from pixelbrax_jax.flags import is_key
 from pixelbrax_jax.physics.mujoco.compatibility import accept_device_put_replicated, import_silenced
 from pixelbrax_jax.types import EnvParams, Timestep
 
@@ -74,7 +75,7 @@ class BraxEnv(Env):
         The state's ``pipeline_state`` is the pixel environment's ``EnvState``. Raises TypeError if
         ``rng`` is not one key.
         """
-        if not jnp.issubdtype(rng.dtype, jax.dtypes.prng_key):
+        if not is_key(rng.dtype):
             rng = jax.random.wrap_key_data(rng)
         state, timestep = self.env.reset(rng, self.sys)
         return State(pipeline_state=state, **self._fields(timestep))

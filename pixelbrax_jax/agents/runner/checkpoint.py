@@ -14,13 +14,13 @@ from tempfile import TemporaryFile
 from typing import Any, TypeVar
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
 from pixelbrax_jax.agents.runner.devices import any_process
 from pixelbrax_jax.agents.runner.progress import Report, silent
 from pixelbrax_jax.agents.runner.settings import differences, unknown_settings, versions
+from pixelbrax_jax.flags import is_key
 
 FORMAT = 4
 """Number of the format, increased when the meaning of stored data changes."""
@@ -314,7 +314,7 @@ def _read(folder: Path, steps: int, template: Tree, *, whole: bool, advice: str 
         if not like.size:
             return jax.device_put(np.zeros(like.shape, like.dtype), _sharding(like))
         value = restored[_name(path)]
-        return jax.random.wrap_key_data(value) if _is_key(like) else value
+        return jax.random.wrap_key_data(value) if is_key(like.dtype) else value
 
     return jax.tree_util.tree_map_with_path(leaf, template)
 
@@ -329,12 +329,8 @@ def _name(path: Any) -> str:
     return jax.tree_util.keystr(path, simple=True, separator=".")
 
 
-def _is_key(leaf: Any) -> bool:
-    return bool(jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key))
-
-
 def _numbers(leaf: jax.Array) -> jax.Array:
-    return jax.random.key_data(leaf) if _is_key(leaf) else leaf
+    return jax.random.key_data(leaf) if is_key(leaf.dtype) else leaf
 
 
 def _sharding(leaf: Any) -> Any:

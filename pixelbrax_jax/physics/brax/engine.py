@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from pixelbrax_jax.flags import as_by_default, default_flags, under_default_flags
+from pixelbrax_jax.flags import as_by_default, default_flags, is_key, under_default_flags
 from pixelbrax_jax.physics.base import Kinematics, RewardFn
 from pixelbrax_jax.physics.divergence import GuardedPhysics
 from pixelbrax_jax.physics.mujoco.compatibility import (
@@ -314,8 +314,7 @@ def _changed(env: envs.Env, **attributes: Any) -> envs.Env:
 
 def _as_dtype(leaf: Any, dtype: Any) -> jax.Array:
     # A key in Brax's info is typed or uint32, like the key of reset.
-    is_key = jnp.issubdtype(dtype, jax.dtypes.prng_key)
-    return leaf if is_key else jnp.asarray(leaf, dtype)
+    return leaf if is_key(dtype) else jnp.asarray(leaf, dtype)
 
 
 def _carry(brax_state: envs.State) -> BraxCarry:
