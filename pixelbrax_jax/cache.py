@@ -1,4 +1,4 @@
-"""The cache folder, programs kept in it, and paths in the home folder."""
+"""The cache folder, programs kept in it, paths in the home folder, and complete files."""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ import hashlib
 import os
 import platform
 import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 
@@ -35,6 +38,16 @@ def in_home(path: Path) -> Path:
         raise FileNotFoundError(
             f"{path} is in a home folder that is unknown; set HOME, or give the whole path."
         ) from error
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yield a path for a file that then replaces ``path``, so that ``path`` is always complete."""
+    # A folder of its own, because several processes may write the file at once.
+    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+        part = Path(folder, path.name)
+        yield part
+        part.replace(path)
 
 
 KEEP_PROGRAMS = "PIXELBRAX_KEEP_PROGRAMS"

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from pixelbrax_gym.bench.tables import table
+from pixelbrax_jax.cache import replacing
 from pixelbrax_jax.generalisation.frames import write_sheet
 from pixelbrax_jax.generalisation.intervals import interquartile_mean
 from pixelbrax_jax.generalisation.making import LevelEnv, Levels
@@ -146,13 +147,15 @@ def play(
                 returns = np.asarray(player(level), np.float64)
                 of_run[name] = returns.tolist()
                 if path is not None:
-                    _write(path / RETURNS, _json(scores, known))
+                    with replacing(path / RETURNS) as part:
+                        part.write_text(_json(scores, known), "utf-8")
             mean = float(np.mean(of_run[name]))
             report(f"{name}, {run}: return {mean:.1f}{'' if is_new else ', from the file'}")
     order = [level.level.name for level in levels.levels]
     scores.returns = {run: {name: known[run][name] for name in order} for run in players}
     if path is not None:
-        _write(path / ROWS, scores.csv())
+        with replacing(path / ROWS) as part:
+            part.write_text(scores.csv(), "utf-8")
     return scores
 
 
@@ -180,10 +183,3 @@ def read(scores: Scores, folder: Path) -> Returns:
 
 def _json(scores: Scores, returns: Mapping[str, Any]) -> str:
     return json.dumps(asdict(scores) | {"returns": returns}) + "\n"
-
-
-def _write(path: Path, text: str) -> None:
-    """Write a file and rename it, so that it is complete after an interruption."""
-    part = path.with_name(path.name + ".part")
-    part.write_text(text, "utf-8")
-    part.replace(path)

@@ -7,7 +7,6 @@ import hashlib
 import json
 import os
 import sys
-import tempfile
 import warnings
 import zipfile
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from pixelbrax_jax.cache import cache_folder, whole_path
+from pixelbrax_jax.cache import cache_folder, replacing, whole_path
 from pixelbrax_jax.distractors import folders, procedural
 from pixelbrax_jax.distractors.media import AGAIN, read_clip
 from pixelbrax_jax.types import Clips
@@ -262,15 +261,12 @@ def _read_cache(cache_dir: str | Path | None, name: Path) -> _Decoded | None:
 
 
 def _write_cache(cache_dir: str | Path | None, name: Path, clips: _Decoded) -> None:
-    """Write to a temporary folder and rename the file, so that the cache is never incomplete."""
     frames, length, lacks = clips
     try:
         file = cache_folder(cache_dir) / name
         file.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=file.parent) as part:
-            half = Path(part, file.name)
-            np.savez(half, frames=frames, length=length, lacks=np.array(lacks, str))
-            half.replace(file)
+        with replacing(file) as part:
+            np.savez(part, frames=frames, length=length, lacks=np.array(lacks, str))
     except OSError as error:
         _warn(
             f"clips could not be cached ({error}) and are decoded again each time; set the "

@@ -19,6 +19,7 @@ from tensorboardX.proto.summary_pb2 import Summary
 from tensorboardX.record_writer import masked_crc32c
 
 from pixelbrax_jax.agents.runner.progress import Report, reason
+from pixelbrax_jax.cache import replacing
 
 _SUMS = ("episode/return_sum", "episode/length_sum", "episode/count")
 
@@ -238,7 +239,6 @@ def _keep_until(path: Path, first_step: int) -> float:
     if not path.exists():
         return 0.0
     kept = [r for r in read_metrics(path) if first_step and r["steps"] <= first_step]
-    fresh = path.with_suffix(".part")
-    fresh.write_text("".join(json.dumps(record) + "\n" for record in kept), "utf-8")
-    fresh.replace(path)
+    with replacing(path) as part:
+        part.write_text("".join(json.dumps(record) + "\n" for record in kept), "utf-8")
     return kept[-1]["seconds"] if kept else 0.0

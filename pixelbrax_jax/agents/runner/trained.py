@@ -29,6 +29,7 @@ from pixelbrax_jax.agents.runner.settings import (
 )
 from pixelbrax_jax.agents.runner.splits import CLEAN, plays_clips
 from pixelbrax_jax.agents.train_state import Networks
+from pixelbrax_jax.cache import replacing
 from pixelbrax_jax.distractors.presets import as_tuple
 from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.flags import under_default_flags
@@ -159,12 +160,6 @@ def save_policy(algorithm: Algorithm, networks: Networks, path: str | Path) -> P
     )(jax.ShapeDtypeStruct((batch, *spec.shape), spec.dtype))
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    # A temporary file is renamed, so a file of this name is always complete.
-    part = path.with_name(path.name + ".part")
-    try:
+    with replacing(path) as part:
         part.write_bytes(exported.serialize())
-        part.replace(path)
-    except OSError:
-        part.unlink(missing_ok=True)
-        raise
     return path
