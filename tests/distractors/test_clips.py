@@ -13,6 +13,7 @@ from PIL import Image
 
 from pixelbrax_gym import cli
 from pixelbrax_jax import distractors, load_clips
+from pixelbrax_jax.cache import replacing
 from pixelbrax_jax.distractors import clips as clips_module
 from pixelbrax_jax.distractors import procedural
 from pixelbrax_jax.video import write_frames
@@ -285,6 +286,22 @@ def test_a_damaged_cache_is_made_again(davis, tmp_path, length):
         load_clips(davis, "train", height=8, width=8).frames, first.frames
     )
     assert not list((tmp_path / "cache").rglob("*.tmp"))
+
+
+def test_a_file_that_is_replaced_is_complete_after_an_interruption(tmp_path):
+    file = tmp_path / "clips.npz"
+
+    def write(text: str, interrupted: bool) -> None:
+        with replacing(file) as part:
+            part.write_text(text)
+            if interrupted:
+                raise KeyboardInterrupt
+
+    write("whole", interrupted=False)
+    with pytest.raises(KeyboardInterrupt):
+        write("ha", interrupted=True)
+    assert file.read_text() == "whole"
+    assert list(tmp_path.iterdir()) == [file]
 
 
 @pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="root may write anywhere")
