@@ -35,7 +35,8 @@ def test_there_is_one_place_that_says_how():
 
 def test_extras_that_are_named_exist():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
-    calls = re.findall(r"install_extra\(([^)]*)\)", "".join(p.read_text("utf-8") for p in SOURCES))
+    sources = "".join(path.read_text("utf-8") for path in SOURCES)
+    calls = re.findall(r"(?:install|needs)_extra\(([^)]*)\)", sources)
     named = {name for call in calls for name in re.findall(r"""["'](\w+)["']""", call)}
     named |= set(doctor.EXTRAS.values())
     assert {"torch", "clips", "cuda13"} <= named

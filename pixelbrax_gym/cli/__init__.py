@@ -16,7 +16,6 @@ from typing import Any, TypeVar
 
 from pixelbrax_gym.bench.machine import installed_version
 from pixelbrax_jax.cache import keep_programs
-from pixelbrax_jax.extras import install_extra
 
 Options = TypeVar("Options")
 
@@ -105,15 +104,6 @@ def parse(command: str, kind: type[Options], arguments: Sequence[str]) -> Option
     import tyro
 
     return tyro.cli(kind, prog=f"pixelbrax {command}", args=arguments)
-
-
-@contextmanager
-def needs_extra(name: str) -> Iterator[None]:
-    """Add the ``pip install`` line of an extra to an ImportError."""
-    try:
-        yield
-    except ImportError as error:
-        raise ImportError(f"{error}; try: {install_extra(name)}") from error
 
 
 def _help() -> str:

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import arg
 
-from pixelbrax_gym.cli import CommandError, needs_extra
+from pixelbrax_gym.cli import CommandError
+from pixelbrax_jax.extras import needs_extra
 
 if TYPE_CHECKING:
     from pixelbrax_jax.agents.runner.trained import Trained

@@ -6,8 +6,9 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
-from pixelbrax_gym.cli import needs_extra, say
+from pixelbrax_gym.cli import say
 from pixelbrax_gym.cli._agents import AgentOptions, load
+from pixelbrax_jax.extras import needs_extra
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

@@ -9,7 +9,8 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from pixelbrax_gym.cli import CommandError, needs_extra, parse, say
+from pixelbrax_gym.cli import CommandError, parse, say
+from pixelbrax_jax.extras import needs_extra
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any, get_type_hints
 import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
-from pixelbrax_gym.cli import CommandError, UsageError, needs_extra, say
+from pixelbrax_gym.cli import CommandError, UsageError, say
+from pixelbrax_jax.extras import needs_extra
 from pixelbrax_jax.validation import check_choice, check_positive_int
 
 if TYPE_CHECKING:

@@ -25,7 +25,7 @@ from pixelbrax_gym.generalisation.evaluation import (
 from pixelbrax_gym.gymnasium.vector_env import GymnasiumVectorEnv
 from pixelbrax_jax import EnvConfig, VectorPixelEnv
 from pixelbrax_jax.config import ENV_OPTIONS, env_config
-from pixelbrax_jax.extras import install_extra
+from pixelbrax_jax.extras import needs_extra
 from pixelbrax_jax.flags import default_flags
 from pixelbrax_jax.generalisation.making import Levels, make_levels
 from pixelbrax_jax.generalisation.suites import EPISODES, SUITES
@@ -249,11 +249,9 @@ def _one_frame(space: Any, frames: int) -> Any:
 
 def _storage(folder: Path, pairs: _Pairs, settings: dict[str, Any]) -> Any:
     """Return Minari's storage of the folder, with the episodes that it has."""
-    try:
+    with needs_extra("dataset"):
         import minari.dataset._storages.arrow_storage  # noqa: F401  # it needs pyarrow
         from minari.dataset.minari_storage import MinariStorage
-    except ImportError as error:
-        raise ImportError(f"{error}; try: {install_extra('dataset')}") from error
     settings = json.loads(json.dumps(settings, default=str))
     about = folder / _ABOUT
     if about.exists():

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from pixelbrax_jax.extras import install_extra
+from pixelbrax_jax.extras import needs_extra
 
 _DRIVER = "SDL_VIDEODRIVER"
 
@@ -17,12 +17,8 @@ class Window:
 
     def __init__(self, title: str, fps: int) -> None:
         """Import pygame, or raise an ImportError; ``show`` opens the window."""
-        try:
+        with needs_extra("human", "render_mode='human' needs pygame"):
             import pygame
-        except ImportError as error:
-            raise ImportError(
-                f"render_mode='human' needs pygame; try: {install_extra('human')}"
-            ) from error
         self._pygame, self._title, self._fps = pygame, title, fps
         self._screen: Any = None
         self._clock: Any = None

@@ -7,13 +7,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from pixelbrax_jax.extras import install_extra
+from pixelbrax_jax.extras import needs_extra
 
-try:
+with needs_extra("torch", "torch is not installed"):
     import torch
     import torch.utils.dlpack
-except ImportError as error:
-    raise ImportError(f"torch is not installed; try: {install_extra('torch')}") from error
 
 
 def to_torch(tree: Any) -> Any:

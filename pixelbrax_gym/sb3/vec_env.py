@@ -9,14 +9,10 @@ import gymnasium
 import jax
 import numpy as np
 
-from pixelbrax_jax.extras import install_extra
+from pixelbrax_jax.extras import needs_extra
 
-try:
+with needs_extra("sb3", "Stable-Baselines3 is not installed"):
     from stable_baselines3.common.vec_env import VecEnv
-except ImportError as missing:
-    raise ImportError(
-        f"Stable-Baselines3 is not installed; try: {install_extra('sb3')}"
-    ) from missing
 
 from pixelbrax_gym.gymnasium.spaces import action_space, channels_first_space, observation_space
 from pixelbrax_gym.interop.export import to_numpy

@@ -7,15 +7,13 @@ from typing import Any
 import numpy as np
 from gymnasium import error
 
-from pixelbrax_jax.extras import install_extra
+from pixelbrax_jax.extras import needs_extra
 
-try:
+with needs_extra("torchrl", "TorchRL is not installed"):
     import torch
     from tensordict import TensorDict, TensorDictBase
     from torchrl.data import Unbounded
     from torchrl.envs import EnvBase
-except ImportError as missing:
-    raise ImportError(f"TorchRL is not installed; try: {install_extra('torchrl')}") from missing
 
 from pixelbrax_gym.interop.actions import name_rows
 from pixelbrax_gym.interop.dlpack import as_device, default_torch_device, to_torch

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from pixelbrax_jax.distractors.folders import Source
-from pixelbrax_jax.extras import install_extra
+from pixelbrax_jax.extras import needs_extra
 from pixelbrax_jax.ffmpeg import complaint, declared_frames, decode
 
 AGAIN = "get it again, or remove it"
@@ -54,12 +54,8 @@ def read_clip(
 
 def _read_video(file: Path, keep: Callable[[Any], None]) -> str:
     from_array = pillow().fromarray
-    try:
+    with needs_extra("clips", "reading videos needs imageio-ffmpeg"):
         found, log = decode(file, lambda frame: keep(from_array(frame)))
-    except ImportError as error:
-        raise ImportError(
-            f"reading videos needs imageio-ffmpeg; try: {install_extra('clips')}"
-        ) from error
     why = complaint(log)
     if not found:
         return why or "it has no frames"
@@ -168,8 +164,6 @@ def _to_rgb(image: Any) -> Any:
 
 def pillow() -> Any:
     """Return Pillow's module ``Image``, or raise an ImportError with the fix."""
-    try:
+    with needs_extra("clips", "reading images needs Pillow"):
         from PIL import Image
-    except ImportError as error:
-        raise ImportError(f"reading images needs Pillow; try: {install_extra('clips')}") from error
     return Image
