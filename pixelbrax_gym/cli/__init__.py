@@ -8,7 +8,6 @@ import sys
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
-from difflib import get_close_matches
 from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
@@ -16,6 +15,7 @@ from typing import Any, TypeVar
 
 from pixelbrax_gym.bench.machine import installed_version
 from pixelbrax_jax.cache import keep_programs
+from pixelbrax_jax.validation import suggest
 
 Options = TypeVar("Options")
 
@@ -47,10 +47,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.write(f"{installed_version('pixelbrax') or 'not installed'}\n")
         return 0
     if first not in commands():
-        near = get_close_matches(first, commands(), 1)
-        meant = f" Did you mean {near[0]!r}?" if near else ""
-        told = f"unknown command {first!r}.{meant}" if first else "name a command."
-        sys.stderr.write(f"pixelbrax: {told}\n\n{_help()}")
+        unknown = f"unknown command {first!r}.{suggest(first, commands())}"
+        sys.stderr.write(f"pixelbrax: {unknown if first else 'name a command.'}\n\n{_help()}")
         return 2
     _find_modules_here()
     try:

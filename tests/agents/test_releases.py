@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from pixelbrax_jax.agents.on_policy.ppg import PPGConfig
 from pixelbrax_jax.agents.on_policy.ppo import PPO, PPOConfig
 from pixelbrax_jax.agents.runner import settings
 from pixelbrax_jax.agents.runner.checkpoint import CheckpointError, Checkpoints, read_about
@@ -76,21 +75,12 @@ def test_a_run_of_0_2_0_goes_on(folder):
     assert load_config(read_about(folder / "checkpoints")) == ppo().config
 
 
-def test_a_setting_that_a_run_lacks_has_the_default_of_its_time(folder, monkeypatch):
+def test_a_setting_that_a_run_lacks_has_the_default(folder):
     change(folder, without=("vf_coef", "clip_value"))
     restore(folder, ppo())
     with pytest.raises(CheckpointError, match=r"vf_coef: 0\.5 there, 0\.7 here"):
         restore(folder, ppo(vf_coef=0.7))
-    # As if the default had been another one then.
-    monkeypatch.setitem(settings.FORMER_DEFAULTS, "vf_coef", 0.7)
-    restore(folder, ppo(vf_coef=0.7))
-    with pytest.raises(CheckpointError, match=r"vf_coef: 0\.7 there, 0\.5 here"):
-        restore(folder, ppo())
-    about = read_about(folder / "checkpoints")
-    assert load_config(about) == ppo(vf_coef=0.7).config
-    # Other algorithms need not have the setting.
-    monkeypatch.setitem(settings.FORMER_DEFAULTS, "decoupled", True)
-    assert "decoupled" not in settings.former_settings(PPGConfig)
+    assert load_config(read_about(folder / "checkpoints")) == ppo().config
 
 
 def test_a_default_of_0_2_0_that_changes_is_kept_for_older_runs(folder):

@@ -28,9 +28,6 @@ from pixelbrax_jax.validation import check_choice
 
 RESUME = ("never", "latest")
 
-FORMER_DEFAULTS: dict[str, Any] = {}
-"""Former defaults, by name of the setting, for stored runs that lack it."""
-
 OF_RUNS = ("seed", "seeds")
 """Settings of ``RunConfig`` that affect the result of a run."""
 
@@ -103,8 +100,7 @@ def describe_run(
 
 def former_settings(kind: type[TrainConfig]) -> dict[str, Any]:
     """Return the values, by name, that settings of class ``kind`` have if a run lacks them."""
-    known = describe(kind()) | {name: getattr(RunConfig(), name) for name in OF_RUNS}
-    return {name: FORMER_DEFAULTS.get(name, value) for name, value in known.items()}
+    return describe(kind()) | {name: getattr(RunConfig(), name) for name in OF_RUNS}
 
 
 def versions() -> dict[str, str]:
