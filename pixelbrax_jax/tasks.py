@@ -16,7 +16,7 @@ from pixelbrax_jax.physics.task import Task
 
 @dataclass(frozen=True, eq=False)
 class Suite:
-    """Tasks by name that one engine simulates, and the names of options that only they take.
+    """Tasks by name that one engine simulates.
 
     ``loader`` is the module with ``load(task, options)``, and ``options`` the dataclass of the
     options that only these tasks take.
