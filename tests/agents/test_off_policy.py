@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pixelbrax_jax.agents.off_policy.config import DrQv2Config
-from pixelbrax_jax.agents.off_policy.losses import atoms, noisy, projected
+from pixelbrax_jax.agents.off_policy.drqv2 import noisy, projected
 from pixelbrax_jax.agents.off_policy.replay import Replay
 from pixelbrax_jax.agents.presets import TASK_SETTINGS, preset
 from pixelbrax_jax.agents.rollout import Frames, Rollout
@@ -135,7 +135,7 @@ def test_noise_is_clipped_and_bounded_and_lets_gradients_pass():
 
 def test_a_projection_is_that_of_a_loop_and_keeps_sum_and_mean():
     rng = np.random.default_rng(0)
-    support = np.asarray(atoms(-2.0, 3.0, 11))
+    support = np.linspace(-2.0, 3.0, 11, dtype=np.float32)
     probabilities = rng.dirichlet(np.ones(11), 6)
     values = rng.uniform(-3.0, 4.0, (6, 11))
     found = np.asarray(projected(jnp.asarray(probabilities), jnp.asarray(values), support))

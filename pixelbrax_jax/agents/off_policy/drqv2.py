@@ -18,7 +18,6 @@ from pixelbrax_jax.agents.config import TrainConfig
 from pixelbrax_jax.agents.networks.encoders import LAYERS, Convolutions
 from pixelbrax_jax.agents.networks.q_functions import DeterministicActor, TwinQ
 from pixelbrax_jax.agents.off_policy.config import DrQv2Config
-from pixelbrax_jax.agents.off_policy.losses import atoms, noisy, projected
 from pixelbrax_jax.agents.off_policy.replay import Batch, Replay
 from pixelbrax_jax.agents.optimizer import Optimizer
 from pixelbrax_jax.agents.rollout import collect, shifted, split_obs
@@ -36,6 +35,9 @@ from pixelbrax_jax.agents.train_state import (
 )
 from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.types import EnvParams
+
+_LARGEST_ACTION = 1.0 - 1e-6
+"""Bound of the actions in updates, at which ``tanh`` has a gradient."""
 
 
 class OffPolicyState(TrainState):
@@ -324,4 +326,31 @@ class DrQv2(Algorithm):
 
     @property
     def _atoms(self) -> jax.Array:
-        return atoms(self.config.v_min, self.config.v_max, self.config.num_atoms)
+        config = self.config
+        return jnp.linspace(config.v_min, config.v_max, config.num_atoms, dtype=jnp.float32)
+
+
+def noisy(action: jax.Array, std: Any, key: jax.Array, clip: float | None = None) -> jax.Array:
+    """Add normal noise, within +- ``clip``, to (B, A) actions, and clip the result to [-1, 1].
+
+    The gradient passes the bounds (the truncated normal of DrQ-v2's code, arXiv 2107.09645).
+    """
+    noise = std * jax.random.normal(key, action.shape)
+    if clip is not None:
+        noise = jnp.clip(noise, -clip, clip)
+    noised = action + noise
+    bounded = jnp.clip(noised, -_LARGEST_ACTION, _LARGEST_ACTION)
+    return noised + jax.lax.stop_gradient(bounded - noised)
+
+
+def projected(probabilities: jax.Array, values: jax.Array, support: jax.Array) -> jax.Array:
+    """Project (..., M) probabilities onto (M,) atoms (C51; Bellemare et al., arXiv 1707.06887).
+
+    Each of (..., M) values, clipped to the atoms' range, gives its probability to the two equally
+    spaced atoms beside it, so that the mean stays.
+    """
+    spacing = support[1] - support[0]
+    values = jnp.clip(values, support[0], support[-1])
+    distance = jnp.abs(values[..., None] - support) / spacing
+    share = jnp.clip(1.0 - distance, 0.0, 1.0)
+    return jnp.sum(probabilities[..., None] * share, -2)
