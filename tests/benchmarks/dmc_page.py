@@ -70,6 +70,21 @@ def states() -> str:
     return f"{sum(task['states'] for task in tasks):,}"
 
 
+def whole(measure: str, **of: str) -> str:
+    """The span over tasks of the whole picture's speed over that of another measure."""
+    found = rows("dmc-look")
+    tasks = dict.fromkeys(row["arguments"]["task"] for row in found)
+    ours = [speed_of(found, "dmc.with_look", task=task, look="dmc") for task in tasks]
+    others = [speed_of(found, measure, task=task, **of) for task in tasks]
+    shares = sorted(one / other for one, other in zip(ours, others, strict=True))
+    return " to ".join(number(share) for share in (shares[0], shares[-1]))
+
+
+def speed_of(found: list[dict], measure: str, **arguments: str) -> float:
+    """Steps a second of a case that was measured."""
+    return float(tables.value(find(found, measure, **arguments), "steps_per_second"))
+
+
 def part() -> str:
     """After how many control steps the first episode parts."""
     return f"{min(n for task in kept_physics().values() if (n := task['episode']['apart']))}"
@@ -179,8 +194,11 @@ def pictures() -> str:
     return table(["mean difference of a color, of 255", "image", "bodies"], lines)
 
 
+WHOLE = partial(whole, "peers.dm_control_envs")
 FIGURES = {
     "transfer": transfer,
+    "whole": WHOLE,
+    "whole-share": partial(whole, "dmc.with_look", look="dmc-plain"),
     "pictures": pictures,
     "tasks": tasks,
     "least": lambda: named(next(iter(ratios()))),
@@ -258,6 +276,7 @@ def picture() -> str:
 
 README = {
     "picture": picture,
+    "whole": WHOLE,
     "cheetah": lambda: number(speeds("dmc_cheetah_run")[0]),
     "cheetah-ratio": lambda: f"{ratios()['dmc_cheetah_run']:.0f}",
     "slowest": lambda: named(next(iter(ratios()))),
