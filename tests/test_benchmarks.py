@@ -56,6 +56,7 @@ ANSWERS = {
     "startup.first_frame": {"seconds": {"import": 1.0, "make": 2.0}},
     "scene.describe": {},
     "dmc.pixels": {"steps_per_second": 500.0, "first_frame": {"without": 40.0, "with": 9.0}},
+    "dmc.with_look": {"steps_per_second": 300.0},
     "peers.dm_control_envs": {"steps_per_second": 4.0, "processes": 2, "opengl": "a software one"},
     "peers.gymnasium_envs": {
         "steps_per_second": 5.0,
