@@ -77,7 +77,8 @@ def whole(measure: str, **of: str) -> str:
     ours = [speed_of(found, "dmc.with_look", task=task, look="dmc") for task in tasks]
     others = [speed_of(found, measure, task=task, **of) for task in tasks]
     shares = sorted(one / other for one, other in zip(ours, others, strict=True))
-    return " to ".join(number(share) for share in (shares[0], shares[-1]))
+    ends = shares[0], shares[-1]
+    return " to ".join(f"{share:.0f}" if share > 1 else f"{share:.2f}" for share in ends)
 
 
 def speed_of(found: list[dict], measure: str, **arguments: str) -> float:
