@@ -255,7 +255,7 @@ class Look(struct.PyTreeNode):
     Attributes:
         ground: static, ``"checker"`` or ``"grid"`` (thin dark lines), the pattern of planes that
             are ground, from the corner of finite planes, the middle of infinite ones.
-        shadows: static, whether geoms cast shadows.
+        shadows: static, whether geoms cast shadows (without diffuse and specular light).
         shininess: static positive int, the exponent.
         light: (3,), world direction TO the light, any length but 0; None for no such light.
         ambient, diffuse, specular, highlight: () coefficients.

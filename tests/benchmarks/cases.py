@@ -88,7 +88,7 @@ def dmc() -> Iterator[Case]:
 
 
 def dm_control(group: str, task: str) -> Case:
-    """The task in dm_control, in this process."""
+    """The task in dm_control, one environment."""
     row = DMC_TASKS[task]
     where = {"task": task, "domain": row.domain, "goal": row.task, "processes": 0}
     # The camera that the field takes; the quadruped is out of the sight of its first one.
@@ -96,12 +96,15 @@ def dm_control(group: str, task: str) -> Case:
     return PeerCase(group, "peers.dm_control_envs", where)
 
 
-LOOKED_AT = ("cartpole_swingup", "cheetah_run", "walker_walk", "humanoid_walk", "quadruped_walk")
+LOOKED_AT = (
+    *("cartpole_swingup", "cheetah_run", "walker_walk", "humanoid_walk", "quadruped_walk"),
+    "manipulator_bring_ball",
+)
 
 
 def looks() -> Iterator[Case]:
     """Some of these tasks with the default look, with DM Control's whole picture, and there."""
-    for task in (f"dmc_{name}" for name in (*LOOKED_AT, "manipulator_bring_ball")):
+    for task in (f"dmc_{name}" for name in LOOKED_AT):
         for look in ("dmc-plain", "dmc"):
             where = {"task": task, "num_envs": 128, "look": look}
             yield Case("dmc-look", "dmc.with_look", where, HERE)

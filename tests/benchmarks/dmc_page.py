@@ -137,10 +137,9 @@ def physics() -> str:
 
 def speeds(task: str) -> tuple[float, float]:
     """Steps per second of a task, ours and dm_control's."""
-    ours, theirs = (
-        find(rows(), measure, task=task) for measure in ("dmc.pixels", "peers.dm_control_envs")
-    )
-    return ours["values"]["steps_per_second"], theirs["values"]["steps_per_second"]
+    found = rows()
+    ours = speed_of(found, "dmc.pixels", task=task)
+    return ours, speed_of(found, "peers.dm_control_envs", task=task)
 
 
 @cache
@@ -183,13 +182,17 @@ COMPARED = {
 }
 
 
+def of_pictures(pair: str, area: str) -> list[float]:
+    """Mean differences of a pair of pictures over an area, by model."""
+    kept = json.loads((FOLDER / "pictures.json").read_text("utf-8"))
+    return [row[area] for row in kept["mean_absolute_difference_of_255"][pair].values()]
+
+
 def pictures() -> str:
     """How far pictures of DM Control are from OpenGL's, in Markdown: median and range of models."""
-    kept = json.loads((FOLDER / "pictures.json").read_text("utf-8"))
     lines = []
     for pair, name in COMPARED.items():
-        found = kept["mean_absolute_difference_of_255"][pair].values()
-        areas = ([model[area] for model in found] for area in ("all", "else"))
+        areas = (of_pictures(pair, area) for area in ("all", "else"))
         texts = (f"{median(area):.1f} ({min(area):.1f} to {max(area):.1f})" for area in areas)
         lines.append([name, *texts])
     return table(["mean difference of a color, of 255", "image", "bodies"], lines)
@@ -270,9 +273,7 @@ def training_minutes() -> str:
 
 def picture() -> str:
     """The median of models of how far their pictures are from dm_control's."""
-    kept = json.loads((FOLDER / "pictures.json").read_text("utf-8"))
-    found = kept["mean_absolute_difference_of_255"]["ours, theirs"].values()
-    return f"{median(model['all'] for model in found):.1f}"
+    return f"{median(of_pictures('ours, theirs', 'all')):.1f}"
 
 
 README = {

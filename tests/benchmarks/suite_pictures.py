@@ -16,6 +16,7 @@ import json
 import math
 from collections.abc import Iterator
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -65,12 +66,14 @@ def pictures(domain: str, task: str, camera: int, movable: tuple[str, ...]) -> d
         Lists of the pictures in ``COMPARED``, (84, 84, 3) float or uint8, and of ``area``,
         (84, 84) int: 0 sky, 1 ground, 2 else.
     """
-    single = _theirs(domain, task, camera, SIZE, multisamples=0)
+    ours = _ours(domain, task, camera, movable)
     large = _theirs(domain, task, camera, SUPERSAMPLED * SIZE, multisamples=0)
     return {
-        **_ours(domain, task, camera, movable),
+        "ours": [_levels(frame) for frame in ours],
+        "ours with 4 rays": [_levels(f) for f in _ours(domain, task, camera, movable, samples=4)],
+        "area": [_area(frame) for frame in ours],
         "theirs": _theirs(domain, task, camera, SIZE),
-        "single": single,
+        "single": _theirs(domain, task, camera, SIZE, multisamples=0),
         "picked": [
             np.mean([image[y::SUPERSAMPLED, x::SUPERSAMPLED] for x, y in POSITIONS], axis=0)
             for image in large
@@ -103,21 +106,24 @@ def _theirs(
     return [physics.render(size, size, camera_id=camera) for physics in states]
 
 
-def _ours(domain: str, task: str, camera: int, movable: tuple[str, ...]) -> dict[str, list]:
-    drawn: dict[str, list] = {"ours": [], "ours with 4 rays": [], "area": []}
-    for samples, name in ((1, "ours"), (4, "ours with 4 rays")):
-        draw = None
-        for physics in _states(domain, task):
-            if draw is None:
-                own = suite_models.of(domain, physics.model.ptr, camera, movable)
-                draw = jax.jit(partial(_render, own, samples))
-            frame = draw(*own.links(physics.data.ptr))
-            image = np.stack([frame.r, frame.g, frame.b], axis=-1)
-            drawn[name].append(np.floor(image * 255 + 0.5).astype(np.uint8))
-            if samples == 1:
-                seen, ground = np.asarray(frame.seg) >= 0, np.asarray(frame.ground)
-                drawn["area"].append(np.where(ground, 1, np.where(seen, 2, 0)))
-    return drawn
+def _ours(
+    domain: str, task: str, camera: int, movable: tuple[str, ...], samples: int = 1
+) -> list[Frame]:
+    states = _states(domain, task)
+    first = next(states)
+    own = suite_models.of(domain, first.model.ptr, camera, movable)
+    draw = jax.jit(partial(_render, own, samples))
+    return [draw(*own.links(physics.data.ptr)) for physics in chain([first], states)]
+
+
+def _levels(frame: Frame) -> np.ndarray:
+    image = np.stack([frame.r, frame.g, frame.b], axis=-1)
+    return np.floor(image * 255 + 0.5).astype(np.uint8)
+
+
+def _area(frame: Frame) -> np.ndarray:
+    seen, ground = np.asarray(frame.seg) >= 0, np.asarray(frame.ground)
+    return np.where(ground, 1, np.where(seen, 2, 0))
 
 
 def _render(own: Any, samples: int, xpos: jax.Array, xquat: jax.Array) -> Frame:
