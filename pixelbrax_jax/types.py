@@ -181,7 +181,8 @@ class Camera(struct.PyTreeNode):
 
     Attributes:
         pos: (3,).
-        xmat: (3, 3), columns are its right, up and back directions, as in MuJoCo and OpenGL.
+        xmat: (3, 3), columns are its right, up and back directions, as in MuJoCo and OpenGL; it
+            looks along minus the third one.
         fovy: (), vertical field of view.
     """
 
