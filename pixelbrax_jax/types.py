@@ -301,8 +301,8 @@ class Scene(struct.PyTreeNode):
 
     Attributes:
         geoms: shapes, sizes and colors.
-        pos: (G, 3), geom centers.
-        xmat: (G, 3, 3), geom orientations; columns are the geom's axes.
+        pos: (G, 3), geom centers; those of the world (link -1) as in ``geoms``.
+        xmat: (G, 3, 3), geom orientations, likewise; columns are the geom's axes.
         camera: the viewpoint.
         look: light, sky and ground.
         sky_xmat: (3, 3), the camera's orientation for the sky's texture, so that a batch with one

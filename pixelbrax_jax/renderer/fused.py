@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache, partial
 from typing import Any, NamedTuple
 
@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pixelbrax_jax import spatial
 from pixelbrax_jax.renderer import opengl, shading
 from pixelbrax_jax.renderer.intersect import (
     Hit,
@@ -55,17 +56,52 @@ def sky_of(
     return [added[:, c] for c in range(3)]
 
 
+def ground_light_of(
+    scene: Scene, height: int, width: int, first_row: jax.Array | int, num_rows: int
+) -> dict[int, list[jax.Array]]:
+    """Return what lights multiply each bounded ground's colors by with OpenGL's formulas.
+
+    That is for pixels of a band, (num_rows * width,) each, as if each saw that ground. It depends
+    on the poses of camera, lamps and ground alone: a batch in which none moves computes it once.
+    """
+    geoms, look = scene.geoms, scene.look
+    grounds = [g for g in range(len(geoms.kind)) if geoms.is_ground(g) and geoms.is_bounded(g)]
+    if not look.opengl or not grounds:
+        return {}
+    if all(geoms.link[g] < 0 for g in grounds):
+        # As in the scene, but the same arrays for all of a batch.
+        scene = scene.replace(pos=geoms.pos, xmat=spatial.quat_to_mat(geoms.quat))
+    view = jax.lax.optimization_barrier(view_of(scene, height))
+    ray = _rays(view, height, width, first_row, num_rows)
+    return {
+        g: shading.computed_apart(partial(_on_ground, view, ray, solid_of(view, g, False)))
+        for g in grounds
+    }
+
+
+def _on_ground(view: View, ray: Vector, plane: Solid) -> list[Any]:
+    """Return the same for one ground and any rays."""
+    lights = opengl.lights_of(view.look, (0.0, 0.0, 1.0))
+    place = _place(plane, ray, plane.hit(ray, plane.center).t)
+    return opengl.on_plane(lights, (0.0, 0.0, 0.0), plane.center, plane.axes, plane.size, place)
+
+
 Near = Callable[[int, Callable[[Any], Any], Any], Any]
 """``near(g, update, value)`` returns ``update(value)`` if some pixel of a block may see geom ``g``,
 and may return ``value`` otherwise."""
 
 
 def see(
-    view: View, ray: Vector, near: Near | None = None, texture: Sequence[jax.Array] = ()
+    view: View,
+    ray: Vector,
+    near: Near | None = None,
+    texture: Sequence[jax.Array] = (),
+    ground_light: Mapping[int, Sequence[jax.Array]] | None = None,
 ) -> Frame:
     """Return what pixels with unit rays see; ``near`` may skip geoms that none sees.
 
-    ``texture`` is what the sky's texture adds to their red, green and blue, if it has one.
+    ``texture`` is what the sky's texture adds to their red, green and blue, if it has one, and
+    ``ground_light`` what ``ground_light_of`` returns; None computes it here.
 
     All parts have the shape of the rays' components. ``seg`` is the rank of the visible geom, and
     the number of geoms for the sky. ``depth`` is exact to a relative ``2**(b - 24)``, with b bits
@@ -119,9 +155,10 @@ def see(
     grounds = []
     for g in filter(geoms.is_ground, view.order):
         on_ground |= seen[g]
-        fraction, place = _ground_fraction(view, g, ray, hit(g).t, solid(g))
-        if geoms.is_bounded(g):
-            grounds.append((seen[g], solid(g), place))
+        fraction = _ground_fraction(view, g, ray, hit(g).t, solid(g))
+        if look.opengl and geoms.is_bounded(g):
+            shown = _on_ground(view, ray, solid(g)) if ground_light is None else ground_light[g]
+            grounds.append((seen[g], shown))
         for c in range(3):
             first, second = look.ground_rgb[0, c], look.ground_rgb[1, c]
             color[c] = jnp.where(seen[g], first + fraction * (second - first), color[c])
@@ -135,7 +172,7 @@ def see(
     normal, light = (*n_xy, n_z), _phong_light
     matte = on_ground
     if look.opengl:
-        light = partial(_opengl_light, in_kernel=near is not None)
+        light = _opengl_light
         for g in view.order:
             if geoms.textured and geoms.textured[g]:
                 matte |= seen[g]
@@ -170,14 +207,19 @@ def render(
     """Return a band of rows of an image of the scene; see ``base.render``."""
     # The barrier keeps these numbers out of the loop over pixels.
     view = jax.lax.optimization_barrier(view_of(scene, height))
+    ray = _rays(view, height, width, first_row, num_rows)
+    texture = sky_of(scene, height, width, first_row, num_rows)
+    ground_light = ground_light_of(scene, height, width, first_row, num_rows)
+    frame = see(view, ray, texture=texture, ground_light=ground_light)
+    frame = frame.replace(seg=jnp.array([*view.order, -1], jnp.int32)[frame.seg])
+    return jax.tree.map(lambda plane: plane.reshape(num_rows, width), frame)
+
+
+def _rays(view: View, height: int, width: int, first_row: jax.Array | int, num_rows: int) -> Vector:
     # All rows in one axis, because separate rows would end in pixels that do not fill a vector.
     index = jnp.arange(num_rows * width, dtype=jnp.int32)
     row = jax.lax.div(index, np.int32(width)) + first_row
-    column = jax.lax.rem(index, np.int32(width))
-    texture = sky_of(scene, height, width, first_row, num_rows)
-    frame = see(view, rays(view, height, width, row, column), texture=texture)
-    frame = frame.replace(seg=jnp.array([*view.order, -1], jnp.int32)[frame.seg])
-    return jax.tree.map(lambda plane: plane.reshape(num_rows, width), frame)
+    return rays(view, height, width, row, jax.lax.rem(index, np.int32(width)))
 
 
 def _directions(ray: Vector, to_light: Vector | None, lamps: bool) -> list[tuple[Vector, Any]]:
@@ -203,8 +245,8 @@ def _normal_products(
 class _Surface(NamedTuple):
     """What pixels see: rays, points, normals, their products with the light, ground and textures.
 
-    ``normal`` has x and y only with lamps or ``Look.opengl``. Each bounded ground is where it is
-    seen, its plane, and the places along its x and y.
+    ``normal`` has x and y only with lamps or ``Look.opengl``. With the latter, ``grounds`` has for
+    each bounded ground where it is seen, and what lights multiply its colors by.
     """
 
     ray: Vector
@@ -214,7 +256,7 @@ class _Surface(NamedTuple):
     n_l: jax.Array
     on_ground: jax.Array
     matte: jax.Array
-    grounds: list[tuple[jax.Array, Solid, Vector]]
+    grounds: list[tuple[jax.Array, Sequence[jax.Array]]]
 
 
 Ways = Callable[[Vector, Vector], Iterator[tuple[jax.Array, jax.Array]]]
@@ -259,16 +301,13 @@ def _phong_light(look: Look, surface: _Surface, ways: Ways) -> tuple[Any, Any]:
     return shade, highlight
 
 
-def _opengl_light(look: Look, surface: _Surface, ways: Ways, *, in_kernel: bool) -> tuple[Any, Any]:
+def _opengl_light(look: Look, surface: _Surface, ways: Ways) -> tuple[Any, Any]:
     """Return the same with OpenGL's formulas; see ``opengl.py``."""
     ray, points, normal, to_light, _, on_ground, matte, grounds = surface
     lights = opengl.lights_of(look, (0.0, 0.0, 1.0))
     factors = [light(ray, points, normal) for light in lights]
     textures = [opengl.on_texture(pair) for pair in factors]
-    for here, plane, place in grounds:
-        eye = (0.0, 0.0, 0.0)
-        image = partial(opengl.on_plane, lights, eye, plane.center, plane.axes, plane.size, place)
-        found = image() if in_kernel else shading.computed_apart(image)
+    for here, found in grounds:
         textures = [jnp.where(here, *pair) for pair in zip(found, textures, strict=True)]
     lit: list[Any] = [True] * len(lights)
     if to_light is not None:
@@ -288,19 +327,21 @@ def _opengl_light(look: Look, surface: _Surface, ways: Ways, *, in_kernel: bool)
     return shade, highlight
 
 
-def _ground_fraction(
-    view: View, g: int, ray: Vector, t: jax.Array, plane: Solid
-) -> tuple[jax.Array, Vector]:
-    """Return the second color's fraction on plane ``g``, and the place along x and y in metres."""
+def _place(plane: Solid, ray: Vector, t: jax.Array) -> Vector:
+    """Return places along a plane's x and y, metres, seen at distances ``t`` along rays."""
+    return tuple(t * dot(ray, axis) - dot(plane.center, axis) for axis in plane.axes[:2])
+
+
+def _ground_fraction(view: View, g: int, ray: Vector, t: jax.Array, plane: Solid) -> jax.Array:
+    """Return the second color's fraction on plane ``g``."""
     normal = plane.axes[2]
     slope = 1.0 / at_most(dot(ray, normal), -1e-7)
     inv_pitch = 1.0 / view.look.ground_pitch
     step = -t * ray[2] * view.pixel * inv_pitch
-    place, coords, widths, across, upward = [], [], [], [], []
-    for number, (axis, half) in enumerate(zip(plane.axes[:2], plane.size[:2], strict=True)):
+    coords, widths, across, upward = [], [], [], []
+    for number, along in enumerate(_place(plane, ray, t)):
+        axis, half = plane.axes[number], plane.size[number]
         ray_axis = dot(ray, axis)
-        along = t * ray_axis - dot(plane.center, axis)
-        place.append(along)
         if view.geoms.is_bounded(g):
             # MuJoCo's textures start at the corner of least x and largest y.
             along = along + half if number == 0 else half - along
@@ -313,4 +354,4 @@ def _ground_fraction(
         upward.append(above)
     if view.look.opengl:
         widths = [step * opengl.footprint(across, upward)] * 2
-    return shading.second_color_fraction(view.look, *coords, *widths), place
+    return shading.second_color_fraction(view.look, *coords, *widths)

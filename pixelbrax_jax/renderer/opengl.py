@@ -113,7 +113,9 @@ def on_plane(
     for weight, (along_x, along_y) in corners:
         point = tuple(center[k] + along_x * axes[0][k] + along_y * axes[1][k] for k in range(3))
         way = [p - e for p, e in zip(point, eye, strict=True)]
-        inv_distance = jax.lax.rsqrt(at_least(dot(way, way), _TINY))
+        square = dot(way, way)
+        # A select, because XLA would store a root that has several readers.
+        inv_distance = jnp.where(square > _TINY, jax.lax.rsqrt(at_least(square, _TINY)), 1.0)
         ray = tuple(component * inv_distance for component in way)
         for k, light in enumerate(lights):
             totals[k] += weight * on_texture(light(ray, point, axes[2]))
@@ -130,7 +132,9 @@ def _cell(size: Vector, axis: int, place: Any) -> tuple[Any, Any, Any]:
     width = 2.0 * at_least(at_least(size[2], half / _MOST_CELLS), _TINY)
     # Without the summand a quotient that is whole might be rounded down.
     start = -width * jnp.floor(half / width + 1e-4)
-    low = start + width * jnp.floor((place - start) / width)
+    low = start + width * jnp.floor((place - start) * (1.0 / width))
     low, high = between(-half, low, half), between(-half, low + width, half)
     low, high = (jnp.where(half > 0.0, end, place) for end in (low, high))
-    return low, high, between(0.0, (place - low) / at_least(high - low, _TINY), 1.0)
+    room = high - low
+    inv_room = jnp.where(room > _TINY, 1.0 / at_least(room, _TINY), 0.0)  # a select, as above
+    return low, high, between(0.0, (place - low) * inv_room, 1.0)

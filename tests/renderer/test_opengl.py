@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -9,8 +10,10 @@ import pytest
 from pixelbrax_jax import GeomKind, make_look
 from pixelbrax_jax.renderer.base import render
 from pixelbrax_jax.renderer.opengl import on_plane
+from pixelbrax_jax.scene.place import place
+from pixelbrax_jax.spatial import make_rig
 from pixelbrax_jax.types import Lamp
-from tests.renderer.scenes import scene_of
+from tests.renderer.scenes import geoms_of, scene_of
 from tests.renderer.test_planes import RENDERERS, ground_points
 
 SIZE = 24
@@ -100,6 +103,28 @@ def test_a_plane_is_lit_at_the_vertices_of_its_grid(renderer):
     assert seen > 200
     # A light for each point would differ.
     assert abs(interpolated(0.3, 0.2, ends_x, ends_y) - on_vertex(0.3, 0.2)) > 0.03
+
+
+def test_light_on_a_ground_is_computed_once_for_cameras_that_do_not_move():
+    geoms = geoms_of(
+        [GeomKind.PLANE, GeomKind.SPHERE], [(2.0, 2.0, 0.2), (0.1, 0.0, 0.0)], bounded=(True, False)
+    ).replace(link=(-1, 0))
+
+    def roots(link):
+        """Numbers of roots of all pixels of one image, and of each image of a batch."""
+        rig = make_rig((0, -3, 1), (0, 0, 1), 45.0, link=link)
+
+        def red(xpos):
+            xquat = jnp.array([[1.0, 0.0, 0.0, 0.0]])
+            return render(place(geoms, rig, LOOK, xpos, xquat), 5, 5, "fused").r
+
+        program = jax.jit(jax.vmap(red)).lower(jnp.zeros((7, 1, 3))).as_text()
+        lines = [line for line in program.splitlines() if "stablehlo.rsqrt" in line]
+        return [sum(shape in line for line in lines) for shape in ("<25xf32>", "<7x25xf32>")]
+
+    (once, each), (moving_once, moving_each) = roots(-1), roots(0)
+    # At three vertices the way to the eye, both highlights, and the way to the lamp.
+    assert once - moving_once == moving_each - each == 12
 
 
 def test_cells_are_not_smaller_than_a_part_of_the_plane():
