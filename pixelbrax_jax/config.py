@@ -12,7 +12,7 @@ import jax
 from pixelbrax_jax.distractors.base import Distractor
 from pixelbrax_jax.distractors.clips import ClipBank
 from pixelbrax_jax.distractors.presets import as_tuple
-from pixelbrax_jax.observations import IMAGES, check_obs_mode, parts_of
+from pixelbrax_jax.observations import IMAGES, Sizes, check_obs_mode, check_sizes, parts_of
 from pixelbrax_jax.physics.brax.tasks import BraxOptions
 from pixelbrax_jax.physics.mujoco.options import MujocoOptions
 from pixelbrax_jax.plain import from_plain
@@ -39,6 +39,10 @@ class ProgramConfig:
     """Height of a frame in pixels."""
     width: int = 84
     """Width of a frame in pixels."""
+    sizes: Sizes = ()
+    """Height and width of each of several cameras' images, with a name, in the order of the
+    cameras: ``{"front": (84, 84), "top": (48, 64)}``. An observation is then a dictionary with
+    entries such as ``pixels/front``."""
     frame_stack: int = 3
     """Number of frames in one observation."""
     obs_mode: str = "pixels"
@@ -61,6 +65,9 @@ class ProgramConfig:
         for name in ("height", "width", "frame_stack", "action_repeat"):
             self._store(name, check_positive_int(name, self._static(name)))
         self._store("obs_mode", check_obs_mode(self._static("obs_mode")))
+        self._store("sizes", check_sizes(self.sizes))
+        if self.sizes and not self.images:
+            raise ValueError(f"sizes={self.sizes!r} need images, but obs_mode={self.obs_mode!r}.")
         check_renderer(self._static("renderer"))
         self._store("samples", check_samples(self._static("samples")))
         self._store("distractors", as_tuple(from_plain(self.distractors)))
@@ -69,6 +76,12 @@ class ProgramConfig:
     def images(self) -> tuple[str, ...]:
         """Names of the images in an observation; none with ``obs_mode="state"``."""
         return tuple(part for part in parts_of(self.obs_mode) if part in IMAGES)
+
+    @property
+    def image_sizes(self) -> dict[str, tuple[int, int]]:
+        """``sizes`` as heights and widths by name."""
+        rows: Any = self.sizes
+        return {name: (height, width) for name, height, width in rows}
 
     def _static(self, name: str) -> Any:
         """Return an option, or raise TypeError if it is an array or cannot be hashed."""

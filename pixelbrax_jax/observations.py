@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
 
-from pixelbrax_jax.validation import check_choice
+from pixelbrax_jax.validation import check_choice, check_positive_int
 
 
 class Image(NamedTuple):
@@ -22,11 +23,45 @@ IMAGES = {
 }
 """Images by name, in the order of an observation's entries."""
 
+
+def image_of(entry: str) -> Image:
+    """Return the image of an observation's entry, such as ``depth`` or ``depth/top``."""
+    return IMAGES[entry.split("/")[0]]
+
+
 PARTS = (*IMAGES, "state")
 """Names that ``obs_mode`` may join."""
 
 MAX_DEPTH = 100.0
 """Largest depth of an observation in metres, also that of the sky."""
+
+
+Sizes = Mapping[str, tuple[int, int]] | tuple[tuple[str, int, int], ...]
+
+
+def check_sizes(value: Any) -> tuple[tuple[str, int, int], ...]:
+    """Return rows of a camera's name, height and width, given such rows or a mapping."""
+    if isinstance(value, Mapping):
+        value = [(name, *_items(size)) for name, size in value.items()]
+    rows = [_items(row) for row in _items(value)]
+    if not all(len(row) == 3 and isinstance(row[0], str) and row[0] for row in rows):
+        raise ValueError(
+            "sizes must give each camera's image a name, a height and a width, such as "
+            f"{{'front': (84, 84), 'top': (48, 64)}}, got {value!r}."
+        )
+    names = [row[0] for row in rows]
+    if len(set(names)) < len(names):
+        raise ValueError(f"sizes must have different names, got {', '.join(names)}.")
+    if len(rows) == 1:
+        raise ValueError(f"sizes are for several cameras, got {value!r}: use height and width.")
+    return tuple(
+        (name, *(check_positive_int(f"the size of {name!r}", size) for size in row))
+        for name, *row in rows
+    )
+
+
+def _items(value: Any) -> tuple[Any, ...]:
+    return tuple(value) if isinstance(value, Iterable) and not isinstance(value, str) else (value,)
 
 
 def check_obs_mode(value: object) -> str:

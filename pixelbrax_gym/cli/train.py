@@ -9,7 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_type_hints
 
 import tyro
-from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
+from tyro.constructors import (
+    ConstructorRegistry,
+    PrimitiveConstructorSpec,
+    PrimitiveTypeInfo,
+    UnsupportedTypeAnnotationError,
+)
 
 from pixelbrax_gym.cli import CommandError, UsageError, say
 from pixelbrax_jax.extras import needs_extra
@@ -133,9 +138,9 @@ def parse(algorithm: str, arguments: Sequence[str]) -> tuple[Launch, TrainConfig
         "options": RunConfig(output_dir=f"runs/{algorithm}"),
     }
     # One flat list of options for all.
-    flat: Any = tyro.conf.OmitArgPrefixes
+    flat, parsed_alone = tyro.conf.OmitArgPrefixes, tyro.conf.SuppressFixed
     command: Any = make_dataclass(
-        "Train", [(part, flat[type(value)]) for part, value in parts.items()]
+        "Train", [(part, flat[parsed_alone[type(value)]]) for part, value in parts.items()]
     )
     with _names_for_objects():
         parsed = tyro.cli(
@@ -161,7 +166,11 @@ def _names_for_objects() -> ConstructorRegistry:
     }
 
     @registry.primitive_rule
-    def names(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+    def names(
+        info: PrimitiveTypeInfo,
+    ) -> PrimitiveConstructorSpec | UnsupportedTypeAnnotationError | None:
+        if info.type == types["sizes"]:
+            return UnsupportedTypeAnnotationError(())  # agents see images of one size
         if info.type not in {types["distractors"], types["camera"], *metavars}:
             return None
         if info.type == types["camera"]:

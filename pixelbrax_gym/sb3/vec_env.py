@@ -25,17 +25,20 @@ from pixelbrax_jax.validation import check_bool, check_choice
 
 def check_channels(env: PixelEnv, channels_first: bool) -> None:
     """Reject images whose shortest axis, which Stable-Baselines3 reads as channels, is another."""
-    channels = 3 * env.frame_stack * env.num_cameras
-    shortest = min(env.height, env.width)
-    misread = shortest < channels if channels_first else env.height <= min(env.width, channels)
-    if "pixels" in env.images and misread:
-        cameras = f", {env.num_cameras} cameras" if env.num_cameras > 1 else ""
-        raise ValueError(
-            f"height={env.height}, width={env.width}{cameras} and frame_stack={env.frame_stack} "
-            f"make images with {channels} channels, but Stable-Baselines3 takes the shortest axis "
-            f"of an image for its channels: use a height and width above {channels} pixels, or "
-            "stack fewer frames."
-        )
+    if "pixels" not in env.images:
+        return
+    sizes = [*env.image_sizes.values()] or [(env.height, env.width)]
+    cameras = 1 if env.sizes else env.num_cameras
+    channels = 3 * env.frame_stack * cameras
+    for height, width in sizes:
+        if min(height, width) < channels if channels_first else height <= min(width, channels):
+            several = f", {cameras} cameras" if cameras > 1 else ""
+            raise ValueError(
+                f"height={height}, width={width}{several} and frame_stack={env.frame_stack} make "
+                f"images with {channels} channels, but Stable-Baselines3 takes the shortest axis "
+                f"of an image for its channels: use a height and width above {channels} pixels, or "
+                "stack fewer frames."
+            )
 
 
 class SB3VecEnv(VecEnv):

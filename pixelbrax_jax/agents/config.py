@@ -169,6 +169,11 @@ def _check_env(env: EnvConfig) -> None:
             raise TypeError(f"{name} of training settings must be a name, got {value!r}.")
     if not all(isinstance(item, str) for item in as_tuple(env.distractors)):
         raise TypeError(f"distractors of training settings must be names, got {env.distractors!r}.")
+    if env.sizes:
+        raise ValueError(
+            f"sizes={env.sizes!r} cannot be trained on: an agent's cameras are channels of one "
+            "image, with height and width."
+        )
     if env.obs_mode not in ("pixels", "depth"):
         raise ValueError(
             f"obs_mode of training settings must be 'pixels' or 'depth', got {env.obs_mode!r}; "

@@ -59,6 +59,11 @@ class BraxEnv(Env):
         """
         if not isinstance(env, PixelEnv):
             raise TypeError(f"env must be a PixelEnv, got {type(env).__name__}.")
+        if env.sizes:
+            raise ValueError(
+                f"sizes={env.sizes!r} are not for Brax's trainers: all cameras share height and "
+                "width there."
+            )
         if env.images not in ((), ("pixels",)):
             raise ValueError(
                 f"obs_mode={env.obs_mode!r} is not for Brax's trainers, whose images are pixels: "

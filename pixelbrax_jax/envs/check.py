@@ -95,9 +95,11 @@ def _check_timestep(env: PixelEnv, timestep: Timestep, origin: str) -> None:
 
 
 def _check_stack(env: PixelEnv, first: Timestep) -> None:
-    for name in env.images:
-        image = np.asarray(first.obs[name] if isinstance(first.obs, dict) else first.obs)
-        frames = image.reshape(env.height, env.width, env.frame_stack, -1)
+    parts = first.obs if isinstance(first.obs, dict) else {"": first.obs}
+    for part in parts.values():
+        if part.ndim != 3:
+            continue
+        frames = np.asarray(part).reshape(*part.shape[:2], env.frame_stack, -1)
         _require(
             bool((frames == frames[:, :, :1]).all()),
             "the first observation must be copies of the first frame",

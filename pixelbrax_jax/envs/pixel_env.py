@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Any
@@ -16,7 +17,7 @@ from pixelbrax_jax.distractors.presets import as_tuple
 from pixelbrax_jax.envs.arguments import check_action, check_key
 from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.memory import check_fits
-from pixelbrax_jax.observations import IMAGES, MAX_DEPTH, parts_of
+from pixelbrax_jax.observations import IMAGES, MAX_DEPTH, image_of, parts_of
 from pixelbrax_jax.physics.base import Physics, check_physics
 from pixelbrax_jax.ranges import sample
 from pixelbrax_jax.renderer.base import draw, render
@@ -70,6 +71,11 @@ class PixelEnv(ProgramConfig):
                 "dataclass, or do not override its __eq__."
             ) from error
         self._store("num_cameras", check_positive_int("num_cameras", self.num_cameras))
+        if self.sizes and len(self.sizes) != self.num_cameras:
+            raise ValueError(
+                f"sizes={self.sizes!r} are of {len(self.sizes)} cameras, but there are "
+                f"{self.num_cameras}: give one size for each camera, or none."
+            )
         chain = Chain(as_tuple(self.distractors) if self.images else ())
         self._store("distractors", chain.links)
         self._check_distractors()
@@ -117,20 +123,25 @@ class PixelEnv(ProgramConfig):
     @property
     def drawn_spec(self) -> Any:
         """Shape and dtype of what ``draw_obs`` returns, as ``jax.ShapeDtypeStruct``."""
-        cameras = (self.num_cameras,) if self.num_cameras > 1 else ()
-        shape = (*cameras, self.height, self.width)
-        return _bare({n: jax.ShapeDtypeStruct(shape, IMAGES[n].drawn) for n in self.images})
+        cameras = (self.num_cameras,) if self.num_cameras > 1 and not self.sizes else ()
+        drawn = {
+            name: jax.ShapeDtypeStruct((*cameras, *stack.shape[:2]), image_of(name).drawn)
+            for name, stack in self._stacks.items()
+        }
+        return _bare(drawn)
 
     @cached_property
     def _stacks(self) -> dict[str, jax.ShapeDtypeStruct]:
         """Shape and dtype of each image's frame stack."""
-        frames = self.num_cameras * self.frame_stack
-        return {
-            name: jax.ShapeDtypeStruct(
-                (self.height, self.width, IMAGES[name].channels * frames), IMAGES[name].dtype
-            )
-            for name in self.images
-        }
+        size, of_camera = (self.height, self.width), self.image_sizes.items()
+        sizes = {f"{n}/{camera}": size for n in self.images for camera, size in of_camera}
+        sizes = sizes or dict.fromkeys(self.images, size)
+        frames = self.frame_stack * (1 if self.sizes else self.num_cameras)
+        stacks = {}
+        for name, size in sizes.items():
+            channels, dtype, _ = image_of(name)
+            stacks[name] = jax.ShapeDtypeStruct((*size, channels * frames), dtype)
+        return stacks
 
     def check_memory(self, num_envs: int) -> None:
         """Raise MemoryError if observations and states of two steps do not fit into main memory."""
@@ -139,7 +150,10 @@ class PixelEnv(ProgramConfig):
         if self.images:
             stacks = self._stacks.values()
             num_bytes += 2 * num_envs * sum(x.size * x.dtype.itemsize for x in stacks)
-            what += f", height={self.height}, width={self.width}, frame_stack={self.frame_stack}"
+            size = (
+                f"sizes={self.sizes}" if self.sizes else f"height={self.height}, width={self.width}"
+            )
+            what += f", {size}, frame_stack={self.frame_stack}"
         check_fits(what, num_bytes)
 
     @partial(jax.jit, static_argnums=0)
@@ -334,20 +348,25 @@ class PixelEnv(ProgramConfig):
 
     def draw_obs(self, sim: SimState, params: EnvParams) -> Any:
         """Render the images of an observation, as ``drawn_spec`` says."""
-        scene, *others = (self._scene(sim, params, c) for c in range(self.num_cameras))
+        scenes = [self._scene(sim, params, camera) for camera in range(self.num_cameras)]
+        scene, size = scenes[0], (self.height, self.width)
 
         def seen_by(camera: Camera) -> tuple[jax.Array, ...]:
-            seen = scene.replace(camera=camera)
-            return self._draw(seen, sim, params, self.height, self.width, self.images)
+            return self._draw(scene.replace(camera=camera), sim, params, *size, self.images)
 
-        if others:
-            cameras = [scene.camera, *(other.camera for other in others)]
+        drawn: Iterable[jax.Array]
+        if self.sizes:
+            seen = zip(scenes, self.image_sizes.values(), strict=True)
+            drawn_by = [self._draw(scene, sim, params, *size, self.images) for scene, size in seen]
+            drawn = [image for images in zip(*drawn_by, strict=True) for image in images]
+        elif len(scenes) > 1:
+            cameras = [seen.camera for seen in scenes]
             drawn = jax.vmap(seen_by)(jax.tree.map(lambda *x: jnp.stack(x), *cameras))
         else:
             drawn = seen_by(scene.camera)
-        images = dict(zip(self.images, drawn, strict=True))
-        if "depth" in images:
-            images["depth"] = jnp.minimum(images["depth"], MAX_DEPTH)
+        images = dict(zip(self._stacks, drawn, strict=True))
+        for name in (name for name in images if image_of(name) is IMAGES["depth"]):
+            images[name] = jnp.minimum(images[name], MAX_DEPTH)
         return _bare(images)
 
     def _draw(
@@ -400,7 +419,8 @@ class PixelEnv(ProgramConfig):
             return state.sim.physics.obs
         if "state" not in parts_of(self.obs_mode):
             return state.frames
-        frames = state.frames if len(self.images) > 1 else {self.images[0]: state.frames}
+        names = tuple(self._stacks)
+        frames = state.frames if len(names) > 1 else {names[0]: state.frames}
         return {**frames, "state": state.sim.physics.obs}
 
     def _size(self, height: int | None, width: int | None) -> tuple[int, int]:

@@ -189,7 +189,8 @@ class VectorPixelEnv:
         draw, look = params.of_row(env.draw_obs), params.join(params.own).look
         # Reflections and the sky's texture are images of their own.
         if look.reflectance is not None or look.sky_texture is not None:
-            rays = env.height * env.width * env.num_cameras * env.samples
+            images = jax.tree.leaves(env.drawn_spec)
+            rays = max(image.size for image in images) * env.samples
             newest = draw_rows(draw, rows, rays)
         else:
             newest = jax.vmap(draw)(*rows)

@@ -99,6 +99,36 @@ def test_two_cameras_see_what_two_environments_see(mode):
     assert (both[-1]["segmentation"][0] != both[0]["segmentation"][0]).any()
 
 
+def test_cameras_of_their_own_sizes_see_what_environments_of_these_sizes_see():
+    parts, sizes = "pixels+depth+state", {"own": (16, 16), "above": (10, 24)}
+    env = PixelEnv(Ball(), obs_mode=parts, num_cameras=2, sizes=sizes, frame_stack=2)
+    check_env(env, TWO)
+    assert {name: part.shape for name, part in env.obs_spec.items()} == {
+        "pixels/own": (16, 16, 6),
+        "pixels/above": (10, 24, 6),
+        "depth/own": (16, 16, 2),
+        "depth/above": (10, 24, 2),
+        "state": (2,),
+    }
+
+    def episodes(env, params):
+        venv = VectorPixelEnv(env, 3)
+        state, timestep = venv.reset(jax.random.key(1), params)
+        steps = [timestep.obs]
+        for _ in range(6):
+            state, timestep = venv.step(state, jnp.array([[1.0], [0.5], [-1.0]]), params)
+            steps.append(timestep.obs)
+        return jax.device_get(steps)
+
+    together = episodes(env, TWO)
+    for (name, (height, width)), rig in zip(sizes.items(), TWO.rig, strict=True):
+        alone = PixelEnv(Ball(), obs_mode=parts, height=height, width=width, frame_stack=2)
+        for ours, theirs in zip(together, episodes(alone, PARAMS.replace(rig=rig)), strict=True):
+            np.testing.assert_array_equal(ours[f"pixels/{name}"], theirs["pixels"])
+            np.testing.assert_allclose(ours[f"depth/{name}"], theirs["depth"], rtol=1e-6)
+    assert (together[-1]["pixels/above"] != together[0]["pixels/above"]).any()
+
+
 @pytest.mark.skipif(importlib.util.find_spec("dm_control") is None, reason="needs dm_control")
 def test_depth_and_segmentation_are_those_of_mujocos_rays():
     """On a DM Control task, with MuJoCo's own model, kinematics and camera."""
@@ -153,6 +183,15 @@ def test_the_order_of_parts_does_not_matter():
         ({"camera": ("front", "sid")}, "unknown camera of task 'inverted_pendulum': 'sid'"),
         ({"obs_mode": "depth", "distractors": Color()}, "'color' changes only colors, which"),
         ({"obs_mode": "depth+state", "distractors": Video()}, "'video' changes only colors"),
+        ({"sizes": {"front": (36, 36)}}, "are for several cameras, .*: use height and width"),
+        ({"sizes": {"front": 36, "top": 36}}, "a name, a height and a width, such as"),
+        ({"sizes": (("a", 36, 36), ("a", 24, 24))}, "different names, got a, a"),
+        ({"sizes": {"front": (36, 36), "top": (0, 9)}}, "the size of 'top' must be a positive"),
+        ({"sizes": {"front": (36, 36), "top": (9, 9)}}, "of 2 cameras, but there are 1: give one"),
+        (
+            {"sizes": {"a": (9, 9), "b": (9, 9)}, "obs_mode": "state"},
+            "need images, but obs_mode='state'",
+        ),
         (
             {"camera": ("front", "top"), "distractors": "camera"},
             "moves one camera, but there are 2",
