@@ -156,7 +156,7 @@ class Programs:
                 f"the state does not have the structure of this environment's state (it has "
                 f"{len(given[0])} arrays, expected {len(wanted[0])}): use a state of an "
                 "environment with the same task, physics backend, distractors, number of "
-                "cameras and obs_mode."
+                "cameras, names in camera_sizes and obs_mode."
             )
         for value, (path, spec) in zip(given[0], wanted[0], strict=True):
             shape, dtype = np.shape(value), getattr(value, "dtype", type(value).__name__)

@@ -12,7 +12,14 @@ import jax
 from pixelbrax_jax.distractors.base import Distractor
 from pixelbrax_jax.distractors.clips import ClipBank
 from pixelbrax_jax.distractors.presets import as_tuple
-from pixelbrax_jax.observations import IMAGES, Sizes, check_obs_mode, check_sizes, parts_of
+from pixelbrax_jax.observations import (
+    IMAGES,
+    CameraSizes,
+    check_camera_sizes,
+    check_obs_mode,
+    in_order,
+    parts_of,
+)
 from pixelbrax_jax.physics.brax.tasks import BraxOptions
 from pixelbrax_jax.physics.mujoco.options import MujocoOptions
 from pixelbrax_jax.plain import from_plain
@@ -39,10 +46,11 @@ class ProgramConfig:
     """Height of a frame in pixels."""
     width: int = 84
     """Width of a frame in pixels."""
-    sizes: Sizes = ()
-    """Height and width of each of several cameras' images, with a name, in the order of the
-    cameras: ``{"front": (84, 84), "top": (48, 64)}``. An observation is then a dictionary with
-    entries such as ``pixels/front``."""
+    camera_sizes: CameraSizes = ()
+    """Height and width of each of several cameras' images by the camera's name, which is yours for
+    a ``CameraRig`` or ``Camera``: ``{"front": (84, 84), "top": (48, 64)}``. An observation is then
+    a dictionary with entries such as ``pixels/front``; ``height`` and ``width`` become the first
+    camera's."""
     frame_stack: int = 3
     """Number of frames in one observation."""
     obs_mode: str = "pixels"
@@ -65,9 +73,12 @@ class ProgramConfig:
         for name in ("height", "width", "frame_stack", "action_repeat"):
             self._store(name, check_positive_int(name, self._static(name)))
         self._store("obs_mode", check_obs_mode(self._static("obs_mode")))
-        self._store("sizes", check_sizes(self.sizes))
-        if self.sizes and not self.images:
-            raise ValueError(f"sizes={self.sizes!r} need images, but obs_mode={self.obs_mode!r}.")
+        self._store_camera_sizes(check_camera_sizes(self.camera_sizes))
+        if self.camera_sizes and not self.images:
+            raise ValueError(
+                f"camera_sizes need images, but obs_mode={self.obs_mode!r} has none: leave them "
+                "out, or add 'pixels' to obs_mode."
+            )
         check_renderer(self._static("renderer"))
         self._store("samples", check_samples(self._static("samples")))
         self._store("distractors", as_tuple(from_plain(self.distractors)))
@@ -79,9 +90,15 @@ class ProgramConfig:
 
     @property
     def image_sizes(self) -> dict[str, tuple[int, int]]:
-        """``sizes`` as heights and widths by name."""
-        rows: Any = self.sizes
+        """``camera_sizes`` as heights and widths by name."""
+        rows: Any = self.camera_sizes
         return {name: (height, width) for name, height, width in rows}
+
+    def _store_camera_sizes(self, rows: tuple[tuple[str, int, int], ...]) -> None:
+        self._store("camera_sizes", rows)
+        for _, height, width in rows[:1]:
+            self._store("height", height)
+            self._store("width", width)
 
     def _static(self, name: str) -> Any:
         """Return an option, or raise TypeError if it is an array or cannot be hashed."""
@@ -118,7 +135,8 @@ class EnvConfig(BraxOptions, MujocoOptions, ProgramConfig):
     imports the module that registers it."""
     camera: View | tuple[View, ...] = "default"
     """Viewpoint: a name of ``named_rigs``, a ``CameraRig`` or a ``Camera``; or a tuple of several,
-    whose images are the channels of each frame, one camera after the other."""
+    whose images are the channels of each frame, one camera after the other, without
+    ``camera_sizes``."""
     look: str | Look = "default"
     """Light, sky and ground: ``default``, ``original``, ``dmc``, ``dmc-plain`` or a ``Look``. For a
     task of MuJoCo ``default`` is ``dmc-plain`` with the lights of its model; ``dmc`` is the picture
@@ -150,6 +168,8 @@ class EnvConfig(BraxOptions, MujocoOptions, ProgramConfig):
         if self.shadows is not None:
             self._store("shadows", check_bool("shadows", self.shadows))
         self._store("camera", _check_camera(from_plain(self.camera)))
+        if self.camera_sizes:
+            self._store_camera_sizes(in_order(self.camera_sizes, self.cameras))
         self._store("look", from_plain(self.look))
         make_look(self.look)
         if self.clips is not None and not isinstance(self.clips, (str, PathLike, ClipBank)):

@@ -36,28 +36,45 @@ MAX_DEPTH = 100.0
 """Largest depth of an observation in metres, also that of the sky."""
 
 
-Sizes = Mapping[str, tuple[int, int]] | tuple[tuple[str, int, int], ...]
+CameraSizes = Mapping[str, tuple[int, int]] | tuple[tuple[str, int, int], ...]
+"""Heights and widths by camera, or rows of name, height and width."""
 
 
-def check_sizes(value: Any) -> tuple[tuple[str, int, int], ...]:
-    """Return rows of a camera's name, height and width, given such rows or a mapping."""
+def check_camera_sizes(value: Any) -> tuple[tuple[str, int, int], ...]:
+    """Return ``camera_sizes`` as rows."""
     if isinstance(value, Mapping):
         value = [(name, *_items(size)) for name, size in value.items()]
     rows = [_items(row) for row in _items(value)]
     if not all(len(row) == 3 and isinstance(row[0], str) and row[0] for row in rows):
         raise ValueError(
-            "sizes must give each camera's image a name, a height and a width, such as "
+            "camera_sizes must have a height and a width by the name of each camera, such as "
             f"{{'front': (84, 84), 'top': (48, 64)}}, got {value!r}."
         )
     names = [row[0] for row in rows]
     if len(set(names)) < len(names):
-        raise ValueError(f"sizes must have different names, got {', '.join(names)}.")
+        raise ValueError(f"camera_sizes must have different names, got {', '.join(names)}.")
     if len(rows) == 1:
-        raise ValueError(f"sizes are for several cameras, got {value!r}: use height and width.")
+        raise ValueError(
+            f"camera_sizes are for several cameras, got only {names[0]!r}: use height and width."
+        )
     return tuple(
-        (name, *(check_positive_int(f"the size of {name!r}", size) for size in row))
+        (name, *(check_positive_int(f"camera_sizes[{name!r}]", size) for size in row))
         for name, *row in rows
     )
+
+
+def in_order(rows: Iterable[Any], cameras: tuple[Any, ...]) -> tuple[tuple[str, int, int], ...]:
+    """Return rows of ``camera_sizes`` in the order of the cameras, whose names they must have."""
+    names = [camera for camera in cameras if isinstance(camera, str)]
+    by_name = {row[0]: row for row in rows}
+    unnamed = iter(row for name, row in by_name.items() if name not in names)
+    if len(by_name) != len(cameras) or not set(names) <= set(by_name):
+        shown = [camera if isinstance(camera, str) else "(any name)" for camera in cameras]
+        raise ValueError(
+            f"camera_sizes must have the names of the cameras, {', '.join(shown)}; got "
+            f"{', '.join(by_name)}."
+        )
+    return tuple(by_name[c] if isinstance(c, str) else next(unnamed) for c in cameras)
 
 
 def _items(value: Any) -> tuple[Any, ...]:

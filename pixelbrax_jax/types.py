@@ -436,7 +436,7 @@ class Timestep(struct.PyTreeNode):
         obs: according to ``obs_mode``; a dictionary of several. ``"pixels"`` are (H, W, 3K) uint8,
             ``"depth"`` (H, W, K) in metres along the viewing axis, at most 100, ``"segmentation"``
             (H, W, K) int32, rows of ``EnvParams.geoms`` or -1 for the sky; oldest frame first.
-            With C cameras a frame has C times the channels. ``"state"`` is (S,).
+            C cameras have C times the channels, or entries with ``camera_sizes``. ``"state"`` (S,).
         reward: (), 0 after a reset.
         terminated: () bool, the task ended.
         truncated: () bool, the time limit was reached; never together with ``terminated``.

@@ -169,7 +169,7 @@ def _names_for_objects() -> ConstructorRegistry:
     def names(
         info: PrimitiveTypeInfo,
     ) -> PrimitiveConstructorSpec | UnsupportedTypeAnnotationError | None:
-        if info.type == types["sizes"]:
+        if info.type == types["camera_sizes"]:
             return UnsupportedTypeAnnotationError(())  # agents see images of one size
         if info.type not in {types["distractors"], types["camera"], *metavars}:
             return None

@@ -90,6 +90,8 @@ def scores_of(config: EnvConfig, suite: str, levels: Levels) -> Scores:
     options = {name: to_plain(getattr(config, name)) for name in ENV_OPTIONS}
     for name in LEFT_OUT:
         del options[name]
+    if not config.camera_sizes:
+        del options["camera_sizes"]  # files of releases without it go on
     bank = levels.bank
     shown = None if bank is None else f"{len(bank.names)} clips, {bank.digest[:16]}"
     options |= {"episodes": levels.episodes, "clips": shown}

@@ -107,10 +107,12 @@ def record_pairs(
     check_choice("sees", sees, VIEWS)
     for name in images:
         check_choice("images", name, IMAGES)
-    if own := [name for name in (*LEFT_OUT, "obs_mode", "sizes") if name in options]:
+    if own := [name for name in (*LEFT_OUT, "obs_mode") if name in options]:
         raise TypeError(f"{own[0]} is decided by the recording; leave it out.")
     reserved = ("output_dir", "episodes", "clips", "images", "sees", "policy_name", "num_envs")
     config = env_config(task, options, (*reserved, "output", "report"))
+    if config.camera_sizes:
+        raise ValueError("camera_sizes cannot be recorded: leave them out; use height and width.")
     episodes = SUITES[suite].episodes if episodes is None else episodes
     levels = make_levels(config, suite, episodes, clips, report, only=level)
     num_envs = min(check_positive_int("num_envs", num_envs), levels.episodes)

@@ -27,17 +27,16 @@ def check_channels(env: PixelEnv, channels_first: bool) -> None:
     """Reject images whose shortest axis, which Stable-Baselines3 reads as channels, is another."""
     if "pixels" not in env.images:
         return
-    sizes = [*env.image_sizes.values()] or [(env.height, env.width)]
-    cameras = 1 if env.sizes else env.num_cameras
+    cameras = 1 if env.camera_sizes else env.num_cameras
     channels = 3 * env.frame_stack * cameras
-    for height, width in sizes:
+    for name, (height, width) in (env.image_sizes or {"": (env.height, env.width)}).items():
         if min(height, width) < channels if channels_first else height <= min(width, channels):
+            what = f"camera_sizes[{name!r}]={height, width}" if name else f"{height=}, {width=}"
             several = f", {cameras} cameras" if cameras > 1 else ""
             raise ValueError(
-                f"height={height}, width={width}{several} and frame_stack={env.frame_stack} make "
-                f"images with {channels} channels, but Stable-Baselines3 takes the shortest axis "
-                f"of an image for its channels: use a height and width above {channels} pixels, or "
-                "stack fewer frames."
+                f"{what}{several} and frame_stack={env.frame_stack} make images with {channels} "
+                "channels, but Stable-Baselines3 takes the shortest axis of an image for its "
+                f"channels: use a height and width above {channels} pixels, or stack fewer frames."
             )
 
 

@@ -28,9 +28,9 @@ class TorchRLEnv(EnvBase):
     """``num_envs`` copies of a pixel task, stepped together.
 
     Batch size (N,). Keys: ``pixels``, (N, H, W, 3K) uint8, oldest frame first, ``depth`` and
-    ``segmentation`` as ``obs_mode`` asks; ``observation``, (N, S) float32, the state; ``action``,
-    (N, A) float32 in [-1, 1]; ``reward``, (N, 1) float32; ``done``, ``terminated`` and
-    ``truncated``, (N, 1) bool.
+    ``segmentation`` as ``obs_mode`` asks (with ``camera_sizes`` such as ``pixels/top``);
+    ``observation``, (N, S) float32, the state; ``action``, (N, A) float32 in [-1, 1]; ``reward``,
+    (N, 1) float32; ``done``, ``terminated`` and ``truncated``, (N, 1) bool.
 
     The step that ends an episode returns its last observation under ``"next"``. The same program
     resets the environment; ``reset`` then returns the first observation for the rows of its

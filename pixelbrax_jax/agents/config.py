@@ -169,10 +169,10 @@ def _check_env(env: EnvConfig) -> None:
             raise TypeError(f"{name} of training settings must be a name, got {value!r}.")
     if not all(isinstance(item, str) for item in as_tuple(env.distractors)):
         raise TypeError(f"distractors of training settings must be names, got {env.distractors!r}.")
-    if env.sizes:
+    if env.camera_sizes:
         raise ValueError(
-            f"sizes={env.sizes!r} cannot be trained on: an agent's cameras are channels of one "
-            "image, with height and width."
+            "camera_sizes cannot be trained on, because an agent's cameras are channels of one "
+            "image: leave them out; height and width are for all cameras."
         )
     if env.obs_mode not in ("pixels", "depth"):
         raise ValueError(

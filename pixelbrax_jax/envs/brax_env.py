@@ -59,10 +59,10 @@ class BraxEnv(Env):
         """
         if not isinstance(env, PixelEnv):
             raise TypeError(f"env must be a PixelEnv, got {type(env).__name__}.")
-        if env.sizes:
+        if env.camera_sizes:
             raise ValueError(
-                f"sizes={env.sizes!r} are not for Brax's trainers: all cameras share height and "
-                "width there."
+                "camera_sizes are not for Brax's trainers, whose cameras share height and width: "
+                "leave them out."
             )
         if env.images not in ((), ("pixels",)):
             raise ValueError(

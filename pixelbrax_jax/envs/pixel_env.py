@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Any
@@ -71,11 +70,9 @@ class PixelEnv(ProgramConfig):
                 "dataclass, or do not override its __eq__."
             ) from error
         self._store("num_cameras", check_positive_int("num_cameras", self.num_cameras))
-        if self.sizes and len(self.sizes) != self.num_cameras:
-            raise ValueError(
-                f"sizes={self.sizes!r} are of {len(self.sizes)} cameras, but there are "
-                f"{self.num_cameras}: give one size for each camera, or none."
-            )
+        if self.camera_sizes and len(self.camera_sizes) != self.num_cameras:
+            count = len(self.camera_sizes)
+            raise ValueError(f"camera_sizes has {count} cameras, num_cameras={self.num_cameras}.")
         chain = Chain(as_tuple(self.distractors) if self.images else ())
         self._store("distractors", chain.links)
         self._check_distractors()
@@ -123,7 +120,7 @@ class PixelEnv(ProgramConfig):
     @property
     def drawn_spec(self) -> Any:
         """Shape and dtype of what ``draw_obs`` returns, as ``jax.ShapeDtypeStruct``."""
-        cameras = (self.num_cameras,) if self.num_cameras > 1 and not self.sizes else ()
+        cameras = (self.num_cameras,) if self.num_cameras > 1 and not self.camera_sizes else ()
         drawn = {
             name: jax.ShapeDtypeStruct((*cameras, *stack.shape[:2]), image_of(name).drawn)
             for name, stack in self._stacks.items()
@@ -133,12 +130,11 @@ class PixelEnv(ProgramConfig):
     @cached_property
     def _stacks(self) -> dict[str, jax.ShapeDtypeStruct]:
         """Shape and dtype of each image's frame stack."""
-        size, of_camera = (self.height, self.width), self.image_sizes.items()
-        sizes = {f"{n}/{camera}": size for n in self.images for camera, size in of_camera}
-        sizes = sizes or dict.fromkeys(self.images, size)
-        frames = self.frame_stack * (1 if self.sizes else self.num_cameras)
+        entries = {f"{n}/{c}": size for n in self.images for c, size in self.image_sizes.items()}
+        entries = entries or dict.fromkeys(self.images, self._size())
+        frames = self.frame_stack * (1 if self.camera_sizes else self.num_cameras)
         stacks = {}
-        for name, size in sizes.items():
+        for name, size in entries.items():
             channels, dtype, _ = image_of(name)
             stacks[name] = jax.ShapeDtypeStruct((*size, channels * frames), dtype)
         return stacks
@@ -151,7 +147,9 @@ class PixelEnv(ProgramConfig):
             stacks = self._stacks.values()
             num_bytes += 2 * num_envs * sum(x.size * x.dtype.itemsize for x in stacks)
             size = (
-                f"sizes={self.sizes}" if self.sizes else f"height={self.height}, width={self.width}"
+                f"camera_sizes={self.camera_sizes}"
+                if self.camera_sizes
+                else f"height={self.height}, width={self.width}"
             )
             what += f", {size}, frame_stack={self.frame_stack}"
         check_fits(what, num_bytes)
@@ -349,21 +347,22 @@ class PixelEnv(ProgramConfig):
     def draw_obs(self, sim: SimState, params: EnvParams) -> Any:
         """Render the images of an observation, as ``drawn_spec`` says."""
         scenes = [self._scene(sim, params, camera) for camera in range(self.num_cameras)]
-        scene, size = scenes[0], (self.height, self.width)
 
-        def seen_by(camera: Camera) -> tuple[jax.Array, ...]:
-            return self._draw(scene.replace(camera=camera), sim, params, *size, self.images)
+        def image(scene: Scene, size: tuple[int, int]) -> tuple[jax.Array, ...]:
+            return self._draw(scene, sim, params, *size, self.images)
 
-        drawn: Iterable[jax.Array]
-        if self.sizes:
-            seen = zip(scenes, self.image_sizes.values(), strict=True)
-            drawn_by = [self._draw(scene, sim, params, *size, self.images) for scene, size in seen]
-            drawn = [image for images in zip(*drawn_by, strict=True) for image in images]
+        def of_view(camera: Camera, sky_xmat: Any) -> tuple[jax.Array, ...]:
+            return image(scenes[0].replace(camera=camera, sky_xmat=sky_xmat), self._size())
+
+        drawn: Any
+        if self.camera_sizes:
+            by_camera = map(image, scenes, self.image_sizes.values())
+            drawn = [part for parts in zip(*by_camera, strict=True) for part in parts]
         elif len(scenes) > 1:
-            cameras = [seen.camera for seen in scenes]
-            drawn = jax.vmap(seen_by)(jax.tree.map(lambda *x: jnp.stack(x), *cameras))
+            views = [(scene.camera, scene.sky_xmat) for scene in scenes]
+            drawn = jax.vmap(of_view)(*jax.tree.map(lambda *x: jnp.stack(x), *views))
         else:
-            drawn = seen_by(scene.camera)
+            drawn = image(scenes[0], self._size())
         images = dict(zip(self._stacks, drawn, strict=True))
         for name in (name for name in images if image_of(name) is IMAGES["depth"]):
             images[name] = jnp.minimum(images[name], MAX_DEPTH)
@@ -423,7 +422,7 @@ class PixelEnv(ProgramConfig):
         frames = state.frames if len(names) > 1 else {names[0]: state.frames}
         return {**frames, "state": state.sim.physics.obs}
 
-    def _size(self, height: int | None, width: int | None) -> tuple[int, int]:
+    def _size(self, height: int | None = None, width: int | None = None) -> tuple[int, int]:
         return (
             self.height if height is None else check_positive_int("height", height),
             self.width if width is None else check_positive_int("width", width),

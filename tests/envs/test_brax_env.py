@@ -95,7 +95,7 @@ def test_depth_is_not_for_braxs_networks():
     with pytest.raises(ValueError, match="is not for Brax's trainers, whose images"):
         make_brax(obs_mode="pixels+depth")
     with pytest.raises(ValueError, match="not for Brax's trainers: all cameras share height"):
-        make_brax(num_cameras=2, sizes={"front": (36, 36), "top": (24, 24)})
+        make_brax(num_cameras=2, camera_sizes={"front": (36, 36), "top": (24, 24)})
 
 
 def test_a_raw_key_means_the_typed_one():

@@ -99,9 +99,32 @@ def test_two_cameras_see_what_two_environments_see(mode):
     assert (both[-1]["segmentation"][0] != both[0]["segmentation"][0]).any()
 
 
+def test_sizes_have_the_order_of_the_cameras():
+    both = {"top": (24, 48), "front": (36, 32)}
+    config = pb.EnvConfig(camera=("front", "top"), camera_sizes=both)
+    assert config.camera_sizes == (("front", 36, 32), ("top", 24, 48))
+    assert (config.height, config.width) == (36, 32)
+    rig = make_rig((0.2, -0.5, 5.0), (0.0, 0.0, 0.0), 40.0)
+    config = pb.EnvConfig(camera=(rig, "top"), camera_sizes={"top": (24, 48), "mine": (9, 9)})
+    assert config.camera_sizes == (("mine", 9, 9), ("top", 24, 48))
+
+
+def test_each_camera_has_its_own_sky():
+    texture = np.random.default_rng(0).uniform(0, 0.5, (6, 4, 4, 3)).astype(np.float32)
+    rigs = (make_rig((0, -3, 1), (0, 0, 2), 60.0), make_rig((-3, 0, 1), (0, 0, 2), 60.0))
+    look = PARAMS.look.replace(sky_texture=texture)
+    both = PixelEnv(Ball(), num_cameras=2, height=16, width=16, frame_stack=1)
+    obs = both.reset(jax.random.key(0), PARAMS.replace(rig=rigs, look=look))[1].obs
+    one = PixelEnv(Ball(), height=16, width=16, frame_stack=1)
+    for c, rig in enumerate(rigs):
+        alone = one.reset(jax.random.key(0), PARAMS.replace(rig=rig, look=look))[1].obs
+        np.testing.assert_array_equal(obs[..., 3 * c : 3 * c + 3], alone)
+    assert (obs[..., :3] != obs[..., 3:]).any()
+
+
 def test_cameras_of_their_own_sizes_see_what_environments_of_these_sizes_see():
     parts, sizes = "pixels+depth+state", {"own": (16, 16), "above": (10, 24)}
-    env = PixelEnv(Ball(), obs_mode=parts, num_cameras=2, sizes=sizes, frame_stack=2)
+    env = PixelEnv(Ball(), obs_mode=parts, num_cameras=2, camera_sizes=sizes, frame_stack=2)
     check_env(env, TWO)
     assert {name: part.shape for name, part in env.obs_spec.items()} == {
         "pixels/own": (16, 16, 6),
@@ -183,14 +206,18 @@ def test_the_order_of_parts_does_not_matter():
         ({"camera": ("front", "sid")}, "unknown camera of task 'inverted_pendulum': 'sid'"),
         ({"obs_mode": "depth", "distractors": Color()}, "'color' changes only colors, which"),
         ({"obs_mode": "depth+state", "distractors": Video()}, "'video' changes only colors"),
-        ({"sizes": {"front": (36, 36)}}, "are for several cameras, .*: use height and width"),
-        ({"sizes": {"front": 36, "top": 36}}, "a name, a height and a width, such as"),
-        ({"sizes": (("a", 36, 36), ("a", 24, 24))}, "different names, got a, a"),
-        ({"sizes": {"front": (36, 36), "top": (0, 9)}}, "the size of 'top' must be a positive"),
-        ({"sizes": {"front": (36, 36), "top": (9, 9)}}, "of 2 cameras, but there are 1: give one"),
+        ({"camera_sizes": {"top": (36, 36)}}, "several cameras, got only 'top': use height and"),
+        ({"camera_sizes": {"front": 36, "top": 36}}, "a height and a width by the name of each"),
+        ({"camera_sizes": (("a", 36, 36), ("a", 24, 24))}, "different names, got a, a"),
+        ({"camera_sizes": {"a": (36, 36), "top": (0, 9)}}, r"camera_sizes\['top'\] must be a pos"),
+        ({"camera_sizes": {"a": (36, 36), "top": (9, 9)}}, "of the cameras, default; got a, top"),
         (
-            {"sizes": {"a": (9, 9), "b": (9, 9)}, "obs_mode": "state"},
-            "need images, but obs_mode='state'",
+            {"camera": ("front", "top"), "camera_sizes": {"front": (9, 9), "side": (9, 9)}},
+            "of the cameras, front, top; got front, side",
+        ),
+        (
+            {"camera_sizes": {"a": (9, 9), "b": (9, 9)}, "obs_mode": "state"},
+            "need images, but obs_mode='state' has none: leave them out",
         ),
         (
             {"camera": ("front", "top"), "distractors": "camera"},
@@ -216,6 +243,8 @@ def test_each_environment_may_have_its_own_cameras():
 
 def test_params_have_as_many_rigs_as_cameras():
     env = PixelEnv(Ball(), **SIZE)
+    with pytest.raises(ValueError, match="camera_sizes has 2 cameras, num_cameras=3"):
+        PixelEnv(Ball(), num_cameras=3, camera_sizes={"a": (9, 9), "b": (9, 9)})
     with pytest.raises(ValueError, match="num_cameras=1 rigs, got 2"):
         env.reset(jax.random.key(0), TWO)
 

@@ -28,7 +28,7 @@ CASES = [
     {
         "obs_mode": "pixels+depth+state",
         "camera": ("default", "top"),
-        "sizes": {"near": (12, 12), "top": (9, 16)},
+        "camera_sizes": {"default": (12, 12), "top": (9, 16)},
     },
 ]
 ACTIONS = np.array([[-0.2], [0.9], [1.0]], np.float32)
@@ -72,11 +72,11 @@ def test_spaces(make_single):
 def test_torchrls_checker(make_torchrl, options):
     env = make_torchrl(**(SMALL | options))
     check_env_specs(env)
-    depth = "depth/near" if "sizes" in options else "depth"
+    depth = "depth/default" if "camera_sizes" in options else "depth"
     assert type(env.observation_spec[depth]) is PixelSpec
     td = env.rollout(3)
     assert td[depth].dtype == torch.float32
-    if "sizes" in options:
+    if "camera_sizes" in options:
         assert td["pixels/top"].shape == (3, 3, 9, 16, 3)
     elif "camera" in options:
         assert td["segmentation"].dtype == torch.int32
@@ -92,11 +92,11 @@ def test_stable_baselines_checker(options):
     check_sb3_env(gymnasium.make(ID, **(SMALL | options)).unwrapped, skip_render_check=True)
 
 
-@pytest.mark.parametrize("sizes", [(), {"near": (36, 36), "top": (40, 48)}])
+@pytest.mark.parametrize("sizes", [(), {"default": (36, 36), "top": (40, 48)}])
 def test_stable_baselines_learns_from_several_images(sizes):
     env = pixelbrax_gym.SB3VecEnv(
         TASK, 2, obs_mode="pixels+depth", camera=("default", "top"),
-        height=36, width=36, sizes=sizes, frame_stack=1,
+        height=36, width=36, camera_sizes=sizes, frame_stack=1,
     )  # fmt: skip
     PPO("MultiInputPolicy", env, n_steps=4, batch_size=8, n_epochs=1, device="cpu").learn(8)
 
@@ -114,8 +114,8 @@ def test_channels_first_is_for_all_images(make_sb3):
 def test_two_cameras_count_as_channels(make_sb3):
     with pytest.raises(ValueError, match="height=12, width=12, 2 cameras and frame_stack=2"):
         make_sb3(camera=("default", "top"))
-    with pytest.raises(ValueError, match="height=5, width=16 and frame_stack=2 make images with 6"):
-        make_sb3(camera=("default", "top"), sizes={"near": (16, 16), "top": (5, 16)})
+    with pytest.raises(ValueError, match=r"camera_sizes\['top'\]=\(5, 16\) and frame_stack=2"):
+        make_sb3(camera=("default", "top"), camera_sizes={"default": (16, 16), "top": (5, 16)})
 
 
 @pytest.mark.parametrize("output", ["numpy", "torch"])
@@ -151,13 +151,15 @@ def test_states_and_copies_continue(num_envs):
         for obs in expected:
             jax.tree.map(np.testing.assert_array_equal, one.step(actions)[0], obs)
     one_camera = gymnasium.make_vec(ID, num_envs=num_envs, **SMALL)
-    with pytest.raises(ValueError, match="number of cameras and obs_mode"):
+    with pytest.raises(ValueError, match="number of cameras, names in camera_sizes and obs_mode"):
         one_camera.set_state(state)
 
 
-@pytest.mark.parametrize("sizes", [(), {"near": (12, 12), "top": (9, 16)}])
+@pytest.mark.parametrize("sizes", [(), {"default": (12, 12), "top": (9, 16)}])
 def test_cameras_go_through_json(sizes):
-    env = gymnasium.make(ID, camera=("default", "top"), sizes=sizes, obs_mode="depth", **SMALL)
+    env = gymnasium.make(
+        ID, camera=("default", "top"), camera_sizes=sizes, obs_mode="depth", **SMALL
+    )
     spec = gymnasium.envs.registration.EnvSpec.from_json(env.spec.to_json())
     again = gymnasium.make(spec)
     assert again.spec == env.spec
