@@ -6,9 +6,10 @@ import json
 from contextlib import suppress
 from functools import cache, partial
 from itertools import groupby
+from math import sqrt
 from operator import itemgetter
 from pathlib import Path
-from statistics import median
+from statistics import mean, median, stdev
 
 from pixelbrax_gym.bench.tables import number, table
 from pixelbrax_gym.cli import _leaderboard as leaderboard
@@ -198,6 +199,47 @@ def pictures() -> str:
     return table(["mean difference of a color, of 255", "image", "bodies"], lines)
 
 
+PARTS = {
+    "whole": "nothing",
+    "sky": "the sky's texture",
+    "marks": "marks on the checker",
+    "light": "OpenGL's light",
+    "reflection": "the reflection",
+    "shadows": "shadows",
+    "none": "all but shadows: `dmc-plain`",
+    "four rays": "nothing, but `samples=4`",
+}
+"""Names of the forms in docs/dmc/parts.json."""
+
+
+def parts() -> str:
+    """What each part of the picture changes, and costs, in Markdown."""
+    kept = json.loads((FOLDER / "parts.json").read_text("utf-8"))
+    speeds, returns = kept["speed"], kept["policy"]
+
+    def far(form: str, area: str) -> str:
+        return f"{median(row[form][area] for row in kept['pictures'].values()):.1f}"
+
+    def earned(form: str) -> str:
+        if form == "whole":
+            return f"{mean(returns[form]):.0f}"
+        changes = [one - all_ for one, all_ in zip(returns[form], returns["whole"], strict=True)]
+        return f"{mean(changes):+.0f} ± {stdev(changes) / sqrt(len(changes)):.0f}"
+
+    def fast(form: str, task: str) -> str:
+        if form == "whole":
+            return number(1e3 * kept["num_envs"] / speeds[task][form])
+        return number(speeds[task]["whole"] / speeds[task][form]) if form in speeds[task] else ""
+
+    lines = []
+    for form, name in PARTS.items():
+        drawn = form != "four rays"
+        shown = [far(form, "all"), far(form, "else"), earned(form)] if drawn else ["", "", ""]
+        lines.append([name, *shown, *(fast(form, task) for task in speeds)])
+    tasks = (task.removeprefix("dmc_").split("_")[0] for task in speeds)
+    return table(["left out", "image", "bodies", "return", *tasks], lines)
+
+
 WHOLE = partial(whole, "peers.dm_control_envs")
 FIGURES = {
     "transfer": transfer,
@@ -214,7 +256,7 @@ FIGURES = {
     "states": states,
     "part": part,
 }
-ALL = {"speed": speed, "looks": looks, "physics": physics}
+ALL = {"speed": speed, "looks": looks, "parts": parts, "physics": physics}
 
 
 LEADERBOARD = FOLDER.parent / "leaderboard"

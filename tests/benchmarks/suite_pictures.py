@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -28,7 +28,7 @@ from PIL import Image, ImageDraw
 from pixelbrax_jax.physics.mujoco.lighting import detailed
 from pixelbrax_jax.renderer.base import render
 from pixelbrax_jax.scene.place import place
-from pixelbrax_jax.types import Frame
+from pixelbrax_jax.types import Frame, Look
 from tests.renderer import suite_models
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -66,14 +66,14 @@ def pictures(domain: str, task: str, camera: int, movable: tuple[str, ...]) -> d
         Lists of the pictures in ``COMPARED``, (84, 84, 3) float or uint8, and of ``area``,
         (84, 84) int: 0 sky, 1 ground, 2 else.
     """
-    ours = _ours(domain, task, camera, movable)
-    large = _theirs(domain, task, camera, SUPERSAMPLED * SIZE, multisamples=0)
+    drawn = ours(domain, task, camera, movable)
+    large = theirs(domain, task, camera, SUPERSAMPLED * SIZE, multisamples=0)
     return {
-        "ours": [_levels(frame) for frame in ours],
-        "ours with 4 rays": [_levels(f) for f in _ours(domain, task, camera, movable, samples=4)],
-        "area": [_area(frame) for frame in ours],
-        "theirs": _theirs(domain, task, camera, SIZE),
-        "single": _theirs(domain, task, camera, SIZE, multisamples=0),
+        "ours": [levels(frame) for frame in drawn],
+        "ours with 4 rays": [levels(f) for f in ours(domain, task, camera, movable, samples=4)],
+        "area": [area(frame) for frame in drawn],
+        "theirs": theirs(domain, task, camera, SIZE),
+        "single": theirs(domain, task, camera, SIZE, multisamples=0),
         "picked": [
             np.mean([image[y::SUPERSAMPLED, x::SUPERSAMPLED] for x, y in POSITIONS], axis=0)
             for image in large
@@ -99,37 +99,52 @@ def _states(domain: str, task: str, multisamples: int | None = None) -> Iterator
     environment.close()
 
 
-def _theirs(
+def theirs(
     domain: str, task: str, camera: int, size: int, multisamples: int | None = None
 ) -> list[np.ndarray]:
+    """Draw the states with dm_control, (size, size, 3) uint8 each."""
     states = _states(domain, task, multisamples)
     return [physics.render(size, size, camera_id=camera) for physics in states]
 
 
-def _ours(
-    domain: str, task: str, camera: int, movable: tuple[str, ...], samples: int = 1
+def ours(
+    domain: str,
+    task: str,
+    camera: int,
+    movable: tuple[str, ...],
+    samples: int = 1,
+    look_of: Callable[[Look, Look], Look] = lambda whole, plain: whole,
 ) -> list[Frame]:
+    """Draw the states with the look that is chosen from the whole picture's and the plain one."""
     states = _states(domain, task)
     first = next(states)
     own = suite_models.of(domain, first.model.ptr, camera, movable)
-    draw = jax.jit(partial(_render, own, samples))
+    draw = jax.jit(partial(_render, own, samples, look_of))
     return [draw(*own.links(physics.data.ptr)) for physics in chain([first], states)]
 
 
-def _levels(frame: Frame) -> np.ndarray:
+def levels(frame: Frame) -> np.ndarray:
+    """Return (84, 84, 3) uint8."""
     image = np.stack([frame.r, frame.g, frame.b], axis=-1)
     return np.floor(image * 255 + 0.5).astype(np.uint8)
 
 
-def _area(frame: Frame) -> np.ndarray:
+def area(frame: Frame) -> np.ndarray:
+    """Return (84, 84) int: 0 sky, 1 ground, 2 else."""
     seen, ground = np.asarray(frame.seg) >= 0, np.asarray(frame.ground)
     return np.where(ground, 1, np.where(seen, 2, 0))
 
 
-def _render(own: Any, samples: int, xpos: jax.Array, xquat: jax.Array) -> Frame:
+def _render(
+    own: Any,
+    samples: int,
+    look_of: Callable[[Look, Look], Look],
+    xpos: jax.Array,
+    xquat: jax.Array,
+) -> Frame:
     scene = own.scene
     pixel = 2.0 * float(np.tan(np.deg2rad(scene.rig.fovy) / 2.0)) / (SIZE * math.isqrt(samples))
-    look = detailed(own.model, scene.look, pixel)
+    look = look_of(detailed(own.model, scene.look, pixel), scene.look)
     placed = place(scene.geoms, scene.rig, look, xpos, xquat)
     return render(placed, SIZE, SIZE, samples=samples)
 
