@@ -46,6 +46,7 @@ UNCHECKED = {
     # Options of the environment, checked with those of every other one.
     "task", "backend", "engine", "reward_preset", "distractors", "clips", "camera", "look",
     "shadows", "samples", "split", "obs_mode", "renderer", "dynamics", "test_dynamics",
+    "camera_sizes",
     # Truth values.
     "state_critic", "anneal", "normalize_reward", "clip_value", "decoupled",
     "checkpoint_replay", "layer_norm", "bfloat16",

@@ -105,7 +105,7 @@ def test_depth_is_scaled_to_a_fraction():
 def test_settings_say_what_they_need():
     with pytest.raises(ValueError, match="must be 'pixels' or 'depth', got 'pixels\\+depth'"):
         PPOConfig(env=EnvConfig(obs_mode="pixels+depth"))
-    with pytest.raises(ValueError, match="cannot be trained on: an agent's cameras are channels"):
+    with pytest.raises(ValueError, match="an agent's cameras are channels of one image: leave"):
         PPOConfig(env=EnvConfig(camera=("a", "b"), camera_sizes={"a": (36, 36), "b": (24, 24)}))
     with pytest.raises(TypeError, match="camera of training settings must be a name, got"):
         PPOConfig(env=EnvConfig(camera=("front", PARAMS.rig)))

@@ -29,6 +29,7 @@ SINCE: dict[str, object] = {
     "engine": "auto",
     "num_starts": 0,
     "samples": 1,
+    "camera_sizes": [],
     "dynamics": "",
     "test_dynamics": "",
 }

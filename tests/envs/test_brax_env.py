@@ -94,7 +94,7 @@ def test_sizes_are_those_of_the_observation():
 def test_depth_is_not_for_braxs_networks():
     with pytest.raises(ValueError, match="is not for Brax's trainers, whose images"):
         make_brax(obs_mode="pixels+depth")
-    with pytest.raises(ValueError, match="not for Brax's trainers: all cameras share height"):
+    with pytest.raises(ValueError, match="trainers, whose cameras share height and width: leave"):
         make_brax(num_cameras=2, camera_sizes={"front": (36, 36), "top": (24, 24)})
 
 
