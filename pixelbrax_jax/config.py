@@ -17,7 +17,7 @@ from pixelbrax_jax.observations import (
     CameraSizes,
     check_camera_sizes,
     check_obs_mode,
-    in_order,
+    order_by_camera,
     parts_of,
 )
 from pixelbrax_jax.physics.brax.tasks import BraxOptions
@@ -169,7 +169,7 @@ class EnvConfig(BraxOptions, MujocoOptions, ProgramConfig):
             self._store("shadows", check_bool("shadows", self.shadows))
         self._store("camera", _check_camera(from_plain(self.camera)))
         if self.camera_sizes:
-            self._store_camera_sizes(in_order(self.camera_sizes, self.cameras))
+            self._store_camera_sizes(order_by_camera(self.camera_sizes, self.cameras))
         self._store("look", from_plain(self.look))
         make_look(self.look)
         if self.clips is not None and not isinstance(self.clips, (str, PathLike, ClipBank)):

@@ -63,7 +63,9 @@ def check_camera_sizes(value: Any) -> tuple[tuple[str, int, int], ...]:
     )
 
 
-def in_order(rows: Iterable[Any], cameras: tuple[Any, ...]) -> tuple[tuple[str, int, int], ...]:
+def order_by_camera(
+    rows: Iterable[Any], cameras: tuple[Any, ...]
+) -> tuple[tuple[str, int, int], ...]:
     """Return rows of ``camera_sizes`` in the order of the cameras, whose names they must have."""
     names = [camera for camera in cameras if isinstance(camera, str)]
     by_name = {row[0]: row for row in rows}

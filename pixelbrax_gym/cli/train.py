@@ -138,9 +138,9 @@ def parse(algorithm: str, arguments: Sequence[str]) -> tuple[Launch, TrainConfig
         "options": RunConfig(output_dir=f"runs/{algorithm}"),
     }
     # One flat list of options for all.
-    flat, parsed_alone = tyro.conf.OmitArgPrefixes, tyro.conf.SuppressFixed
+    flat, hide_unparsable = tyro.conf.OmitArgPrefixes, tyro.conf.SuppressFixed
     command: Any = make_dataclass(
-        "Train", [(part, flat[parsed_alone[type(value)]]) for part, value in parts.items()]
+        "Train", [(part, flat[hide_unparsable[type(value)]]) for part, value in parts.items()]
     )
     with _names_for_objects():
         parsed = tyro.cli(

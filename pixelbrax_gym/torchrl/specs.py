@@ -63,7 +63,7 @@ def observation_spec(
     specs: dict[str, TensorSpec] = {}
     for name, part in entries(spec, images).items():
         shape, dtype = (num_envs, *part.shape), getattr(torch, part.dtype.name)
-        if name.split("/")[0] in images:
+        if name != "observation":
             specs[name] = PixelSpec(shape, device, dtype)
         else:
             specs[name] = Unbounded(shape, device=device, dtype=dtype)

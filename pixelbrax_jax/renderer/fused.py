@@ -80,7 +80,7 @@ def ground_light_of(
 
 
 def _on_ground(view: View, ray: Vector, plane: Solid) -> list[Any]:
-    """Return the same for one ground and any rays."""
+    """Return what lights multiply the colors of one ground by, where rays see it."""
     lights = opengl.lights_of(view.look, (0.0, 0.0, 1.0))
     place = _place(plane, ray, plane.hit(ray, plane.center).t)
     return opengl.on_plane(lights, (0.0, 0.0, 0.0), plane.center, plane.axes, plane.size, place)

@@ -135,6 +135,7 @@ def _cell(size: Vector, axis: int, place: Any) -> tuple[Any, Any, Any]:
     low = start + width * jnp.floor((place - start) * (1.0 / width))
     low, high = between(-half, low, half), between(-half, low + width, half)
     low, high = (jnp.where(half > 0.0, end, place) for end in (low, high))
-    room = high - low
-    inv_room = jnp.where(room > _TINY, 1.0 / at_least(room, _TINY), 0.0)  # a select, as above
-    return low, high, between(0.0, (place - low) * inv_room, 1.0)
+    length = high - low
+    # A select, because XLA would store a quotient that has several readers.
+    inv_length = jnp.where(length > _TINY, 1.0 / at_least(length, _TINY), 0.0)
+    return low, high, between(0.0, (place - low) * inv_length, 1.0)
