@@ -100,6 +100,28 @@ def test_pixels_are_scaled_before_they_are_convolved():
             np.testing.assert_allclose(actual, expected, rtol=1e-6, atol=1e-6 * scale)
 
 
+def test_kernels_of_several_runs_convolve_one_image_each():
+    """Also in derivatives: one native convolution of a CPU has one kernel."""
+    keys = jax.random.split(jax.random.key(7), 3)
+    x = jax.random.normal(keys[0], (2, 1, 7, 6, 3))
+    weights = jax.random.normal(keys[1], (2, 3, 3, 3, 5))
+    upper = jax.random.normal(keys[2], (2, 1, 5, 4, 5))
+
+    @jax.jit
+    def both(x, weights, upper):
+        def pulled(x, weights, upper):
+            value, pull = jax.vjp(partial(convolve, stride=1, pads=((0, 0), (0, 0))), x, weights)
+            return value, *pull(upper)
+
+        one_by_one = [pulled(*run) for run in zip(x, weights, upper, strict=True)]
+        return jax.vmap(pulled)(x, weights, upper), one_by_one
+
+    together, one_by_one = both(x, weights, upper)
+    for run, alone in enumerate(one_by_one):
+        for actual, expected in zip(together, alone, strict=True):
+            np.testing.assert_allclose(actual[run], expected, rtol=1e-5, atol=1e-5)
+
+
 def inputs_of_last_layer(name: str, size: int) -> int:
     """Numbers that an encoder's dense layer gets of square images."""
     pixels = jnp.zeros((1, size, size, 3))

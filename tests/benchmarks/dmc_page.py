@@ -161,17 +161,28 @@ def named(task: str) -> str:
 
 def transfer() -> str:
     """Returns of policies here and in dm_control, from the same starts, in Markdown."""
-    lines = [
-        [
-            f"`{one['task']}`",
-            one["episodes"],
-            f"{one['return']:.0f}",
-            f"{one['return_there']:.0f}",
-            f"{one['difference']:+.0f} ± {one['difference_standard_error']:.0f}",
-        ]
-        for one in json.loads((FOLDER / "transfer.json").read_text("utf-8"))
-    ]
-    return table(["policy", "episodes", "here", "in dm_control", "difference"], lines)
+    lines = []
+    kept = json.loads((FOLDER / "transfer.json").read_text("utf-8"))
+    for task, found in groupby(kept, key=itemgetter("task")):
+        rows = list(found)
+        differences = [row["difference"] for row in rows]
+        errors = [row["difference_standard_error"] for row in rows]
+        over = stdev(differences) / sqrt(len(rows)) if len(rows) > 1 else errors[0]
+        lines.append(
+            [
+                f"`{task}`",
+                ", ".join(str(row["seed"]) for row in rows),
+                f"{mean(row['return'] for row in rows):.0f}",
+                f"{mean(row['return_there'] for row in rows):.0f}",
+                f"{mean(differences):+.0f} ± {over:.0f}",
+                ", ".join(
+                    f"{one:+.0f} ± {error:.0f}"
+                    for one, error in zip(differences, errors, strict=True)
+                ),
+            ]
+        )
+    columns = ["task", "seeds", "here", "in dm_control", "difference", "of each policy"]
+    return table(columns, lines)
 
 
 COMPARED = {

@@ -1,9 +1,9 @@
-"""Plays the package's policies of the DM Control Suite here and in dm_control, for docs/dmc.md.
+"""Plays trained policies of the DM Control Suite here and in dm_control, for docs/dmc.md.
 
-    MUJOCO_GL=egl python -m tests.benchmarks.transfer             policies that are new; 5 min each
-    MUJOCO_GL=egl python -m tests.benchmarks.transfer walker      those with this in their names
+    MUJOCO_GL=egl python -m tests.benchmarks.transfer             the package's policies, 5 min each
+    MUJOCO_GL=egl python -m tests.benchmarks.transfer RUN...      those of runs
 
-A policy whose file differs from the one that was played is played again.
+A policy that was played already is not played again. A task and seed keep their latest policy.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import hashlib
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 from tests.benchmarks.dmc_page import FOLDER
 from tests.benchmarks.experiments import EPISODES, PRETRAINED
@@ -25,19 +26,26 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("name", nargs="?", default="", help="part of the names of tasks")
-    wanted = parser.parse_args().name
-    rows = {row["task"]: row for row in json.loads(KEPT.read_text("utf-8"))}
-    for policy in sorted(PRETRAINED.glob("dmc_*.jax")):
-        digest = hashlib.sha256(policy.read_bytes()).hexdigest()[:16]
-        if wanted not in policy.stem or rows.get(policy.stem, {}).get("policy") == digest:
+    parser.add_argument("runs", nargs="*", type=Path, help="folders of runs")
+    runs = parser.parse_args().runs
+    files = [run / "policy.jax" for run in runs] or sorted(PRETRAINED.glob("dmc_*.jax"))
+    rows = json.loads(KEPT.read_text("utf-8"))
+    for file in files:
+        digest = hashlib.sha256(file.read_bytes()).hexdigest()[:16]
+        if any(row["policy"] == digest for row in rows):
             continue
-        command = [sys.executable, "-m", "pixelbrax_gym.cli", "evaluate"]
-        command += ["--pretrained", policy.stem, "--in", "dm_control", "--episodes", str(EPISODES)]
+        source = [str(file.parent)] if runs else ["--pretrained", file.stem]
+        command = [sys.executable, "-m", "pixelbrax_gym.cli", "evaluate", *source]
+        command += ["--in", "dm_control", "--episodes", str(EPISODES)]
         line = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
-        rows[policy.stem] = json.loads(line) | {"policy": digest}
-        kept = sorted(rows.values(), key=lambda row: row["task"])
-        KEPT.write_text(json.dumps(kept, indent=1) + "\n")
+        new = json.loads(line) | {"policy": digest}
+        rows = [row for row in rows if key(row) != key(new)] + [new]
+        KEPT.write_text(json.dumps(sorted(rows, key=key), indent=1) + "\n")
+
+
+def key(row: dict) -> tuple[str, int]:
+    """What has one policy."""
+    return row["task"], row["seed"]
 
 
 if __name__ == "__main__":
