@@ -78,6 +78,21 @@ def test_distractors_and_shadows_are_part_of_that_kernel(options, large):
     assert values["spilled"] == SPILLED
 
 
+@pytest.mark.parametrize("task", ["dmc_cartpole_swingup", "dmc_walker_walk"])
+def test_the_whole_picture_of_dm_control_is_one_large_kernel(task):
+    values = compiled(task, "renderer", look="dmc")
+    assert values["large_kernels"] == 1
+    assert values["read_bytes"] + values["written_bytes"] <= 1.2 * values["output_bytes"]
+    assert values["spilled"] == SPILLED
+
+
+def test_samples_are_drawn_by_the_kernel_and_averaged():
+    values = compiled("ant", "renderer", samples=4)
+    assert values["large_kernels"] == 3
+    assert values["host_steps"] == 1
+    assert values["spilled"] == SPILLED
+
+
 @pytest.mark.parametrize("program", ["state step", "step"])
 def test_a_step_launches_no_more_than_it_did(program):
     values = compiled("ant", program)

@@ -86,13 +86,27 @@ def render(
             raise ValueError(f"{name} must be at least 1 pixel, got {value}.")
     rows = height if num_rows is None else num_rows
     first_row = jnp.asarray(first_row, jnp.int32)
-    if (times := math.isqrt(check_samples(samples))) > 1:
-        frame = render(scene, height, width, renderer, first_row=first_row, num_rows=num_rows)
-        r, g, b = _means(scene, first_row, height, width, rows, renderer, times)
+    times = math.isqrt(check_samples(samples))
+    return _render(scene, first_row, height, width, rows, check_renderer(renderer), times)
+
+
+def _render(
+    scene: Scene,
+    first_row: jax.Array,
+    height: int,
+    width: int,
+    num_rows: int,
+    renderer: str,
+    times: int = 1,
+) -> Frame:
+    """``render`` with ``times`` by ``times`` samples, for whatever device it is compiled."""
+    if times > 1:
+        frame = _render(scene, first_row, height, width, num_rows, renderer)
+        r, g, b = _means(scene, first_row, height, width, num_rows, renderer, times)
         return frame.replace(r=r, g=g, b=b)
-    if check_renderer(renderer) == "reference":
-        return reference.render(scene, height, width, first_row, rows)
-    return _fast(scene, first_row, height, width, rows, renderer)
+    if renderer == "reference":
+        return reference.render(scene, height, width, first_row, num_rows)
+    return _fast(scene, first_row, height, width, num_rows, renderer)
 
 
 def draw(
@@ -193,7 +207,8 @@ class _Drawing:
 
         size, rows = (self.height, self.width), jnp.arange(self.height)
         if self.samples > 1:
-            frame = render(self.scene, *size, "pallas", samples=self.samples)
+            times = math.isqrt(self.samples)
+            frame = _render(self.scene, jnp.int32(0), *size, self.height, "pallas", times)
             return self._planes_of(frame, rows)
         return kernel.draw(
             self.scene, *size, lambda frame: pack(self.change(frame, rows)), self.images
@@ -235,7 +250,7 @@ def _means(
 
     def large() -> list[jax.Array]:
         rows, size = num_rows * times, (height * times, width * times)
-        frame = render(scene, *size, renderer, first_row=first_row * times, num_rows=rows)
+        frame = _render(scene, first_row * times, *size, rows, renderer)
         return [frame.r, frame.g, frame.b]
 
     return [_shrunk(plane, times) for plane in shading.computed_apart(large)]
