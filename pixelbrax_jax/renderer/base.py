@@ -247,13 +247,19 @@ def _means(
     times: int,
 ) -> list[jax.Array]:
     """Return red, green and blue of a band of rows, means over ``times`` by ``times`` rays."""
+    size, first, rows = (height * times, width * times), first_row * times, num_rows * times
+    if renderer == "pallas":
+        from pixelbrax_jax.renderer import kernel
 
-    def large() -> list[jax.Array]:
-        rows, size = num_rows * times, (height * times, width * times)
-        frame = _render(scene, first_row * times, *size, rows, renderer)
-        return [frame.r, frame.g, frame.b]
+        planes = kernel.colors(scene, *size, first, rows)
+    else:
 
-    return [_shrunk(plane, times) for plane in shading.computed_apart(large)]
+        def large() -> list[jax.Array]:
+            frame = _render(scene, first, *size, rows, renderer)
+            return [frame.r, frame.g, frame.b]
+
+        planes = shading.computed_apart(large)
+    return [_shrunk(plane, times) for plane in planes]
 
 
 @_means.defjvp

@@ -15,6 +15,7 @@ from pixelbrax_jax.observations import IMAGES
 from pixelbrax_jax.renderer.fused import Near, see, sky_of
 from pixelbrax_jax.renderer.intersect import at_least, at_most
 from pixelbrax_jax.renderer.per_pixel import PerPixel, per_pixel
+from pixelbrax_jax.renderer.shading import from_words, to_words
 from pixelbrax_jax.renderer.view import View, order_of, rays, view_of
 from pixelbrax_jax.types import Frame, GeomKind, Scene
 
@@ -86,6 +87,18 @@ def render(
     for geom in filter(scene.geoms.is_ground, order_of(scene.geoms)):
         ground |= seg == geom
     return Frame(r=r, g=g, b=b, depth=depth, seg=seg, ground=ground)
+
+
+def colors(
+    scene: Scene, height: int, width: int, first_row: jax.Array | int, num_rows: int
+) -> list[jax.Array]:
+    """Render red, green and blue of a band of rows, rounded to 10 bits; see ``render``."""
+
+    def words(_numbers: Any, _images: Any, frame: Frame) -> list[jax.Array]:
+        return to_words([frame.r, frame.g, frame.b])
+
+    band = _Band(height, width, first_row, num_rows)
+    return from_words(_call(words, scene, (), (), band, [jnp.uint32]), 3)
 
 
 class _Band(NamedTuple):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -52,14 +52,7 @@ def computed_apart(compute: Callable[[], list[jax.Array]]) -> list[jax.Array]:
     like = [jax.ShapeDtypeStruct(value.shape, jnp.uint32) for value in values[::3]]
 
     def words(consts: list[jax.Array]) -> list[jax.Array]:
-        levels = [(value * 1023.0 + 0.5).astype(jnp.uint32) for value in compute_values(consts)]
-        packed = []
-        for first in range(0, len(levels), 3):
-            word = levels[first]
-            for k, level in enumerate(levels[first + 1 : first + 3], 1):
-                word |= level << 10 * k
-            packed.append(word)
-        return packed
+        return to_words(compute_values(consts))
 
     found = by_platform(
         (program.consts,),
@@ -67,9 +60,25 @@ def computed_apart(compute: Callable[[], list[jax.Array]]) -> list[jax.Array]:
         cpu=lambda consts: in_a_conditional(lambda _: words(consts), like),
         default=lambda consts: jax.lax.optimization_barrier(words(consts)),
     )
+    return from_words(found, len(values))
+
+
+def to_words(values: Sequence[jax.Array]) -> list[jax.Array]:
+    """Round values in [0, 1] to 10 bits, three in each uint32."""
+    levels = [(value * 1023.0 + 0.5).astype(jnp.uint32) for value in values]
+    words = []
+    for first in range(0, len(levels), 3):
+        word = levels[first]
+        for k, level in enumerate(levels[first + 1 : first + 3], 1):
+            word |= level << 10 * k
+        words.append(word)
+    return words
+
+
+def from_words(words: Sequence[jax.Array], count: int) -> list[jax.Array]:
+    """Return the ``count`` values of ``to_words``, float32."""
     return [
-        ((found[k // 3] >> 10 * (k % 3)) & 1023).astype(jnp.float32) / 1023.0
-        for k in range(len(values))
+        ((words[k // 3] >> 10 * (k % 3)) & 1023).astype(jnp.float32) / 1023.0 for k in range(count)
     ]
 
 
