@@ -324,13 +324,14 @@ def training_minutes() -> str:
     return f"{span(taken)} minutes on each of {len(tasks)} tasks of DM Control"
 
 
-def picture() -> str:
+def picture(area: str = "all") -> str:
     """The median of models of how far their pictures are from dm_control's."""
-    return f"{median(of_pictures('ours, theirs', 'all')):.1f}"
+    return f"{median(of_pictures('ours, theirs', area)):.1f}"
 
 
 README = {
     "picture": picture,
+    "picture-bodies": partial(picture, "else"),
     "whole": WHOLE,
     "cheetah": lambda: number(speeds("dmc_cheetah_run")[0]),
     "cheetah-ratio": lambda: f"{ratios()['dmc_cheetah_run']:.0f}",
