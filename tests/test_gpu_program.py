@@ -15,7 +15,7 @@ import jax
 import pytest
 
 from tests.benchmarks import runner
-from tests.benchmarks.ahead.case import MUJOCO_STEPS, AheadCase
+from tests.benchmarks.ahead.case import MUJOCO_STEPS, TRAINING, AheadCase
 
 pytestmark = [pytest.mark.gpu_program, pytest.mark.timeout(900)]
 
@@ -114,6 +114,17 @@ def test_a_step_of_mujoco_xla_is_one_graph(where):
     before = kept(**options)
     if before is None:
         pytest.skip(f"no report of jax {jax.__version__} is kept")
+    assert values["launches"] <= 1.1 * before["launches"]
+
+
+@pytest.mark.parametrize("where", TRAINING, ids=str)
+def test_an_iteration_of_training_launches_no_more_than_it_did(where):
+    options = {name: x for name, x in where.items() if name not in ("num_envs", "card")}
+    before = kept(**options, num_envs=where["num_envs"])
+    if before is None:
+        pytest.skip(f"no report of jax {jax.__version__} is kept")
+    values = compiled(**options, num_envs=where["num_envs"])
+    assert values["host_steps"] <= before["host_steps"]
     assert values["launches"] <= 1.1 * before["launches"]
 
 

@@ -13,7 +13,7 @@ from pixelbrax_jax.processor import num_cores
 from pixelbrax_jax.tasks import DMC_TASKS
 from tests.benchmarks import runner, tables
 from tests.benchmarks.ahead import tables as compiled
-from tests.benchmarks.ahead.case import MUJOCO_STEPS, PROGRAMS, AheadCase
+from tests.benchmarks.ahead.case import MUJOCO_STEPS, PROGRAMS, TRAINING, AheadCase
 from tests.benchmarks.ahead.targets import CARDS
 from tests.benchmarks.case import TASKS, Case, Group
 from tests.benchmarks.original import ORIGINAL
@@ -230,7 +230,7 @@ GROUPS = {
             for task in TASKS
             for program in PROGRAMS
         ]
-        + [AheadCase("gpu-program", "compiling.gpu", where) for where in MUJOCO_STEPS],
+        + [AheadCase("gpu-program", "compiling.gpu", where) for where in MUJOCO_STEPS + TRAINING],
         compiled.gpu,
         "Compiled, not run. Parts for the host are launched one after the other, a loop outside a "
         "graph among them as one; 1 is one CUDA graph. A loop of unknown length counts as one "

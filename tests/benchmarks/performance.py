@@ -10,7 +10,7 @@ from typing import Any
 
 from pixelbrax_gym.bench.tables import number, table
 from tests.benchmarks.ahead import tables as compiled
-from tests.benchmarks.ahead.case import MUJOCO_STEPS, PROGRAMS
+from tests.benchmarks.ahead.case import MUJOCO_STEPS, PROGRAMS, TRAINING
 from tests.benchmarks.ahead.targets import LAUNCH_SECONDS
 from tests.benchmarks.case import TASKS
 from tests.benchmarks.original import ORIGINAL
@@ -143,10 +143,10 @@ def programs() -> str:
     return compiled.gpu(shown, LEFT_OUT)
 
 
-def mujoco_programs() -> str:
-    """Steps of DM Control's tasks for an H100."""
+def these_programs(wanted: list[dict[str, Any]]) -> str:
+    """Programs for an H100 with these arguments."""
     rows = rows_of("programs", "gpu-program")
-    shown = [next(row for row in rows if row["arguments"] == where) for where in MUJOCO_STEPS]
+    shown = [next(row for row in rows if row["arguments"] == where) for where in wanted]
     return compiled.gpu(shown, LEFT_OUT)
 
 
@@ -289,7 +289,8 @@ PERFORMANCE = {
 
 ACCELERATORS = {
     "gpu-programs": programs,
-    "mujoco-programs": mujoco_programs,
+    "mujoco-programs": partial(these_programs, MUJOCO_STEPS),
+    "training-programs": partial(these_programs, TRAINING),
     "tpu-programs": tpu_programs,
     "traffic": lambda: span(traffic("renderer")),
     "traffic-plain": lambda: f"{max(traffic('plain renderer')):.0f}",

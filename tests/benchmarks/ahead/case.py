@@ -40,6 +40,15 @@ MUJOCO_STEPS += [
     for task in ("dmc_cheetah_run", "dmc_finger_spin")
 ]
 
+TRAINING = [
+    {
+        **{"task": "dmc_reacher_easy", "program": "iteration", "num_envs": 256, "card": "H100"},
+        **{"num_starts": 4096, "algorithm": algorithm, "preset": preset},
+    }
+    for algorithm, preset in (("drqv2", "fast"), ("ppo", "cpu"))
+]
+"""Iterations of training."""
+
 
 @dataclass(frozen=True)
 class AheadCase(Case):

@@ -20,6 +20,10 @@ import jax.numpy as jnp
 from jax.experimental import topologies
 
 import pixelbrax_jax as pb
+from pixelbrax_jax import agents
+from pixelbrax_jax.agents.config import make_env
+from pixelbrax_jax.agents.registry import make_algorithm
+from pixelbrax_jax.agents.train_state import TrainState
 from pixelbrax_jax.compilation import compiler_options
 from pixelbrax_jax.validation import check_choice
 from tests.benchmarks.ahead.case import DUMP, PROGRAMS
@@ -115,7 +119,11 @@ def _compile(topology: Any, platform: str, function: Any, arguments: Any) -> tup
         return function(*args)
 
     started = time.perf_counter()
-    traced = jax.jit(ahead, in_shardings=where, out_shardings=where).trace(*arguments)
+    # An iteration of training reuses the memory of the state, as the runner has it.
+    donated = (0,) if isinstance(arguments[0], TrainState) else ()
+    traced = jax.jit(ahead, in_shardings=where, out_shardings=where, donate_argnums=donated).trace(
+        *arguments
+    )
     lowered = traced.lower(lowering_platforms=(platform,))
     compiled = lowered.compile(compiler_options(platform=platform))
     return compiled, round(time.perf_counter() - started, 1)
@@ -139,16 +147,16 @@ def make_program(
     name: str, task: str, num_envs: int, **options: Any
 ) -> tuple[Callable[..., Any], tuple[Any, ...]]:
     """One of ``PROGRAMS``, with the shapes of its arguments; nothing is computed."""
-    check_choice("program", name, PROGRAMS)
+    check_choice("program", name, (*PROGRAMS, "iteration"))
+    if name == "iteration":
+        return _iteration(task=task, num_envs=num_envs, **options)
     obs_mode = "state" if name == "state step" else "pixels"
     if name == "plain renderer":
         options = {"renderer": "fused", **options}
     env, params = pb.make(task, obs_mode=obs_mode, **options)
     envs = pb.VectorPixelEnv(env, num_envs)
     state, _ = jax.eval_shape(envs.reset, jax.eval_shape(lambda: jax.random.key(0)), params)
-    params = jax.tree.map(
-        lambda x: jax.ShapeDtypeStruct(jnp.shape(x), jnp.asarray(x).dtype), params
-    )
+    params = _shapes(params)
     action = jax.ShapeDtypeStruct((num_envs, env.action_size), jnp.float32)
     if name.endswith("renderer"):
         return jax.vmap(env.draw, in_axes=(0, None)), (state.sim, params)
@@ -163,6 +171,21 @@ def make_program(
         return jax.lax.scan(step, state, None, length=SCAN_LENGTH)
 
     return scan, (state, action, params)
+
+
+def _iteration(
+    algorithm: str, preset: str, **changes: Any
+) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+    """An iteration of training with an algorithm's preset, and the shapes of its arguments."""
+    config = agents.preset(algorithm, preset, **changes)
+    env, params = make_env(config)
+    made = make_algorithm(config, pb.VectorPixelEnv(env, config.num_envs))
+    state = jax.eval_shape(made.init, jax.eval_shape(lambda: jax.random.key(0)), params)
+    return made.iterate, (state, _shapes(params))
+
+
+def _shapes(tree: Any) -> Any:
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(jnp.shape(x), jnp.asarray(x).dtype), tree)
 
 
 def find_assembler() -> str | None:

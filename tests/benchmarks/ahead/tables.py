@@ -75,7 +75,9 @@ def tpu(rows: list[Row]) -> str:
 
 def _about(row: Row, device: str) -> Iterator[str]:
     about = row["arguments"]
-    yield from (device, title(about["task"]), f"{about['num_envs']:,}", about["program"])
+    names = ("algorithm", "preset", "program")
+    program = " ".join(about[name] for name in names if name in about)
+    yield from (device, title(about["task"]), f"{about['num_envs']:,}", program)
 
 
 def _count(value: int | None) -> str:
