@@ -73,6 +73,7 @@ def play(task: str, training: str, suite: str, runs: list[Path], folder: Path) -
     """Play the levels of a suite that have not been played, and keep all returns of these runs."""
     command = ["nice", "-n", "19", sys.executable, "-m", "pixelbrax_gym.cli", "evaluate"]
     command += [*map(str, runs), "--suite", suite, "--clips", "procedural"]
+    command += ["--episodes", str(EPISODES)]
     command += ["--output-dir", str(folder)]
     if subprocess.run(command, check=False, stdout=subprocess.DEVNULL).returncode:
         return False
