@@ -99,11 +99,23 @@ def page(suite: str) -> str:
             continue
         columns = {f"{name} ({len(found.returns)})": found.rows() for name, found in scores.items()}
         lines = [[rows[0].level, *map(_cell, rows)] for rows in zip(*columns.values(), strict=True)]
-        head = "level"
+        heads = ["level", *columns]
         if suite == "axes":
-            head, lines = "axis", _one_row_an_axis(columns)
-        parts.append(f"**`{task}`**, {agent}\n\n{table((head, *columns), lines)}")
+            heads[0], lines = "axis", _one_row_an_axis(columns)
+        for name, returns in published(task).items() if suite == "dmcgb2" else ():
+            heads.append(name)
+            lines = [[*line, returns.get(line[0], "")] for line in lines]
+        parts.append(f"**`{task}`**, {agent}\n\n{table(heads, lines)}")
     return "\n\n".join(parts)
+
+
+def published(task: str) -> dict[str, dict[str, str]]:
+    """Published means and standard deviations of a task, by agent and level."""
+    kept = json.loads((KEPT / "published.json").read_text("utf-8"))
+    return {
+        f"{agent}, published": {level: f"{mean} ± {over}" for level, (mean, over) in levels.items()}
+        for agent, levels in kept["returns"].get(task, {}).items()
+    }
 
 
 def _cell(row: Row) -> str:
