@@ -219,14 +219,14 @@ class _Drawing:
         return self._planes_of(self._render_rows(first_row, num_rows), rows)
 
     def _render_rows(self, first_row: jax.Array, num_rows: int) -> Frame:
-        return render(
+        return _render(
             self.scene,
+            first_row,
             self.height,
             self.width,
+            num_rows,
             "fused" if self.renderer == "auto" else self.renderer,
-            first_row=first_row,
-            num_rows=num_rows,
-            samples=self.samples,
+            math.isqrt(self.samples),
         )
 
     def _planes_of(self, frame: Frame, rows: jax.Array) -> tuple[jax.Array, ...]:

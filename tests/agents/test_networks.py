@@ -100,8 +100,30 @@ def test_pixels_are_scaled_before_they_are_convolved():
             np.testing.assert_allclose(actual, expected, rtol=1e-6, atol=1e-6 * scale)
 
 
-def test_kernels_of_several_runs_convolve_one_image_each():
-    """Also in derivatives: one native convolution of a CPU has one kernel."""
+def test_a_convolution_differentiates_twice():
+    keys = jax.random.split(jax.random.key(8))
+    x, weights = jax.random.normal(keys[0], (1, 5, 6, 2)), jax.random.normal(keys[1], (3, 3, 2, 3))
+
+    @jax.jit
+    def both(x, weights):
+        def second(function):
+            def first(x):
+                return jnp.sum(jax.grad(lambda x: jnp.sum(function(x, weights) ** 3))(x) ** 2)
+
+            return jax.grad(first)(x)
+
+        plain = partial(
+            jax.lax.conv_general_dilated, window_strides=(1, 1), padding="VALID",
+            dimension_numbers=("NHWC", "HWIO", "NHWC"),
+        )  # fmt: skip
+        return second(partial(convolve, stride=1, pads=((0, 0), (0, 0)))), second(plain)
+
+    actual, expected = both(x, weights)
+    np.testing.assert_allclose(actual, expected, rtol=1e-4, atol=1e-4 * float(expected.max()))
+
+
+def test_each_run_under_vmap_has_its_own_kernel():
+    """Also in gradients; images under vmap share one."""
     keys = jax.random.split(jax.random.key(7), 3)
     x = jax.random.normal(keys[0], (2, 1, 7, 6, 3))
     weights = jax.random.normal(keys[1], (2, 3, 3, 3, 5))
@@ -114,12 +136,14 @@ def test_kernels_of_several_runs_convolve_one_image_each():
             return value, *pull(upper)
 
         one_by_one = [pulled(*run) for run in zip(x, weights, upper, strict=True)]
-        return jax.vmap(pulled)(x, weights, upper), one_by_one
+        shared = jax.vmap(pulled, (0, None, 0))(x, weights[0], upper)
+        return jax.vmap(pulled)(x, weights, upper), shared, one_by_one
 
-    together, one_by_one = both(x, weights, upper)
-    for run, alone in enumerate(one_by_one):
-        for actual, expected in zip(together, alone, strict=True):
-            np.testing.assert_allclose(actual[run], expected, rtol=1e-5, atol=1e-5)
+    together, shared, one_by_one = both(x, weights, upper)
+    for values, runs in ((together, (0, 1)), (shared, (0,))):
+        for run in runs:
+            for actual, expected in zip(values, one_by_one[run], strict=True):
+                np.testing.assert_allclose(actual[run], expected, rtol=1e-5, atol=1e-5)
 
 
 def inputs_of_last_layer(name: str, size: int) -> int:

@@ -43,7 +43,10 @@ def _unchanged(x: jax.Array) -> jax.Array:
 def convolve(
     x: jax.Array, kernel: jax.Array, stride: int, pads: Pads, before: Before = _unchanged
 ) -> jax.Array:
-    """Cross-correlate ``before(x)``, (B, H, W, C), with (h, w, C, D)."""
+    """Cross-correlate ``before(x)``, (B, H, W, C), with (h, w, C, D).
+
+    On a CPU there are derivatives in reverse mode (``jax.grad``, also of ``jax.grad``) alone.
+    """
 
     def native(x: jax.Array, kernel: jax.Array) -> jax.Array:
         x = before(x).astype(kernel.dtype)
@@ -52,10 +55,10 @@ def convolve(
         )
 
     def on_cpu(x: jax.Array, kernel: jax.Array) -> jax.Array:
-        if stride > 1 or kernel.shape[0] == 1:
+        if stride > 1:
             return _as_products(x, kernel, stride, pads, before)
         x = before(x).astype(kernel.dtype)
-        return _slid(jnp.pad(x, ((0, 0), *pads, (0, 0))), kernel)
+        return _with_stride_1(jnp.pad(x, ((0, 0), *pads, (0, 0))), kernel)
 
     result: jax.Array = jax.lax.platform_dependent(x, kernel, cpu=on_cpu, default=native)
     return result
@@ -66,7 +69,7 @@ def convolve(
 
 
 @jax.custom_batching.custom_vmap
-def _native(x: jax.Array, kernel: jax.Array) -> jax.Array:
+def _convolve_natively(x: jax.Array, kernel: jax.Array) -> jax.Array:
     """Convolve with stride 1 without padding: the row above is removed again."""
     padded = jax.lax.conv_general_dilated(
         x, kernel, (1, 1), ((1, 0), (0, 0)), dimension_numbers=("NHWC", "HWIO", "NHWC")
@@ -74,36 +77,42 @@ def _native(x: jax.Array, kernel: jax.Array) -> jax.Array:
     return padded[:, 1:]
 
 
-@_native.def_vmap
-def _native_batched(
-    _: int, batched: tuple[bool, bool], x: jax.Array, kernel: jax.Array
+@_convolve_natively.def_vmap
+def _convolve_batched(
+    size: int, batched: tuple[bool, bool], x: jax.Array, kernel: jax.Array
 ) -> tuple[jax.Array, bool]:
-    axes = tuple(0 if one else None for one in batched)
-    return jax.vmap(_as_products, axes)(x, kernel), True
+    if batched[1]:
+        # XLA for CPUs computes convolutions with a kernel each in slow loops.
+        return jax.vmap(_as_products, (0 if batched[0] else None, 0))(x, kernel), True
+    result = _convolve_natively(x.reshape(-1, *x.shape[2:]), kernel)
+    return result.reshape(size, -1, *result.shape[1:]), True
 
 
 @jax.custom_vjp
-def _slid(x: jax.Array, kernel: jax.Array) -> jax.Array:
-    """Convolve with stride 1 without padding, on a CPU."""
-    result: jax.Array = _native(x, kernel)
+def _with_stride_1(x: jax.Array, kernel: jax.Array) -> jax.Array:
+    """Convolve without padding, on a CPU."""
+    result: jax.Array = _convolve_natively(x, kernel)
     return result
 
 
-def _slid_forward(x: jax.Array, kernel: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-    return _slid(x, kernel), (x, kernel)
+def _with_stride_1_forward(
+    x: jax.Array, kernel: jax.Array
+) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+    return _with_stride_1(x, kernel), (x, kernel)
 
 
-def _slid_backward(
+def _with_stride_1_backward(
     inputs: tuple[jax.Array, jax.Array], cotangent: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     x, kernel = inputs
     of_kernel = jax.linear_transpose(partial(_as_products, x), kernel)
     borders = ((size - 1, size - 1) for size in kernel.shape[:2])
     surrounded = jnp.pad(cotangent, ((0, 0), *borders, (0, 0)))
-    return _native(surrounded, kernel[::-1, ::-1].swapaxes(2, 3)), *of_kernel(cotangent)
+    of_x = _with_stride_1(surrounded, kernel[::-1, ::-1].swapaxes(2, 3))
+    return of_x, *of_kernel(cotangent)
 
 
-_slid.defvjp(_slid_forward, _slid_backward)
+_with_stride_1.defvjp(_with_stride_1_forward, _with_stride_1_backward)
 
 
 def _as_products(

@@ -42,12 +42,17 @@ MUJOCO_STEPS += [
 
 TRAINING = [
     {
-        **{"task": "dmc_reacher_easy", "program": "iteration", "num_envs": 256, "card": "H100"},
-        **{"num_starts": 4096, "algorithm": algorithm, "preset": preset},
+        "task": "dmc_reacher_easy",
+        "program": "iteration",
+        "num_envs": 256,
+        "card": "H100",
+        "num_starts": 4096,
+        "algorithm": algorithm,
+        "preset": preset,
     }
     for algorithm, preset in (("drqv2", "fast"), ("ppo", "cpu"))
 ]
-"""Iterations of training."""
+"""All that an algorithm does between two logs."""
 
 
 @dataclass(frozen=True)

@@ -146,7 +146,7 @@ def _host_steps() -> int | None:
 def make_program(
     name: str, task: str, num_envs: int, **options: Any
 ) -> tuple[Callable[..., Any], tuple[Any, ...]]:
-    """One of ``PROGRAMS``, with the shapes of its arguments; nothing is computed."""
+    """One of ``PROGRAMS`` or an ``iteration`` of training, with the shapes of its arguments."""
     check_choice("program", name, (*PROGRAMS, "iteration"))
     if name == "iteration":
         return _iteration(task=task, num_envs=num_envs, **options)
