@@ -174,7 +174,7 @@ def transfer() -> str:
                 ", ".join(str(row["seed"]) for row in rows),
                 f"{mean(row['return'] for row in rows):.0f}",
                 f"{mean(row['return_there'] for row in rows):.0f}",
-                f"{mean(differences):+.0f} ± {over:.0f}",
+                f"{round(mean(differences)):+d} ± {over:.0f}",
                 ", ".join(
                     f"{one:+.0f} ± {error:.0f}"
                     for one, error in zip(differences, errors, strict=True)
