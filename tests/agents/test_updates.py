@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from functools import partial
 
 import jax
@@ -70,17 +71,19 @@ def test_ppg_without_auxiliary_phases_is_ppo():
             "critic": networks["critic"],
         }
 
-    close = partial(assert_close, rtol=1e-4, atol=1e-6)
+    # Compiled without optimisation, XLA rounds convolutions in these two programs differently.
+    optimized = os.environ.get("PIXELBRAX_TESTS_OPTIMIZE") == "1"
+    tolerance = {"rtol": 0.0} if optimized else {"rtol": 1e-5, "atol": 1e-7}
+    agree = partial(assert_close, **tolerance)
     one, other = PPO_AGENT.init(), PPG_AGENT.init()
     assert same(shared(one.networks), shared(other.networks))
     for _ in range(ITERATIONS):
         one, facts = PPO_AGENT.iterate(one)
         other, more_facts = PPG_AGENT.iterate(other)
-        # In two programs XLA may round convolutions otherwise.
-        close(shared(one.networks), shared(other.networks))
-        close(facts, more_facts)
-    close(one.env_state.sim.physics, other.env_state.sim.physics)
-    close(one.scaler, other.scaler)
+        agree(shared(one.networks), shared(other.networks))
+        agree(facts, more_facts)
+    agree(one.env_state, other.env_state)
+    agree(one.scaler, other.scaler)
 
 
 def test_ppg_s_actor_keeps_its_value_head_until_the_auxiliary_phase():
