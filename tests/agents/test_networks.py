@@ -12,8 +12,9 @@ from flax import linen as nn
 from scipy import integrate, stats
 
 from pixelbrax_jax.agents.networks.actor_critic import POLICIES, Actor, Critic
+from pixelbrax_jax.agents.networks.convolution import convolve
 from pixelbrax_jax.agents.networks.distributions import Normal
-from pixelbrax_jax.agents.networks.encoders import ENCODERS, SMALLEST, centered, convolve, max_pool
+from pixelbrax_jax.agents.networks.encoders import ENCODERS, SMALLEST, centered, max_pool
 
 
 def plain_max_pool(x):

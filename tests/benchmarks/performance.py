@@ -270,7 +270,6 @@ PERFORMANCE = {
         f"{rounded(ant(), 1)} to "
         + rounded(_lines("adapters", "adapter", 256)["Gymnasium, torch"]["steps_per_second"], 1)
     ),
-    "dm-control": lambda: f"{dm_control():.0f}",
     "batches-1000": partial(batches, 1000),
     "batches-10": partial(batches, 10),
     "kilobytes": held,

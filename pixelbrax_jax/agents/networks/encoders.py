@@ -11,17 +11,12 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
-from pixelbrax_jax._platform.conditional import in_a_conditional
-
-Pads = tuple[tuple[int, int], tuple[int, int]]
+from pixelbrax_jax.agents.networks.convolution import Before, convolve, unchanged
 
 Layers = tuple[tuple[int, int, int], ...]
 """Channels, size and stride of each convolution."""
 
 Initializer = Callable[..., jax.Array]
-
-Before = Callable[[jax.Array], jax.Array]
-"""Changes each number of an array by itself."""
 
 
 def scaled(pixels: jax.Array) -> jax.Array:
@@ -36,129 +31,6 @@ def centered(pixels: jax.Array) -> jax.Array:
     return scaled(pixels) - 0.5
 
 
-def _unchanged(x: jax.Array) -> jax.Array:
-    return x
-
-
-def convolve(
-    x: jax.Array, kernel: jax.Array, stride: int, pads: Pads, before: Before = _unchanged
-) -> jax.Array:
-    """Cross-correlate ``before(x)``, (B, H, W, C), with (h, w, C, D).
-
-    On a CPU there are derivatives in reverse mode (``jax.grad``, also of ``jax.grad``) alone.
-    """
-
-    def native(x: jax.Array, kernel: jax.Array) -> jax.Array:
-        x = before(x).astype(kernel.dtype)
-        return jax.lax.conv_general_dilated(
-            x, kernel, (stride, stride), pads, dimension_numbers=("NHWC", "HWIO", "NHWC")
-        )
-
-    def on_cpu(x: jax.Array, kernel: jax.Array) -> jax.Array:
-        if stride > 1:
-            return _as_products(x, kernel, stride, pads, before)
-        x = before(x).astype(kernel.dtype)
-        return _with_stride_1(jnp.pad(x, ((0, 0), *pads, (0, 0))), kernel)
-
-    result: jax.Array = jax.lax.platform_dependent(x, kernel, cpu=on_cpu, default=native)
-    return result
-
-
-# In loops XLA for CPUs computes a native convolution several times as fast as matrix products, if
-# it has padding, but those of its derivatives many times slower.
-
-
-@jax.custom_batching.custom_vmap
-def _convolve_natively(x: jax.Array, kernel: jax.Array) -> jax.Array:
-    """Convolve with stride 1 without padding: the row above is removed again."""
-    padded = jax.lax.conv_general_dilated(
-        x, kernel, (1, 1), ((1, 0), (0, 0)), dimension_numbers=("NHWC", "HWIO", "NHWC")
-    )
-    return padded[:, 1:]
-
-
-@_convolve_natively.def_vmap
-def _convolve_batched(
-    size: int, batched: tuple[bool, bool], x: jax.Array, kernel: jax.Array
-) -> tuple[jax.Array, bool]:
-    if batched[1]:
-        # XLA for CPUs computes convolutions with a kernel each in slow loops.
-        return jax.vmap(_as_products, (0 if batched[0] else None, 0))(x, kernel), True
-    result = _convolve_natively(x.reshape(-1, *x.shape[2:]), kernel)
-    return result.reshape(size, -1, *result.shape[1:]), True
-
-
-@jax.custom_vjp
-def _with_stride_1(x: jax.Array, kernel: jax.Array) -> jax.Array:
-    """Convolve without padding, on a CPU."""
-    result: jax.Array = _convolve_natively(x, kernel)
-    return result
-
-
-def _with_stride_1_forward(
-    x: jax.Array, kernel: jax.Array
-) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-    return _with_stride_1(x, kernel), (x, kernel)
-
-
-def _with_stride_1_backward(
-    inputs: tuple[jax.Array, jax.Array], cotangent: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    x, kernel = inputs
-    of_kernel = jax.linear_transpose(partial(_as_products, x), kernel)
-    borders = ((size - 1, size - 1) for size in kernel.shape[:2])
-    surrounded = jnp.pad(cotangent, ((0, 0), *borders, (0, 0)))
-    of_x = _with_stride_1(surrounded, kernel[::-1, ::-1].swapaxes(2, 3))
-    return of_x, *of_kernel(cotangent)
-
-
-_with_stride_1.defvjp(_with_stride_1_forward, _with_stride_1_backward)
-
-
-def _as_products(
-    x: jax.Array,
-    kernel: jax.Array,
-    stride: int = 1,
-    pads: Pads = ((0, 0), (0, 0)),
-    before: Before = _unchanged,
-) -> jax.Array:
-    """Convolve over blocks of stride x stride pixels, with one matrix product per kernel block."""
-    batch, height, width, channels = x.shape
-    (top, bottom), (left, right) = pads
-    rows = (top + height + bottom - kernel.shape[0]) // stride + 1
-    columns = (left + width + right - kernel.shape[1]) // stride + 1
-    # Blocks of the kernel, and of the part of the image that the kernel covers.
-    tall, wide = (-(-side // stride) for side in kernel.shape[:2])
-    down, across = rows + tall - 1, columns + wide - 1
-    borders = (
-        (0, 0, 0),
-        (top, down * stride - top - height, 0),
-        (left, across * stride - left - width, 0),
-        (0, 0, 0),
-    )
-
-    def blocks(x: jax.Array) -> jax.Array:
-        x = jax.lax.pad(x, jnp.zeros((), x.dtype), borders)
-        x = x.reshape(batch, down, stride, across, stride, channels).transpose(0, 1, 3, 2, 4, 5)
-        return x.reshape(batch, down, across, stride * stride * channels)
-
-    if x.dtype == jnp.uint8 and not any(side > 0 for border in borders for side in border):
-        # Bytes are moved fast, unless XLA moves and scales them at once.
-        moved = in_a_conditional(lambda _: blocks(x), jax.eval_shape(blocks, x))
-        x = before(moved).astype(kernel.dtype)
-    else:
-        x = blocks(before(x).astype(kernel.dtype))
-    missing = ((0, tall * stride - kernel.shape[0]), (0, wide * stride - kernel.shape[1]))
-    kernel = jnp.pad(kernel, (*missing, (0, 0), (0, 0)))
-    kernel = kernel.reshape(tall, stride, wide, stride, channels, -1).transpose(0, 2, 1, 3, 4, 5)
-    kernel = kernel.reshape(tall, wide, x.shape[-1], -1)
-    result = jnp.zeros((), x.dtype)
-    for i in range(tall):
-        for j in range(wide):
-            result += x[:, i : i + rows, j : j + columns] @ kernel[i, j]
-    return result
-
-
 class Conv(nn.Module):
     """A convolution with a bias over channels-last images, like ``flax.linen.Conv``."""
 
@@ -167,7 +39,7 @@ class Conv(nn.Module):
     stride: int = 1
     padding: str = "VALID"
     kernel_init: Initializer = nn.initializers.lecun_normal()
-    before: Before = _unchanged
+    before: Before = unchanged
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
@@ -290,7 +162,7 @@ def _convolved(x: jax.Array, layers: Layers, before: Before, **options: Any) -> 
     """Return the features of convolutions in the module that calls; ``before`` acts on ``x``."""
     for channels, size, stride in layers:
         x = nn.relu(Conv(channels, size, stride, before=before, **options)(x))
-        before = _unchanged
+        before = unchanged
     return _flat(x)
 
 

@@ -1,0 +1,113 @@
+"""Convolutions that are fast on a CPU too, also in loops and in gradients."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+Pads = tuple[tuple[int, int], tuple[int, int]]
+"""Rows above and below, columns to the left and to the right."""
+
+Before = Callable[[jax.Array], jax.Array]
+"""Changes each number of an array by itself."""
+
+
+def unchanged(x: jax.Array) -> jax.Array:
+    """Return ``x``."""
+    return x
+
+
+def convolve(
+    x: jax.Array, kernel: jax.Array, stride: int, pads: Pads, before: Before = unchanged
+) -> jax.Array:
+    """Cross-correlate ``before(x)``, (B, H, W, C), with (h, w, C, D).
+
+    On a CPU there are derivatives in reverse mode (``jax.grad``, also of ``jax.grad``) alone.
+    """
+
+    def native(x: jax.Array, kernel: jax.Array) -> jax.Array:
+        x = before(x).astype(kernel.dtype)
+        return jax.lax.conv_general_dilated(
+            x, kernel, (stride, stride), pads, dimension_numbers=("NHWC", "HWIO", "NHWC")
+        )
+
+    def on_cpu(x: jax.Array, kernel: jax.Array) -> jax.Array:
+        return _by_image(x, kernel, stride, pads, before)
+
+    result: jax.Array = jax.lax.platform_dependent(x, kernel, cpu=on_cpu, default=native)
+    return result
+
+
+# The patches of one image fit into a cache, those of a batch do not. XLA's own convolutions are as
+# fast only in some shapes, and its gradients of them are many times slower in loops.
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(2, 3, 4))
+def _by_image(
+    x: jax.Array, kernel: jax.Array, stride: int, pads: Pads, before: Before
+) -> jax.Array:
+    def convolved(image: jax.Array) -> jax.Array:
+        return _patches(image, kernel, stride, pads, before) @ _matrix(kernel)
+
+    return jax.lax.map(convolved, x)
+
+
+def _by_image_forward(
+    x: jax.Array, kernel: jax.Array, stride: int, pads: Pads, before: Before
+) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+    return _by_image(x, kernel, stride, pads, before), (x, kernel)
+
+
+def _by_image_backward(
+    stride: int,
+    pads: Pads,
+    before: Before,
+    inputs: tuple[jax.Array, jax.Array],
+    cotangents: jax.Array,
+) -> tuple[jax.Array | None, jax.Array]:
+    x, kernel = inputs
+    of_images = jnp.issubdtype(x.dtype, jnp.floating)
+
+    def add(of_matrix: jax.Array, one: Any) -> tuple[jax.Array, jax.Array | None]:
+        image, cotangent = one
+        patches, pull = jax.vjp(lambda image: _patches(image, kernel, stride, pads, before), image)
+        # This order is faster than that of the transpose.
+        of_matrix += jnp.einsum(
+            "hwd,hwp->dp", cotangent, patches, preferred_element_type=jnp.float32
+        )
+        return of_matrix, pull(cotangent @ _matrix(kernel).T)[0] if of_images else None
+
+    of_matrix = jnp.zeros(_matrix(kernel).T.shape)
+    of_matrix, of_x = jax.lax.scan(add, of_matrix, (x, cotangents))
+    return of_x, of_matrix.T.reshape(kernel.shape).astype(kernel.dtype)
+
+
+_by_image.defvjp(_by_image_forward, _by_image_backward)
+
+
+def _patches(
+    image: jax.Array, kernel: jax.Array, stride: int, pads: Pads, before: Before
+) -> jax.Array:
+    """Return the numbers under the kernel at each of its places, (H', W', h * w * C)."""
+    image = jnp.pad(before(image).astype(kernel.dtype), (*pads, (0, 0)))
+    height, width = kernel.shape[:2]
+    rows, columns = (
+        max(0, (whole - side) // stride + 1)
+        for whole, side in zip(image.shape, (height, width), strict=False)
+    )
+    return jnp.concatenate(
+        [
+            image[i : i + rows * stride : stride, j : j + columns * stride : stride]
+            for i in range(height)
+            for j in range(width)
+        ],
+        -1,
+    )
+
+
+def _matrix(kernel: jax.Array) -> jax.Array:
+    return kernel.reshape(-1, kernel.shape[-1])
