@@ -139,7 +139,7 @@ $(VENV)/.installed-%: $(VENV)/.created pyproject.toml constraints.txt
 	@echo "Installing PixelBrax and its clients into .venv-clients; the first time takes minutes ..."
 	@$(PYTHON) -m venv --clear .venv-clients
 	@.venv-clients/bin/python -m pip install --quiet --disable-pip-version-check \
-		-c constraints.txt -e ".[dev]"
+		-c constraints.txt -e ".[dev,warp]"
 	@.venv-clients/bin/python -m pip install --quiet --disable-pip-version-check \
 		--no-deps -r tests/clients/requirements.txt
 	@touch $@

@@ -159,7 +159,7 @@ def _findings(m: Machine) -> Iterator[Finding]:
     share = _memory_share(m.environ)
     if on_gpu and share <= 0.5:
         yield _ok("JAX leaves GPU memory for other libraries")
-    elif on_gpu and m.torch_cuda:
+    elif on_gpu and m.torch_cuda is True:
         yield _note(
             f"JAX reserves {share:.0%} of the GPU's memory when it starts; torch gets the rest",
             f"export {new}=0.4, or XLA_PYTHON_CLIENT_PREALLOCATE=false, before Python starts",

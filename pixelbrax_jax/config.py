@@ -120,6 +120,7 @@ class ProgramConfig:
         object.__setattr__(self, name, value)
 
 
+_LONGEST_EPISODE = 2**31 - 1
 _SUITE_OPTIONS = (*fields(BraxOptions), *fields(MujocoOptions))
 
 
@@ -164,6 +165,8 @@ class EnvConfig(BraxOptions, MujocoOptions, ProgramConfig):
         MujocoOptions.__post_init__(self)
         self._store("dynamics", check_ranges("dynamics", self.dynamics))
         episode_length = check_positive_int("episode_length", self._static("episode_length"))
+        if episode_length > _LONGEST_EPISODE:
+            raise ValueError(f"episode_length must be below 2**31, got {episode_length}.")
         self._store("episode_length", episode_length)
         if self.shadows is not None:
             self._store("shadows", check_bool("shadows", self.shadows))

@@ -17,8 +17,10 @@ from pixelbrax_jax.ffmpeg import encoder, find_ffmpeg
 
 SUFFIXES = (".gif", ".mp4")
 
-_LONGEST = 655_350.0
+_LONGEST = 655_350
 """Longest display time of a GIF's image in milliseconds: hundredths of a second, in 16 bits."""
+_SHORTEST = 20
+"""Shortest time in milliseconds; viewers take less for a tenth of a second."""
 
 NO_WRITER = f"a video needs imageio-ffmpeg and Pillow; try: {install_extra('video')}"
 
@@ -75,10 +77,18 @@ def _gif(path: Path, fps: float) -> Iterator[Callable[[np.ndarray], None]]:
     from PIL import Image
 
     images: list[Any] = []
-    times: list[float] = []
+    times: list[int] = []
+    count = shown = 0
 
     def append(frame: np.ndarray) -> None:
-        image, time = Image.fromarray(frame), 1000.0 / fps
+        nonlocal count, shown
+        count += 1
+        # A GIF counts hundredths of a second. Rounded one by one, they would not add up.
+        end = 10 * round(100 * count / fps)
+        image, time = Image.fromarray(frame), end - shown
+        if time < _SHORTEST:
+            return
+        shown = end
         # Older releases of Pillow lose the time of equal images; newer ones add it up.
         still = bool(images) and image == images[-1]
         if still:
@@ -101,7 +111,7 @@ def _gif(path: Path, fps: float) -> Iterator[Callable[[np.ndarray], None]]:
             _save_gif(path, images, times)
 
 
-def _save_gif(path: Path, images: list[Any], times: list[float]) -> None:
+def _save_gif(path: Path, images: list[Any], times: list[int]) -> None:
     first, *others = images
     moving = {"save_all": True, "duration": times if others else times[0], "loop": 0}
     try:

@@ -242,6 +242,8 @@ def test_every_third_party_is_declared():
     used = {_DISTRIBUTIONS.get(name, name.replace("_", "-")) for name in third_parties(ROOT)}
     # TorchRL pins the release of tensordict that goes with it.
     used -= {"tensordict"}
+    # An extra of MuJoCo XLA brings the release of Warp that goes with it.
+    used -= {"warp"}
     # Used only by who has it.
     used -= {"wandb", "mujoco-playground"}
     assert used <= core | extras, f"not declared: {used - core - extras}"

@@ -10,6 +10,7 @@ from pathlib import Path
 import imageio.v3 as imageio
 import numpy as np
 import pytest
+from PIL import Image
 
 from pixelbrax_jax.ffmpeg import find_ffmpeg
 from pixelbrax_jax.video import write_frames
@@ -36,6 +37,19 @@ def test_frames_come_back(tmp_path, name):
     read = imageio.imread(path, index=None)
     assert read.shape == (6, 32, 48, 3)
     np.testing.assert_allclose(read.mean((1, 2, 3)), [0, 255] * 3, atol=8)
+
+
+@pytest.mark.parametrize("fps", [30, 40, 60, 125])
+def test_a_gif_lasts_as_long_as_its_frames(tmp_path, fps):
+    """Rates at which a frame is no whole number of hundredths of a second."""
+    path = write_frames(tmp_path / "a.gif", flashes(30), fps)
+    times = []
+    with Image.open(path) as image:
+        for index in range(image.n_frames):
+            image.seek(index)
+            times.append(image.info["duration"])
+    assert sum(times) == pytest.approx(30_000 / fps, abs=25)
+    assert min(times) >= 20
 
 
 def test_the_time_of_a_gif(tmp_path):

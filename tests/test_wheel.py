@@ -103,7 +103,7 @@ def test_the_metadata_says_what_a_user_needs(wheel):
         "train",
         "dataset",
     }
-    extras |= {"cuda12", "cuda13"}
+    extras |= {"cuda12", "cuda13", "warp"}
     extras |= {"all", "test", "dev", "docs"}
     assert set(metadata.get_all("Provides-Extra")) == extras
     # What is heavy or needs a display is never installed unasked.

@@ -15,6 +15,7 @@ import numpy as np
 from tyro.conf import Positional, arg
 
 from pixelbrax_gym.cli import CommandError, parse, say
+from pixelbrax_gym.resets import check_seed
 from pixelbrax_jax.extras import install_extra
 from pixelbrax_jax.validation import check_positive_int
 
@@ -72,6 +73,7 @@ def run(arguments: Sequence[str]) -> int:
 
     check_positive_int("size", options.size)
     check_positive_int("num_frames", options.num_frames)
+    check_seed(options.seed)
     try:
         env, act = _make(options)
     except TypeError as error:

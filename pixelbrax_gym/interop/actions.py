@@ -44,7 +44,8 @@ def as_actions(action: Any, shape: tuple[int, ...], device: jax.Device) -> Any:
         _check_shape(given.shape, shape)
         _check_floating(given.dtype.kind == "f", given.dtype)
         # A copy: JAX may read it after the caller has begun to fill in the next action.
-        values = np.array(given, np.float32)
+        with np.errstate(over="ignore"):  # infinity is clipped like all beyond the limits
+            values = np.array(given, np.float32)
     if isinstance(values, np.ndarray):
         _check_nan(values)
     return values

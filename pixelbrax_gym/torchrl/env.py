@@ -188,7 +188,7 @@ class TorchRLEnv(EnvBase):
                 **{name: outputs[name] for name in names},
             }
         )
-        self.infos = exported["infos"]
+        self.infos = {name: x.to(self.device) for name, x in exported["infos"].items()}
         values = {name: exported[name][:, None] for name in names}
         values |= self._observations(exported["obs"])
         if where is not None:

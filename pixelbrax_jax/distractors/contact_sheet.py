@@ -23,7 +23,8 @@ _WIDTH, _TEXT = 1200, 16
 def check_image(path: str) -> None:
     """Check that an image can be saved under a name, before clips are read."""
     suffix, folder = Path(path).suffix.lower(), Path(path).absolute().parent
-    if suffix not in pillow().registered_extensions():
+    image = pillow()
+    if image.registered_extensions().get(suffix) not in image.SAVE:
         raise ValueError(f"a contact sheet must be a .png, .jpg or .webp image, got {path!r}.")
     if not folder.is_dir():
         raise FileNotFoundError(f"there is no folder {folder} for the contact sheet.")

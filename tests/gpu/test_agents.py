@@ -50,5 +50,5 @@ def test_ppo_learns_to_balance(tmp_path):
     command += ["--eval-episodes", "32", "--output-dir", str(folder)]
     subprocess.run(command, check=True, timeout=1500, env=deterministic())
     rows = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
-    returns = [row["clean/return"] for row in rows if "clean/return" in row]
+    returns = [row["eval/clean/return"] for row in rows if "eval/clean/return" in row]
     assert returns[-1] > 500.0

@@ -86,5 +86,5 @@ def test_a_step_of_the_device_is_that_of_a_cpu(device):
 def test_steps_are_made_at_some_speed(device):
     """A smoke test, with no clock in the assertion but that of the benchmark."""
     num_envs = 1024 if device == "cuda" else 4
-    found = throughput.scan("inverted_pendulum", num_envs, size=84 if device == "cuda" else 24)
+    found = throughput.scan("inverted_pendulum", num_envs)
     assert found["steps_per_second"] > 0

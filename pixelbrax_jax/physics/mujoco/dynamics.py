@@ -71,7 +71,8 @@ class Dynamics:
     """A model's dynamics, for one environment, by an engine of ``options.ENGINES``.
 
     With ``"auto"`` MuJoCo computes programs lowered for a CPU, in float64, and MuJoCo XLA all
-    others, in float32; with ``prefers_xla`` MuJoCo XLA takes the steps on a CPU, too.
+    others, in float32; with ``prefers_xla`` MuJoCo XLA takes the steps on a CPU, too. With
+    ``"warp"`` MuJoCo Warp takes the steps on every device.
     """
 
     def __init__(
@@ -105,6 +106,9 @@ class Dynamics:
         fields = [getattr(data, name).shape for name in reads]
         self._shapes = [(model.nbody, 3), (model.nbody, 4), (model.nsensordata,), *fields]
         self._reads = tuple(reads)
+        if engine == "warp":
+            # It says now what it lacks or cannot compute.
+            _ = self.xla
 
     def by_mujoco(self) -> Dynamics:
         """Return the same dynamics, all computed by MuJoCo itself in programs for a CPU."""
@@ -115,10 +119,14 @@ class Dynamics:
     @cached_property
     def xla(self) -> Xla:
         """The engine for accelerators, loaded at the first use."""
-        from pixelbrax_jax.physics.mujoco.xla import Xla
-
         # The first use may be within a program that is being traced.
         with jax.ensure_compile_time_eval():
+            if self.engine == "warp":
+                from pixelbrax_jax.physics.mujoco.warp import Warp
+
+                return Warp(self.model, **self._xla_options)
+            from pixelbrax_jax.physics.mujoco.xla import Xla
+
             return Xla(self.model, plain=self.engine == "mjx", **self._xla_options)
 
     def state(
@@ -197,12 +205,13 @@ class Dynamics:
 
         if self.engine in ("xla", "mjx") or (method == "step" and self._steps_by_xla):
             return by_xla(*arrays)
+        who = "MuJoCo Warp" if self.engine == "warp" else "MuJoCo itself"
         results: list[jax.Array] = by_platform(
             tuple(arrays),
             like,
-            cpu=by_native,
+            cpu=None if self.engine == "warp" else by_native,
             default=by_xla,
-            no_derivative="MuJoCo itself has no derivatives: choose engine='xla', MuJoCo XLA, "
+            no_derivative=f"{who} has no derivatives: choose engine='xla', MuJoCo XLA, "
             "which has them.",
         )
         return results

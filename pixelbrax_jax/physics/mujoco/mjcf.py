@@ -93,7 +93,7 @@ def mjcf_physics(
         reset_noise: joint positions and velocities are sampled uniformly within plus or minus this
             of ``init_q`` and 0 (metres, radians, per second); 0.01 by default.
         n_frames: the model's time steps per control step.
-        engine: ``auto``, ``mujoco``, ``xla`` or ``mjx``, as for the DM Control Suite.
+        engine: ``auto``, ``mujoco``, ``xla``, ``mjx`` or ``warp``, as for the DM Control Suite.
         num_starts: number of initial states made once, of which each episode draws one; 0 samples
             a new one for each.
         colors: replacements for the model's colors by geom name, red, green, blue in [0, 1].
@@ -116,7 +116,7 @@ def mjcf_physics(
         raise ValueError(f"reset_noise must be finite and not negative, got {reset_noise}")
     substeps = check_positive_int("n_frames", n_frames)
     spec, model = _load(source)
-    if engine in ("xla", "mjx"):
+    if engine in ("xla", "mjx", "warp"):
         check_simulated(model)
     if model.nv == 0:
         raise ValueError("the model has no joint, so nothing can move")

@@ -6,7 +6,7 @@ import copy
 import os
 import queue
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import cache, partial
 from itertools import pairwise
@@ -179,7 +179,11 @@ class Native:
         count = _num_threads(len(states))
         edges = [len(states) * k // count for k in range(count + 1)]
         others = [_threads().submit(block, *edge) for edge in pairwise(edges[1:])]
-        block(*edges[:2])
+        try:
+            block(*edges[:2])
+        finally:
+            # They write to the same arrays, which live no longer than this call.
+            wait(others)
         for other in others:
             other.result()
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from pixelbrax_jax.validation import check_choice, check_count
 
-ENGINES = ("auto", "mujoco", "xla", "mjx")
+ENGINES = ("auto", "mujoco", "xla", "mjx", "warp")
 """Names of the engines."""
 
 
@@ -16,7 +16,8 @@ class MujocoOptions:
 
     engine: str = "auto"
     """Engine of DM Control's and Gymnasium's tasks: ``mujoco`` (MuJoCo itself, on a CPU), ``xla``
-    (MuJoCo XLA, on any device and with gradients), ``mjx`` (the same with no stage of our own), or
+    (MuJoCo XLA, on any device and with gradients), ``mjx`` (the same with no stage of our own),
+    ``warp`` (MuJoCo Warp, for NVIDIA GPUs; not yet run on one), or
     ``auto``: in programs for a CPU ``mujoco``, but ``xla`` for a few small models that it steps
     faster; in others ``xla``."""
     num_starts: int = 0

@@ -71,7 +71,7 @@ class Xla:
         multipliers: jax.Array,
     ) -> Arrays:
         """See ``Native.step``."""
-        first, model = qpos, _changed(self._moving, multipliers)
+        first, model = qpos, changed(self._moving, multipliers)
 
         def one(carry: Arrays) -> Arrays:
             qpos, qvel, act, warmstart, *_ = carry
@@ -90,22 +90,27 @@ class Xla:
         else:
             # A loop, so that the program has one copy of the step.
             carry = jax.lax.fori_loop(0, num_steps, lambda _, carry: one(carry), carry)
+        return self._stepped(first, carry, ctrl, multipliers)
+
+    def _stepped(
+        self, first: jax.Array, carry: Arrays, ctrl: jax.Array, multipliers: jax.Array
+    ) -> Arrays:
+        """Return what ``step`` returns, of what the last physics step left."""
         qpos, qvel, act, warmstart, sensors, *left = carry
         data = self._data(qpos, qvel, act=act, ctrl=ctrl, sensordata=sensors)
-        moved = qpos - first
-        readings = self._readings(_changed(self._mx, multipliers), data)
-        return qpos, qvel, act, warmstart, moved, *readings, *left
+        readings = self._readings(changed(self._mx, multipliers), data)
+        return qpos, qvel, act, warmstart, qpos - first, *readings, *left
 
     def first(self, qpos: jax.Array, qvel: jax.Array, multipliers: jax.Array) -> Arrays:
         """See ``Native.first``; without forces where no observation of a first state has any."""
         data = self._data(qpos, qvel)
         left: Arrays = ()
         if self._starts_with_forces:
-            model = _changed(self._passive, multipliers)
+            model = changed(self._passive, multipliers)
             forward = self._stages.forward(model, data)
             data = data.replace(sensordata=forward.sensordata)
             left = self._left(model, forward, is_after_step=False)
-        return *self._readings(_changed(self._mx, multipliers), data), *left
+        return *self._readings(changed(self._mx, multipliers), data), *left
 
     def _left(self, model: Any, data: Any, *, is_after_step: bool) -> Arrays:
         """Return the fields of ``MjData`` that a step leaves."""
@@ -138,7 +143,8 @@ class Xla:
         return data.replace(qpos=qpos, qvel=qvel, **fields)
 
 
-def _changed(model: Any, multipliers: jax.Array) -> Any:
+def changed(model: Any, multipliers: jax.Array) -> Any:
+    """Return a model of which the multipliers, if there are any, change the dynamics."""
     return model.tree_replace(multiplied(model, multipliers)) if len(multipliers) else model
 
 

@@ -51,6 +51,7 @@ class Extent:
     tests_seconds: float
     adapters: tuple[str, int, float]
     peers: tuple[tuple[str, int, int], ...]
+    by_warp: tuple[str, ...]
 
 
 CARD = Extent(
@@ -70,6 +71,7 @@ CARD = Extent(
     tests_seconds=240.0,
     adapters=("halfcheetah", 1024, 30.0),
     peers=(("ant", 1024, 84), ("humanoid", 1024, 64), ("ant", 8192, 64)),
+    by_warp=("dmc_cartpole_swingup", "dmc_walker_walk", "dmc_cheetah_run", "dmc_humanoid_walk"),
 )  # fmt: skip
 
 REHEARSAL = Extent(
@@ -85,6 +87,7 @@ REHEARSAL = Extent(
     tests_seconds=150.0,
     adapters=("inverted_pendulum", 4, 2.0),
     peers=(("inverted_pendulum", 4, 24),),
+    by_warp=("dmc_cartpole_swingup",),
 )
 
 
@@ -139,6 +142,8 @@ def _ordered(extent: Extent) -> Iterator[Timed]:
             yield Timed("renderers", "speeds.frames", drawn, gigabytes=4 * memory)
         yield Timed("renderers", "renderers.mjx", where, gigabytes=memory)
         yield Timed("renderers", "renderers.warp", where, seconds=60, gigabytes=memory)
+    for task in extent.by_warp:
+        yield from (steps(task, n, None, engine="warp") for n in few)
     # By policy and batch, so that a cut grid has a figure of every task.
     for policy in ("random", "network"):
         for n in extent.batches:
@@ -149,7 +154,12 @@ def _ordered(extent: Extent) -> Iterator[Timed]:
 
 
 def steps(
-    task: str, num_envs: int, size: int | None, policy: str = "random", flags: str = ""
+    task: str,
+    num_envs: int,
+    size: int | None,
+    policy: str = "random",
+    flags: str = "",
+    engine: str = "auto",
 ) -> Timed:
     """Return the case of steps per second with images of a size, or of states without one."""
     where: Mapping[str, Any] = {
@@ -158,6 +168,7 @@ def steps(
         "size": size,
         "policy": policy,
         "flags": flags,
+        "engine": engine,
     }
     return Timed("speeds", "speeds.steps", where, gigabytes=_gigabytes(num_envs, size or 0))
 

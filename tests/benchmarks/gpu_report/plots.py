@@ -29,7 +29,11 @@ def draw(rows: Sequence[Row], folder: Path) -> list[Path]:
 
 def _speeds(rows: list[Row]) -> plt.Figure:
     """A panel for each task; a color for each observation, dashes for actions of a network."""
-    rows = [row for row in rows if not row["arguments"]["flags"]]
+    rows = [
+        row
+        for row in rows
+        if not row["arguments"]["flags"] and row["arguments"]["engine"] == "auto"
+    ]
     tasks = list(dict.fromkeys(row["arguments"]["task"] for row in rows))
     kinds = sorted({row["arguments"]["size"] or 0 for row in rows})
     figure, panels = row_of_panels(len(tasks), (1.5 + 2.6 * len(tasks), 3.6), sharey=True)

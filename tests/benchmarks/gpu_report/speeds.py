@@ -18,7 +18,12 @@ Policy = Callable[[Any, jax.Array], jax.Array]
 
 
 def steps(
-    task: str, num_envs: int, size: int | None, policy: str, flags: str = ""
+    task: str,
+    num_envs: int,
+    size: int | None,
+    policy: str,
+    flags: str = "",
+    engine: str = "auto",
 ) -> Callable[[float], dict[str, Any]]:
     """Measure environment steps in one compiled loop, with autoreset.
 
@@ -28,11 +33,12 @@ def steps(
         size: height and width of images in pixels; None has states as observations.
         policy: ``"random"``, uniform actions; or ``"network"``, which sees every observation.
         flags: XLA's flags of the process, which are set before it starts.
+        engine: the physics engine of a task of DM Control.
     """
     del flags
     options: dict[str, Any] = {"height": size, "width": size} if size else {"obs_mode": "state"}
     if task in DMC_TASKS:
-        options["num_starts"] = 4096
+        options |= {"num_starts": 4096, "engine": engine}
     env, params = pb.make(task, **options)
     params = jax.device_put(params)
     venv = pb.VectorPixelEnv(env, num_envs)

@@ -70,6 +70,7 @@ def speeds(rows: list[Row]) -> str:
         where = row["arguments"]
         size = f"{where['size']} x {where['size']}" if where["size"] else "state"
         how = where["policy"] + (", loops by the host" if where["flags"] == HOST_LOOPS else "")
+        how += ", MuJoCo Warp" if where["engine"] == "warp" else ""
         lines.setdefault((title(where["task"]), size, how), {})[where["num_envs"]] = row
     heads = ("task", "observation", "policy", *(f"N = {n:,}" for n in batches), "compiled in, s")
     return table(

@@ -1,0 +1,108 @@
+"""MuJoCo Warp: steps of a model on an NVIDIA GPU, and slowly on a CPU."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pixelbrax_jax.extras import needs_extra
+from pixelbrax_jax.physics.mujoco.opengl import mujoco
+from pixelbrax_jax.physics.mujoco.xla import Arrays, Xla, changed
+
+with needs_extra("warp"):
+    import warp
+
+# It prints a line for each of some sixty kernels that it compiles.
+warp.config.log_level = max(warp.config.log_level, warp.LOG_WARNING)
+
+from mujoco import mjx  # noqa: E402  # isort: skip
+
+
+class Warp(Xla):
+    """The same as ``Xla``, with steps by MuJoCo Warp; all else is computed by MuJoCo XLA."""
+
+    def __init__(self, model: mujoco.MjModel, **options: Any):
+        """Put a model on the device; see ``Xla``."""
+        super().__init__(model, plain=True, **options)
+        if lacking := sorted({"cfrc_ext"}.intersection(self._fields)):
+            raise ValueError(
+                f"engine='warp' does not compute {', '.join(lacking)}, which this task's formulas "
+                "need. Choose engine='xla' or engine='auto'."
+            )
+        self._warp = mjx.put_model(self.simulated, impl="warp")
+        # Contacts and constraints of MuJoCo XLA are as many as there can be.
+        most = mjx.make_data(self.simulated, impl="jax")._impl
+        self._most_contacts = max(1, most.contact.dist.shape[0])
+        self._most_constraints = max(1, most.efc_D.shape[0])
+        # Equal functions, so that programs of equal shapes are traced once.
+        self._rows = cache(self._make_rows)
+
+    def step(self, num_steps: int, *arrays: jax.Array) -> Arrays:
+        """See ``Native.step``."""
+        first, *_, ctrl, multipliers = arrays
+        rows = self._rows(num_steps)(*(x[None] for x in arrays))
+        qpos, qvel, act, warmstart, sensors, *left = (x[0] for x in rows)
+        return self._stepped(first, (qpos, qvel, act, warmstart, sensors, *left), ctrl, multipliers)
+
+    def _make_rows(self, num_steps: int) -> Any:
+        """Return a function that steps (N, ...) rows: Warp must know how many there are."""
+
+        @jax.custom_batching.custom_vmap
+        def rows(*arrays: jax.Array) -> Arrays:
+            blank = self._blank(len(arrays[0]))
+
+            def one(carry: Arrays, ctrl: jax.Array, multipliers: jax.Array) -> Arrays:
+                qpos, qvel, act, warmstart, *_ = carry
+                data = blank.replace(
+                    qpos=qpos, qvel=qvel, act=act, qacc_warmstart=warmstart, ctrl=ctrl
+                )
+                data = mjx.step(changed(self._warp, multipliers), data)
+                return (
+                    *(data.qpos, data.qvel, data.act, data.qacc_warmstart, data.sensordata),
+                    *(getattr(data, name) for name in self._fields),
+                )
+
+            *state, ctrl, multipliers = arrays
+            like = jax.eval_shape(jax.vmap(one), tuple(state), ctrl, multipliers)
+            carry = (*state, *(jnp.zeros(x.shape, x.dtype) for x in like[4:]))
+            result: Arrays = jax.lax.fori_loop(
+                0, num_steps, lambda _, carry: jax.vmap(one)(carry, ctrl, multipliers), carry
+            )
+            return result
+
+        @rows.def_vmap
+        def rows_of_rows(
+            size: int, batched: list[bool], *arrays: jax.Array
+        ) -> tuple[Arrays, tuple[bool, ...]]:
+            many = [
+                x if is_batched else jnp.broadcast_to(x, (size, *x.shape))
+                for x, is_batched in zip(arrays, batched, strict=True)
+            ]
+            each = many[0].shape[1]
+            results = rows(*(x.reshape(size * each, *x.shape[2:]) for x in many))
+            shaped = tuple(x.reshape(size, each, *x.shape[1:]) for x in results)
+            return shaped, (True,) * len(shaped)
+
+        return rows
+
+    def _blank(self, num_rows: int) -> Any:
+        with jax.ensure_compile_time_eval():
+            data = mjx.make_data(
+                self.simulated,
+                impl="warp",
+                naconmax=num_rows * self._most_contacts,
+                njmax=self._most_constraints,
+            )
+        return jax.tree.map(_filled, data)
+
+
+def _filled(x: jax.Array) -> jax.Array:
+    """Return equal numbers as a broadcast one, so that a program does not contain them all."""
+    values = np.asarray(x)
+    if values.size and (values == values.flat[0]).all():
+        return jnp.full(values.shape, values.flat[0], values.dtype)
+    return x
