@@ -39,7 +39,7 @@ def batch_last(fn: Callable[..., Any], in_axes: Sequence[int | None]) -> Callabl
         sizes = {len(x) for x, batched in leaves if batched}
         if len(sizes) != 1:
             raise ValueError(f"arguments must have the same number of rows, got {sorted(sizes)}.")
-        if any(_varies(x) for x, _ in leaves):
+        if any(num_varying(jax.typeof(x)) for x, _ in leaves):
             return jax.vmap(fn, in_axes=tuple(in_axes))(*args)
         (size,) = sizes
         padded = size if size <= FEW else -(-size // _LANES) * _LANES
@@ -68,11 +68,6 @@ def batch_last(fn: Callable[..., Any], in_axes: Sequence[int | None]) -> Callabl
         return jax.tree.unflatten(tree, [jnp.moveaxis(x, -1, 0)[:size] for x in rows])
 
     return rows_of
-
-
-def _varies(x: jax.Array) -> bool:
-    """Return whether ``jax.shard_map`` tracks that ``x`` differs between devices."""
-    return num_varying(jax.typeof(x)) > 0
 
 
 def _row(x: jax.Array) -> jax.ShapeDtypeStruct:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -148,22 +148,10 @@ def changes_params_alone(distractor: Distractor) -> bool:
     return False
 
 
-def apply(
-    change: Change | Distractor, params: EnvParams, key: jax.Array, episode: jax.Array
-) -> EnvParams:
-    """Return the parameters of one episode after a change, or after such a distractor's start."""
-    if isinstance(change, Change):
-        return change.change(params, key, episode)
-    return change.change_params(change.reset(key, params), params)
-
-
 def _turn_cameras(params: EnvParams, axis: jax.Array, angle: jax.Array) -> EnvParams:
     """Turn cameras at their places about an axis in their own frames, by radians."""
-    return _map_cameras(params, lambda rig: turned(rig, axis, angle))
-
-
-def _map_cameras(params: EnvParams, function: Callable[[CameraRig], CameraRig]) -> EnvParams:
-    rig = jax.tree.map(function, params.rig, is_leaf=lambda x: isinstance(x, CameraRig))
+    turn = partial(turned, axis=axis, angle=angle)
+    rig = jax.tree.map(turn, params.rig, is_leaf=lambda x: isinstance(x, CameraRig))
     return params.replace(rig=rig)
 
 

@@ -22,7 +22,7 @@ from pixelbrax_jax.envs.param_rows import split_params
 from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.flags import default_flags
-from pixelbrax_jax.generalisation.changes import Change, apply, changes_params_alone
+from pixelbrax_jax.generalisation.changes import Change, changes_params_alone
 from pixelbrax_jax.generalisation.suites import EPISODES, Level, levels_of
 from pixelbrax_jax.registry import find_task
 from pixelbrax_jax.scene.cameras import seen_from
@@ -156,11 +156,10 @@ def _draw(changes: Sequence[Change | Distractor], base: EnvParams, keys: jax.Arr
 
     def of_episode(key: jax.Array, episode: jax.Array) -> list[Any]:
         def step(params: EnvParams, change: Change | Distractor) -> EnvParams:
-            if isinstance(change, Distractor):
-                own = Chain.key(key, change, 0)
-            else:
+            if isinstance(change, Change):
                 own = jax.random.fold_in(key, chosen.index(change))
-            return apply(change, params, own, episode)
+                return change.change(params, own, episode)
+            return change.change_params(change.reset(Chain.key(key, change, 0), params), params)
 
         after = jax.tree.leaves(reduce(step, chosen, base))
         return [None if new is old else new for new, old in zip(after, before, strict=True)]

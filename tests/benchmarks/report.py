@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pixelbrax_gym.bench.tables import table
+from pixelbrax_jax.cache import replacing
 from tests.benchmarks.case import Case, Group, Row
 
 _HEADING = (
@@ -60,17 +61,17 @@ class Results:
         }
         used = {known["machine"] for known in cases.values()}
         self.kept["machines"] = {k: v for k, v in self.kept["machines"].items() if k in used}
-        _replace(self.file, json.dumps(self.kept, indent=1) + "\n")
+        write_whole(self.file, json.dumps(self.kept, indent=1) + "\n")
 
     def write_page(self, groups: Mapping[str, Group]) -> None:
         """Write the page beside the file."""
-        _replace(self.file.with_suffix(".md"), page(self.kept, groups))
+        write_whole(self.file.with_suffix(".md"), page(self.kept, groups))
 
 
-def _replace(file: Path, text: str) -> None:
-    part = file.with_suffix(f"{file.suffix}.part")
-    part.write_text(text, "utf-8")
-    part.replace(file)
+def write_whole(file: Path, text: str) -> None:
+    """Write a file that is complete at any time."""
+    with replacing(file) as part:
+        part.write_text(text, "utf-8")
 
 
 def page(kept: Mapping[str, Row], groups: Mapping[str, Group]) -> str:

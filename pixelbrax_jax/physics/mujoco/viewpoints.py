@@ -20,14 +20,9 @@ def tracked_body(model: mujoco.MjModel) -> int:
     Cameras and lamps of that mode follow the center of mass of its subtree, if the subtrees of
     their own bodies have the same mass.
     """
-    for modes, bodies in (
-        (model.cam_mode, model.cam_bodyid),
-        (model.light_mode, model.light_bodyid),
-    ):
-        for mode, body in zip(modes, bodies, strict=True):
-            if mode == _TRACKCOM:
-                return int(body)
-    return -1
+    modes = np.concatenate([model.cam_mode, model.light_mode])
+    bodies = np.concatenate([model.cam_bodyid, model.light_bodyid])
+    return next(map(int, bodies[modes == _TRACKCOM]), -1)
 
 
 def follows_tracked(model: mujoco.MjModel, body: int) -> bool:

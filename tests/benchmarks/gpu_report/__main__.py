@@ -34,6 +34,7 @@ from tests.benchmarks.gpu_report.card import (
 from tests.benchmarks.gpu_report.plan import CARD, REHEARSAL, Timed, plan
 from tests.benchmarks.gpu_report.programs import FOLDER
 from tests.benchmarks.gpu_report.results import Results
+from tests.benchmarks.report import write_whole
 
 TABLES_SECONDS = 15.0
 """Time that is left for tables and plots."""
@@ -185,8 +186,8 @@ def _tables(folder: Path) -> int:
     kernel = machine["rehearsal"] or machine["kernel"]
     cases = plan(REHEARSAL if machine["rehearsal"] else CARD, kernel)
     whole = {"machine": machine, "cases": results.rows}
-    _replace(folder / "report.json", json.dumps(whole, indent=1) + "\n")
-    _replace(folder / "report.md", tables.page(machine, rows, cases))
+    write_whole(folder / "report.json", json.dumps(whole, indent=1) + "\n")
+    write_whole(folder / "report.md", tables.page(machine, rows, cases))
     made = [folder / "report.md", folder / "report.json"]
     try:
         from tests.benchmarks.gpu_report import plots
@@ -196,12 +197,6 @@ def _tables(folder: Path) -> int:
         made += plots.draw(rows, folder)
     _say("wrote " + ", ".join(map(str, made)))
     return 0
-
-
-def _replace(file: Path, text: str) -> None:
-    part = file.with_suffix(f"{file.suffix}.part")
-    part.write_text(text, "utf-8")
-    part.replace(file)
 
 
 def _about(case: Timed) -> str:

@@ -101,28 +101,19 @@ def _reward_pendulum(seen: Snapshot) -> jax.Array:
     return tolerance(seen.xmat("pole")[2, 2], (_COSINE_BOUND, 1.0))
 
 
+_xla = partial(Formulas, prefers_xla=True)
+
+
 def _acrobot(margin: float) -> Formulas:
-    return Formulas(
-        _start_anywhere, _observe_acrobot, partial(_reward_acrobot, margin=margin), prefers_xla=True
-    )
+    return _xla(_start_anywhere, _observe_acrobot, partial(_reward_acrobot, margin=margin))
 
 
 TASKS = {
     "dmc_acrobot_swingup": _acrobot(1.0),
     "dmc_acrobot_swingup_sparse": _acrobot(0.0),
-    "dmc_cartpole_balance": Formulas(
-        _start_upright, _observe_cartpole, _reward_cartpole, prefers_xla=True
-    ),
-    "dmc_cartpole_balance_sparse": Formulas(
-        _start_upright, _observe_cartpole, _reward_cartpole_sparse, prefers_xla=True
-    ),
-    "dmc_cartpole_swingup": Formulas(
-        _start_hanging, _observe_cartpole, _reward_cartpole, prefers_xla=True
-    ),
-    "dmc_cartpole_swingup_sparse": Formulas(
-        _start_hanging, _observe_cartpole, _reward_cartpole_sparse, prefers_xla=True
-    ),
-    "dmc_pendulum_swingup": Formulas(
-        _start_anywhere, _observe_pendulum, _reward_pendulum, prefers_xla=True
-    ),
+    "dmc_cartpole_balance": _xla(_start_upright, _observe_cartpole, _reward_cartpole),
+    "dmc_cartpole_balance_sparse": _xla(_start_upright, _observe_cartpole, _reward_cartpole_sparse),
+    "dmc_cartpole_swingup": _xla(_start_hanging, _observe_cartpole, _reward_cartpole),
+    "dmc_cartpole_swingup_sparse": _xla(_start_hanging, _observe_cartpole, _reward_cartpole_sparse),
+    "dmc_pendulum_swingup": _xla(_start_anywhere, _observe_pendulum, _reward_pendulum),
 }
