@@ -15,6 +15,7 @@ import math
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -132,7 +133,19 @@ def _one_row_an_axis(columns: dict[str, list[Row]]) -> list[list[str]]:
     return [[axis, *map(", ".join, zip(*sizes, strict=True))] for axis, sizes in axes.items()]
 
 
-FIGURES = {suite: partial(page, suite) for suite in SUITES}
+def largest_error() -> str:
+    """The largest standard error of a mean on one of the axes."""
+    found = [
+        kept(task, training, "axes")
+        for task, agent in TASKS.items()
+        for training in TRAININGS[agent]
+    ]
+    errors = [row.standard_error for scores in found if scores for row in scores.rows()]
+    return f"{max(error for error in errors if not math.isnan(error)):.0f}"
+
+
+FIGURES: dict[str, Callable[[], str]] = {suite: partial(page, suite) for suite in SUITES}
+FIGURES["axes-error"] = largest_error
 
 
 def main() -> int:

@@ -189,4 +189,6 @@ class DrQv2Config(TrainConfig):
         """Tell the largest ``buffer_size`` whose frames take at most so many bytes."""
         per_iteration = self.num_envs * self.num_steps
         largest = int(num_bytes // (self.frame_bytes * per_iteration)) * per_iteration
+        if largest < max(self.learning_starts, 1):
+            return "not even learning_starts fits; choose a smaller height and width."
         return f"the largest that fits is buffer_size={largest}."

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterable, Sequence
+from functools import partial
 from typing import Any
 
 import jax
@@ -35,14 +36,20 @@ class Xla:
         out_of_reach: Iterable[str] = (),
         reads: Sequence[str] = (),
         plain: bool = False,
+        folded: bool = False,
     ):
-        """Put a model on the device; ``plain`` takes MuJoCo XLA's own step. See ``Formulas``."""
+        """Put a model on the device; ``plain`` takes MuJoCo XLA's own step.
+
+        For ``folded`` see ``stages.forward``, for the rest ``Formulas``.
+        """
         load_onto_own_device(mjx_io)
         check_simulated(model)
         self._model = model
         self._starts_with_forces = starts_with_forces or bool(reads)
         self._fields = tuple(reads)
-        self._stages: Any = mjx if plain or not stages.is_supported(model) else stages
+        ours = not plain and stages.is_supported(model)
+        self._step: Any = partial(stages.step, folded=folded) if ours else mjx.step
+        self._forward: Any = partial(stages.forward, folded=folded) if ours else mjx.forward
         self.simulated = _simulated(model, out_of_reach)
         try:
             self._mx = mjx.put_model(self.simulated, impl="jax")
@@ -76,7 +83,7 @@ class Xla:
         def one(carry: Arrays) -> Arrays:
             qpos, qvel, act, warmstart, *_ = carry
             data = self._data(qpos, qvel, act=act, qacc_warmstart=warmstart, ctrl=ctrl)
-            data = self._stages.step(model, data)
+            data = self._step(model, data)
             return (
                 *(data.qpos, data.qvel, data.act, data.qacc_warmstart),
                 *(data.sensordata, *self._left(model, data, is_after_step=True)),
@@ -107,7 +114,7 @@ class Xla:
         left: Arrays = ()
         if self._starts_with_forces:
             model = changed(self._passive, multipliers)
-            forward = self._stages.forward(model, data)
+            forward = self._forward(model, data)
             data = data.replace(sensordata=forward.sensordata)
             left = self._left(model, forward, is_after_step=False)
         return *self._readings(changed(self._mx, multipliers), data), *left

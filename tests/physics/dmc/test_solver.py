@@ -207,6 +207,15 @@ def test_each_stage_of_our_own_is_used_and_agrees_with_mujoco_xlas(integrator, m
         assert np.quantile(far, 0.9) < 1e-3
 
 
+def test_what_depends_on_the_model_alone_may_be_computed_beforehand():
+    model = model_of("elliptic", 3, arms=3)
+    qpos, qvel = states(model)
+    results = [after_a_step(model, qpos, qvel, folded=folded) for folded in (False, True)]
+    for one, other in zip(*results, strict=True):
+        scale = np.maximum(1.0, np.abs(one).max(initial=0))
+        np.testing.assert_allclose(one / scale, other / scale, atol=1e-4)
+
+
 def recorded(function, used):
     def record(*args):
         used.append(function.__name__)
