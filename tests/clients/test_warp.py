@@ -77,10 +77,7 @@ def test_dynamics_vary():
     dynamics = {"gravity": (0.5, 2.0), "mass": 1.1}
     results = []
     for engine in ("xla", "warp"):
-        env, params = pb.make(
-            "dmc_cartpole_swingup", engine=engine, obs_mode="state", dynamics=dynamics
-        )
-        env = pb.VectorPixelEnv(env, NUM_ENVS)
+        env, params = venv("dmc_cartpole_swingup", engine, dynamics)
         state, _ = jax.jit(env.reset)(jax.random.key(0), params)
         results.append(np.asarray(jax.jit(partial(moved, env, params))(state, actions(env))))
     np.testing.assert_allclose(*results, atol=1e-6)

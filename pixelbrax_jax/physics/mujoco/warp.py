@@ -28,10 +28,10 @@ class Warp(Xla):
     def __init__(self, model: mujoco.MjModel, **options: Any):
         """Put a model on the device; see ``Xla``."""
         super().__init__(model, plain=True, **options)
-        if lacking := sorted({"cfrc_ext"}.intersection(self._fields)):
+        if "cfrc_ext" in self._fields:
             raise ValueError(
-                f"engine='warp' does not compute {', '.join(lacking)}, which this task's formulas "
-                "need. Choose engine='xla' or engine='auto'."
+                "engine='warp' does not compute cfrc_ext, which this task's formulas need. Choose "
+                "engine='xla' or engine='auto'."
             )
         self._warp = mjx.put_model(self.simulated, impl="warp")
         # Contacts and constraints of MuJoCo XLA are as many as there can be.
