@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cache
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -38,25 +38,35 @@ class Warp(Xla):
         most = mjx.make_data(self.simulated, impl="jax")._impl
         self._most_contacts = max(1, most.contact.dist.shape[0])
         self._most_constraints = max(1, most.efc_D.shape[0])
-        # Equal functions, so that programs of equal shapes are traced once.
-        self._rows = cache(self._make_rows)
+        self._rows = self._make_rows()
 
-    def step(self, num_steps: int, *arrays: jax.Array) -> Arrays:
-        """See ``Native.step``."""
-        first, *_, ctrl, multipliers = arrays
-        rows = self._rows(num_steps)(*(x[None] for x in arrays))
-        qpos, qvel, act, warmstart, sensors, *left = (x[0] for x in rows)
-        return self._stepped(first, (qpos, qvel, act, warmstart, sensors, *left), ctrl, multipliers)
+    def _mover(self, model: Any, multipliers: jax.Array) -> Callable[[Any], Any]:
+        """See ``Xla``; Warp has a model of its own."""
+        del model
+        names = "qpos", "qvel", "act", "qacc_warmstart", "ctrl"
+        left = (*names[:4], "sensordata", *self._fields)
 
-    def _make_rows(self, num_steps: int) -> Any:
+        def move(data: Any) -> Any:
+            rows = self._rows(multipliers[None], *(getattr(data, name)[None] for name in names))
+            return data.replace(**{name: x[0] for name, x in zip(left, rows, strict=True)})
+
+        return move
+
+    def _make_rows(self) -> Any:
         """Return a function that steps (N, ...) rows: Warp must know how many there are."""
 
         @jax.custom_batching.custom_vmap
         def rows(*arrays: jax.Array) -> Arrays:
             blank = self._blank(len(arrays[0]))
 
-            def one(carry: Arrays, ctrl: jax.Array, multipliers: jax.Array) -> Arrays:
-                qpos, qvel, act, warmstart, *_ = carry
+            def one(
+                multipliers: jax.Array,
+                qpos: jax.Array,
+                qvel: jax.Array,
+                act: jax.Array,
+                warmstart: jax.Array,
+                ctrl: jax.Array,
+            ) -> Arrays:
                 data = blank.replace(
                     qpos=qpos, qvel=qvel, act=act, qacc_warmstart=warmstart, ctrl=ctrl
                 )
@@ -66,12 +76,7 @@ class Warp(Xla):
                     *(getattr(data, name) for name in self._fields),
                 )
 
-            *state, ctrl, multipliers = arrays
-            like = jax.eval_shape(jax.vmap(one), tuple(state), ctrl, multipliers)
-            carry = (*state, *(jnp.zeros(x.shape, x.dtype) for x in like[4:]))
-            result: Arrays = jax.lax.fori_loop(
-                0, num_steps, lambda _, carry: jax.vmap(one)(carry, ctrl, multipliers), carry
-            )
+            result: Arrays = jax.vmap(one)(*arrays)
             return result
 
         @rows.def_vmap

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Any
 
@@ -79,11 +79,12 @@ class Xla:
     ) -> Arrays:
         """See ``Native.step``."""
         first, model = qpos, changed(self._moving, multipliers)
+        move = self._mover(model, multipliers)
 
         def one(carry: Arrays) -> Arrays:
             qpos, qvel, act, warmstart, *_ = carry
             data = self._data(qpos, qvel, act=act, qacc_warmstart=warmstart, ctrl=ctrl)
-            data = self._step(model, data)
+            data = move(data)
             return (
                 *(data.qpos, data.qvel, data.act, data.qacc_warmstart),
                 *(data.sensordata, *self._left(model, data, is_after_step=True)),
@@ -97,16 +98,15 @@ class Xla:
         else:
             # A loop, so that the program has one copy of the step.
             carry = jax.lax.fori_loop(0, num_steps, lambda _, carry: one(carry), carry)
-        return self._stepped(first, carry, ctrl, multipliers)
-
-    def _stepped(
-        self, first: jax.Array, carry: Arrays, ctrl: jax.Array, multipliers: jax.Array
-    ) -> Arrays:
-        """Return what ``step`` returns, of what the last physics step left."""
         qpos, qvel, act, warmstart, sensors, *left = carry
         data = self._data(qpos, qvel, act=act, ctrl=ctrl, sensordata=sensors)
         readings = self._readings(changed(self._mx, multipliers), data)
         return qpos, qvel, act, warmstart, qpos - first, *readings, *left
+
+    def _mover(self, model: Any, multipliers: jax.Array) -> Callable[[Any], Any]:
+        """Return a function that advances data by one time step; ``model`` is already changed."""
+        del multipliers
+        return partial(self._step, model)
 
     def first(self, qpos: jax.Array, qvel: jax.Array, multipliers: jax.Array) -> Arrays:
         """See ``Native.first``; without forces where no observation of a first state has any."""
