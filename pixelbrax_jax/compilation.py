@@ -83,7 +83,10 @@ def jit(
         def call(*args: _P.args, **kwargs: _P.kwargs) -> _T:
             if is_guarded("host_to_device"):
                 args, kwargs = jax.tree.map(_put, (args, kwargs))
-            return program(_physics(env_of(args[0])))(*args, **kwargs)
+            # Loops count with 64 bits if they may when they are lowered, and what XLA makes of a
+            # convolution's loop then rounds otherwise.
+            with jax.enable_x64(False):
+                return program(_physics(env_of(args[0])))(*args, **kwargs)
 
         return call
 

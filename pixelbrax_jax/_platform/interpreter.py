@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -13,7 +13,16 @@ from jax import lax
 from jax.extend import core
 
 from pixelbrax_jax._platform.by_platform import num_varying
-from pixelbrax_jax._platform.rules import FEW, RULES, Operand, bind, row_aval, rule, spread
+from pixelbrax_jax._platform.rules import (
+    FEW,
+    RULES,
+    Operand,
+    bind,
+    row_aval,
+    rule,
+    scan_sizes,
+    spread,
+)
 
 _LANES = 16
 """Rows are padded to a multiple, so that SIMD loops have no scalar remainder."""
@@ -159,7 +168,7 @@ def _cond(eqn: core.JaxprEqn, inputs: Sequence[Operand], size: int) -> list[Any]
 
 def _scan(eqn: core.JaxprEqn, inputs: list[Operand], size: int) -> list[Operand]:
     closed, params = eqn.params["jaxpr"], eqn.params
-    num_consts, num_carry = _scan_sizes(params)
+    num_consts, num_carry = scan_sizes(params)
     consts, first = inputs[:num_consts], inputs[num_consts : num_consts + num_carry]
     xs = inputs[num_consts + num_carry :]
     reached = _reach_scan(eqn, [x.batched for x in inputs])
@@ -228,16 +237,8 @@ def _spread_where(
     ]
 
 
-def _scan_sizes(params: Mapping[str, Any]) -> tuple[int, int]:
-    if "num_carry" in params:
-        return params["num_consts"], params["num_carry"]
-    # From jax 0.12 on, operands are in groups.
-    consts, carry, _ = params["ft_in"].unpack()
-    return len(consts), len(carry)
-
-
 def _reach_scan(eqn: core.JaxprEqn, flags: list[bool]) -> list[bool]:
-    start, num_carry = _scan_sizes(eqn.params)
+    start, num_carry = scan_sizes(eqn.params)
     stop = start + num_carry
     # A carry that becomes batched may make others batched in the next iteration.
     carried, before = flags[start:stop], None

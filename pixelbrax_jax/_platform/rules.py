@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -73,6 +73,15 @@ def bind(eqn: core.JaxprEqn, *values: Any, **changed: Any) -> list[Any]:
     functions, params = params if isinstance(params, tuple) else ((), params)
     outputs = eqn.primitive.bind(*functions, *values, **params)
     return list(outputs) if eqn.primitive.multiple_results else [outputs]
+
+
+def scan_sizes(params: Mapping[str, Any]) -> tuple[int, int]:
+    """Return how many constants and carries a scan has, from its parameters."""
+    if "num_carry" in params:
+        return params["num_consts"], params["num_carry"]
+    # From jax 0.12 on, operands are in groups.
+    consts, carry, _ = params["ft_in"].unpack()
+    return len(consts), len(carry)
 
 
 def spread(operand: Operand, shape: tuple[int, ...], size: int) -> jax.Array:

@@ -95,6 +95,7 @@ PAGES: dict[str, Figures] = {
     "docs/results.md": results.FIGURES,
     "docs/benchmarks/learning.md": results.RUNS,
     "docs/measurements.md": results.TRIED,
+    "docs/agents/drqv2.md": results.DRQV2,
     "docs/leaderboard.md": {"board": lambda: leaderboard.page(ROOT / "docs/leaderboard")},
     "docs/dmc.md": dmc_page.FIGURES,
     "docs/benchmarks/dmc.md": dmc_page.ALL,

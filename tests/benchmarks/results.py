@@ -299,6 +299,30 @@ def elsewhere(name: str) -> str:
     return f"{read('elsewhere.json')[name]['return']:,.0f}"
 
 
+def swingup_table() -> str:
+    """DrQ-v2 as published, beside its published curve."""
+    kept = read("drqv2_swingup.json")
+    ours = {each["steps"]: each for each in kept["evaluations"]}
+    published = {int(steps): returns for steps, returns in kept["published"]["returns"].items()}
+    lines = [
+        [
+            f"{steps:,}",
+            _with_error(ours[steps]) if steps in ours else "",
+            _with_range(published[steps]) if steps in published else "",
+        ]
+        for steps in sorted({*ours, *published})
+    ]
+    return markdown_table(("frames", "one seed here", "ten seeds, published"), lines)
+
+
+def _with_error(found: dict) -> str:
+    return f"{found['return']:.0f} ± {found['standard_error']:.0f}"
+
+
+def _with_range(returns: list[float]) -> str:
+    return f"{np.mean(returns):.0f} ({min(returns):.0f} to {max(returns):.0f})"
+
+
 FIGURES: Figures = {
     "short": lambda: short_table(seeds_of()),
     "pretrained": pretrained_table,
@@ -319,6 +343,7 @@ RUNS: Figures = {
     "baselines": lambda: baselines_table(seeds_of()),
     "distracted": lambda: distracted_table(seeds_of()),
 }
+DRQV2: Figures = {"swingup": swingup_table}
 TRIED: Figures = {"by-brax": partial(elsewhere, "walker2d by Brax's reward")}
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from flax import struct
 
 from pixelbrax_jax._platform.by_platform import by_platform
+from pixelbrax_jax._platform.folding import fold
 from pixelbrax_jax._platform.host_call import host_call, register
 from pixelbrax_jax.physics.mujoco.multipliers import check_varies
 from pixelbrax_jax.physics.mujoco.native import Native
@@ -129,16 +130,6 @@ class Dynamics:
 
             return Xla(self.model, plain=self.engine == "mjx", **self._xla_options)
 
-    @cached_property
-    def folded(self) -> Xla:
-        """The same for programs of accelerators."""
-        from pixelbrax_jax.physics.mujoco.xla import Xla
-
-        if self.engine != "auto":
-            return self.xla
-        with jax.ensure_compile_time_eval():
-            return Xla(self.model, folded=True, **self._xla_options)
-
     def state(
         self,
         qpos: jax.Array,
@@ -203,7 +194,7 @@ class Dynamics:
             register(name, partial(_of_rows, function, [len(shape) for shape in shapes]))
             return host_call(name, row, like)
 
-        def by_xla(*row: jax.Array, name: str = "xla") -> list[jax.Array]:
+        def by_xla(*row: jax.Array) -> list[jax.Array]:
             if self.engine == "mujoco":
                 raise NotImplementedError(
                     "engine='mujoco' computes on a CPU alone; for programs of other devices choose "
@@ -211,16 +202,17 @@ class Dynamics:
                 )
             # Accelerators round what they multiply by default, a GPU to ten bits.
             with jax.default_matmul_precision("highest"):
-                return list(getattr(getattr(self, name), method)(*options, *row))
+                return list(getattr(self.xla, method)(*options, *row))
 
         if self.engine in ("xla", "mjx") or (method == "step" and self._steps_by_xla):
             return by_xla(*arrays)
-        who = "MuJoCo Warp" if self.engine == "warp" else "MuJoCo itself"
+        is_warp = self.engine == "warp"
+        who = "MuJoCo Warp" if is_warp else "MuJoCo itself"
         results: list[jax.Array] = by_platform(
             tuple(arrays),
             like,
-            cpu=None if self.engine == "warp" else by_native,
-            default=partial(by_xla, name="folded"),
+            cpu=None if is_warp else by_native,
+            default=by_xla if is_warp else fold(by_xla),
             no_derivative=f"{who} has no derivatives: choose engine='xla', MuJoCo XLA, "
             "which has them.",
         )

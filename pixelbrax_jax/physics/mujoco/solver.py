@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from typing import Any, NamedTuple
 
 import jax
@@ -107,13 +106,12 @@ class _Problem(NamedTuple):
         return cost + self.cones.cost(self._of_cones(residual))
 
 
-def solve(model: Any, data: Any, folded: bool = False) -> Any:
+def solve(model: Any, data: Any) -> Any:
     """Find accelerations and constraint forces, as ``mujoco.mjx._src.solver.solve`` does.
 
     Costs are piecewise quadratic, so Newton's step is exact once the right constraints are active:
     the loop ends when a whole step does not change them. Costs of slipping contacts with elliptic
     cones are not quadratic: the loop ends when the forces after a whole step are as predicted.
-    For ``folded`` see ``stages.forward``.
     """
     impl = data._impl
     # MuJoCo's order: equalities, dry friction, then limits and contacts.
@@ -126,19 +124,18 @@ def solve(model: Any, data: Any, folded: bool = False) -> Any:
         """Add constraints that are never active, up to a multiple of the rows added at a time."""
         return jnp.pad(x, [(0, -len(x) % _rows(impl.efc_J)), *[(0, 0)] * (x.ndim - 1)])
 
-    with jax.ensure_compile_time_eval() if folded else nullcontext():
-        friction = jnp.where(kind == _FRICTION, impl.efc_frictionloss, jnp.inf)
-        problem = _Problem(
-            inertia=support.full_m(model, data),
-            smooth=data.qacc_smooth,
-            jacobian=pad(impl.efc_J),
-            reference=pad(impl.efc_aref),
-            stiffness=pad(jnp.where(kind == _CONE, 0.0, impl.efc_D)),
-            low=pad(-friction),
-            high=pad(jnp.where(kind == _ONE_SIDED, 0.0, friction)),
-            first=impl.nefc - num_cones,
-            cones=cones,
-        )
+    friction = jnp.where(kind == _FRICTION, impl.efc_frictionloss, jnp.inf)
+    problem = _Problem(
+        inertia=support.full_m(model, data),
+        smooth=data.qacc_smooth,
+        jacobian=pad(impl.efc_J),
+        reference=pad(impl.efc_aref),
+        stiffness=pad(jnp.where(kind == _CONE, 0.0, impl.efc_D)),
+        low=pad(-friction),
+        high=pad(jnp.where(kind == _ONE_SIDED, 0.0, friction)),
+        first=impl.nefc - num_cones,
+        cones=cones,
+    )
     warm, smooth = data.qacc_warmstart, data.qacc_smooth
     start = _once(jnp.where(problem.cost(warm) < problem.cost(smooth), warm, smooth))
 

@@ -7,7 +7,6 @@ between planes and capsules. ``mjx.step`` has the others in the same order.
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import nullcontext
 from typing import Any
 
 import jax
@@ -37,35 +36,29 @@ def is_supported(model: mujoco.MjModel) -> bool:
     )
 
 
-def step(model: Any, data: Any, folded: bool = False) -> Any:
-    """Advance by one time step, as ``mjx.step`` does; for ``folded`` see ``forward``."""
+def step(model: Any, data: Any) -> Any:
+    """Advance by one time step, as ``mjx.step`` does."""
     if int(model.opt.integrator) == _EULER:
-        return _euler(model, forward(model, data, folded))
+        return _euler(model, forward(model, data))
     # Traced once, used four times.
-    compute = jax.jit(lambda data: forward(model, data, folded))
+    compute = jax.jit(lambda data: forward(model, data))
     return _runge_kutta(model, compute(data), compute)
 
 
-def forward(model: Any, data: Any, folded: bool = False) -> Any:
-    """Compute accelerations, as ``mjx.forward`` does.
-
-    With ``folded``, what depends on the model alone is computed while the program is traced: XLA
-    for GPUs leaves much of it in the program, a kernel each. Tracing then takes longer.
-    """
-    # Nothing in it may depend on the platform, which would be that of now.
-    with jax.ensure_compile_time_eval() if folded else nullcontext():
-        for stage in (mjx.kinematics, mjx.com_pos, mjx.camlight, mjx.tendon, mjx.crb):
-            data = stage(model, data)
-        data = collide(model, smooth.tendon_armature(model, data))
-        stages = mjx.make_constraint, mjx.transmission, mjx.sensor_pos, mjx.fwd_velocity
-        for stage in (*stages, mjx.sensor_vel, mjx.fwd_actuation):
-            data = stage(model, data)
-        applied = data.qfrc_applied + support.xfrc_accumulate(model, data)
+def forward(model: Any, data: Any) -> Any:
+    """Compute accelerations, as ``mjx.forward`` does."""
+    for stage in (mjx.kinematics, mjx.com_pos, mjx.camlight, mjx.tendon, mjx.crb):
+        data = stage(model, data)
+    data = collide(model, smooth.tendon_armature(model, data))
+    stages = mjx.make_constraint, mjx.transmission, mjx.sensor_pos, mjx.fwd_velocity
+    for stage in (*stages, mjx.sensor_vel, mjx.fwd_actuation):
+        data = stage(model, data)
+    applied = data.qfrc_applied + support.xfrc_accumulate(model, data)
     force = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator + applied
     acceleration = _solve_inertia(model, data, data._impl.M, force)
     data = data.replace(qfrc_smooth=force, qacc_smooth=acceleration)
     is_free = data._impl.efc_J.size == 0
-    data = data.replace(qacc=acceleration) if is_free else solve(model, data, folded)
+    data = data.replace(qacc=acceleration) if is_free else solve(model, data)
     return mjx.sensor_acc(model, data)
 
 

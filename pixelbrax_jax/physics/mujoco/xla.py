@@ -36,20 +36,16 @@ class Xla:
         out_of_reach: Iterable[str] = (),
         reads: Sequence[str] = (),
         plain: bool = False,
-        folded: bool = False,
     ):
-        """Put a model on the device; ``plain`` takes MuJoCo XLA's own step.
-
-        For ``folded`` see ``stages.forward``, for the rest ``Formulas``.
-        """
+        """Put a model on the device; ``plain`` takes MuJoCo XLA's own step, see ``Formulas``."""
         load_onto_own_device(mjx_io)
         check_simulated(model)
         self._model = model
         self._starts_with_forces = starts_with_forces or bool(reads)
         self._fields = tuple(reads)
         ours = not plain and stages.is_supported(model)
-        self._step: Any = partial(stages.step, folded=folded) if ours else mjx.step
-        self._forward: Any = partial(stages.forward, folded=folded) if ours else mjx.forward
+        self._step: Any = stages.step if ours else mjx.step
+        self._forward: Any = stages.forward if ours else mjx.forward
         self.simulated = _simulated(model, out_of_reach)
         try:
             self._mx = mjx.put_model(self.simulated, impl="jax")

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from pixelbrax_jax._platform.folding import fold
 from pixelbrax_jax._platform.interpreter import batch_last
 from pixelbrax_jax.physics.mujoco import elimination, stages
 from pixelbrax_jax.physics.mujoco.stages import is_supported
@@ -116,7 +117,7 @@ def test_forms_for_a_gpu_give_the_same(monkeypatch):
     monkeypatch.setattr(jax.lax, "platform_dependent", for_cuda)
     model = model_of("pyramidal", 3, arms=3)
     qpos, qvel = states(model)
-    ours = after_a_step(model, qpos, qvel)[3]
+    ours = after_a_step(model, qpos, qvel, lambda step: jax.vmap(fold(step)))[3]
     assert used == {"by_pieces", "eliminate"}
     for found, data in zip(ours, mujocos(model, qpos, qvel, mujoco.mj_forward), strict=True):
         scale = np.maximum(1.0, np.abs(data.qacc).max())
@@ -153,7 +154,7 @@ def test_steep_capsules_slide_as_in_mujoco():
         np.testing.assert_allclose(found, data.qvel, atol=1e-3)
 
 
-# On a GPU the humanoid's 27 unknowns are eliminated in a loop, fewer without one.
+# On a GPU the humanoid's 27 unknowns are eliminated in a loop, fewer without one, few at once.
 @pytest.mark.parametrize(
     ("solve", "unknowns", "batch"),
     [
@@ -162,7 +163,8 @@ def test_steep_capsules_slide_as_in_mujoco():
             for unknowns in (1, 3, elimination.LARGEST, elimination.LARGEST + 1)
             for batch in (jax.vmap, last)
         ),
-        (partial(elimination.eliminate, unroll=True), 9, jax.vmap),
+        *((elimination.eliminate_numbers, unknowns, jax.vmap) for unknowns in (1, 2, 9)),
+        (partial(elimination.eliminate, unroll=True), 12, jax.vmap),
         (elimination.eliminate, 27, jax.vmap),
     ],
 )
@@ -179,10 +181,17 @@ def test_solutions_are_numpys(solve, unknowns, batch):
     assert np.median(error) < 1e-5
 
 
-@pytest.mark.parametrize("unknowns", [2, elimination.LARGEST + 1])
-def test_matrices_of_other_kinds_have_no_solution(unknowns):
+@pytest.mark.parametrize(
+    ("solve", "unknowns"),
+    [
+        (elimination.solve, 2),
+        (elimination.solve, elimination.LARGEST + 1),
+        (elimination.eliminate_numbers, 3),
+    ],
+)
+def test_matrices_of_other_kinds_have_no_solution(solve, unknowns):
     matrix = jnp.diag(jnp.ones(unknowns).at[1].set(-1.0))
-    assert jnp.isnan(elimination.solve(matrix, jnp.ones(unknowns))).all()
+    assert jnp.isnan(solve(matrix, jnp.ones(unknowns))).all()
 
 
 STAGES = ("collide", "solve", "_solve_inertia")
@@ -205,15 +214,6 @@ def test_each_stage_of_our_own_is_used_and_agrees_with_mujoco_xlas(integrator, m
         scale = np.maximum(1.0, np.abs(other).max(axis=1, keepdims=True))
         far = (np.abs(one - other) / scale).max(axis=1)
         assert np.quantile(far, 0.9) < 1e-3
-
-
-def test_what_depends_on_the_model_alone_may_be_computed_beforehand():
-    model = model_of("elliptic", 3, arms=3)
-    qpos, qvel = states(model)
-    results = [after_a_step(model, qpos, qvel, folded=folded) for folded in (False, True)]
-    for one, other in zip(*results, strict=True):
-        scale = np.maximum(1.0, np.abs(one).max(initial=0))
-        np.testing.assert_allclose(one / scale, other / scale, atol=1e-4)
 
 
 def recorded(function, used):
