@@ -83,8 +83,8 @@ def jit(
         def call(*args: _P.args, **kwargs: _P.kwargs) -> _T:
             if is_guarded("host_to_device"):
                 args, kwargs = jax.tree.map(_put, (args, kwargs))
-            # Loops count with 64 bits if they may when they are lowered, and what XLA makes of a
-            # convolution's loop then rounds otherwise.
+            # JAX gives loop counters 64 bits if jax_enable_x64 is set while it lowers, after
+            # `under_default_flags` has ended. XLA then rounds otherwise in loops of convolutions.
             with jax.enable_x64(False):
                 return program(_physics(env_of(args[0])))(*args, **kwargs)
 

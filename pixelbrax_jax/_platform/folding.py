@@ -1,107 +1,172 @@
-"""Programs of which everything that is known while they are traced is computed then.
+"""Compute what is known while a program is traced, and index by constants with slices.
 
-XLA for GPUs leaves much of that in a program, a kernel each. It also makes a kernel of each
-indexing by constants, in place of slices, which it joins with what is around them.
+XLA for GPUs leaves both in a program, one kernel each.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+import warnings
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.extend import core
+from jax.sharding import AxisType
 
 from pixelbrax_jax._platform.by_platform import num_varying
 from pixelbrax_jax._platform.rules import bind, row_aval, scan_sizes
 
-_LARGEST = 64
+_MOST_ROWS = 64
 """Largest number of rows, and of indices, that become slices."""
 
-_OF_DEVICES = {"platform_index", "axis_index"}
-"""Primitives without operands whose results are not known yet."""
+_KNOWN_LATER = {"by_platform", "platform_index"}
+"""Primitives whose results depend on the device that a program is lowered for."""
 
 _UNKNOWN = object()
 
 
-def fold(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function with the same results, up to rounding, whose program has fewer kernels.
+class _Known(NamedTuple):
+    """Results of an equation; None for those that no equation of the program reads."""
 
-    Within a ``jax.shard_map`` that tracks varying values it is ``function`` itself.
+    results: list[Any]
+
+
+class _Inner(NamedTuple):
+    """The plan of the program within an equation: of a call, or of a loop's body."""
+
+    plan: list[_Known | _Inner | None]
+
+
+_Plan = list[_Known | _Inner | None]
+"""One entry for each equation of a program; None if it is neither known nor contains a program."""
+
+
+def fold(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function with the same results, up to rounding and weak types.
+
+    It takes positional arguments alone. Bodies of ``while`` loops and branches stay as they are.
+    The function itself is computed under ``jax.disable_jit``, for arguments on a mesh with explicit
+    axes or that ``jax.shard_map`` tracks, and, with a RuntimeWarning, where an unknown release of
+    JAX has other programs.
     """
 
     def folded(*args: Any) -> Any:
         leaves = jax.tree.leaves(args)
         closed, shapes = jax.make_jaxpr(function, return_shape=True)(*args)
-        if any(num_varying(jax.typeof(x)) for x in (*leaves, *closed.consts)):
+        is_disabled = getattr(jax.config, "jax_disable_jit", False)
+        if is_disabled or any(map(_is_sharded, (*leaves, *closed.consts))):
             return function(*args)
-        # In one program: one for each result would take seconds to compile.
-        constants = jax.jit(lambda: _constants(closed, leaves)).lower().compile()()
-        results = _evaluate(closed, leaves, iter(constants))
+        # Whatever this meets in an unknown release must not stop a user: `function`, and so the
+        # user's mistakes, went through `make_jaxpr` above.
+        try:
+            # In one program: one for each result would take seconds to compile.
+            plan = jax.jit(lambda: _plan(closed, leaves)).lower().compile()()
+            results = _evaluate(closed, leaves, plan)
+        except Exception as error:
+            warnings.warn(
+                f"jax {jax.__version__} has programs that PixelBrax cannot fold "
+                f"({type(error).__name__}: {error}). Results are as good, and a GPU launches more "
+                "kernels.",
+                RuntimeWarning,
+                stacklevel=1,  # one line, which Python warns of once
+            )
+            return function(*args)
         return jax.tree.unflatten(jax.tree.structure(shapes), results)
 
     return folded
 
 
-def _constants(closed: core.ClosedJaxpr, operands: Sequence[Any]) -> list[Any]:
-    """Return the results of equations whose operands are known, in their order.
+def _plan(closed: core.ClosedJaxpr, operands: Sequence[Any]) -> _Plan:
+    """Return what is known of a program's equations, given the operands that are no tracers."""
 
-    A loop has one entry, for its turns.
-    """
-    found: list[Any] = []
+    def mark(values: Sequence[Any]) -> list[Any]:
+        return [_UNKNOWN if isinstance(x, jax.core.Tracer) else x for x in values]
 
-    def apply(eqn: core.JaxprEqn, inputs: list[Any]) -> list[Any]:
-        if _may_be_known(eqn) and not any(x is _UNKNOWN for x in inputs):
-            found.append(bind(eqn, *inputs))
-            return list(found[-1])
-        if eqn.primitive.name == "jit":
-            return _walk(eqn.params["jaxpr"], inputs, apply)
-        if eqn.primitive.name == "scan":
-            num_consts, _ = scan_sizes(eqn.params)
-            others = [_UNKNOWN] * (len(inputs) - num_consts)
-            found.append(_constants(eqn.params["jaxpr"], [*inputs[:num_consts], *others]))
-        return [_UNKNOWN] * len(eqn.outvars)
-
-    consts, operands = (
-        [x if _is_known(x) else _UNKNOWN for x in values] for values in (closed.consts, operands)
-    )
-    _walk(core.ClosedJaxpr(closed.jaxpr, consts), operands, apply)
-    return found
+    return _walk(closed.jaxpr, mark(closed.consts), mark(operands))[0]
 
 
-def _evaluate(
-    closed: core.ClosedJaxpr, operands: Sequence[Any], constants: Iterator[Any]
-) -> list[Any]:
-    def apply(eqn: core.JaxprEqn, inputs: list[Any]) -> list[Any]:
-        name = eqn.primitive.name
-        if _may_be_known(eqn) and all(map(_is_known, inputs)):
-            return list(next(constants))
-        if name == "jit":
-            return _walk(eqn.params["jaxpr"], inputs, apply)
-        if name == "scan":
-            return _scan(eqn, inputs, next(constants))
-        found = None
-        if name == "gather":
-            found = _gather(eqn.params["dimension_numbers"], eqn.params["slice_sizes"], *inputs)
-        elif name in ("scatter", "scatter-add"):
-            adds = name == "scatter-add"
-            found = _scatter(eqn.params["dimension_numbers"], *inputs, adds=adds)
-        return bind(eqn, *inputs) if found is None else [found]
+def _walk(
+    jaxpr: core.Jaxpr, consts: Sequence[Any], operands: Sequence[Any]
+) -> tuple[_Plan, list[Any]]:
+    """Return the plan, and the results, some of which are ``_UNKNOWN``."""
+    values, plan = _given(jaxpr, consts, operands), []
+    read_later = {id(atom) for atom in jaxpr.outvars}
+    for eqn in jaxpr.eqns:
+        inputs = [_read(values, atom) for atom in eqn.invars]
+        results = [_UNKNOWN] * len(eqn.outvars)
+        entry: _Known | _Inner | None = None
+        if not any(x is _UNKNOWN for x in inputs) and _may_be_known(eqn):
+            with eqn.ctx.manager:
+                results = bind(eqn, *inputs)
+            entry = _Known(results)
+        elif eqn.primitive.name == "jit":
+            inner = eqn.params["jaxpr"]
+            with eqn.ctx.manager:
+                found, results = _walk(inner.jaxpr, inner.consts, inputs)
+            entry = _Inner(found)
+        elif eqn.primitive.name == "scan":
+            inner, (count, _) = eqn.params["jaxpr"], scan_sizes(eqn.params)
+            others = [_UNKNOWN] * (len(inputs) - count)
+            entry = _Inner(_walk(inner.jaxpr, inner.consts, [*inputs[:count], *others])[0])
+        if not isinstance(entry, _Known):
+            read_later.update(map(id, eqn.invars))
+        plan.append(entry)
+        values.update(zip(eqn.outvars, results, strict=True))
+    for i, (eqn, entry) in enumerate(zip(jaxpr.eqns, plan, strict=True)):
+        if isinstance(entry, _Known):
+            pairs = zip(eqn.outvars, entry.results, strict=True)
+            plan[i] = _Known([x if id(var) in read_later else None for var, x in pairs])
+    return plan, [_read(values, atom) for atom in jaxpr.outvars]
 
-    return _walk(closed, operands, apply)
+
+def _evaluate(closed: core.ClosedJaxpr, operands: Sequence[Any], plan: _Plan) -> list[Any]:
+    values = _given(closed.jaxpr, closed.consts, operands)
+    for eqn, entry in zip(closed.jaxpr.eqns, plan, strict=True):
+        if isinstance(entry, _Known):
+            results = entry.results
+        else:
+            inputs = [_read(values, atom) for atom in eqn.invars]
+            with eqn.ctx.manager:
+                results = _apply(eqn, inputs, entry)
+        values.update(zip(eqn.outvars, results, strict=True))
+    return [_read(values, atom) for atom in closed.jaxpr.outvars]
 
 
-def _scan(eqn: core.JaxprEqn, inputs: list[Any], constants: list[Any]) -> list[Any]:
-    params = eqn.params
+def _given(jaxpr: core.Jaxpr, consts: Sequence[Any], operands: Sequence[Any]) -> dict[Any, Any]:
+    values = zip(jaxpr.constvars, consts, strict=True), zip(jaxpr.invars, operands, strict=True)
+    return {var: value for pairs in values for var, value in pairs}
+
+
+def _read(values: dict[Any, Any], atom: core.Var | core.Literal) -> Any:
+    if isinstance(atom, core.Literal):
+        return np.asarray(atom.val, row_aval(atom).dtype)
+    return values[atom]
+
+
+def _apply(eqn: core.JaxprEqn, inputs: list[Any], entry: _Inner | None) -> list[Any]:
+    name, params = eqn.primitive.name, eqn.params
+    if entry is not None and name == "scan":
+        return _scan(params, inputs, entry.plan)
+    if entry is not None:
+        return _evaluate(params["jaxpr"], inputs, entry.plan)
+    found = None
+    if name == "gather":
+        found = _gather(params["dimension_numbers"], params["slice_sizes"], *inputs)
+    elif name in ("scatter", "scatter-add"):
+        adds = name == "scatter-add"
+        found = _scatter(params["dimension_numbers"], *inputs, adds=adds)
+    return bind(eqn, *inputs) if found is None else [found]
+
+
+def _scan(params: Any, inputs: list[Any], plan: _Plan) -> list[Any]:
     num_consts, num_carry = scan_sizes(params)
     stop = num_consts + num_carry
 
     def turn(carried: list[Any], slices: list[Any]) -> tuple[list[Any], list[Any]]:
-        operands = [*inputs[:num_consts], *carried, *slices]
-        results = _evaluate(params["jaxpr"], operands, iter(constants))
+        results = _evaluate(params["jaxpr"], [*inputs[:num_consts], *carried, *slices], plan)
         return results[:num_carry], results[num_carry:]
 
     options = {name: params[name] for name in ("length", "reverse", "unroll")}
@@ -109,34 +174,18 @@ def _scan(eqn: core.JaxprEqn, inputs: list[Any], constants: list[Any]) -> list[A
     return [*last, *ys]
 
 
-def _walk(
-    closed: core.ClosedJaxpr,
-    operands: Sequence[Any],
-    apply: Callable[[core.JaxprEqn, list[Any]], list[Any]],
-) -> list[Any]:
-    """Return the results of a program, each equation of which ``apply`` computes."""
-    values: dict[core.Var, Any] = {}
-
-    def read(atom: core.Var | core.Literal) -> Any:
-        if isinstance(atom, core.Literal):
-            return np.asarray(atom.val, row_aval(atom).dtype)
-        return values[atom]
-
-    values.update(zip(closed.jaxpr.constvars, closed.consts, strict=True))
-    values.update(zip(closed.jaxpr.invars, operands, strict=True))
-    for eqn in closed.jaxpr.eqns:
-        inputs = [read(atom) for atom in eqn.invars]
-        with eqn.ctx.manager:
-            values.update(zip(eqn.outvars, apply(eqn, inputs), strict=True))
-    return [read(atom) for atom in closed.jaxpr.outvars]
-
-
 def _may_be_known(eqn: core.JaxprEqn) -> bool:
-    return eqn.primitive.name not in _OF_DEVICES and not eqn.effects
+    if eqn.primitive.name in _KNOWN_LATER or eqn.effects:
+        return False
+    return all(
+        _may_be_known(inner) for sub in core.jaxprs_in_params(eqn.params) for inner in sub.eqns
+    )
 
 
-def _is_known(value: Any) -> bool:
-    return not isinstance(value, jax.core.Tracer)
+def _is_sharded(x: Any) -> bool:
+    aval = jax.typeof(x)
+    mesh = getattr(getattr(aval, "sharding", None), "mesh", None)
+    return num_varying(aval) > 0 or AxisType.Explicit in getattr(mesh, "axis_types", ())
 
 
 def _gather(numbers: Any, slice_sizes: tuple[int, ...], x: Any, indices: Any) -> Any:
@@ -176,8 +225,8 @@ def _rows(
     indices: Any, axes: tuple[int, ...], batching: Sequence[int], shape: tuple[int, ...]
 ) -> Any:
     """Return constant indices of one axis; None for others, too many, or any out of bounds."""
-    if len(axes) != 1 or batching or not _is_known(indices):
+    if len(axes) != 1 or batching or isinstance(indices, jax.core.Tracer):
         return None
     rows, size = np.asarray(indices)[..., 0], shape[axes[0]]
-    is_small = 0 < rows.size <= _LARGEST and size <= _LARGEST
+    is_small = 0 < rows.size <= _MOST_ROWS and size <= _MOST_ROWS
     return rows if is_small and bool(np.all((rows >= 0) & (rows < size))) else None

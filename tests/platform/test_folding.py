@@ -10,6 +10,8 @@ from jax.extend import core
 from jax.sharding import AxisType
 from jax.sharding import PartitionSpec as P
 
+from pixelbrax_jax._platform import folding
+from pixelbrax_jax._platform.by_platform import by_platform
 from pixelbrax_jax._platform.folding import fold
 from tests.platform.functions import FUNCTIONS, TABLE
 
@@ -90,16 +92,95 @@ def test_other_indices_stay_as_they_are(function):
     same(jax.jit(fold(function))(MATRIX), function(MATRIX))
 
 
-def test_what_is_known_is_not_in_the_program():
+def loop_of(constant, index=0):
+    """A loop of a loop, with known constants and a known index."""
+
+    def turn(i, x):
+        return jax.lax.fori_loop(0, 2, lambda j, y: y[index] + jnp.cos(constant) * y, x)
+
+    return lambda x: jax.lax.fori_loop(0, 3, turn, x)
+
+
+@pytest.mark.parametrize(
+    ("function", "names"),
+    [
+        (lambda x: x + jnp.sin(TABLE).sum() * jnp.arange(3), {"add"}),
+        (lambda x: x + jax.jit(jnp.sin)(TABLE[0]), {"add"}),
+        (lambda x: loop_of(jnp.sin(TABLE[0]))(x), None),
+        (lambda x: loop_of(jnp.sin(TABLE[0]), jnp.argsort(-TABLE[0]))(x), None),
+    ],
+    ids=["outside", "in a call", "for loops", "indices of loops"],
+)
+def test_what_is_known_is_not_in_the_program(function, names):
+    found = names_of(fold(function), X)
+    assert not found & {"sin", "cos", "sort", "gather"}
+    assert names is None or found == names
+    same(jax.jit(fold(function))(X), function(X))
+
+
+def of_platform():
+    return jax.lax.platform_dependent(cpu=lambda: 1.0, cuda=lambda: 7.0, default=lambda: 2.0)
+
+
+@pytest.mark.parametrize(
+    "known",
+    [
+        of_platform,
+        jax.jit(of_platform),
+        lambda: jax.lax.fori_loop(0, 3, lambda i, y: y + of_platform(), 0.0),
+        lambda: by_platform(
+            (TABLE[0],), TABLE[0], cpu=jnp.sin, cuda=lambda x: 7 * x, default=jnp.cos
+        ),
+    ],
+    ids=["itself", "in a call", "in a loop", "by_platform"],
+)
+def test_the_platform_is_not_known_yet(known):
+    folded = jax.jit(fold(lambda x: x + known()))
+    same(folded(X), X + known())
+    text = folded.trace(X).lower(lowering_platforms=("cuda",)).as_text()
+    assert "7.0" in text
+    assert "sine" not in text
+
+
+def test_a_program_may_be_computed_at_once():
+    """Outside of ``jax.jit`` some values of a derivative or a batch are no tracers."""
+
     def function(x):
-        return x + jnp.sin(TABLE).sum() * jnp.arange(3)
+        turns = jax.lax.fori_loop(0, 3, lambda i, y: (y[0] + x.sum(), y[1]), (0.0, 2.0))
+        return jnp.where(x > 0, x, x[jnp.argmax(x)]) * turns[0] * jnp.sin(turns[1]) + of_platform()
 
-    assert names_of(fold(function), X) == {"add"}
+    same(fold(function)(X), function(X))
+    same(jax.vmap(fold(function))(MATRIX), jax.vmap(function)(MATRIX))
+    grads = (
+        jax.grad(lambda x, form=form: form(function)(x).sum())(X) for form in (fold, lambda f: f)
+    )
+    same(*grads)
 
 
-def test_the_platform_is_not_known_yet():
-    folded = fold(lambda x: x + jax.lax.platform_dependent(cpu=lambda: 1.0, default=lambda: 2.0))
-    assert "platform_index" in names_of(folded, X)
+def test_a_program_without_compilation_is_the_function_itself():
+    with jax.disable_jit():
+        same(fold(lambda x: x[FEW])(X), X[FEW])
+
+
+@pytest.mark.parametrize("axis_type", [AxisType.Auto, AxisType.Explicit])
+def test_arguments_may_be_sharded(axis_type):
+    mesh = jax.make_mesh((1,), ("i",), axis_types=(axis_type,))
+    x = jax.device_put(MATRIX, jax.NamedSharding(mesh, P("i")))
+    function = jax.vmap(lambda row: row[FEW] * jnp.sin(TABLE[0]))
+    same(jax.jit(fold(function))(x), jax.jit(function)(x))
+
+
+@pytest.mark.parametrize("name", ["scan_sizes", "bind"])
+def test_an_unknown_release_of_jax_is_told(monkeypatch, name):
+    """As if it had other parameters."""
+    monkeypatch.setattr(folding, name, lambda *_: {}["num_carry"])
+
+    def function(x):
+        return jax.lax.fori_loop(0, 3, lambda i, y: y[FEW] + jnp.sin(TABLE[0]), x)
+
+    with pytest.warns(RuntimeWarning, match=r"jax .* has programs that PixelBrax cannot fold"):
+        found = jax.jit(fold(function))(X)
+    same(found, function(X))
 
 
 def test_a_shard_map_that_tracks_what_varies():

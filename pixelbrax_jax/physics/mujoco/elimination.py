@@ -9,7 +9,7 @@ LARGEST = 17
 """Largest number of unknowns that a CPU eliminates, where LAPACK is slower, one matrix after the
 other, and that a GPU eliminates without a loop."""
 
-_IN_ONE_KERNEL = 9
+IN_ONE_KERNEL = 9
 """Largest number of unknowns that a GPU eliminates in one kernel. Nine take three seconds to
 compile, seventeen half a minute."""
 
@@ -27,15 +27,16 @@ def solve(matrix: jax.Array, right: jax.Array) -> jax.Array:
         matrix,
         right,
         cpu=eliminate if len(matrix) <= LARGEST else _by_factors,
-        cuda=_on_cuda,
+        cuda=on_cuda,
         default=_by_factors,
     )
     return found
 
 
-def _on_cuda(matrix: jax.Array, right: jax.Array) -> jax.Array:
-    if len(matrix) <= _IN_ONE_KERNEL:
-        return eliminate_numbers(matrix, right)
+def on_cuda(matrix: jax.Array, right: jax.Array) -> jax.Array:
+    """Return what ``solve`` does on an NVIDIA GPU."""
+    if len(matrix) <= IN_ONE_KERNEL:
+        return eliminate_by_entry(matrix, right)
     return eliminate(matrix, right, unroll=len(matrix) <= LARGEST)
 
 
@@ -56,22 +57,22 @@ def eliminate(matrix: jax.Array, right: jax.Array, *, unroll: bool = False) -> j
     return jax.lax.fori_loop(0, len(rows), turn, rows, unroll=unroll)[:, -1]
 
 
-def eliminate_numbers(matrix: jax.Array, right: jax.Array) -> jax.Array:
-    """Solve by elimination, number by number: XLA for GPUs makes one kernel of it; see ``solve``.
+def eliminate_by_entry(matrix: jax.Array, right: jax.Array) -> jax.Array:
+    """Solve by elimination, one operation for each entry; see ``solve``.
 
-    It reads the lower triangle alone.
+    XLA for GPUs makes one kernel of them. Only the lower triangle is read.
     """
     count = len(right)
     rows = [[*(matrix[i, j] for j in range(i + 1)), right[i]] for i in range(count)]
-    for k, (*_, pivot, _) in enumerate(rows):
-        rows[k][k] = jnp.where(pivot > 0, pivot, jnp.nan)
+    for k in range(count):
+        rows[k][k] = jnp.where(rows[k][k] > 0, rows[k][k], jnp.nan)
         for i in range(k + 1, count):
             factor = rows[i][k] / rows[k][k]
             for j in range(k + 1, i + 1):
                 rows[i][j] -= factor * rows[j][k]
             rows[i][-1] -= factor * rows[k][-1]
-    found: list[jax.Array] = []
+    found = [jnp.zeros(())] * count
     for k in reversed(range(count)):
-        known = sum(rows[k + 1 + i][k] * x for i, x in enumerate(reversed(found)))
-        found.append((rows[k][-1] - known) / rows[k][k])
-    return jnp.stack(found[::-1])
+        known = sum(rows[i][k] * found[i] for i in range(k + 1, count))
+        found[k] = (rows[k][-1] - known) / rows[k][k]
+    return jnp.stack(found)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -163,9 +161,11 @@ def test_steep_capsules_slide_as_in_mujoco():
             for unknowns in (1, 3, elimination.LARGEST, elimination.LARGEST + 1)
             for batch in (jax.vmap, last)
         ),
-        *((elimination.eliminate_numbers, unknowns, jax.vmap) for unknowns in (1, 2, 9)),
-        (partial(elimination.eliminate, unroll=True), 12, jax.vmap),
-        (elimination.eliminate, 27, jax.vmap),
+        *(
+            (elimination.on_cuda, unknowns, jax.vmap)
+            for unknowns in (1, 2, elimination.IN_ONE_KERNEL, elimination.IN_ONE_KERNEL + 1)
+        ),
+        (elimination.on_cuda, 27, jax.vmap),
     ],
 )
 def test_solutions_are_numpys(solve, unknowns, batch):
@@ -186,7 +186,7 @@ def test_solutions_are_numpys(solve, unknowns, batch):
     [
         (elimination.solve, 2),
         (elimination.solve, elimination.LARGEST + 1),
-        (elimination.eliminate_numbers, 3),
+        (elimination.on_cuda, 3),
     ],
 )
 def test_matrices_of_other_kinds_have_no_solution(solve, unknowns):
