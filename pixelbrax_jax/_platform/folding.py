@@ -37,7 +37,7 @@ class _Known(NamedTuple):
 class _Inner(NamedTuple):
     """The plan of the program within an equation: of a call, or of a loop's body."""
 
-    plan: list[_Known | _Inner | None]
+    plan: _Plan
 
 
 _Plan = list[_Known | _Inner | None]
@@ -54,10 +54,11 @@ def fold(function: Callable[..., Any]) -> Callable[..., Any]:
     """
 
     def folded(*args: Any) -> Any:
+        if getattr(jax.config, "jax_disable_jit", False):
+            return function(*args)
         leaves = jax.tree.leaves(args)
         closed, shapes = jax.make_jaxpr(function, return_shape=True)(*args)
-        is_disabled = getattr(jax.config, "jax_disable_jit", False)
-        if is_disabled or any(map(_is_sharded, (*leaves, *closed.consts))):
+        if any(map(_is_sharded, (*leaves, *closed.consts))):
             return function(*args)
         # Whatever this meets in an unknown release must not stop a user: `function`, and so the
         # user's mistakes, went through `make_jaxpr` above.

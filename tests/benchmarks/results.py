@@ -161,7 +161,7 @@ def short_table(runs: dict[str, list[dict]]) -> str:
         own = [of_task[name] for x in algorithms if (name := f"{x}-{task}") in of_task]
         if len(own) == len(algorithms):
             ends = [without[key][kind] for kind in ("random", "none")]
-            earned = [f"{end['return']:,.0f} ± {end['standard_error']:,.0f}" for end in ends]
+            earned = [_with_error(end) for end in ends]
             lines.append([title(key, list(tasks)), *map(reached, own), *earned])
     return markdown_table(heads, lines)
 
@@ -173,7 +173,7 @@ def baselines_table(runs: dict[str, list[dict]]) -> str:
     without, from_state = read("untrained.json"), read("from_state.json")
     for key in tasks:
         ends = [without[key][kind] for kind in ("random", "none")]
-        line = [f"{end['return']:,.0f} ± {end['standard_error']:,.0f}" for end in ends]
+        line = [_with_error(end) for end in ends]
         if seen := from_state.get(key):
             line += [f"{seen['return'][-1]:,.0f}", f"{seen['steps'][-1] / 1e6:.1f}"]
         lines.append([title(key, list(tasks)), *line, *[""] * (4 - len(line))])
@@ -240,7 +240,7 @@ def pretrained_table() -> str:
                 "" if name not in TASKS else f"`{about['env_options']['reward_preset']}`",
                 "DrQ-v2" if about["algorithm"] == "drqv2" else about["algorithm"].upper(),
                 f"{about['steps'] / 1e6:.1f}",
-                f"{about['return']:,.0f} ± {about['standard_error']:,.0f}",
+                _with_error(about),
                 about["versions"]["pixelbrax"],
             ]
         )
@@ -316,11 +316,11 @@ def swingup_table() -> str:
 
 
 def _with_error(found: dict) -> str:
-    return f"{found['return']:.0f} ± {found['standard_error']:.0f}"
+    return f"{found['return']:,.0f} ± {found['standard_error']:,.0f}"
 
 
 def _with_range(returns: list[float]) -> str:
-    return f"{np.mean(returns):.0f} ({min(returns):.0f} to {max(returns):.0f})"
+    return f"{np.mean(returns):.0f} ({span(returns, '{:.0f}')})"
 
 
 FIGURES: Figures = {

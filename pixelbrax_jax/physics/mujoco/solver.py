@@ -119,12 +119,12 @@ def solve(model: Any, data: Any) -> Any:
     num_cones = 0 if cones is None else cones.scale.size
     counts = [impl.ne, impl.nf, impl.nefc - impl.ne - impl.nf - num_cones, num_cones]
     kind = np.repeat([_EQUALITY, _FRICTION, _ONE_SIDED, _CONE], counts)
+    friction = jnp.where(kind == _FRICTION, impl.efc_frictionloss, jnp.inf)
 
     def pad(x: jax.Array) -> jax.Array:
         """Add constraints that are never active, up to a multiple of the rows added at a time."""
         return jnp.pad(x, [(0, -len(x) % _rows(impl.efc_J)), *[(0, 0)] * (x.ndim - 1)])
 
-    friction = jnp.where(kind == _FRICTION, impl.efc_frictionloss, jnp.inf)
     problem = _Problem(
         inertia=support.full_m(model, data),
         smooth=data.qacc_smooth,

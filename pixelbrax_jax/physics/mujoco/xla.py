@@ -37,15 +37,13 @@ class Xla:
         reads: Sequence[str] = (),
         plain: bool = False,
     ):
-        """Put a model on the device; ``plain`` takes MuJoCo XLA's own step, see ``Formulas``."""
+        """Put a model on the device; ``plain`` takes MuJoCo XLA's own step. See ``Formulas``."""
         load_onto_own_device(mjx_io)
         check_simulated(model)
         self._model = model
         self._starts_with_forces = starts_with_forces or bool(reads)
         self._fields = tuple(reads)
-        ours = not plain and stages.is_supported(model)
-        self._step: Any = stages.step if ours else mjx.step
-        self._forward: Any = stages.forward if ours else mjx.forward
+        self._stages: Any = mjx if plain or not stages.is_supported(model) else stages
         self.simulated = _simulated(model, out_of_reach)
         try:
             self._mx = mjx.put_model(self.simulated, impl="jax")
@@ -102,7 +100,7 @@ class Xla:
     def _mover(self, model: Any, multipliers: jax.Array) -> Callable[[Any], Any]:
         """Return a function that advances data by one time step; ``model`` is already changed."""
         del multipliers
-        return partial(self._step, model)
+        return partial(self._stages.step, model)
 
     def first(self, qpos: jax.Array, qvel: jax.Array, multipliers: jax.Array) -> Arrays:
         """See ``Native.first``; without forces where no observation of a first state has any."""
@@ -110,7 +108,7 @@ class Xla:
         left: Arrays = ()
         if self._starts_with_forces:
             model = changed(self._passive, multipliers)
-            forward = self._forward(model, data)
+            forward = self._stages.forward(model, data)
             data = data.replace(sensordata=forward.sensordata)
             left = self._left(model, forward, is_after_step=False)
         return *self._readings(changed(self._mx, multipliers), data), *left
