@@ -20,6 +20,9 @@ def xla_flags(optimize: bool) -> str:
         optimize: whether programs are optimised as those of users are.
     """
     flags = {"xla_cpu_prefer_vector_width": 512}
+    # The parts of a program would be compiled side by side, on cores that another worker has.
+    if is_known("xla_cpu_parallel_codegen_split_count"):
+        flags["xla_cpu_parallel_codegen_split_count"] = 1
     if not optimize:
         flags |= {name: off for name, (off, _) in _optimizations().items()}
     return " ".join(f"--{name}={str(value).lower()}" for name, value in flags.items())

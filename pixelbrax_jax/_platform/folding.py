@@ -17,7 +17,7 @@ from jax.extend import core
 from jax.sharding import AxisType
 
 from pixelbrax_jax._platform.by_platform import num_varying
-from pixelbrax_jax._platform.rules import bind, row_aval, scan_sizes
+from pixelbrax_jax._platform.rules import bind, row_aval, split_scan
 
 _MOST_ROWS = 64
 """Largest number of rows, and of indices, that become slices."""
@@ -109,9 +109,9 @@ def _walk(
                 found, results = _walk(inner.jaxpr, inner.consts, inputs)
             entry = _Inner(found)
         elif eqn.primitive.name == "scan":
-            inner, (count, _) = eqn.params["jaxpr"], scan_sizes(eqn.params)
-            others = [_UNKNOWN] * (len(inputs) - count)
-            entry = _Inner(_walk(inner.jaxpr, inner.consts, [*inputs[:count], *others])[0])
+            inner, (known, carry, xs) = eqn.params["jaxpr"], split_scan(eqn.params, inputs)
+            others = [_UNKNOWN] * len([*carry, *xs])
+            entry = _Inner(_walk(inner.jaxpr, inner.consts, [*known, *others])[0])
         if not isinstance(entry, _Known):
             read_later.update(map(id, eqn.invars))
         plan.append(entry)
@@ -163,15 +163,14 @@ def _apply(eqn: core.JaxprEqn, inputs: list[Any], entry: _Inner | None) -> list[
 
 
 def _scan(params: Any, inputs: list[Any], plan: _Plan) -> list[Any]:
-    num_consts, num_carry = scan_sizes(params)
-    stop = num_consts + num_carry
+    consts, carry, xs = split_scan(params, inputs)
 
     def turn(carried: list[Any], slices: list[Any]) -> tuple[list[Any], list[Any]]:
-        results = _evaluate(params["jaxpr"], [*inputs[:num_consts], *carried, *slices], plan)
-        return results[:num_carry], results[num_carry:]
+        results = _evaluate(params["jaxpr"], [*consts, *carried, *slices], plan)
+        return results[: len(carry)], results[len(carry) :]
 
     options = {name: params[name] for name in ("length", "reverse", "unroll")}
-    last, ys = lax.scan(turn, inputs[num_consts:stop], inputs[stop:], **options)
+    last, ys = lax.scan(turn, carry, xs, **options)
     return [*last, *ys]
 
 

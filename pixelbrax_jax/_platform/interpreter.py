@@ -20,7 +20,7 @@ from pixelbrax_jax._platform.rules import (
     bind,
     row_aval,
     rule,
-    scan_sizes,
+    split_scan,
     spread,
 )
 
@@ -168,10 +168,8 @@ def _cond(eqn: core.JaxprEqn, inputs: Sequence[Operand], size: int) -> list[Any]
 
 def _scan(eqn: core.JaxprEqn, inputs: list[Operand], size: int) -> list[Operand]:
     closed, params = eqn.params["jaxpr"], eqn.params
-    num_consts, num_carry = scan_sizes(params)
-    consts, first = inputs[:num_consts], inputs[num_consts : num_consts + num_carry]
-    xs = inputs[num_consts + num_carry :]
-    reached = _reach_scan(eqn, [x.batched for x in inputs])
+    consts, first, xs = split_scan(params, inputs)
+    num_carry, reached = len(first), _reach_scan(eqn, [x.batched for x in inputs])
     flags = reached[:num_carry]
 
     def carry(operands: Sequence[Operand]) -> list[Any]:
@@ -238,13 +236,12 @@ def _spread_where(
 
 
 def _reach_scan(eqn: core.JaxprEqn, flags: list[bool]) -> list[bool]:
-    start, num_carry = scan_sizes(eqn.params)
-    stop = start + num_carry
+    consts, carried, xs = split_scan(eqn.params, flags)
     # A carry that becomes batched may make others batched in the next iteration.
-    carried, before = flags[start:stop], None
+    before = None
     while carried != before:
         before = carried
-        reached = _reach(eqn.params["jaxpr"], [*flags[:start], *carried, *flags[stop:]])
+        reached = _reach(eqn.params["jaxpr"], [*consts, *carried, *xs])
         carried = [a or b for a, b in zip(carried, reached, strict=False)]
     return [*carried, *reached[len(carried) :]]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,9 @@ gain nothing."""
 
 _LONGEST_SUM = 16
 """Longest axis of matrix products that are written as sums; longer ones call a library."""
+
+
+_T = TypeVar("_T")
 
 
 class Operand(NamedTuple):
@@ -75,13 +78,16 @@ def bind(eqn: core.JaxprEqn, *values: Any, **changed: Any) -> list[Any]:
     return list(outputs) if eqn.primitive.multiple_results else [outputs]
 
 
-def scan_sizes(params: Mapping[str, Any]) -> tuple[int, int]:
-    """Return how many constants and carries a scan has, from its parameters."""
+def split_scan(
+    params: Mapping[str, Any], operands: list[_T]
+) -> tuple[list[_T], list[_T], list[_T]]:
+    """Return a scan's constants, its carry, and what it takes slices of, from its parameters."""
     if "num_carry" in params:
-        return params["num_consts"], params["num_carry"]
-    # From jax 0.12 on, operands are in groups.
-    consts, carry, _ = params["ft_in"].unpack()
-    return len(consts), len(carry)
+        start, num_carry = params["num_consts"], params["num_carry"]
+    else:  # from jax 0.12 on
+        start, num_carry, _ = map(len, params["ft_in"].unpack())
+    stop = start + num_carry
+    return operands[:start], operands[start:stop], operands[stop:]
 
 
 def spread(operand: Operand, shape: tuple[int, ...], size: int) -> jax.Array:

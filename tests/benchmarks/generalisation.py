@@ -70,14 +70,14 @@ def train(task: str, training: str, seed: int, folder: Path) -> int:
     return run(command, folder, math.inf)
 
 
-def play(task: str, training: str, suite: str, runs: list[Path], folder: Path) -> bool:
-    """Play the levels of a suite that have not been played, and keep all returns of these runs."""
+def play(task: str, training: str, suite: str, runs: list[Path], folder: Path) -> int:
+    """Play levels that have not been played, keep all returns, and return the exit status."""
     command = ["nice", "-n", "19", sys.executable, "-m", "pixelbrax_gym.cli", "evaluate"]
     command += [*map(str, runs), "--suite", suite, "--clips", "procedural"]
     command += ["--episodes", str(EPISODES)]
     command += ["--output-dir", str(folder)]
-    if subprocess.run(command, check=False, stdout=subprocess.DEVNULL).returncode:
-        return False
+    if status := subprocess.run(command, check=False, stdout=subprocess.DEVNULL).returncode:
+        return status
     found = json.loads((folder / RETURNS).read_text("utf-8"))
     found["returns"] = {
         f"seed {seed}": next(
@@ -88,7 +88,7 @@ def play(task: str, training: str, suite: str, runs: list[Path], folder: Path) -
     KEPT.mkdir(parents=True, exist_ok=True)
     kept_at(task, training, suite).write_text(json.dumps(found) + "\n", "utf-8")
     shutil.copyfile(folder / SHEET, KEPT / f"{task}-{suite}.png")
-    return True
+    return 0
 
 
 def page(suite: str) -> str:
@@ -177,18 +177,21 @@ def main() -> int:
             continue
         folder = options.output_dir / f"revision-{REVISION}" / f"{task}-{training}"
         runs = [folder / str(seed) for seed in range(options.seeds)]
-        for seed, made in enumerate(runs):
-            status = train(task, training, seed, made)
+        jobs = {
+            str(made): partial(train, task, training, seed, made) for seed, made in enumerate(runs)
+        }
+        jobs |= {
+            f"{suite} of {folder}": partial(play, task, training, suite, runs, folder / suite)
+            for suite in missing
+        }
+        for name, job in jobs.items():
+            status = job()
             if status > 128 or status < 0:
-                print("stopped; the same command goes on", file=sys.stderr)
+                print(f"stopped in {name}; the same command goes on", file=sys.stderr)
                 return status
             if status:
+                failed.append(name)
                 break
-        failed += [
-            f"{task}-{training}-{suite}"
-            for suite in missing
-            if status or not play(task, training, suite, runs, folder / suite)
-        ]
     if failed:
         print(f"failed: {', '.join(failed)}", file=sys.stderr)
     return bool(failed)

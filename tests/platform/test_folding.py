@@ -170,7 +170,7 @@ def test_arguments_may_be_sharded(axis_type):
     same(jax.jit(fold(function))(x), jax.jit(function)(x))
 
 
-@pytest.mark.parametrize("name", ["scan_sizes", "bind"])
+@pytest.mark.parametrize("name", ["split_scan", "bind"])
 def test_an_unknown_release_of_jax_is_told(monkeypatch, name):
     """As if it had other parameters."""
     monkeypatch.setattr(folding, name, lambda *_: {}["num_carry"])

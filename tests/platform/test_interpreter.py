@@ -72,7 +72,7 @@ def test_equations_keep_their_contexts():
     np.testing.assert_array_equal(actual, jax.vmap(draw)(jnp.zeros(2)))
 
 
-@pytest.mark.parametrize("function", ["scan_sizes", "bind", "_reshape_wrongly"])
+@pytest.mark.parametrize("function", ["split_scan", "bind", "_reshape_wrongly"])
 def test_what_is_not_known_is_computed_by_vmap(monkeypatch, function):
     """As if a release of JAX had other parameters, or shapes that no rule foresaw."""
     if function == "_reshape_wrongly":

@@ -21,6 +21,8 @@ def unchanged(x: jax.Array) -> jax.Array:
     return x
 
 
+# Compiled once where it is called outside a program, too.
+@partial(jax.jit, static_argnums=(2, 3, 4), inline=True)
 def convolve(
     x: jax.Array, kernel: jax.Array, stride: int, pads: Pads, before: Before = unchanged
 ) -> jax.Array:
