@@ -55,7 +55,8 @@ def _by_image(
     def convolved(image: jax.Array) -> jax.Array:
         return _patches(image, kernel, stride, pads, before) @ _matrix(kernel)
 
-    return jax.lax.map(convolved, x)
+    (result,) = _on_each_device(lambda x: [jax.lax.map(convolved, x)], x)
+    return result.reshape(len(x), *result.shape[2:])
 
 
 def _by_image_forward(
@@ -83,12 +84,26 @@ def _by_image_backward(
         )
         return of_matrix, pull(cotangent @ _matrix(kernel).T)[0] if of_images else None
 
-    of_matrix = jnp.zeros(_matrix(kernel).T.shape)
-    of_matrix, of_x = jax.lax.scan(add, of_matrix, (x, cotangents))
-    return of_x, of_matrix.T.reshape(kernel.shape).astype(kernel.dtype)
+    def loop(*one: jax.Array) -> Any:
+        return jax.lax.scan(add, jnp.zeros(_matrix(kernel).T.shape), one)
+
+    of_matrix, of_x = _on_each_device(loop, x, cotangents)
+    of_kernel = of_matrix.sum(0).T.reshape(kernel.shape).astype(kernel.dtype)
+    return of_x if of_x is None else of_x.reshape(x.shape), of_kernel
 
 
 _by_image.defvjp(_by_image_forward, _by_image_backward)
+
+
+def _on_each_device(loop: Callable[..., Any], *batches: jax.Array) -> Any:
+    """Return the results of a loop over each device's part of a batch, (devices, ...).
+
+    XLA does not divide a loop over an axis that is sharded: every device would get all images.
+    """
+    devices, size = jax.device_count(), len(batches[0])
+    if devices == 1 or size % devices:
+        return jax.tree.map(lambda x: x[None], loop(*batches))
+    return jax.vmap(loop)(*(x.reshape(devices, -1, *x.shape[1:]) for x in batches))
 
 
 def _patches(
