@@ -122,8 +122,10 @@ def comparison(group: str, column: str, names: dict[str, str], counts: tuple[int
     return table((column, *heads), lines)
 
 
-def _lines(group: str, column: str, num_envs: int) -> dict[str, dict[str, Any]]:
-    row = measured("cpu-avx512", group, f"{group}.compare", task="ant", num_envs=num_envs)
+def _lines(
+    group: str, column: str, num_envs: int, machine: str = "cpu-avx512"
+) -> dict[str, dict[str, Any]]:
+    row = measured(machine, group, f"{group}.compare", task="ant", num_envs=num_envs)
     # The loop beside TorchRL has another autoreset mode; the first is meant.
     return {line[column]: line for line in reversed(row)}
 
@@ -165,6 +167,20 @@ def ant() -> float:
     """Steps per second of 256 Ants, as peers are measured."""
     where = {"task": "ant", "num_envs": 256}
     return measured("cpu-avx2", "peers", "throughput.gymnasium", **where)["steps_per_second"]
+
+
+def ants() -> str:
+    """Steps per second of 256 Ants through Gymnasium, over all runs, with NumPy or torch."""
+    speeds = [
+        measured(machine, "peers", "throughput.gymnasium", task="ant", num_envs=256)[
+            "steps_per_second"
+        ]
+        for machine in ("cpu-avx2", "cpu-avx512")
+    ]
+    for machine in ("cpu-avx2", "cpu-avx512"):
+        lines = _lines("adapters", "adapter", 256, machine)
+        speeds += [lines[f"Gymnasium, {kind}"]["steps_per_second"] for kind in ("numpy", "torch")]
+    return " to ".join(f"{round(speed, -2):,.0f}" for speed in (min(speeds), max(speeds)))
 
 
 def dm_control() -> float:
@@ -254,6 +270,7 @@ def tpu_megabytes(name: str) -> str:
 
 
 README = {
+    "ants": ants,
     "ant": lambda: number(ant()),
     "dm-control": lambda: f"{dm_control():.0f}",
     "distractors": distractor_ratios,
@@ -266,10 +283,7 @@ PERFORMANCE = {
     "peers": peers,
     "adapters": partial(comparison, "adapters", "adapter", ADAPTERS, (256, 1)),
     "distractors": partial(comparison, "distractors", "distractors", DISTRACTORS, (256, 1024)),
-    "ants": lambda: (
-        f"{rounded(ant(), 1)} to "
-        + rounded(_lines("adapters", "adapter", 256)["Gymnasium, torch"]["steps_per_second"], 1)
-    ),
+    "ants": ants,
     "batches-1000": partial(batches, 1000),
     "batches-10": partial(batches, 10),
     "kilobytes": held,
@@ -283,7 +297,8 @@ PERFORMANCE = {
     "startup-again": lambda: f"{startup('none', 'make, reset and step once more'):.2f}",
     "training-1": lambda: rounded(training(1, 1), 2),
     "training-2": lambda: rounded(training(2, 2), 2),
-    "training-share": lambda: f"{training(2, 2) / training(1, 1) / 2:.2f}",
+    "training-gain": lambda: f"{training(2, 2) / training(1, 1):.1f}",
+    "training-alone": lambda: rounded(training(1, 2), 2),
 }
 
 ACCELERATORS = {

@@ -56,7 +56,7 @@ def _by_image(
         return _patches(image, kernel, stride, pads, before) @ _matrix(kernel)
 
     (result,) = _on_each_device(lambda x: [jax.lax.map(convolved, x)], x)
-    return result.reshape(len(x), *result.shape[2:])
+    return result.reshape(x.shape[0], *result.shape[2:])
 
 
 def _by_image_forward(
@@ -100,8 +100,9 @@ def _on_each_device(loop: Callable[..., Any], *batches: jax.Array) -> Any:
 
     XLA does not divide a loop over an axis that is sharded: every device would get all images.
     """
-    devices, size = jax.device_count(), len(batches[0])
-    if devices == 1 or size % devices:
+    devices, size = jax.device_count(), batches[0].shape[0]
+    # Policies are exported for batches of any size.
+    if devices == 1 or not isinstance(size, int) or size % devices:
         return jax.tree.map(lambda x: x[None], loop(*batches))
     return jax.vmap(loop)(*(x.reshape(devices, -1, *x.shape[1:]) for x in batches))
 
