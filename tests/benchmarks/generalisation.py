@@ -120,6 +120,8 @@ def published(task: str) -> dict[str, dict[str, str]]:
 
 
 def _cell(row: Row) -> str:
+    if row.runs > 1:
+        return f"{row.mean:.0f} ({row.low:.0f} to {row.high:.0f})"
     spread = "" if math.isnan(row.standard_error) else f" ± {row.standard_error:.0f}"
     return f"{row.mean:.0f}{spread}"
 
