@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pixelbrax_jax import PixelEnv, VectorPixelEnv, compilation
+from pixelbrax_jax import VectorPixelEnv, compilation
 from pixelbrax_jax.flags import is_key
 from pixelbrax_jax.types import EnvParams, EnvState, Timestep
 
@@ -47,12 +47,8 @@ class Stepped(NamedTuple):
     outputs: dict[str, Any]
 
 
-def _env(programs: Programs) -> PixelEnv:
-    return programs.vector.env
-
-
 # No program reads `spare`; `keep_unused` still lets its memory be reused.
-_into_spare = compilation.jit(_env, static_argnums=0, donate_argnames="spare", keep_unused=True)
+_into_spare = compilation.jit(static_argnums=0, donate_argnames="spare", keep_unused=True)
 
 
 class Programs:
@@ -67,14 +63,14 @@ class Programs:
     """
 
     def __init__(self, vector: VectorPixelEnv, single: bool) -> None:
-        self.vector, self.single = vector, single
+        self.vector, self.env, self.single = vector, vector.env, single
         self._specs: dict[Any, EnvState] = {}
 
     def __reduce__(self) -> Any:
         """Pickle or copy the options."""
         return programs_of, (self.vector, self.single)
 
-    @compilation.jit(_env, static_argnums=0)
+    @compilation.jit(static_argnums=0)
     def reset(self, seeds: Array, params: EnvParams, offsets: Array | None) -> Stepped:
         """Start episode 0 of (N,) uint32 seeds, with (N,) int32 ``time_limit_offset``."""
         state, timestep = self.vector.reset(jax.vmap(jax.random.key)(seeds), params)
@@ -118,13 +114,13 @@ class Programs:
         packed, ended, outputs = self._stepped(state, timestep.replace(obs=self.vector.obs(state)))
         return Stepped(packed, ended & mask, outputs | {"done": outputs["done"] & mask})
 
-    @compilation.jit(_env, static_argnums=0)
+    @compilation.jit(static_argnums=0)
     def state(self, packed: Packed, params: EnvParams) -> EnvState:
         """Return the states, without the leading axis for a single environment."""
         state = self._state(packed, params)
         return jax.tree.map(lambda x: x[0], state) if self.single else state
 
-    @compilation.jit(_env, static_argnums=0)
+    @compilation.jit(static_argnums=0)
     def start(
         self, state: EnvState, params: EnvParams, packed: Packed | None, mask: Array | None
     ) -> Stepped:
@@ -137,11 +133,11 @@ class Programs:
         see = jax.vmap(self.vector.env.timestep, in_axes=(0, 0, None))
         return self._stepped(state, see(state, rewards, params))
 
-    @compilation.jit(_env, static_argnums=(0, 3, 4))
+    @compilation.jit(static_argnums=(0, 3, 4))
     def images(self, packed: Packed, params: EnvParams, height: int, width: int) -> jax.Array:
         """Render (N, height, width, 3) uint8 images of the states."""
-        env, state = self.vector.env, self._state(packed, params)
-        return jax.vmap(lambda row: env.image(row, params, height, width))(state)
+        image = jax.vmap(lambda row: self.env.image(row, params, height, width))
+        return image(self._state(packed, params))
 
     def check_state(self, state: Any, params: EnvParams) -> None:
         """Reject a state that does not fit; the message names the first difference."""

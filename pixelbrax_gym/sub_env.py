@@ -35,25 +35,11 @@ class SubEnv:
         names = [known for known in dir(type(self)) if not known.startswith("_")]
         raise AttributeError(f"environments have no attribute {name!r}.{suggest(name, names)}")
 
-    @property
-    def unwrapped(self) -> SubEnv:
-        """Return this object, because it has no wrappers."""
-        return self
-
-    def has_wrapper_attr(self, name: str) -> bool:
-        """Return whether the attribute exists."""
-        return hasattr(self, name)
-
-    def get_wrapper_attr(self, name: str) -> Any:
-        """Return the attribute of that name."""
-        return getattr(self, name)
-
-    def set_wrapper_attr(self, name: str, value: Any, *, force: bool = True) -> bool:
-        """Set the attribute, without ``force`` only if it exists; return whether it was set."""
-        if not force and not hasattr(self, name):
-            return False
-        setattr(self, name, value)
-        return True
+    # As of an environment without wrappers.
+    unwrapped = gymnasium.Env.unwrapped
+    has_wrapper_attr = gymnasium.Env.has_wrapper_attr
+    get_wrapper_attr = gymnasium.Env.get_wrapper_attr
+    set_wrapper_attr = gymnasium.Env.set_wrapper_attr
 
     def render(self) -> np.ndarray | None:
         """Return the environment's image; renders all environments."""

@@ -63,13 +63,11 @@ def compiler_options(env: Any = None, platform: str | None = None) -> dict[str, 
     return _options(_physics(env), platform)
 
 
-def jit(
-    env_of: Callable[[Any], Any], **options: Any
-) -> Callable[[Callable[_P, _T]], Callable[_P, _T]]:
-    """Decorate like ``jax.jit``, with ``compiler_options``.
+def jit(**options: Any) -> Callable[[Callable[_P, _T]], Callable[_P, _T]]:
+    """Decorate like ``jax.jit``, with ``compiler_options``; the first argument is static.
 
-    ``env_of`` returns the environment of the function's first argument, which is static. The
-    options are computed at the first call, because importing a package must not start a device.
+    They are those of that argument, an environment or what has one as ``env``, and are computed at
+    the first call, because importing a package must not start a device.
     """
 
     def decorate(function: Callable[_P, _T]) -> Callable[_P, _T]:
@@ -86,7 +84,7 @@ def jit(
             # JAX gives loop counters 64 bits if jax_enable_x64 is set while it lowers, after
             # `under_default_flags` has ended. XLA then rounds otherwise in loops of convolutions.
             with jax.enable_x64(False):
-                return program(_physics(env_of(args[0])))(*args, **kwargs)
+                return program(_physics(args[0]))(*args, **kwargs)
 
         return call
 

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+import math
+from collections.abc import Callable, Iterable
+from functools import partial
 from numbers import Integral, Real
+from typing import Any
 
 import numpy as np
 
@@ -87,22 +90,18 @@ def check_bool(what: str, value: object) -> bool:
     raise TypeError(f"{what} must be True or False, got {value!r}.")
 
 
-def check_positive_int(what: str, value: object) -> int:
-    """Return an integer of at least 1 as a Python int; raise ValueError for anything else."""
-    if isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= 1:
-        return int(value)
-    raise ValueError(f"{what} must be a positive integer, got {value!r}.")
+def _check(kind: type, fits: Callable[[Any], bool], wanted: str, what: str, value: Any) -> Any:
+    """Return a finite number that fits as a Python number; raise ValueError for anything else."""
+    number = isinstance(value, kind) and not isinstance(value, bool)
+    if number and math.isfinite(value) and fits(value):
+        return int(value) if kind is Integral else float(value)
+    raise ValueError(f"{what} must {wanted}, got {value!r}.")
 
 
-def check_count(what: str, value: object) -> int:
-    """Return an integer of at least 0 as a Python int; raise ValueError for anything else."""
-    if isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= 0:
-        return int(value)
-    raise ValueError(f"{what} must be a whole number of at least 0, got {value!r}.")
-
-
-def check_fraction(what: str, value: object) -> float:
-    """Return ``value`` if it is a number in [0, 1]; raise ValueError otherwise."""
-    if isinstance(value, Real) and not isinstance(value, bool) and 0.0 <= float(value) <= 1.0:
-        return float(value)
-    raise ValueError(f"{what} must lie in [0, 1], got {value!r}.")
+check_positive_int = partial(_check, Integral, lambda x: x >= 1, "be a positive integer")
+check_count = partial(_check, Integral, lambda x: x >= 0, "be a whole number of at least 0")
+check_fraction = partial(_check, Real, lambda x: 0 <= x <= 1, "lie in [0, 1]")
+check_positive = partial(_check, Real, lambda x: x > 0, "be a positive number")
+check_not_negative = partial(_check, Real, lambda x: x >= 0, "be a number of at least 0")
+check_finite = partial(_check, Real, lambda _: True, "be a finite number")
+"""``check(what, value)`` returns the value, or raises a ValueError that names ``what``."""

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-    from pixelbrax_gym.generalisation.scores import Player
     from pixelbrax_jax.agents.runner.trained import Trained
     from pixelbrax_jax.generalisation.making import LevelEnv, Levels
 
@@ -35,20 +34,16 @@ def evaluate(
         raise ValueError("--suite plays all runs of a folder; leave out --run.")
     agents = _load(options, runs)
     with needs_extra("train"):
-        from pixelbrax_gym.generalisation.evaluation import scores_of
         from pixelbrax_gym.generalisation.scores import RETURNS, ROWS, SHEET, play
         from pixelbrax_jax.generalisation.making import make_levels
-        from pixelbrax_jax.generalisation.suites import SUITES
 
     report = partial(say, "evaluate")
     config = next(iter(agents.values())).algorithm.config.env
-    episodes = SUITES[suite].episodes if episodes is None else episodes
     levels = make_levels(config, suite, episodes, options.clips, report)
     _check_new_clips(agents, levels, report)
     report(f"{len(levels.levels)} levels in {levels.num_programs} programs")
-    scores = scores_of(config, suite, levels)
-    players = {name: _player(agent, episodes) for name, agent in agents.items()}
-    play(levels, players, scores, output_dir, report)
+    players = {name: partial(_returns, agent, levels.episodes) for name, agent in agents.items()}
+    scores = play(levels, players, output_dir, report)
     if output_dir is not None:
         report(f"wrote {RETURNS}, {ROWS} and {SHEET} in {output_dir}")
     return scores.markdown()
@@ -90,14 +85,11 @@ def _name(agent: Trained) -> str:
     return type(agent.algorithm).__name__
 
 
-def _player(agent: Trained, episodes: int) -> Player:
+def _returns(agent: Trained, episodes: int, level: LevelEnv) -> np.ndarray:
     from pixelbrax_jax.agents.runner.evaluate import Evaluator
 
-    def play(level: LevelEnv) -> np.ndarray:
-        evaluator = Evaluator(agent.algorithm, level.env, level.params, num_episodes=episodes)
-        return evaluator(agent.networks).returns
-
-    return play
+    evaluator = Evaluator(agent.algorithm, level.env, level.params, num_episodes=episodes)
+    return evaluator(agent.networks).returns
 
 
 def _check_new_clips(

@@ -96,7 +96,7 @@ def _played(agent: Trained, options: Options) -> tuple[Any, str, dict[str, Any]]
     """Return the agent's policy, its name and the options of its environment."""
     import jax
 
-    from pixelbrax_gym.generalisation.evaluation import LEFT_OUT
+    from pixelbrax_gym.generalisation.scores import LEFT_OUT
     from pixelbrax_jax.config import ENV_OPTIONS
 
     config, algorithm = agent.algorithm.config.env, agent.algorithm

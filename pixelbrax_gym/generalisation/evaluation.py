@@ -3,26 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from os import PathLike
 from typing import Any
 
 import jax
 import numpy as np
 
-from pixelbrax_gym.generalisation.scores import Player, Scores, play
+from pixelbrax_gym.generalisation.scores import LEFT_OUT, Scores, play
 from pixelbrax_gym.gymnasium.vector_env import GymnasiumVectorEnv
-from pixelbrax_jax import EnvConfig, VectorPixelEnv
+from pixelbrax_jax import EnvParams, VectorPixelEnv
 from pixelbrax_jax.config import ENV_OPTIONS, env_config
 from pixelbrax_jax.flags import default_flags
 from pixelbrax_jax.generalisation.making import LevelEnv, Levels, make_levels
 from pixelbrax_jax.generalisation.suites import EPISODES, SUITES
-from pixelbrax_jax.plain import to_plain
 from pixelbrax_jax.validation import check_choice
 
 Policy = Callable[[Any], Any]
-
-LEFT_OUT = ("task", "clips", "split", "distractors", "dynamics")
-"""Options that a suite decides."""
 
 
 def evaluate_suite(
@@ -73,45 +70,48 @@ def evaluate_suite(
     if own := [name for name in LEFT_OUT if name in options]:
         raise TypeError(f"{own[0]} is decided by the levels of a suite; leave it out.")
     config = env_config(task, options, ("episodes", "clips", "output", "output_dir", "report"))
-    episodes = SUITES[suite].episodes if episodes is None else episodes
     levels = make_levels(config, suite, episodes, clips, report)
-    scores = scores_of(config, suite, levels)
-    envs = _Envs(config, levels, output)
-
-    def player(one: Policy) -> Player:
-        return lambda level: envs.play(level, one)
-
-    players = {name: player(one) for name, one in policies.items()}
-    return play(levels, players, scores, output_dir, report)
+    envs = _Envs(levels, output)
+    players = {name: partial(envs.play, policy=one) for name, one in policies.items()}
+    return play(levels, players, output_dir, report)
 
 
-def scores_of(config: EnvConfig, suite: str, levels: Levels) -> Scores:
-    """Return scores without returns, with all that decides them but the policy."""
-    options = {name: to_plain(getattr(config, name)) for name in ENV_OPTIONS}
-    for name in LEFT_OUT:
-        del options[name]
-    if not config.camera_sizes:
-        del options["camera_sizes"]  # files of releases without it go on
-    bank = levels.bank
-    shown = None if bank is None else f"{len(bank.names)} clips, {bank.digest[:16]}"
-    options |= {"episodes": levels.episodes, "clips": shown}
-    return Scores(suite, config.task, options)
+def make_envs(
+    levels: Levels, one: LevelEnv, num_envs: int, output: str, **changes: Any
+) -> GymnasiumVectorEnv:
+    """Make the vector environment of a level with some options changed."""
+    options: dict[str, Any] = {
+        name: getattr(levels.config, name) for name in ENV_OPTIONS if name not in LEFT_OUT
+    }
+    options["distractors"] = one.env.distractors
+    options["clips"] = levels.bank if one.level.clips else None
+    return GymnasiumVectorEnv(levels.config.task, num_envs, output=output, **options | changes)
+
+
+def begin(envs: GymnasiumVectorEnv, keys: jax.Array, params: EnvParams) -> Any:
+    """Start the episodes of these keys, or of one for all, and return the observations."""
+    # Levels differ in the parameters that a vector environment passes to its programs.
+    envs._stateful.params = params
+    state, _ = VectorPixelEnv(envs._stateful.env, envs.num_envs).reset(keys, params)
+    return envs.reset(options={"state": state})[0]
 
 
 class _Envs:
     """Vector environments of a suite's levels; levels with one program share one."""
 
-    def __init__(self, config: EnvConfig, levels: Levels, output: str) -> None:
-        self._config, self._levels, self._output = config, levels, output
+    def __init__(self, levels: Levels, output: str) -> None:
+        self._levels, self._output = levels, output
         self._made: dict[Any, GymnasiumVectorEnv] = {}
 
     def play(self, one: LevelEnv, policy: Policy) -> np.ndarray:
         """Play the episodes of a level; return their (E,) returns."""
-        envs, num = self._envs(one), self._levels.episodes
+        num = self._levels.episodes
+        if one.env not in self._made:
+            self._made[one.env] = make_envs(self._levels, one, num, self._output)
+        envs = self._made[one.env]
         with default_flags():
             key = jax.random.key(EPISODES)
-        state, _ = VectorPixelEnv(one.env, num).reset(key, one.params)
-        obs, _ = envs.reset(options={"state": state})
+        obs = begin(envs, key, one.params)
         shape = (num, one.env.action_size)
         over, returns = np.zeros(num, bool), np.zeros(num)
         while not over.all():
@@ -121,20 +121,6 @@ class _Envs:
             returns = np.where(over, returns, numpy_of(infos["episode_return"]))
             over |= numpy_of(terminated) | numpy_of(truncated)
         return returns
-
-    def _envs(self, one: LevelEnv) -> GymnasiumVectorEnv:
-        envs = self._made.get(one.env)
-        if envs is None:
-            options = {name: getattr(self._config, name) for name in ENV_OPTIONS if name != "task"}
-            options |= {"distractors": one.env.distractors, "split": "train", "dynamics": ""}
-            options["clips"] = self._levels.bank if one.level.clips else None
-            envs = GymnasiumVectorEnv(
-                self._config.task, self._levels.episodes, output=self._output, **options
-            )
-            self._made[one.env] = envs
-        # Levels differ in the parameters that a vector environment passes to its programs.
-        envs._stateful.params = one.params
-        return envs
 
 
 def checked(actions: Any, shape: tuple[int, ...]) -> Any:

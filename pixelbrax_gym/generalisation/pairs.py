@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
@@ -15,19 +16,13 @@ import gymnasium as gym
 import jax
 import numpy as np
 
-from pixelbrax_gym.generalisation.evaluation import (
-    LEFT_OUT,
-    Policy,
-    checked,
-    numpy_of,
-    scores_of,
-)
-from pixelbrax_gym.gymnasium.vector_env import GymnasiumVectorEnv
-from pixelbrax_jax import EnvConfig, VectorPixelEnv
-from pixelbrax_jax.config import ENV_OPTIONS, env_config
+from pixelbrax_gym.generalisation.evaluation import Policy, begin, checked, make_envs, numpy_of
+from pixelbrax_gym.generalisation.scores import LEFT_OUT, options_of
+from pixelbrax_jax import VectorPixelEnv
+from pixelbrax_jax.config import env_config
 from pixelbrax_jax.extras import needs_extra
 from pixelbrax_jax.flags import default_flags
-from pixelbrax_jax.generalisation.making import Levels, make_levels
+from pixelbrax_jax.generalisation.making import UNDISTURBED, Levels, make_levels
 from pixelbrax_jax.generalisation.suites import EPISODES, SUITES
 from pixelbrax_jax.validation import check_choice, check_positive_int
 
@@ -113,12 +108,12 @@ def record_pairs(
     config = env_config(task, options, (*reserved, "output", "report"))
     if config.camera_sizes:
         raise ValueError("camera_sizes cannot be recorded: leave them out; use height and width.")
-    episodes = SUITES[suite].episodes if episodes is None else episodes
     levels = make_levels(config, suite, episodes, clips, report, only=level)
-    num_envs = min(check_positive_int("num_envs", num_envs), levels.episodes)
-    pairs = _Pairs(config, levels, images, num_envs, output)
-    settings = scores_of(config, suite, levels).options | {
-        "task": config.task,
+    episodes = levels.episodes
+    num_envs = min(check_positive_int("num_envs", num_envs), episodes)
+    pairs = _Pairs(levels, images, num_envs, output)
+    settings = options_of(levels) | {
+        "task": levels.config.task,
         "suite": suite,
         "level": level,
         "images": list(images),
@@ -144,27 +139,15 @@ def record_pairs(
 class _Pairs:
     """The environments of both views, stepped by the same actions; ``spaces`` are of one frame."""
 
-    def __init__(
-        self,
-        config: EnvConfig,
-        levels: Levels,
-        images: tuple[str, ...],
-        num_envs: int,
-        output: str,
-    ) -> None:
+    def __init__(self, levels: Levels, images: tuple[str, ...], num_envs: int, output: str) -> None:
         (self._one,) = levels.levels
         self._levels, self._num_envs = levels, num_envs
-        shared: dict[str, Any] = {n: getattr(config, n) for n in ENV_OPTIONS if n not in LEFT_OUT}
-        make = partial(GymnasiumVectorEnv, config.task, num_envs, output=output)
-        shown = "+".join(("pixels", *images, "state"))
-        clean = make(**shared | {"obs_mode": shown})
-        shared |= {"distractors": self._one.env.distractors}
-        if levels.bank is not None:
-            shared |= {"clips": levels.bank, "split": "train"}
-        self._envs = {"clean": clean, "level": make(**shared)}
+        make = partial(make_envs, levels, self._one, num_envs, output)
+        clean = make(**UNDISTURBED, obs_mode="+".join(("pixels", *images, "state")))
+        self._envs = {"clean": clean, "level": make()}
         stacks: Any = clean.single_observation_space
         stacks = {**stacks.spaces, "pixels_level": self._envs["level"].single_observation_space}
-        frames = {n: 1 if n == "state" else config.frame_stack for n in stacks}
+        frames = {n: 1 if n == "state" else levels.config.frame_stack for n in stacks}
         self.spaces = {n: _one_frame(space, frames[n]) for n, space in stacks.items()}
         self.action_space: Any = clean.single_action_space
         self._num_steps = clean._stateful.max_episode_steps
@@ -228,13 +211,12 @@ class _Pairs:
         """Start the episodes with these numbers; return both observations."""
         with default_flags():
             keys = VectorPixelEnv.env_keys(jax.random.key(EPISODES), self._levels.episodes)[index]
-        self._envs["level"]._stateful.params = self._levels.params_of(self._one, index)
-        found = {}
-        for name, envs in self._envs.items():
-            env, params = envs._stateful.env, envs._stateful.params
-            state, _ = VectorPixelEnv(env, self._num_envs).reset(keys, params)
-            found[name] = envs.reset(options={"state": state})[0]
-        return found
+        clean, level = self._envs.values()
+        params = self._levels.params_of(self._one, index)
+        return {
+            "clean": begin(clean, keys, clean._stateful.params),
+            "level": begin(level, keys, params),
+        }
 
     def _frames(self, obs: dict[str, Any]) -> dict[str, np.ndarray]:
         """Return the newest frame of each image, and the state."""
@@ -281,7 +263,8 @@ def _storage(folder: Path, pairs: _Pairs, settings: dict[str, Any]) -> Any:
         data_format="parquet",
         jpeg_encoding=False,
     )
-    name = "-".join([settings["task"], settings["suite"], settings["level"]])
+    # Minari's ids have no dots and colons.
+    name = re.sub(r"[^-\w]", "-", "-".join(settings[n] for n in ("task", "suite", "level")))
     storage.update_metadata(
         {
             "dataset_id": f"pixelbrax/{name}-v0",

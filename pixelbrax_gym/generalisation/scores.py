@@ -16,21 +16,23 @@ import numpy as np
 
 from pixelbrax_gym.bench.tables import table
 from pixelbrax_jax.cache import replacing
+from pixelbrax_jax.config import ENV_OPTIONS
 from pixelbrax_jax.generalisation.frames import write_sheet
 from pixelbrax_jax.generalisation.intervals import interquartile_mean
-from pixelbrax_jax.generalisation.making import LevelEnv, Levels
+from pixelbrax_jax.generalisation.making import UNDISTURBED, LevelEnv, Levels
+from pixelbrax_jax.plain import to_plain
 
 RETURNS, ROWS, SHEET = "returns.json", "table.csv", "levels.png"
 """Files in the output folder."""
+
+LEFT_OUT = ("task", *UNDISTURBED)
+"""Options that a suite decides."""
 
 ALL = "all but clean"
 """Name of the last row, of all levels but the first."""
 
 Returns = dict[str, dict[str, list[float]]]
 """The returns of episodes by run and level."""
-
-Player = Callable[[LevelEnv], np.ndarray]
-"""Plays the episodes of a level; returns their (E,) returns."""
 
 
 @dataclass(frozen=True)
@@ -119,18 +121,27 @@ def _text(value: float, digits: int) -> str:
     return "" if math.isnan(value) else f"{value:.{digits}f}"
 
 
+def options_of(levels: Levels) -> dict[str, Any]:
+    """Return all that decides the returns of a policy but suite and task, as JSON values."""
+    names = [name for name in ENV_OPTIONS if name not in LEFT_OUT]
+    options = {name: to_plain(getattr(levels.config, name)) for name in names}
+    bank = levels.bank
+    shown = None if bank is None else f"{len(bank.names)} clips, {bank.digest[:16]}"
+    return options | {"episodes": levels.episodes, "clips": shown}
+
+
 def play(
     levels: Levels,
-    players: Mapping[str, Player],
-    scores: Scores,
-    folder: str | PathLike[str] | None = None,
-    report: Callable[[str], object] = lambda _: None,
+    players: Mapping[str, Callable[[LevelEnv], np.ndarray]],
+    folder: str | PathLike[str] | None,
+    report: Callable[[str], object],
 ) -> Scores:
-    """Play all levels with all runs; ``scores`` has the options and no returns.
+    """Play all levels with all runs, functions that return the (E,) returns of a level.
 
     The folder gets the contact sheet first and the returns after each level; levels whose returns
     it has are not played again.
     """
+    scores = Scores(levels.suite, levels.config.task, options_of(levels))
     path = None if folder is None else Path(folder)
     known: Returns = {}
     if path is not None:
@@ -166,7 +177,7 @@ def read(scores: Scores, folder: Path) -> Returns:
         return {}
     try:
         found = json.loads(file.read_text("utf-8"))
-        returns = found["returns"]
+        returns, _ = found["returns"], found["options"]
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{file} has no returns of a suite; choose another folder.") from error
     wanted = json.loads(_json(scores, {}))

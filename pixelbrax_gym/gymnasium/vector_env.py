@@ -211,7 +211,7 @@ class GymnasiumVectorEnv(StatefulAdapter, gymnasium.vector.VectorEnv):
         if len(each) != self.num_envs:
             raise ValueError(f"expected one value for each of {self.num_envs}, got {len(each)}.")
         for sub_env, value in zip(self._sub_envs, each, strict=True):
-            sub_env.set_wrapper_attr(name, value)
+            setattr(sub_env, name, value)
 
     def close_extras(self, **kwargs: Any) -> None:
         """Release the states."""

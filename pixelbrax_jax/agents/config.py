@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, fields, replace
-from functools import partial
-from numbers import Real
 from typing import Annotated, Any, ClassVar, Self, get_type_hints
 
 import numpy as np
@@ -21,32 +18,20 @@ from pixelbrax_jax.types import EnvParams
 from pixelbrax_jax.validation import (
     check_choice,
     check_count,
+    check_finite,
     check_fraction,
+    check_not_negative,
     check_options,
+    check_positive,
     check_positive_int,
 )
-
-
-def check_positive(name: str, value: object, or_zero: bool = False) -> None:
-    """Raise a ValueError unless the setting is positive (or zero) and finite."""
-    known = isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
-    if not (known and (value > 0 or (or_zero and value == 0))):  # type: ignore[operator]
-        wanted = "a number of at least 0" if or_zero else "a positive number"
-        raise ValueError(f"{name} must be {wanted}, got {value!r}.")
-
-
-def check_finite(name: str, value: object) -> None:
-    """Raise a ValueError unless the setting is a finite number."""
-    if not isinstance(value, Real) or isinstance(value, bool) or not math.isfinite(value):
-        raise ValueError(f"{name} must be a finite number, got {value!r}.")
-
 
 PositiveInt = Annotated[int, check_positive_int]
 Count = Annotated[int, check_count]
 Fraction = Annotated[float, check_fraction]
 Finite = Annotated[float, check_finite]
 Positive = Annotated[float, check_positive]
-NotNegative = Annotated[float, partial(check_positive, or_zero=True)]
+NotNegative = Annotated[float, check_not_negative]
 
 
 def check_annotated(settings: Any) -> None:

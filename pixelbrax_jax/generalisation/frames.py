@@ -9,7 +9,6 @@ import numpy as np
 
 from pixelbrax_jax.compilation import jit
 from pixelbrax_jax.distractors.contact_sheet import labelled
-from pixelbrax_jax.envs.param_rows import split_params
 from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.flags import default_flags
@@ -21,28 +20,22 @@ _SMALLEST = 168
 """Least height of a frame in pixels; smaller images are rendered larger by a whole factor."""
 
 
-def first_frames(levels: Levels) -> dict[str, np.ndarray]:
-    """Render the first frame of episode 0 of each level, (H, W, 3) uint8 by name."""
+def write_sheet(levels: Levels, path: str | Path) -> None:
+    """Write an image with the first frame of each level; raise an ImportError without Pillow."""
     with default_flags():
         key = VectorPixelEnv.env_keys(jax.random.key(EPISODES), 1)[0]
     frames = {}
     for one in levels.levels:
-        rows = split_params(one.params, levels.episodes)
-        params = rows.join([leaf[0] for leaf in rows.own])
         factor = max(1, -(-_SMALLEST // one.env.height))
         size = factor * one.env.height, factor * one.env.width
+        params = levels.params_of(one, 0)
         frames[one.level.name] = np.asarray(_first_frame(one.env, key, params, *size))
-    return frames
+    labelled(frames).save(path)
 
 
-@jit(lambda env: env, static_argnums=(0, 3, 4))
+@jit(static_argnums=(0, 3, 4))
 def _first_frame(
     env: PixelEnv, key: jax.Array, params: EnvParams, height: int, width: int
 ) -> jax.Array:
     state, _ = env.reset(key, params)
     return env.image(state, params, height, width)
-
-
-def write_sheet(levels: Levels, path: str | Path) -> None:
-    """Write an image with the first frame of each level; raise an ImportError without Pillow."""
-    labelled(first_frames(levels)).save(path)

@@ -23,11 +23,14 @@ from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.flags import default_flags
 from pixelbrax_jax.generalisation.changes import Change, changes_params_alone
-from pixelbrax_jax.generalisation.suites import EPISODES, Level, levels_of
+from pixelbrax_jax.generalisation.suites import EPISODES, SUITES, Level, levels_of
 from pixelbrax_jax.registry import find_task
 from pixelbrax_jax.scene.cameras import seen_from
 from pixelbrax_jax.types import EnvParams
 from pixelbrax_jax.validation import check_choice, check_positive_int
+
+UNDISTURBED: dict[str, Any] = {"distractors": (), "clips": None, "split": "train", "dynamics": ""}
+"""Options without distractors and varied dynamics; a suite decides them."""
 
 _EPISODE = 2**32 - 1
 """Index of the episode whose keys draw the levels' parameters; no training reaches it."""
@@ -53,24 +56,22 @@ class LevelEnv:
     env: PixelEnv
     params: EnvParams
 
-    @property
-    def program(self) -> Any:
-        """A value that is equal for levels that share compiled programs."""
-        leaves, tree = jax.tree.flatten(self.params)
-        return self.env, tree, tuple(np.shape(leaf) for leaf in leaves)
-
 
 @dataclass(frozen=True, eq=False)
 class Levels:
     """The levels of a suite, ready to be played, and the clips that they show.
 
     Attributes:
+        config: the task and the options that the suite does not decide.
+        suite: name of the suite.
         levels: in the order of the suite.
         episodes: number E of episodes, rows of the parameters.
         bank: the clips of all levels; None without any.
         splits: range of the clips of each split in the bank.
     """
 
+    config: EnvConfig
+    suite: str
     levels: tuple[LevelEnv, ...]
     episodes: int
     bank: ClipBank | None
@@ -79,10 +80,11 @@ class Levels:
     @property
     def num_programs(self) -> int:
         """Number of different programs."""
-        return len({level.program for level in self.levels})
+        flat = [(one.env, *jax.tree.flatten(one.params)) for one in self.levels]
+        return len({(env, tree, *map(np.shape, leaves)) for env, leaves, tree in flat})
 
-    def params_of(self, level: LevelEnv, index: np.ndarray) -> EnvParams:
-        """Return the parameters of the episodes with these numbers (M,), a row for each."""
+    def params_of(self, level: LevelEnv, index: Any) -> EnvParams:
+        """Return the parameters of an episode, or of those with numbers (M,), a row for each."""
         rows = split_params(level.params, self.episodes)
         return rows.join([own[index] for own in rows.own])
 
@@ -91,7 +93,7 @@ class Levels:
 def make_levels(
     config: EnvConfig,
     suite: str,
-    episodes: int,
+    episodes: int | None = None,
     clips: str | PathLike[str] | None = None,
     report: Callable[[str], object] = lambda _: None,
     only: str | None = None,
@@ -105,9 +107,10 @@ def make_levels(
     """
     if config.obs_mode == "state":
         raise ValueError("a suite changes the image, but obs_mode='state' shows none; take pixels.")
-    episodes = check_positive_int("episodes", episodes)
     config = replace(config, task=find_task(config.task))
     levels = levels_of(suite, config.task)
+    episodes = SUITES[suite].episodes if episodes is None else episodes
+    episodes = check_positive_int("episodes", episodes)
     if only is not None:
         check_choice("level", only, [level.name for level in levels])
         levels = tuple(level for level in levels if level.name == only)
@@ -133,18 +136,14 @@ def make_levels(
             shown = list(splits[split])[: level.num_clips]
             of_level = of_level.replace(clips=_show(base.clips, shown, level.in_order, keys))
         ready.append(LevelEnv(level, env, jax.device_put(of_level)))
-    return Levels(tuple(ready), episodes, bank, splits)
+    return Levels(config, suite, tuple(ready), episodes, bank, splits)
 
 
 def _make(config: EnvConfig, level: Level, bank: ClipBank | None) -> tuple[PixelEnv, EnvParams]:
     links = [link for link in level.changes if isinstance(link, Distractor)]
-    return make(
-        config,
-        distractors=tuple(link for link in links if not changes_params_alone(link)),
-        clips=bank if level.clips else None,
-        split="train",
-        dynamics="",
-    )
+    own = tuple(link for link in links if not changes_params_alone(link))
+    shown = {"distractors": own, "clips": bank if level.clips else None}
+    return make(config, **UNDISTURBED | shown)
 
 
 def _draw(changes: Sequence[Change | Distractor], base: EnvParams, keys: jax.Array) -> EnvParams:

@@ -126,9 +126,11 @@ def test_the_command_records_agents_and_random_actions(tmp_path, monkeypatch, ca
 
 
 def test_the_example_reads_the_state_of_clean_images_alone(tmp_path, monkeypatch, capsys):
-    more = suites.Suite(lambda _: (suites.Level("painted", (BodyColor(0.5),)),), 40, "tests")
+    more = suites.Suite(lambda _: (suites.Level("painted-0.5", (BodyColor(0.5),)),), 40, "tests")
     monkeypatch.setitem(suites.SUITES, "tiny", more)
-    record(tmp_path, None, level="painted", num_envs=40, episode_length=20)
+    record(tmp_path, None, level="painted-0.5", num_envs=40, episode_length=20)
+    # Minari refuses a name with a dot.
+    assert minari.MinariDataset(tmp_path).spec.dataset_id.endswith("-tiny-painted-0-5-v0")
     probe = load("linear_probe").main([str(tmp_path), "--cells", "18", "--ridge", "0.01"])
     clean, level = probe["pixels"], probe["pixels_level"]
     assert clean[0] > 0.9, "the position of the ball"

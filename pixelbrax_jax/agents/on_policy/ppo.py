@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import jax
 
-from pixelbrax_jax.agents.config import NotNegative, PositiveInt, TrainConfig, check_positive
+from pixelbrax_jax.agents.config import NotNegative, PositiveInt, TrainConfig
 from pixelbrax_jax.agents.networks.actor_critic import ActorCritic
 from pixelbrax_jax.agents.on_policy.algorithm import Experience, OnPolicy, OnPolicyState
 from pixelbrax_jax.agents.on_policy.config import OnPolicyConfig
@@ -19,7 +19,7 @@ from pixelbrax_jax.agents.on_policy.losses import (
     value_loss,
 )
 from pixelbrax_jax.agents.train_state import UPDATES, Metrics, Networks, stream_key
-from pixelbrax_jax.validation import check_choice
+from pixelbrax_jax.validation import check_choice, check_positive
 
 LAYOUTS = ("separate", "shared")
 

@@ -62,7 +62,7 @@ class Evaluator:
         return Result(returns=returns.astype(np.float64), lengths=lengths)
 
 
-@jit(lambda envs: envs.env, static_argnums=(0, 1))
+@jit(static_argnums=(0, 1))
 def _play(
     envs: VectorPixelEnv, algorithm: Player, networks: Networks, params: EnvParams
 ) -> tuple[jax.Array, jax.Array]:

@@ -21,10 +21,6 @@ from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.types import EnvParams
 
 
-def _env(runs: Runs) -> Any:
-    return runs.algorithm.envs.env
-
-
 @dataclass(frozen=True)
 class Runs:
     """``num_seeds`` runs of an algorithm; equal objects share compiled programs.
@@ -36,7 +32,12 @@ class Runs:
     algorithm: Algorithm
     num_seeds: int = 1
 
-    @jit(_env, static_argnums=0)
+    @property
+    def env(self) -> Any:
+        """The environment, whose compiler options the programs have."""
+        return self.algorithm.envs.env
+
+    @jit(static_argnums=0)
     def init(self, seed: jax.Array, env_params: EnvParams) -> TrainState:
         """Return the initial state; the runs have consecutive seeds."""
         return self._spread(self._init(seed, env_params), {})[0]
@@ -53,12 +54,12 @@ class Runs:
 
     # An iteration reuses the memory of the previous state.
 
-    @jit(_env, static_argnums=0, donate_argnums=1)
+    @jit(static_argnums=0, donate_argnums=1)
     def iterate(self, state: TrainState, env_params: EnvParams) -> tuple[TrainState, Metrics]:
         """See ``Algorithm.iterate``."""
         return self._spread(*self._each(self.algorithm.iterate, state, env_params))
 
-    @jit(_env, static_argnums=0, donate_argnums=1)
+    @jit(static_argnums=0, donate_argnums=1)
     def auxiliary(self, state: TrainState) -> tuple[TrainState, Metrics]:
         """See ``Algorithm.auxiliary``."""
         return self._spread(*self._each(self.algorithm.auxiliary, state))

@@ -11,6 +11,7 @@ from pixelbrax_jax.agents.runner.settings import clip_digests
 from pixelbrax_jax.distractors.presets import resolve
 from pixelbrax_jax.distractors.video import Video
 from pixelbrax_jax.envs.pixel_env import PixelEnv
+from pixelbrax_jax.generalisation.making import UNDISTURBED
 from pixelbrax_jax.types import EnvParams
 from pixelbrax_jax.validation import check_choice
 
@@ -18,14 +19,6 @@ SPLITS = ("clean", "train", "test")
 
 HELD_OUT = {"train": "test", "paper-train": "paper-test"}
 """Test split of each training split; others serve for both, with test clips of another folder."""
-
-CLEAN: dict[str, Any] = {
-    "distractors": (),
-    "clips": None,
-    "split": "train",
-    "dynamics": "",
-}
-"""Options that remove all distractors from an environment, and varied dynamics."""
 
 
 class NoSplitError(ValueError):
@@ -91,7 +84,7 @@ def make_split(
             f"{', '.join(map(repr, names))}."
         )
     if name == "clean":
-        return _make(config, **CLEAN)
+        return _make(config, **UNDISTURBED)
     if name == "train":
         env, params = _make(config)
         if shown and clip_digests(params.clips) != list(shown):

@@ -27,12 +27,13 @@ from pixelbrax_jax.agents.runner.settings import (
     former_settings,
     unknown_settings,
 )
-from pixelbrax_jax.agents.runner.splits import CLEAN, plays_clips
+from pixelbrax_jax.agents.runner.splits import plays_clips
 from pixelbrax_jax.agents.train_state import Networks
 from pixelbrax_jax.cache import replacing
 from pixelbrax_jax.distractors.presets import as_tuple
 from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.flags import under_default_flags
+from pixelbrax_jax.generalisation.making import UNDISTURBED
 from pixelbrax_jax.policy import Policy, load_policy, read_pretrained
 
 
@@ -96,7 +97,7 @@ def load_trained(
     if not 0 <= run < num_seeds:
         raise ValueError(f"run must be from 0 to {num_seeds - 1}, got {run}.")
     # The networks depend on the observations of training, which may include the state.
-    env, params = make_env(config, **CLEAN)
+    env, params = make_env(config, **UNDISTURBED)
     algorithm = ALGORITHMS[about["algorithm"]](config, VectorPixelEnv(env, config.num_envs))
     runs = Runs(algorithm, num_seeds)
     template = runs.template(params).networks

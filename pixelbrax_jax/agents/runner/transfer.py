@@ -17,7 +17,7 @@ from pixelbrax_jax.compilation import jit
 from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.generalisation.suites import EPISODES
-from pixelbrax_jax.types import EnvParams, EnvState, Timestep
+from pixelbrax_jax.types import EnvParams
 
 
 def play_in(
@@ -57,7 +57,7 @@ def play_in(
 
     for episode, key in enumerate(keys):
         frames: deque[np.ndarray] = deque(maxlen=env.frame_stack)
-        state = _reset(bare, key, params)
+        state, _ = _reset(bare, key, params)
         simulator.start(state.sim.physics)
         over = False
         while not over:
@@ -78,24 +78,15 @@ def play_in(
     return Result(returns=returns, lengths=lengths)
 
 
-@jit(lambda _: None, static_argnums=0)
+@jit(static_argnums=0)
 def _act(player: Player, networks: Networks, obs: Any) -> jax.Array:
     return player.act(networks, obs)
 
 
-@jit(lambda env: env, static_argnums=0)
-def _reset(env: PixelEnv, key: jax.Array, params: EnvParams) -> EnvState:
-    return env.reset(key, params)[0]
+_reset, _step = (jit(static_argnums=0)(method) for method in (PixelEnv.reset, PixelEnv.step))
 
 
-@jit(lambda env: env, static_argnums=0)
-def _step(
-    env: PixelEnv, state: EnvState, action: np.ndarray, params: EnvParams
-) -> tuple[EnvState, Timestep]:
-    return env.step(state, action, params)
-
-
-@jit(lambda env: env, static_argnums=0)
+@jit(static_argnums=0)
 def _draw(env: PixelEnv, qpos: Any, qvel: Any, key: jax.Array, params: EnvParams) -> jax.Array:
     """Draw our picture of a pose, with the target of the episode that ``key`` begins."""
     state, _ = replace(env, obs_mode="state").from_qpos(qpos, qvel, key, params)
