@@ -13,21 +13,14 @@ _FIX = (
 )
 
 
-class _Process:
-    forked = False
-
-
-def _jax_runs() -> bool:
-    bridge = sys.modules.get("jax._src.xla_bridge")
-    if bridge is None:
-        return False
-    # JAX has no public function for this. Without this one, assume that JAX runs.
-    started = getattr(bridge, "backends_are_initialized", None)
-    return True if started is None else bool(started())
+_forked = False
 
 
 def _mark_child() -> None:
-    _Process.forked = _Process.forked or _jax_runs()
+    global _forked
+    bridge = sys.modules.get("jax._src.xla_bridge")
+    # JAX has no public function for this.
+    _forked = _forked or (bridge is not None and bridge.backends_are_initialized())
 
 
 if hasattr(os, "register_at_fork"):  # not on Windows, which cannot fork
@@ -36,10 +29,10 @@ if hasattr(os, "register_at_fork"):  # not on Windows, which cannot fork
 
 def is_forked() -> bool:
     """Return whether this process was forked after JAX had started."""
-    return _Process.forked
+    return _forked
 
 
 def check_not_forked() -> None:
     """Raise a RuntimeError in a forked process in which JAX would hang."""
-    if _Process.forked:
+    if _forked:
         raise RuntimeError(_FIX)

@@ -17,7 +17,7 @@ from jax.extend import core
 from jax.sharding import AxisType
 
 from pixelbrax_jax._platform.by_platform import num_varying
-from pixelbrax_jax._platform.rules import bind, row_aval, split_scan
+from pixelbrax_jax._platform.programs import bind, interpret, split_scan
 
 _MOST_ROWS = 64
 """Largest number of rows, and of indices, that become slices."""
@@ -28,7 +28,7 @@ _KNOWN_LATER = {"by_platform", "platform_index"}
 _UNKNOWN = object()
 
 
-class _Known(NamedTuple):
+class _Found(NamedTuple):
     """Results of an equation; None for those that no equation of the program reads."""
 
     results: list[Any]
@@ -40,7 +40,7 @@ class _Inner(NamedTuple):
     plan: _Plan
 
 
-_Plan = list[_Known | _Inner | None]
+_Plan = list[_Found | _Inner | None]
 """One entry for each equation of a program; None if it is neither known nor contains a program."""
 
 
@@ -64,7 +64,7 @@ def fold(function: Callable[..., Any]) -> Callable[..., Any]:
         # user's mistakes, went through `make_jaxpr` above.
         try:
             # In one program: one for each result would take seconds to compile.
-            plan = jax.jit(lambda: _plan(closed, leaves)).lower().compile()()
+            plan = jax.jit(lambda: _plan(closed, [*map(_known, leaves)])[0]).lower().compile()()
             results = _evaluate(closed, leaves, plan)
         except Exception as error:
             warnings.warn(
@@ -80,71 +80,49 @@ def fold(function: Callable[..., Any]) -> Callable[..., Any]:
     return folded
 
 
-def _plan(closed: core.ClosedJaxpr, operands: Sequence[Any]) -> _Plan:
-    """Return what is known of a program's equations, given the operands that are no tracers."""
-
-    def mark(values: Sequence[Any]) -> list[Any]:
-        return [_UNKNOWN if isinstance(x, jax.core.Tracer) else x for x in values]
-
-    return _walk(closed.jaxpr, mark(closed.consts), mark(operands))[0]
+def _known(x: Any) -> Any:
+    return _UNKNOWN if isinstance(x, jax.core.Tracer) else x
 
 
-def _walk(
-    jaxpr: core.Jaxpr, consts: Sequence[Any], operands: Sequence[Any]
-) -> tuple[_Plan, list[Any]]:
-    """Return the plan, and the results, some of which are ``_UNKNOWN``."""
-    values, plan = _given(jaxpr, consts, operands), []
-    read_later = {id(atom) for atom in jaxpr.outvars}
-    for eqn in jaxpr.eqns:
-        inputs = [_read(values, atom) for atom in eqn.invars]
+def _plan(closed: core.ClosedJaxpr, operands: Sequence[Any]) -> tuple[_Plan, list[Any]]:
+    """Return the plan of a program, and its results, some of which are ``_UNKNOWN``."""
+    plan: _Plan = []
+    read_later = {id(atom) for atom in closed.jaxpr.outvars}
+
+    def apply(eqn: core.JaxprEqn, inputs: list[Any]) -> list[Any]:
         results = [_UNKNOWN] * len(eqn.outvars)
-        entry: _Known | _Inner | None = None
+        entry: _Found | _Inner | None = None
         if not any(x is _UNKNOWN for x in inputs) and _may_be_known(eqn):
-            with eqn.ctx.manager:
-                results = bind(eqn, *inputs)
-            entry = _Known(results)
+            results = bind(eqn, *inputs)
+            entry = _Found(results)
         elif eqn.primitive.name == "jit":
-            inner = eqn.params["jaxpr"]
-            with eqn.ctx.manager:
-                found, results = _walk(inner.jaxpr, inner.consts, inputs)
+            found, results = _plan(eqn.params["jaxpr"], inputs)
             entry = _Inner(found)
         elif eqn.primitive.name == "scan":
-            inner, (known, carry, xs) = eqn.params["jaxpr"], split_scan(eqn.params, inputs)
+            consts, carry, xs = split_scan(eqn.params, inputs)
             others = [_UNKNOWN] * len([*carry, *xs])
-            entry = _Inner(_walk(inner.jaxpr, inner.consts, [*known, *others])[0])
-        if not isinstance(entry, _Known):
+            entry = _Inner(_plan(eqn.params["jaxpr"], [*consts, *others])[0])
+        if not isinstance(entry, _Found):
             read_later.update(map(id, eqn.invars))
         plan.append(entry)
-        values.update(zip(eqn.outvars, results, strict=True))
-    for i, (eqn, entry) in enumerate(zip(jaxpr.eqns, plan, strict=True)):
-        if isinstance(entry, _Known):
+        return results
+
+    results = interpret(closed, operands, apply, _known)
+    for i, (eqn, entry) in enumerate(zip(closed.jaxpr.eqns, plan, strict=True)):
+        if isinstance(entry, _Found):
             pairs = zip(eqn.outvars, entry.results, strict=True)
-            plan[i] = _Known([x if id(var) in read_later else None for var, x in pairs])
-    return plan, [_read(values, atom) for atom in jaxpr.outvars]
+            plan[i] = _Found([x if id(var) in read_later else None for var, x in pairs])
+    return plan, results
 
 
 def _evaluate(closed: core.ClosedJaxpr, operands: Sequence[Any], plan: _Plan) -> list[Any]:
-    values = _given(closed.jaxpr, closed.consts, operands)
-    for eqn, entry in zip(closed.jaxpr.eqns, plan, strict=True):
-        if isinstance(entry, _Known):
-            results = entry.results
-        else:
-            inputs = [_read(values, atom) for atom in eqn.invars]
-            with eqn.ctx.manager:
-                results = _apply(eqn, inputs, entry)
-        values.update(zip(eqn.outvars, results, strict=True))
-    return [_read(values, atom) for atom in closed.jaxpr.outvars]
+    entries = iter(plan)
 
+    def apply(eqn: core.JaxprEqn, inputs: list[Any]) -> list[Any]:
+        entry = next(entries)
+        return entry.results if isinstance(entry, _Found) else _apply(eqn, inputs, entry)
 
-def _given(jaxpr: core.Jaxpr, consts: Sequence[Any], operands: Sequence[Any]) -> dict[Any, Any]:
-    values = zip(jaxpr.constvars, consts, strict=True), zip(jaxpr.invars, operands, strict=True)
-    return {var: value for pairs in values for var, value in pairs}
-
-
-def _read(values: dict[Any, Any], atom: core.Var | core.Literal) -> Any:
-    if isinstance(atom, core.Literal):
-        return np.asarray(atom.val, row_aval(atom).dtype)
-    return values[atom]
+    return interpret(closed, operands, apply, lambda x: x)
 
 
 def _apply(eqn: core.JaxprEqn, inputs: list[Any], entry: _Inner | None) -> list[Any]:

@@ -50,17 +50,6 @@ def host_call(
     return list(call(*operands, function=name))
 
 
-class _Extension(ctypes.Structure):
-    pass
-
-
-_Extension._fields_ = [
-    ("size", ctypes.c_size_t),
-    ("type", ctypes.c_int),
-    ("next", ctypes.POINTER(_Extension)),
-]
-
-
 class _Sized(ctypes.Structure):
     """A structure with XLA's header: its size, and extensions."""
 
@@ -83,8 +72,15 @@ class _Metadata(ctypes.Structure):
     ]
 
 
-class _MetadataExtension(ctypes.Structure):
-    _fields_ = [("base", _Extension), ("metadata", ctypes.POINTER(_Metadata))]
+class _Extension(ctypes.Structure):
+    """The only kind that XLA has."""
+
+    _fields_ = [
+        ("size", ctypes.c_size_t),
+        ("type", ctypes.c_int),
+        ("next", ctypes.c_void_p),
+        ("metadata", ctypes.POINTER(_Metadata)),
+    ]
 
 
 class _Buffer(_Sized):
@@ -182,8 +178,7 @@ def _arrays(buffers: _Buffers, *, writable: bool) -> list[np.ndarray]:
 def _handle(pointer: Any) -> Any:
     call = pointer.contents
     if call.extension:  # XLA asks for the version, when the function is registered
-        extension = ctypes.cast(call.extension, ctypes.POINTER(_MetadataExtension))
-        metadata = extension.contents.metadata.contents
+        metadata = call.extension.contents.metadata.contents
         metadata.version.major, metadata.version.minor = _version()
         metadata.traits = metadata.state_type = 0
         return None

@@ -9,20 +9,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.extend import core
 
 from pixelbrax_jax._platform.by_platform import num_varying
-from pixelbrax_jax._platform.rules import (
-    FEW,
-    RULES,
-    Operand,
-    bind,
-    row_aval,
-    rule,
-    split_scan,
-    spread,
-)
+from pixelbrax_jax._platform.programs import bind, interpret, row_aval, split_scan
+from pixelbrax_jax._platform.rules import FEW, RULES, Operand, rule, spread
 
 _LANES = 16
 """Rows are padded to a multiple, so that SIMD loops have no scalar remainder."""
@@ -88,21 +81,10 @@ def _pad_rows(x: jax.Array, size: int) -> jax.Array:
 
 
 def _evaluate(closed: core.ClosedJaxpr, operands: Sequence[Operand], size: int) -> list[Operand]:
-    known: dict[core.Var, Operand] = {}
+    def given(x: Any) -> Operand:
+        return Operand(jnp.asarray(x) if isinstance(x, np.generic) else x, False)
 
-    def read(atom: core.Var | core.Literal) -> Operand:
-        if isinstance(atom, core.Literal):
-            return Operand(jnp.asarray(atom.val, row_aval(atom).dtype), False)
-        return known[atom]
-
-    jaxpr = closed.jaxpr
-    known.update(zip(jaxpr.constvars, (Operand(x, False) for x in closed.consts), strict=True))
-    known.update(zip(jaxpr.invars, operands, strict=True))
-    for eqn in jaxpr.eqns:
-        inputs = [read(atom) for atom in eqn.invars]
-        with eqn.ctx.manager:
-            known.update(zip(eqn.outvars, _apply(eqn, inputs, size), strict=True))
-    return [read(atom) for atom in jaxpr.outvars]
+    return interpret(closed, operands, partial(_apply, size=size), given)
 
 
 def _apply(eqn: core.JaxprEqn, inputs: list[Operand], size: int) -> list[Operand]:
@@ -248,20 +230,14 @@ def _reach_scan(eqn: core.JaxprEqn, flags: list[bool]) -> list[bool]:
 
 def _reach(closed: core.ClosedJaxpr, flags: Sequence[bool]) -> list[bool]:
     """Return which results of a program are batched, as in `_evaluate`."""
-    known = dict(zip(closed.jaxpr.invars, flags, strict=True))
 
-    def read(atom: core.Var | core.Literal) -> bool:
-        return not isinstance(atom, core.Literal) and known.get(atom, False)
-
-    for eqn in closed.jaxpr.eqns:
-        inputs = [read(atom) for atom in eqn.invars]
+    def apply(eqn: core.JaxprEqn, inputs: list[bool]) -> list[bool]:
         if (program := _program(eqn)) is not None:
-            outputs = _reach(program, inputs[len(inputs) - len(program.jaxpr.invars) :])
-        elif eqn.primitive.name == "scan":
-            outputs = _reach_scan(eqn, inputs)
-        elif eqn.primitive.name == "while":
-            outputs = _reach_while(eqn, inputs)
-        else:
-            outputs = [any(inputs)] * len(eqn.outvars)
-        known.update(zip(eqn.outvars, outputs, strict=True))
-    return [read(atom) for atom in closed.jaxpr.outvars]
+            return _reach(program, inputs[len(inputs) - len(program.jaxpr.invars) :])
+        if eqn.primitive.name == "scan":
+            return _reach_scan(eqn, inputs)
+        if eqn.primitive.name == "while":
+            return _reach_while(eqn, inputs)
+        return [any(inputs)] * len(eqn.outvars)
+
+    return interpret(closed, flags, apply, lambda _: False)

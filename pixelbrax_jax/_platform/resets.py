@@ -8,6 +8,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.extend import core
 
 from pixelbrax_jax._platform.by_platform import by_platform, traced_row
 
@@ -74,11 +75,7 @@ def _select_rows(
 
 def _has_open_loop(jaxpr: Any) -> bool:
     """Return whether a program has a loop whose length depends on data."""
-    for eqn in jaxpr.eqns:
-        parts = [
-            getattr(part, "jaxpr", part) for part in jax.tree.leaves(list(eqn.params.values()))
-        ]
-        inner = (part for part in parts if hasattr(part, "eqns"))
-        if eqn.primitive.name == "while" or any(map(_has_open_loop, inner)):
-            return True
-    return False
+    return any(
+        eqn.primitive.name == "while" or any(map(_has_open_loop, core.jaxprs_in_params(eqn.params)))
+        for eqn in jaxpr.eqns
+    )

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, TypeVar
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.extend import core
+
+from pixelbrax_jax._platform.programs import bind, row_aval
 
 FEW = 4
 """Number of rows up to which there is no padding and no inlining of matrix products: short loops
@@ -18,9 +20,6 @@ gain nothing."""
 
 _LONGEST_SUM = 16
 """Longest axis of matrix products that are written as sums; longer ones call a library."""
-
-
-_T = TypeVar("_T")
 
 
 class Operand(NamedTuple):
@@ -62,32 +61,6 @@ def _rule_of_first(name: str) -> Callable[..., Callable[..., jax.Array]]:
         return function
 
     return register
-
-
-def row_aval(atom: core.Var | core.Literal) -> Any:
-    """Return shape and dtype of one row."""
-    return atom.aval
-
-
-def bind(eqn: core.JaxprEqn, *values: Any, **changed: Any) -> list[Any]:
-    """Compute an equation's primitive for other values, with some parameters changed."""
-    params = eqn.primitive.get_bind_params({**eqn.params, **changed})
-    # Other releases of JAX return functions separately.
-    functions, params = params if isinstance(params, tuple) else ((), params)
-    outputs = eqn.primitive.bind(*functions, *values, **params)
-    return list(outputs) if eqn.primitive.multiple_results else [outputs]
-
-
-def split_scan(
-    params: Mapping[str, Any], operands: list[_T]
-) -> tuple[list[_T], list[_T], list[_T]]:
-    """Return a scan's constants, its carry, and what it takes slices of, from its parameters."""
-    if "num_carry" in params:
-        start, num_carry = params["num_consts"], params["num_carry"]
-    else:  # from jax 0.12 on
-        start, num_carry, _ = map(len, params["ft_in"].unpack())
-    stop = start + num_carry
-    return operands[:start], operands[start:stop], operands[stop:]
 
 
 def spread(operand: Operand, shape: tuple[int, ...], size: int) -> jax.Array:

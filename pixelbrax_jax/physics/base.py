@@ -14,7 +14,7 @@ from pixelbrax_jax.types import CameraRig, Geoms, Look, PhysicsState
 
 
 class Kinematics(struct.PyTreeNode):
-    """Poses and velocities, float32, in MuJoCo's order, the input of task formulas.
+    """Poses and velocities, float32, in MuJoCo's order, the input of rewards of Brax's tasks.
 
     ``q`` (Q,) are joint positions (metres, radians; a free joint is a position and a quaternion),
     ``qd`` (V,) joint velocities, per second. ``xpos`` (L, 3), metres, and unit ``xquat`` (L, 4) are

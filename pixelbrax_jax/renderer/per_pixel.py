@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
 
-from pixelbrax_jax._platform.rules import bind, row_aval
+from pixelbrax_jax._platform.programs import bind, interpret, row_aval
 from pixelbrax_jax.types import Frame
 
 _ELEMENTWISE_NAMES = """
@@ -76,19 +76,7 @@ class PerPixel:
 
     def read(self, closed: core.ClosedJaxpr, operands: Sequence[Any]) -> list[Any]:
         """Read a program: compute what does not depend on pixels, and record the rest."""
-        known = dict(zip(closed.jaxpr.constvars, closed.consts, strict=True))
-        known |= dict(zip(closed.jaxpr.invars, operands, strict=True))
-
-        def value(atom: core.Var | core.Literal) -> Any:
-            if isinstance(atom, core.Literal):
-                return np.asarray(atom.val, row_aval(atom).dtype)[()]
-            return known[atom]
-
-        for eqn in closed.jaxpr.eqns:
-            with eqn.ctx.manager:
-                results = self._read_equation(eqn, list(map(value, eqn.invars)))
-            known.update(zip(eqn.outvars, results, strict=True))
-        return list(map(value, closed.jaxpr.outvars))
+        return interpret(closed, operands, self._read_equation, lambda x: x)
 
     def _read_equation(self, eqn: core.JaxprEqn, operands: list[Any]) -> list[Any]:
         if eqn.primitive.name == "jit":

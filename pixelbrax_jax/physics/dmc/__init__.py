@@ -1,1 +1,1 @@
-"""MuJoCo XLA: the engine that simulates the DM Control Suite."""
+"""The DM Control Suite: its models, and formulas of its tasks."""

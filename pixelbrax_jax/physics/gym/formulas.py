@@ -19,6 +19,7 @@ from pixelbrax_jax.physics.mujoco.formulas import (
     Start,
     joined,
     observe_joints,
+    observe_joints_from,
 )
 from pixelbrax_jax.spatial import f32
 
@@ -76,15 +77,6 @@ def _left(seen: Snapshot, body: str) -> jax.Array:
     return seen.data.fields["xpos"][seen.model.body(body).id]
 
 
-def _without_place(seen: Snapshot, *, skipped: int) -> jax.Array:
-    """Return joint positions without the first ones, and velocities.
-
-    * ``qpos[skipped:]``
-    * ``qvel``
-    """
-    return joined(seen.state.qpos[skipped:], seen.state.qvel)
-
-
 def _with_clipped_speed(seen: Snapshot) -> jax.Array:
     """Return joint positions without x, and velocities.
 
@@ -102,7 +94,7 @@ def _observe_ant(seen: Snapshot) -> jax.Array:
     * ``6 * (model.nbody - 1)`` of each body: external torque and force, clipped to [-1, 1]
     """
     forces = jnp.clip(seen.data.fields["cfrc_ext"], -1, 1)
-    return joined(_without_place(seen, skipped=2), forces[1:])
+    return joined(observe_joints_from(seen, skipped=2), forces[1:])
 
 
 def _observe_humanoid(seen: Snapshot) -> jax.Array:
@@ -118,7 +110,7 @@ def _observe_humanoid(seen: Snapshot) -> jax.Array:
     fields = seen.data.fields
     bodies = fields["cinert"][1:], fields["cvel"][1:]
     return joined(
-        _without_place(seen, skipped=2),
+        observe_joints_from(seen, skipped=2),
         *bodies,
         fields["qfrc_actuator"][6:],
         fields["cfrc_ext"][1:],
@@ -355,7 +347,7 @@ FORMULAS = {
     ),
     "gym_halfcheetah": Formulas(
         partial(_near_default, noise=0.1, normal=True),
-        partial(_without_place, skipped=1),
+        partial(observe_joints_from, skipped=1),
         partial(_reward_runner, substeps=5, effort=0.1),
         substeps=5,
     ),
@@ -399,7 +391,7 @@ FORMULAS = {
     ),
     "gym_swimmer": Formulas(
         partial(_near_default, noise=0.1),
-        partial(_without_place, skipped=2),
+        partial(observe_joints_from, skipped=2),
         partial(_reward_runner, substeps=4, effort=1e-4),
         substeps=4,
     ),

@@ -1,1 +1,1 @@
-"""MuJoCo XLA: the engine that simulates the DM Control Suite."""
+"""Tasks of MuJoCo models, stepped by MuJoCo itself, MuJoCo XLA or MuJoCo Warp."""

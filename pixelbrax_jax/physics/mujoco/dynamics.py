@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
@@ -19,6 +19,7 @@ from pixelbrax_jax._platform.folding import fold
 from pixelbrax_jax._platform.host_call import host_call, register
 from pixelbrax_jax.physics.mujoco.multipliers import check_varies
 from pixelbrax_jax.physics.mujoco.native import Native
+from pixelbrax_jax.physics.mujoco.needs import Needs
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
 from pixelbrax_jax.spatial import quat_normalize
 
@@ -72,7 +73,7 @@ class Dynamics:
     """A model's dynamics, for one environment, by an engine of ``options.ENGINES``.
 
     With ``"auto"`` MuJoCo computes programs lowered for a CPU, in float64, and MuJoCo XLA all
-    others, in float32; with ``prefers_xla`` MuJoCo XLA takes the steps on a CPU, too. With
+    others, in float32; with ``needs.prefers_xla`` MuJoCo XLA takes the steps on a CPU, too. With
     ``"warp"`` MuJoCo Warp takes the steps on every device.
     """
 
@@ -80,33 +81,21 @@ class Dynamics:
         self,
         model: mujoco.MjModel,
         posed: mujoco.MjModel,
-        *,
-        engine: str = "auto",
-        prefers_xla: bool = False,
-        reads_forces: bool = False,
-        starts_with_forces: bool = False,
-        out_of_reach: Iterable[str] = (),
-        target_body: str = "",
-        reads: Sequence[str] = (),
+        needs: Needs,
+        engine: str,
     ):
-        """Take a model and the same ``with_poses``. For the rest see ``Formulas``."""
+        """Take a model and the same ``with_poses``."""
         self.model = model
         self.engine = engine
-        self._steps_by_xla = engine == "auto" and prefers_xla
-        self._target_body = model.body(target_body).id if target_body else None
-        self._xla_options: dict[str, Any] = {
-            "reads_forces": reads_forces,
-            "starts_with_forces": starts_with_forces,
-            "out_of_reach": tuple(out_of_reach),
-            "reads": tuple(reads),
-        }
-        self.native = Native(model, posed, reads_forces=reads_forces, reads=reads)
+        self._needs = needs
+        self._steps_by_xla = engine == "auto" and needs.prefers_xla
+        self._target_body = model.body(needs.target_body).id if needs.target_body else None
+        self.native = Native(model, posed, needs)
         # Equal in every process, so that JAX's cache finds the programs that contain it.
-        self.name = "/".join([_digest(model), str(reads_forces), *reads])
+        self.name = "/".join([_digest(model), str(needs.reads_forces), *needs.reads])
         data = mujoco.MjData(model)
-        fields = [getattr(data, name).shape for name in reads]
+        fields = [getattr(data, name).shape for name in needs.reads]
         self._shapes = [(model.nbody, 3), (model.nbody, 4), (model.nsensordata,), *fields]
-        self._reads = tuple(reads)
         if engine == "warp":
             # It says now what it lacks or cannot compute.
             _ = self.xla
@@ -125,10 +114,10 @@ class Dynamics:
             if self.engine == "warp":
                 from pixelbrax_jax.physics.mujoco.warp import Warp
 
-                return Warp(self.model, **self._xla_options)
+                return Warp(self.model, self._needs)
             from pixelbrax_jax.physics.mujoco.xla import Xla
 
-            return Xla(self.model, plain=self.engine == "mjx", **self._xla_options)
+            return Xla(self.model, self._needs, plain=self.engine == "mjx")
 
     def state(
         self,
@@ -171,7 +160,7 @@ class Dynamics:
         if (at := self._target_body) is not None:
             xpos = xpos.at[at].set(state.target[:3])
             xquat = xquat.at[at].set(quat_normalize(state.target[3:]))
-        by_name = dict(zip(self._reads, fields, strict=True))
+        by_name = dict(zip(self._needs.reads, fields, strict=True))
         return Readings(xpos, xquat, sensordata, moved, by_name)
 
     def clearances(self, qpos: jax.Array) -> jax.Array:

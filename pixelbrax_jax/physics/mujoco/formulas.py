@@ -12,6 +12,7 @@ import numpy as np
 from flax import struct
 
 from pixelbrax_jax.physics.mujoco.dynamics import Dynamics, Readings, State
+from pixelbrax_jax.physics.mujoco.needs import Needs
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
 from pixelbrax_jax.spatial import f32, quat_multiply, quat_to_mat, rotate
 
@@ -128,7 +129,16 @@ def observe_joints(seen: Snapshot) -> jax.Array:
     * ``qpos``
     * ``qvel``
     """
-    return joined(seen.state.qpos, seen.state.qvel)
+    return observe_joints_from(seen, skipped=0)
+
+
+def observe_joints_from(seen: Snapshot, *, skipped: int) -> jax.Array:
+    """Return joint positions without the first ones, and velocities.
+
+    * ``qpos[skipped:]``
+    * ``qvel``
+    """
+    return joined(seen.state.qpos[skipped:], seen.state.qvel)
 
 
 def _unchanged(model: mujoco.MjModel) -> None:
@@ -148,8 +158,8 @@ def nothing(seen: Snapshot) -> jax.Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Formulas:
-    """Initial states, observation, reward and end of a task.
+class Formulas(Needs):
+    """Initial states, observation, reward and end of a task, and what they need of the engine.
 
     Attributes:
         remember: returns what the next reward finds in ``State.remembered``.
@@ -158,13 +168,6 @@ class Formulas:
         options: arguments of the model's generator.
         camera: index of the task's camera in the model; None for none.
         movable: names of the geoms, sites and lights that ``Start.target`` moves.
-        target_body: name of the body, fixed to the world, that it moves; empty for none.
-        reads_forces: whether observations use sensors of forces or accelerations.
-        starts_with_forces: whether these sensors are not 0 in an initial state.
-        prefers_xla: whether "auto" steps by MuJoCo XLA on a CPU, too, because it is faster.
-        out_of_reach: geoms that never touch anything, which MuJoCo XLA then skips.
-        reads: fields of ``MjData`` that the formulas see as MuJoCo leaves them after its last step,
-            which computes them before it moves, as Gymnasium's do.
     """
 
     start: Callable[[Dynamics, jax.Array], Start]
@@ -177,9 +180,3 @@ class Formulas:
     options: Mapping[str, Any] = field(default_factory=dict)
     camera: int | None = 0
     movable: tuple[str, ...] = ()
-    target_body: str = ""
-    reads_forces: bool = False
-    starts_with_forces: bool = False
-    prefers_xla: bool = False
-    out_of_reach: tuple[str, ...] = ()
-    reads: tuple[str, ...] = ()

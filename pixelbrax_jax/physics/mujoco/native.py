@@ -16,6 +16,7 @@ import numpy as np
 
 from pixelbrax_jax.physics.mujoco.compatibility import loading_silenced
 from pixelbrax_jax.physics.mujoco.multipliers import MultipliedModels
+from pixelbrax_jax.physics.mujoco.needs import Needs
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
 from pixelbrax_jax.processor import num_cores
 
@@ -38,19 +39,13 @@ class Native:
     once. The result of a row depends on nothing but the row. A row that diverges becomes NaN.
     """
 
-    def __init__(
-        self,
-        model: mujoco.MjModel,
-        posed: mujoco.MjModel,
-        *,
-        reads_forces: bool = False,
-        reads: Sequence[str] = (),
-    ):
-        """Take a model and the same ``with_poses``. For the rest see ``Formulas``."""
-        self._fields = tuple(reads)
+    def __init__(self, model: mujoco.MjModel, posed: mujoco.MjModel, needs: Needs):
+        """Take a model and the same ``with_poses``."""
+        self._fields = needs.reads
         # A state that diverges stays as it is.
         disabled = _OFF.mjDSBL_AUTORESET
-        self._moving = _without(model, disabled if reads_forces else disabled | _OFF.mjDSBL_SENSOR)
+        unread = disabled if needs.reads_forces else disabled | _OFF.mjDSBL_SENSOR
+        self._moving = _without(model, unread)
         self._resting = _without(posed, disabled | _OFF.mjDSBL_ACTUATION)
         self._still = _without(
             posed,
@@ -97,7 +92,7 @@ class Native:
             result[is_bad] = np.nan
         moved[:] = (last - first)[:, edges[0] : edges[1]]
         with self._models(self._still, multipliers) as models:
-            _, found = self._roll(self._still, last, 1, models=models)
+            _, found = self._roll(self._still, models, last, 1)
         _read(found[:, 0], xpos, xquat, sensordata)
         sensordata[:, self._is_force] = sensors[:, self._is_force]
 
@@ -111,7 +106,7 @@ class Native:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the last states, accelerations from their velocities, and sensors."""
         model = self._moving
-        states, sensors = self._roll(model, first, num_steps, ctrl, warmstart, models=models)
+        states, sensors = self._roll(model, models, first, num_steps, ctrl, warmstart)
         last, before = states[:, -1], states[:, -2] if num_steps > 1 else first
         velocities = slice(1 + model.nq, 1 + model.nq + model.nv)
         qacc = (last - before)[:, velocities] / model.opt.timestep
@@ -148,7 +143,7 @@ class Native:
         parts = [np.zeros((len(qpos), 1)), qpos, qvel, np.zeros((len(qpos), self._moving.na))]
         first = np.concatenate(parts, 1, dtype=np.float64)
         with self._models(self._resting, multipliers) as models:
-            _, found = self._roll(self._resting, first, 1, models=models)
+            _, found = self._roll(self._resting, models, first, 1)
         _read(found[:, 0], xpos, xquat, sensordata)
         if fields:
             with self._models(self._moving, multipliers) as models:
@@ -201,11 +196,11 @@ class Native:
     def _roll(
         self,
         model: mujoco.MjModel,
+        models: _Models,
         first: np.ndarray,
         num_steps: int,
         ctrl: np.ndarray | None = None,
         warmstart: np.ndarray | None = None,
-        models: _Models = (),
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return (N, num_steps, ...) states after each step, and sensors before it."""
         num_rows = len(first)
@@ -219,7 +214,7 @@ class Native:
             self._data(model, max(1, rollout.nthread)) as data,
         ):
             rollout.rollout(
-                models or [model] * num_rows,
+                models,
                 data,
                 np.ascontiguousarray(first),
                 controls,

@@ -90,17 +90,7 @@ class MujocoPhysics(GuardedPhysics):
         self.rigs = {**scene.rigs, **rigs} | ({"default": default} if default else {})
         self.unfit_cameras = unfit_cameras(model)
         self.link_names = body_names(model) + scene.links
-        self.dynamics = Dynamics(
-            simulated,
-            posed,
-            engine=engine,
-            reads_forces=formulas.reads_forces,
-            prefers_xla=formulas.prefers_xla,
-            starts_with_forces=formulas.starts_with_forces,
-            out_of_reach=formulas.out_of_reach,
-            target_body=formulas.target_body,
-            reads=formulas.reads,
-        )
+        self.dynamics = Dynamics(simulated, posed, formulas, engine)
         # Rounded, so that 0.0025 * 10 is 0.025.
         self.dt = float(f"{model.opt.timestep * formulas.substeps:.6g}")
         self.action_size = int(model.nu)

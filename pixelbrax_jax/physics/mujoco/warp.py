@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pixelbrax_jax.extras import needs_extra
+from pixelbrax_jax.physics.mujoco.needs import Needs
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
 from pixelbrax_jax.physics.mujoco.xla import Arrays, Xla, changed
 
@@ -22,12 +23,16 @@ warp.config.log_level = max(warp.config.log_level, warp.LOG_WARNING)
 from mujoco import mjx  # noqa: E402  # isort: skip
 
 
+_TAKEN = ("qpos", "qvel", "act", "qacc_warmstart", "ctrl")
+"""Fields of ``MjData`` that a step takes."""
+
+
 class Warp(Xla):
     """The same as ``Xla``, with steps by MuJoCo Warp; all else is computed by MuJoCo XLA."""
 
-    def __init__(self, model: mujoco.MjModel, **options: Any):
+    def __init__(self, model: mujoco.MjModel, needs: Needs):
         """Put a model on the device; see ``Xla``."""
-        super().__init__(model, plain=True, **options)
+        super().__init__(model, needs, plain=True)
         if "cfrc_ext" in self._fields:
             raise ValueError(
                 "engine='warp' does not compute cfrc_ext, which this task's formulas need. Choose "
@@ -43,12 +48,10 @@ class Warp(Xla):
     def _mover(self, model: Any, multipliers: jax.Array) -> Callable[[Any], Any]:
         """See ``Xla``; Warp has a model of its own."""
         del model
-        names = "qpos", "qvel", "act", "qacc_warmstart", "ctrl"
-        left = (*names[:4], "sensordata", *self._fields)
 
         def move(data: Any) -> Any:
-            rows = self._rows(multipliers[None], *(getattr(data, name)[None] for name in names))
-            return data.replace(**{name: x[0] for name, x in zip(left, rows, strict=True)})
+            rows = self._rows(multipliers[None], *(getattr(data, name)[None] for name in _TAKEN))
+            return data.replace(**{name: x[0] for name, x in zip(self._given, rows, strict=True)})
 
         return move
 
@@ -59,22 +62,10 @@ class Warp(Xla):
         def rows(*arrays: jax.Array) -> Arrays:
             blank = self._blank(len(arrays[0]))
 
-            def one(
-                multipliers: jax.Array,
-                qpos: jax.Array,
-                qvel: jax.Array,
-                act: jax.Array,
-                warmstart: jax.Array,
-                ctrl: jax.Array,
-            ) -> Arrays:
-                data = blank.replace(
-                    qpos=qpos, qvel=qvel, act=act, qacc_warmstart=warmstart, ctrl=ctrl
-                )
+            def one(multipliers: jax.Array, *row: jax.Array) -> Arrays:
+                data = blank.replace(**dict(zip(_TAKEN, row, strict=True)))
                 data = mjx.step(changed(self._warp, multipliers), data)
-                return (
-                    *(data.qpos, data.qvel, data.act, data.qacc_warmstart, data.sensordata),
-                    *(getattr(data, name) for name in self._fields),
-                )
+                return tuple(getattr(data, name) for name in self._given)
 
             result: Arrays = jax.vmap(one)(*arrays)
             return result

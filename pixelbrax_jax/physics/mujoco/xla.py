@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any
 
@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from pixelbrax_jax.physics.mujoco import stages
 from pixelbrax_jax.physics.mujoco.compatibility import import_silenced, load_onto_own_device
 from pixelbrax_jax.physics.mujoco.multipliers import multiplied
+from pixelbrax_jax.physics.mujoco.needs import Needs
 from pixelbrax_jax.physics.mujoco.omissions import check_simulated
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
 
@@ -30,21 +31,20 @@ class Xla:
     def __init__(
         self,
         model: mujoco.MjModel,
+        needs: Needs,
         *,
-        reads_forces: bool = False,
-        starts_with_forces: bool = False,
-        out_of_reach: Iterable[str] = (),
-        reads: Sequence[str] = (),
         plain: bool = False,
     ):
-        """Put a model on the device; ``plain`` takes MuJoCo XLA's own step. See ``Formulas``."""
+        """Put a model on the device; ``plain`` takes MuJoCo XLA's own step."""
         load_onto_own_device(mjx_io)
         check_simulated(model)
         self._model = model
-        self._starts_with_forces = starts_with_forces or bool(reads)
-        self._fields = tuple(reads)
+        self._starts_with_forces = needs.starts_with_forces or bool(needs.reads)
+        self._fields = needs.reads
+        # What a step gives, by its names of `MjData`.
+        self._given = ("qpos", "qvel", "act", "qacc_warmstart", "sensordata", *needs.reads)
         self._stages: Any = mjx if plain or not stages.is_supported(model) else stages
-        self.simulated = _simulated(model, out_of_reach)
+        self.simulated = _simulated(model, needs.out_of_reach)
         try:
             self._mx = mjx.put_model(self.simulated, impl="jax")
         except NotImplementedError as error:
@@ -52,9 +52,8 @@ class Xla:
                 f"MuJoCo XLA cannot simulate this model: {error}. Compute on a CPU, with "
                 "engine='mujoco'."
             ) from error
-        self._moving = (
-            self._mx if reads_forces else self._without(mujoco.mjtDisableBit.mjDSBL_SENSOR)
-        )
+        unread = self._without(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+        self._moving = self._mx if needs.reads_forces else unread
         self._passive = self._without(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
 
     def _without(self, feature: mujoco.mjtDisableBit) -> Any:
@@ -77,16 +76,14 @@ class Xla:
 
         def one(carry: Arrays) -> Arrays:
             qpos, qvel, act, warmstart, *_ = carry
-            data = self._data(qpos, qvel, act=act, qacc_warmstart=warmstart, ctrl=ctrl)
-            data = move(data)
-            return (
-                *(data.qpos, data.qvel, data.act, data.qacc_warmstart),
-                *(data.sensordata, *self._left(model, data, is_after_step=True)),
-            )
+            data = move(self._data(qpos, qvel, act=act, qacc_warmstart=warmstart, ctrl=ctrl))
+            if "cfrc_ext" in self._fields:
+                data = smooth.rne_postconstraint(model, data)
+            return tuple(getattr(data, name) for name in self._given)
 
-        carry: Arrays = (qpos, qvel, act, qacc_warmstart, jnp.zeros(self._model.nsensordata))
+        carry: Arrays = (qpos, qvel, act, qacc_warmstart)
         blank = self._data(qpos, qvel)
-        carry += tuple(jnp.zeros_like(getattr(blank, name)) for name in self._fields)
+        carry += tuple(jnp.zeros_like(getattr(blank, name)) for name in self._given[4:])
         if num_steps == 1:
             carry = one(carry)
         else:
@@ -110,14 +107,8 @@ class Xla:
             model = changed(self._passive, multipliers)
             forward = self._stages.forward(model, data)
             data = data.replace(sensordata=forward.sensordata)
-            left = self._left(model, forward, is_after_step=False)
+            left = tuple(getattr(forward, name) for name in self._fields)
         return *self._readings(changed(self._mx, multipliers), data), *left
-
-    def _left(self, model: Any, data: Any, *, is_after_step: bool) -> Arrays:
-        """Return the fields of ``MjData`` that a step leaves."""
-        if is_after_step and "cfrc_ext" in self._fields:
-            data = smooth.rne_postconstraint(model, data)
-        return tuple(getattr(data, name) for name in self._fields)
 
     def clearances(self, qpos: jax.Array) -> Arrays:
         """See ``Native.clearances``; of geoms that do not overlap it may be a distance."""

@@ -11,6 +11,7 @@ import pytest
 from pixelbrax_jax._platform.folding import fold
 from pixelbrax_jax._platform.interpreter import batch_last
 from pixelbrax_jax.physics.mujoco import elimination, stages
+from pixelbrax_jax.physics.mujoco.needs import Needs
 from pixelbrax_jax.physics.mujoco.stages import is_supported
 from pixelbrax_jax.physics.mujoco.xla import Xla
 
@@ -58,7 +59,7 @@ def last(function):
 
 def after_a_step(model, qpos, qvel, batch=jax.vmap, **options):
     """Our ``qpos, qvel, act, qacc`` after a step."""
-    engine = Xla(model, **options)
+    engine = Xla(model, Needs(), **options)
     rest = [jnp.zeros(size) for size in (model.na, model.nv, model.nu, 0)]
     move = batch(lambda q, v: engine.step(1, q, v, *rest)[:4])
     return jax.jit(move)(jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32))

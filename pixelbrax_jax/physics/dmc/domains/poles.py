@@ -8,15 +8,11 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from pixelbrax_jax.physics.dmc.formulas import small_control, tolerance
+from pixelbrax_jax.physics.dmc.formulas import small_control, start_anywhere, tolerance
 from pixelbrax_jax.physics.mujoco.dynamics import Dynamics
 from pixelbrax_jax.physics.mujoco.formulas import Formulas, Snapshot, Start, joined
 
 _COSINE_BOUND = math.cos(math.radians(8))
-
-
-def _start_anywhere(dynamics: Dynamics, key: jax.Array) -> Start:
-    return Start(jax.random.uniform(key, (dynamics.model.nq,), minval=-jnp.pi, maxval=jnp.pi))
 
 
 def _observe_acrobot(seen: Snapshot) -> jax.Array:
@@ -105,7 +101,7 @@ _xla = partial(Formulas, prefers_xla=True)
 
 
 def _acrobot(margin: float) -> Formulas:
-    return _xla(_start_anywhere, _observe_acrobot, partial(_reward_acrobot, margin=margin))
+    return _xla(start_anywhere, _observe_acrobot, partial(_reward_acrobot, margin=margin))
 
 
 TASKS = {
@@ -115,5 +111,5 @@ TASKS = {
     "dmc_cartpole_balance_sparse": _xla(_start_upright, _observe_cartpole, _reward_cartpole_sparse),
     "dmc_cartpole_swingup": _xla(_start_hanging, _observe_cartpole, _reward_cartpole),
     "dmc_cartpole_swingup_sparse": _xla(_start_hanging, _observe_cartpole, _reward_cartpole_sparse),
-    "dmc_pendulum_swingup": _xla(_start_anywhere, _observe_pendulum, _reward_pendulum),
+    "dmc_pendulum_swingup": _xla(start_anywhere, _observe_pendulum, _reward_pendulum),
 }

@@ -18,7 +18,13 @@ from pixelbrax_jax.physics.dmc.formulas import (
     tolerance,
 )
 from pixelbrax_jax.physics.mujoco.dynamics import Dynamics
-from pixelbrax_jax.physics.mujoco.formulas import Formulas, Snapshot, Start, joined
+from pixelbrax_jax.physics.mujoco.formulas import (
+    Formulas,
+    Snapshot,
+    Start,
+    joined,
+    observe_joints_from,
+)
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
 from pixelbrax_jax.spatial import quat_to_mat
 
@@ -54,15 +60,6 @@ def _start_cheetah(dynamics: Dynamics, key: jax.Array) -> Start:
     state = dynamics.state(qpos, data.qvel)
     state, _ = dynamics.step(state, _CHEETAH_SETTLING_STEPS - 1)
     return Start(state.qpos, state.qvel)
-
-
-def _observe_cheetah(seen: Snapshot) -> jax.Array:
-    """Return joint positions without x, and velocities.
-
-    * ``qpos[1:]``
-    * ``qvel``
-    """
-    return joined(seen.state.qpos[1:], seen.state.qvel)
 
 
 def _reward_cheetah(seen: Snapshot) -> jax.Array:
@@ -264,7 +261,9 @@ def _walker(speed: float) -> Formulas:
 
 
 TASKS = {
-    "dmc_cheetah_run": Formulas(_start_cheetah, _observe_cheetah, _reward_cheetah),
+    "dmc_cheetah_run": Formulas(
+        _start_cheetah, partial(observe_joints_from, skipped=1), _reward_cheetah
+    ),
     "dmc_hopper_stand": _hopper(_reward_hopper_stand),
     "dmc_hopper_hop": _hopper(_reward_hopper_hop),
     "dmc_humanoid_stand": _humanoid(0.0),

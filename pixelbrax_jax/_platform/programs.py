@@ -1,0 +1,62 @@
+"""Read JAX's programs, equation by equation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeVar
+
+import numpy as np
+from jax.extend import core
+
+_T = TypeVar("_T")
+
+
+def interpret(
+    closed: core.ClosedJaxpr,
+    operands: Sequence[_T],
+    apply: Callable[[core.JaxprEqn, list[_T]], Sequence[_T]],
+    given: Callable[[Any], _T],
+) -> list[_T]:
+    """Return the results of a program; ``apply(eqn, inputs)`` returns those of an equation.
+
+    ``given`` returns what ``apply`` gets in place of the program's constants, and of its literals,
+    which are NumPy scalars.
+    """
+    jaxpr = closed.jaxpr
+    known = dict(zip(jaxpr.constvars, map(given, closed.consts), strict=True))
+    known.update(zip(jaxpr.invars, operands, strict=True))
+
+    def read(atom: core.Var | core.Literal) -> _T:
+        if isinstance(atom, core.Literal):
+            return given(np.asarray(atom.val, row_aval(atom).dtype)[()])
+        return known[atom]
+
+    for eqn in jaxpr.eqns:
+        inputs = [read(atom) for atom in eqn.invars]
+        with eqn.ctx.manager:
+            known.update(zip(eqn.outvars, apply(eqn, inputs), strict=True))
+    return [read(atom) for atom in jaxpr.outvars]
+
+
+def row_aval(atom: core.Var | core.Literal) -> Any:
+    """Return shape and dtype of one row."""
+    return atom.aval
+
+
+def bind(eqn: core.JaxprEqn, *values: Any, **changed: Any) -> list[Any]:
+    """Compute an equation's primitive for other values, with some parameters changed."""
+    params = eqn.primitive.get_bind_params({**eqn.params, **changed})
+    outputs = eqn.primitive.bind(*values, **params)
+    return list(outputs) if eqn.primitive.multiple_results else [outputs]
+
+
+def split_scan(
+    params: Mapping[str, Any], operands: list[_T]
+) -> tuple[list[_T], list[_T], list[_T]]:
+    """Return a scan's constants, its carry, and what it takes slices of, from its parameters."""
+    if "num_carry" in params:
+        start, num_carry = params["num_consts"], params["num_carry"]
+    else:  # from jax 0.12 on
+        start, num_carry, _ = map(len, params["ft_in"].unpack())
+    stop = start + num_carry
+    return operands[:start], operands[start:stop], operands[stop:]
