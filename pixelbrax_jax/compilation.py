@@ -66,8 +66,9 @@ def compiler_options(env: Any = None, platform: str | None = None) -> dict[str, 
 def jit(**options: Any) -> Callable[[Callable[_P, _T]], Callable[_P, _T]]:
     """Decorate like ``jax.jit``, with ``compiler_options``; the first argument is static.
 
-    They are those of that argument, an environment or what has one as ``env``, and are computed at
-    the first call, because importing a package must not start a device.
+    They are those of that argument, an environment or what has one as ``env``; of anything else,
+    such as an agent, those of no environment. They are computed at the first call, because
+    importing a package must not start a device.
     """
 
     def decorate(function: Callable[_P, _T]) -> Callable[_P, _T]:

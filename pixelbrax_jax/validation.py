@@ -5,11 +5,14 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from functools import partial
 from numbers import Integral, Real
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+
+_T = TypeVar("_T")
 
 _SIMILAR = 0.65
 """Least similarity, up to 1, of a name that is suggested for an unknown one."""
@@ -90,18 +93,31 @@ def check_bool(what: str, value: object) -> bool:
     raise TypeError(f"{what} must be True or False, got {value!r}.")
 
 
-def _check(kind: type, fits: Callable[[Any], bool], wanted: str, what: str, value: Any) -> Any:
-    """Return a finite number that fits as a Python number; raise ValueError for anything else."""
-    number = isinstance(value, kind) and not isinstance(value, bool)
-    if number and math.isfinite(value) and fits(value):
-        return int(value) if kind is Integral else float(value)
+def _check_int(fits: Callable[[int], bool], wanted: str, what: str, value: Any) -> int:
+    """Return an integer that fits as a Python int; raise ValueError for anything else."""
+    if isinstance(value, Integral) and not isinstance(value, bool) and fits(int(value)):
+        return int(value)
     raise ValueError(f"{what} must {wanted}, got {value!r}.")
 
 
-check_positive_int = partial(_check, Integral, lambda x: x >= 1, "be a positive integer")
-check_count = partial(_check, Integral, lambda x: x >= 0, "be a whole number of at least 0")
-check_fraction = partial(_check, Real, lambda x: 0 <= x <= 1, "lie in [0, 1]")
-check_positive = partial(_check, Real, lambda x: x > 0, "be a positive number")
-check_not_negative = partial(_check, Real, lambda x: x >= 0, "be a number of at least 0")
-check_finite = partial(_check, Real, lambda _: True, "be a finite number")
-"""``check(what, value)`` returns the value, or raises a ValueError that names ``what``."""
+def _check_float(fits: Callable[[float], bool], wanted: str, what: str, value: Any) -> float:
+    """Return a finite number that fits as a Python float; raise ValueError for anything else."""
+    if isinstance(value, Real) and not isinstance(value, bool):
+        with suppress(OverflowError):  # an integer beyond all floats
+            number = float(value)
+            if math.isfinite(number) and fits(number):
+                return number
+    raise ValueError(f"{what} must {wanted}, got {value!r}.")
+
+
+_Check = Callable[[str, object], _T]
+"""``check(what, value)`` returns the value; if it does not fit, a ValueError names ``what``."""
+
+check_positive_int: _Check[int] = partial(_check_int, lambda x: x >= 1, "be a positive integer")
+check_count: _Check[int] = partial(_check_int, lambda x: x >= 0, "be a whole number of at least 0")
+check_fraction: _Check[float] = partial(_check_float, lambda x: 0 <= x <= 1, "lie in [0, 1]")
+check_positive: _Check[float] = partial(_check_float, lambda x: x > 0, "be a positive number")
+check_not_negative: _Check[float] = partial(
+    _check_float, lambda x: x >= 0, "be a number of at least 0"
+)
+check_finite: _Check[float] = partial(_check_float, lambda _: True, "be a finite number")

@@ -5,7 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pixelbrax_jax.validation import check_bool, check_choice, check_options, suggest
+from pixelbrax_jax.validation import (
+    check_bool,
+    check_choice,
+    check_count,
+    check_finite,
+    check_fraction,
+    check_not_negative,
+    check_options,
+    check_positive,
+    check_positive_int,
+    suggest,
+)
 
 TASKS = ("ant", "halfcheetah", "inverted_double_pendulum", "inverted_pendulum", "walker2d")
 OPTIONS = ("action_repeat", "frame_stack", "height", "num_envs", "obs_mode", "renderer", "width")
@@ -68,3 +79,25 @@ def test_what_is_no_truth_value(value):
 def test_what_is_no_name(value):
     with pytest.raises(ValueError, match=r"unknown backend: .*llowed: mjx, spring"):
         check_choice("backend", value, ["spring", "mjx"])
+
+
+HUGE = 10**400
+NUMBERS = {
+    "positive integer": (check_positive_int, (1, np.int64(3), HUGE), (0, -2, 1.0, True, "1", None)),
+    "whole number of at least 0": (check_count, (0, np.uint8(3)), (-1, 0.0, False, np.True_)),
+    r"lie in \[0, 1\]": (check_fraction, (0, 1, np.float32(0.5)), (-0.1, 1.1, np.nan, True, "0")),
+    "positive number": (check_positive, (3, 1e-9), (0, -1, np.inf, np.nan, HUGE, True, None)),
+    "number of at least 0": (check_not_negative, (0, 0.0, 7), (-1e-9, np.inf, np.nan, (1,))),
+    "finite number": (check_finite, (-3, np.float32(0)), (np.inf, -np.inf, np.nan, HUGE, "x")),
+}
+
+
+@pytest.mark.parametrize("wanted", NUMBERS)
+def test_numbers(wanted):
+    check, good, bad = NUMBERS[wanted]
+    for value in good:
+        assert check("lr", value) == value
+        assert type(check("lr", value)) in (int, float)
+    for value in bad:
+        with pytest.raises(ValueError, match=rf"^lr must .*{wanted}, got "):
+            check("lr", value)

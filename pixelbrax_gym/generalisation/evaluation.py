@@ -76,7 +76,7 @@ def evaluate_suite(
     return play(levels, players, output_dir, report)
 
 
-def make_envs(
+def make_level_envs(
     levels: Levels, one: LevelEnv, num_envs: int, output: str, **changes: Any
 ) -> GymnasiumVectorEnv:
     """Make the vector environment of a level with some options changed."""
@@ -107,7 +107,7 @@ class _Envs:
         """Play the episodes of a level; return their (E,) returns."""
         num = self._levels.episodes
         if one.env not in self._made:
-            self._made[one.env] = make_envs(self._levels, one, num, self._output)
+            self._made[one.env] = make_level_envs(self._levels, one, num, self._output)
         envs = self._made[one.env]
         with default_flags():
             key = jax.random.key(EPISODES)

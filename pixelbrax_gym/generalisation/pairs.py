@@ -16,7 +16,13 @@ import gymnasium as gym
 import jax
 import numpy as np
 
-from pixelbrax_gym.generalisation.evaluation import Policy, begin, checked, make_envs, numpy_of
+from pixelbrax_gym.generalisation.evaluation import (
+    Policy,
+    begin,
+    checked,
+    make_level_envs,
+    numpy_of,
+)
 from pixelbrax_gym.generalisation.scores import LEFT_OUT, options_of
 from pixelbrax_jax import VectorPixelEnv
 from pixelbrax_jax.config import env_config
@@ -142,7 +148,7 @@ class _Pairs:
     def __init__(self, levels: Levels, images: tuple[str, ...], num_envs: int, output: str) -> None:
         (self._one,) = levels.levels
         self._levels, self._num_envs = levels, num_envs
-        make = partial(make_envs, levels, self._one, num_envs, output)
+        make = partial(make_level_envs, levels, self._one, num_envs, output)
         clean = make(**UNDISTURBED, obs_mode="+".join(("pixels", *images, "state")))
         self._envs = {"clean": clean, "level": make()}
         stacks: Any = clean.single_observation_space
@@ -263,7 +269,7 @@ def _storage(folder: Path, pairs: _Pairs, settings: dict[str, Any]) -> Any:
         data_format="parquet",
         jpeg_encoding=False,
     )
-    # Minari's ids have no dots and colons.
+    # Minari's ids have no dots.
     name = re.sub(r"[^-\w]", "-", "-".join(settings[n] for n in ("task", "suite", "level")))
     storage.update_metadata(
         {

@@ -177,7 +177,7 @@ def read(scores: Scores, folder: Path) -> Returns:
         return {}
     try:
         found = json.loads(file.read_text("utf-8"))
-        returns, _ = found["returns"], found["options"]
+        returns, _ = dict(found["returns"]), dict(found["options"])
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{file} has no returns of a suite; choose another folder.") from error
     wanted = json.loads(_json(scores, {}))

@@ -19,8 +19,9 @@ _forked = False
 def _mark_child() -> None:
     global _forked
     bridge = sys.modules.get("jax._src.xla_bridge")
-    # JAX has no public function for this.
-    _forked = _forked or (bridge is not None and bridge.backends_are_initialized())
+    # JAX has no public function for this. Without this one, assume that JAX runs.
+    started = getattr(bridge, "backends_are_initialized", lambda: True)
+    _forked = _forked or (bridge is not None and started())
 
 
 if hasattr(os, "register_at_fork"):  # not on Windows, which cannot fork

@@ -81,10 +81,10 @@ def _pad_rows(x: jax.Array, size: int) -> jax.Array:
 
 
 def _evaluate(closed: core.ClosedJaxpr, operands: Sequence[Operand], size: int) -> list[Operand]:
-    def given(x: Any) -> Operand:
+    def of_constant(x: Any) -> Operand:
         return Operand(jnp.asarray(x) if isinstance(x, np.generic) else x, False)
 
-    return interpret(closed, operands, partial(_apply, size=size), given)
+    return interpret(closed, operands, partial(_apply, size=size), of_constant)
 
 
 def _apply(eqn: core.JaxprEqn, inputs: list[Operand], size: int) -> list[Operand]:

@@ -15,20 +15,20 @@ def interpret(
     closed: core.ClosedJaxpr,
     operands: Sequence[_T],
     apply: Callable[[core.JaxprEqn, list[_T]], Sequence[_T]],
-    given: Callable[[Any], _T],
+    of_constant: Callable[[Any], _T],
 ) -> list[_T]:
     """Return the results of a program; ``apply(eqn, inputs)`` returns those of an equation.
 
-    ``given`` returns what ``apply`` gets in place of the program's constants, and of its literals,
-    which are NumPy scalars.
+    ``of_constant`` returns what ``apply`` gets in place of the program's constants, and of its
+    literals, which are NumPy scalars.
     """
     jaxpr = closed.jaxpr
-    known = dict(zip(jaxpr.constvars, map(given, closed.consts), strict=True))
+    known = dict(zip(jaxpr.constvars, map(of_constant, closed.consts), strict=True))
     known.update(zip(jaxpr.invars, operands, strict=True))
 
     def read(atom: core.Var | core.Literal) -> _T:
         if isinstance(atom, core.Literal):
-            return given(np.asarray(atom.val, row_aval(atom).dtype)[()])
+            return of_constant(np.asarray(atom.val, row_aval(atom).dtype)[()])
         return known[atom]
 
     for eqn in jaxpr.eqns:

@@ -30,7 +30,7 @@ from pixelbrax_jax.types import EnvParams
 from pixelbrax_jax.validation import check_choice, check_positive_int
 
 UNDISTURBED: dict[str, Any] = {"distractors": (), "clips": None, "split": "train", "dynamics": ""}
-"""Options without distractors and varied dynamics; a suite decides them."""
+"""Options without distractors and without varied dynamics; a suite decides them."""
 
 _EPISODE = 2**32 - 1
 """Index of the episode whose keys draw the levels' parameters; no training reaches it."""
@@ -62,7 +62,7 @@ class Levels:
     """The levels of a suite, ready to be played, and the clips that they show.
 
     Attributes:
-        config: the task and the options that the suite does not decide.
+        config: the task and the options, without distractors and clips of its own.
         suite: name of the suite.
         levels: in the order of the suite.
         episodes: number E of episodes, rows of the parameters.
@@ -107,8 +107,8 @@ def make_levels(
     """
     if config.obs_mode == "state":
         raise ValueError("a suite changes the image, but obs_mode='state' shows none; take pixels.")
-    config = replace(config, task=find_task(config.task))
-    levels = levels_of(suite, config.task)
+    config = replace(config, **UNDISTURBED)
+    levels = levels_of(suite, find_task(config.task))
     episodes = SUITES[suite].episodes if episodes is None else episodes
     episodes = check_positive_int("episodes", episodes)
     if only is not None:
@@ -143,7 +143,7 @@ def _make(config: EnvConfig, level: Level, bank: ClipBank | None) -> tuple[Pixel
     links = [link for link in level.changes if isinstance(link, Distractor)]
     own = tuple(link for link in links if not changes_params_alone(link))
     shown = {"distractors": own, "clips": bank if level.clips else None}
-    return make(config, **UNDISTURBED | shown)
+    return make(config, **shown)
 
 
 def _draw(changes: Sequence[Change | Distractor], base: EnvParams, keys: jax.Array) -> EnvParams:

@@ -41,6 +41,11 @@ program = jax.jit(ours, out_shardings=(spread, spread, NamedSharding(mesh, P()))
 program = program.lower(*arguments).compile()
 for a, b in zip(program(*arguments), jax.jit(pulled(native))(images, kernel), strict=True):
     np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)
+# Policies are exported for batches of any size.
+(size,) = jax.export.symbolic_shape("size")
+shapes = jax.ShapeDtypeStruct((size, 9, 8, 2), images.dtype), kernel
+exported = jax.export.export(jax.jit(lambda x, kernel: ours(x, kernel)[0]))(*shapes)
+np.testing.assert_allclose(exported.call(images, kernel), native(images, kernel), atol=1e-4)
 moves = re.findall(r" (all-[a-z]+|collective-permute)[-a-z]*[(]", program.as_text())
 print(jax.device_count(), *moves)
 """

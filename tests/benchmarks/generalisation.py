@@ -91,23 +91,40 @@ def play(task: str, training: str, suite: str, runs: list[Path], folder: Path) -
     return 0
 
 
-def page(suite: str) -> str:
-    """A table for each task, a column for each training, in Markdown."""
+def columns(task: str, suite: str) -> dict[str, list[Row]]:
+    """Rows of the suite by training, with the number of seeds in the name."""
+    scores = {name: found for name in TRAININGS[TASKS[task]] if (found := kept(task, name, suite))}
+    return {f"{name} ({len(found.returns)})": found.rows() for name, found in scores.items()}
+
+
+def levels_page() -> str:
+    """A table of DMC-GB2 for each task, a column for each training, in Markdown."""
     parts = []
     for task, agent in TASKS.items():
-        scores = {name: found for name in TRAININGS[agent] if (found := kept(task, name, suite))}
-        if not scores:
+        if not (found := columns(task, "dmcgb2")):
             continue
-        columns = {f"{name} ({len(found.returns)})": found.rows() for name, found in scores.items()}
-        lines = [[rows[0].level, *map(_cell, rows)] for rows in zip(*columns.values(), strict=True)]
-        heads = ["level", *columns]
-        if suite == "axes":
-            heads[0], lines = "axis", _one_row_an_axis(columns)
-        for name, returns in published(task).items() if suite == "dmcgb2" else ():
+        lines = [[rows[0].level, *map(_cell, rows)] for rows in zip(*found.values(), strict=True)]
+        heads = ["level", *found]
+        for name, returns in published(task).items():
             heads.append(name)
             lines = [[*line, returns.get(line[0], "")] for line in lines]
         parts.append(f"**`{task}`**, {agent}\n\n{table(heads, lines)}")
     return "\n\n".join(parts)
+
+
+def axes_page() -> str:
+    """One table of all axes, a column for each task and training; sizes are in one cell."""
+    found = {
+        f"{task.removeprefix('dmc_').replace('_', ' ')}, {name}": rows
+        for task in TASKS
+        for name, rows in columns(task, "axes").items()
+    }
+    axes: dict[str, list[list[str]]] = {}
+    for rows in zip(*found.values(), strict=True):
+        axis = rows[0].level.rstrip("-123").replace("-", " ")
+        axes.setdefault(axis, []).append([f"{row.mean:.0f}" for row in rows])
+    lines = [[axis, *map(", ".join, zip(*sizes, strict=True))] for axis, sizes in axes.items()]
+    return table(["axis", *found], lines)
 
 
 def published(task: str) -> dict[str, dict[str, str]]:
@@ -126,15 +143,6 @@ def _cell(row: Row) -> str:
     return f"{row.mean:.0f}{spread}"
 
 
-def _one_row_an_axis(columns: dict[str, list[Row]]) -> list[list[str]]:
-    """Means of an axis' sizes, the smallest first, in one cell."""
-    axes: dict[str, list[list[str]]] = {}
-    for rows in zip(*columns.values(), strict=True):
-        axis = rows[0].level.rstrip("-123").replace("-", " ")
-        axes.setdefault(axis, []).append([f"{row.mean:.0f}" for row in rows])
-    return [[axis, *map(", ".join, zip(*sizes, strict=True))] for axis, sizes in axes.items()]
-
-
 def largest_error() -> str:
     """The largest standard error of a mean on one of the axes."""
     found = [
@@ -146,8 +154,11 @@ def largest_error() -> str:
     return f"{max(error for error in errors if not math.isnan(error)):.0f}"
 
 
-FIGURES: dict[str, Callable[[], str]] = {suite: partial(page, suite) for suite in SUITES}
-FIGURES["axes-error"] = largest_error
+FIGURES: dict[str, Callable[[], str]] = {
+    "dmcgb2": levels_page,
+    "axes": axes_page,
+    "axes-error": largest_error,
+}
 
 
 def main() -> int:
@@ -179,21 +190,22 @@ def main() -> int:
             continue
         folder = options.output_dir / f"revision-{REVISION}" / f"{task}-{training}"
         runs = [folder / str(seed) for seed in range(options.seeds)]
-        jobs = {
+        trainings = {
             str(made): partial(train, task, training, seed, made) for seed, made in enumerate(runs)
         }
-        jobs |= {
+        plays = {
             f"{suite} of {folder}": partial(play, task, training, suite, runs, folder / suite)
             for suite in missing
         }
-        for name, job in jobs.items():
+        for name, job in (trainings | plays).items():
             status = job()
             if status > 128 or status < 0:
                 print(f"stopped in {name}; the same command goes on", file=sys.stderr)
                 return status
             if status:
                 failed.append(name)
-                break
+                if name in trainings:
+                    break
     if failed:
         print(f"failed: {', '.join(failed)}", file=sys.stderr)
     return bool(failed)

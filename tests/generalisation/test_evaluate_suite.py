@@ -133,7 +133,7 @@ def test_a_stopped_call_continues_with_equal_returns(tmp_path):
         evaluate(policy, output_dir=tmp_path, episodes=4)
     with pytest.raises(ValueError, match="has action_repeat=1, this call 2"):
         evaluate(policy, output_dir=tmp_path, action_repeat=2)
-    for text in ("[]", '{"returns": {}}'):
+    for text in ("[]", '{"returns": {}}', '{"returns": {}, "options": 3}'):
         (tmp_path / "returns.json").write_text(text)
         with pytest.raises(ValueError, match="has no returns of a suite"):
             evaluate(policy, output_dir=tmp_path)

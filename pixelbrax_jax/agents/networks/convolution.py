@@ -55,7 +55,7 @@ def _by_image(
     def convolved(image: jax.Array) -> jax.Array:
         return _patches(image, kernel, stride, pads, before) @ _matrix(kernel)
 
-    (result,) = _on_each_device(lambda x: [jax.lax.map(convolved, x)], x)
+    result = _on_each_device(partial(jax.lax.map, convolved), x)
     return result.reshape(x.shape[0], *result.shape[2:])
 
 
@@ -96,9 +96,10 @@ _by_image.defvjp(_by_image_forward, _by_image_backward)
 
 
 def _on_each_device(loop: Callable[..., Any], *batches: jax.Array) -> Any:
-    """Return the results of a loop over each device's part of a batch, (devices, ...).
+    """Return the results of a loop over each part of a batch, (parts, ...), a part a device.
 
-    XLA does not divide a loop over an axis that is sharded: every device would get all images.
+    XLA does not divide a loop over an axis that is sharded: every device would get all images. So
+    it is with a batch that is no multiple of JAX's devices, or is spread over some of them alone.
     """
     devices, size = jax.device_count(), batches[0].shape[0]
     # Policies are exported for batches of any size.

@@ -51,7 +51,7 @@ class Warp(Xla):
 
         def move(data: Any) -> Any:
             rows = self._rows(multipliers[None], *(getattr(data, name)[None] for name in _TAKEN))
-            return data.replace(**{name: x[0] for name, x in zip(self._given, rows, strict=True)})
+            return data.replace(**{name: x[0] for name, x in zip(self._left, rows, strict=True)})
 
         return move
 
@@ -65,7 +65,7 @@ class Warp(Xla):
             def one(multipliers: jax.Array, *row: jax.Array) -> Arrays:
                 data = blank.replace(**dict(zip(_TAKEN, row, strict=True)))
                 data = mjx.step(changed(self._warp, multipliers), data)
-                return tuple(getattr(data, name) for name in self._given)
+                return tuple(getattr(data, name) for name in self._left)
 
             result: Arrays = jax.vmap(one)(*arrays)
             return result

@@ -41,8 +41,8 @@ class Xla:
         self._model = model
         self._starts_with_forces = needs.starts_with_forces or bool(needs.reads)
         self._fields = needs.reads
-        # What a step gives, by its names of `MjData`.
-        self._given = ("qpos", "qvel", "act", "qacc_warmstart", "sensordata", *needs.reads)
+        # What a step leaves, by its names of `MjData`.
+        self._left = ("qpos", "qvel", "act", "qacc_warmstart", "sensordata", *needs.reads)
         self._stages: Any = mjx if plain or not stages.is_supported(model) else stages
         self.simulated = _simulated(model, needs.out_of_reach)
         try:
@@ -79,11 +79,11 @@ class Xla:
             data = move(self._data(qpos, qvel, act=act, qacc_warmstart=warmstart, ctrl=ctrl))
             if "cfrc_ext" in self._fields:
                 data = smooth.rne_postconstraint(model, data)
-            return tuple(getattr(data, name) for name in self._given)
+            return tuple(getattr(data, name) for name in self._left)
 
         carry: Arrays = (qpos, qvel, act, qacc_warmstart)
         blank = self._data(qpos, qvel)
-        carry += tuple(jnp.zeros_like(getattr(blank, name)) for name in self._given[4:])
+        carry += tuple(jnp.zeros_like(getattr(blank, name)) for name in self._left[len(carry) :])
         if num_steps == 1:
             carry = one(carry)
         else:
