@@ -137,6 +137,8 @@ def main() -> None:
         from tests.benchmarks import plots
 
         results.plot()
+        for machine in BENCHMARKS:
+            plots.speed(ROOT / f"docs/benchmarks/{machine}.json")
         folder = ROOT / "docs/leaderboard"
         if entries := leaderboard.read(folder):
             published = json.loads((folder / leaderboard.PUBLISHED).read_text("utf-8"))["agents"]

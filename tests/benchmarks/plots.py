@@ -22,14 +22,22 @@ BASELINES = {"random": ("random policy", ":"), "none": ("no action", "--")}
 """Label and line."""
 
 
-def row_of_panels(count: int, size: tuple[float, float], **options: Any) -> tuple[Any, Any]:
-    """A figure, and its panels side by side."""
-    figure, panels = plt.subplots(
-        1, count, figsize=size, layout="constrained", squeeze=False, **options
+def panels_in_pairs(count: int, **options: Any) -> tuple[Any, list[plt.Axes]]:
+    """A figure, and its panels, two in a row."""
+    rows, columns = math.ceil(count / 2), min(2, count)
+    figure, grid = plt.subplots(
+        rows,
+        columns,
+        figsize=(3.6 * columns, 2.6 * rows + 0.4),
+        layout="constrained",
+        squeeze=False,
+        **options,
     )
-    for panel in panels[0]:
+    for panel in grid.flat:
         panel.grid(alpha=0.3, which="both")
-    return figure, panels[0]
+    for panel in grid.flat[count:]:
+        panel.set_visible(False)
+    return figure, list(grid.flat[:count])
 
 
 def learning(panels: dict[str, tuple[list[list[dict]], dict]], path: Path) -> None:
@@ -37,16 +45,15 @@ def learning(panels: dict[str, tuple[list[list[dict]], dict]], path: Path) -> No
 
     Steps and not minutes, which depend on the machine.
     """
-    figure, row = row_of_panels(len(panels), (4 * len(panels), 3.4))
-    for axes, (name, (groups, untrained)) in zip(row, panels.items(), strict=True):
+    figure, drawn = panels_in_pairs(len(panels))
+    for axes, (name, (groups, untrained)) in zip(drawn, panels.items(), strict=True):
         for seeds in groups:
             _curve(axes, seeds)
         for kind, (label, style) in BASELINES.items():
             level = untrained[kind]["return"]
             axes.axhline(level, color="gray", linestyle=style, label=label)
-        axes.set(xlabel="million control steps", title=name)
-        axes.legend(fontsize=7)
-    row[0].set_ylabel("return of training episodes")
+        axes.set(xlabel="million control steps", ylabel="return in training", title=name)
+    legend(figure, drawn, loc="outside upper center", ncols=5)
     figure.savefig(path, dpi=130)
 
 
@@ -63,13 +70,13 @@ def _curve(axes: plt.Axes, seeds: list[dict]) -> None:
     axes.plot(grid / 1e6, lines.mean(0), color=color, linewidth=1.8, label=algorithm.upper())
 
 
-def _legend(axes: plt.Axes, panels: Iterable[plt.Axes], fontsize: int) -> None:
-    """Show the labels of all panels once each."""
+def legend(where: Any, panels: Iterable[plt.Axes], **options: Any) -> None:
+    """Show the labels of all panels once each, in a figure or one of its panels."""
     named: dict[str, Any] = {}
     for panel in panels:
         handles, labels = panel.get_legend_handles_labels()
         named |= zip(labels, handles, strict=True)
-    axes.legend(named.values(), named.keys(), fontsize=fontsize)
+    where.legend(named.values(), named.keys(), fontsize=8, **options)
 
 
 def leaderboard(entries: list[dict], published: dict[str, dict], path: Path) -> None:
@@ -103,7 +110,7 @@ def leaderboard(entries: list[dict], published: dict[str, dict], path: Path) -> 
             axes.grid(alpha=0.3)
             if task.startswith("dmc_"):
                 axes.set_ylim(0, 1050)
-    _legend(panels[0, 0], panels.flat, fontsize=7)
+    legend(figure, panels.flat, loc="outside upper center", ncols=4)
     figure.savefig(path, dpi=110)
 
 
@@ -120,7 +127,7 @@ def speed(file: Path) -> None:
     tasks = list(dict.fromkeys(row["arguments"]["task"] for row in rows))
     if not tasks:
         return
-    figure, panels = row_of_panels(len(tasks), (1 + 3 * len(tasks), 3.6), sharey=True)
+    figure, panels = panels_in_pairs(len(tasks), sharey=True)
     for panel, task in zip(panels, tasks, strict=True):
         for obs_mode, label in (("state", "state only"), ("pixels", "84 x 84 pixels")):
             points = sorted(
@@ -128,9 +135,10 @@ def speed(file: Path) -> None:
                 for row in rows
                 if row["arguments"]["task"] == task and row["arguments"].get("obs_mode") == obs_mode
             )
-            panel.loglog([x for x, _ in points], [y for _, y in points], "o-", label=label)
-        panel.set(title=title(task), xlabel="environments")
-        panel.legend(fontsize=7)
-    panels[0].set_ylabel("steps / s")
+            panel.semilogx([x for x, _ in points], [y for _, y in points], "o-", label=label)
+        panel.set(title=title(task), xlabel="environments", ylabel="steps a second")
+        panel.yaxis.set_major_formatter("{x:,.0f}")
+    panels[0].set_ylim(bottom=0)  # of all, which share it
+    legend(figure, panels, loc="outside upper center", ncols=2)
     figure.savefig(file.with_suffix(".png"), dpi=130)
     plt.close(figure)

@@ -8,7 +8,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 
 from tests.benchmarks.case import Row
-from tests.benchmarks.plots import row_of_panels
+from tests.benchmarks.plots import legend, panels_in_pairs
 from tests.benchmarks.tables import succeeded, title
 
 
@@ -36,7 +36,7 @@ def _speeds(rows: list[Row]) -> plt.Figure:
     ]
     tasks = list(dict.fromkeys(row["arguments"]["task"] for row in rows))
     kinds = sorted({row["arguments"]["size"] or 0 for row in rows})
-    figure, panels = row_of_panels(len(tasks), (1.5 + 2.6 * len(tasks), 3.6), sharey=True)
+    figure, panels = panels_in_pairs(len(tasks), sharey=True)
     for panel, task in zip(panels, tasks, strict=True):
         for policy, style in (("random", "o-"), ("network", "s--")):
             for size in kinds:
@@ -52,19 +52,17 @@ def _speeds(rows: list[Row]) -> plt.Figure:
                         *zip(*points, strict=True), style, color=f"C{kinds.index(size)}",
                         label=f"{label}, {policy}", markersize=4,
                     )  # fmt: skip
-        panel.set(title=title(task), xlabel="environments")
-        panel.legend(fontsize=6)
-    panels[0].set_ylabel("steps / s")
+        panel.set(title=title(task), xlabel="environments", ylabel="steps a second")
+    legend(figure, panels, loc="outside upper center", ncols=4)
     return figure
 
 
 def _learning(rows: list[Row]) -> plt.Figure:
     """A panel for each run."""
-    figure, panels = row_of_panels(len(rows), (1 + 3.6 * len(rows), 3.2))
+    figure, panels = panels_in_pairs(len(rows))
     for panel, row in zip(panels, rows, strict=True):
         where, curve = row["arguments"], row["values"]["curve"]
         panel.plot([at for at, _, _ in curve], [value for _, _, value in curve])
         name = f"{where['algorithm']}, {where['preset']}: {title(where['task'])}"
-        panel.set(title=name, xlabel="seconds of training")
-    panels[0].set_ylabel("return of training episodes")
+        panel.set(title=name, xlabel="seconds of training", ylabel="return in training")
     return figure
