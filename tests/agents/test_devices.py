@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
 
-ROOT = Path(__file__).parents[2]
+from tests.two_devices import run_on_two_devices
 
 SCRIPT = """
 import re
@@ -55,15 +50,4 @@ print(jax.device_count(), *moves)
     ("num_images", "told"), [(6, ["2", "all-reduce"]), (5, ["2"])], ids=["half each", "odd"]
 )
 def test_two_devices_sum_the_gradients_of_their_own_images(num_images, told):
-    flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=2"
-    done = subprocess.run(
-        [sys.executable, "-c", SCRIPT.format(num_images=num_images)],
-        env=os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"},
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=300,
-    )
-    assert done.returncode == 0, done.stderr[-2000:]
-    assert done.stdout.split() == told
+    assert run_on_two_devices(SCRIPT.format(num_images=num_images)).split() == told

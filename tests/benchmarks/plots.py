@@ -53,7 +53,7 @@ def learning(panels: dict[str, tuple[list[list[dict]], dict]], path: Path) -> No
             level = untrained[kind]["return"]
             axes.axhline(level, color="gray", linestyle=style, label=label)
         axes.set(xlabel="million control steps", ylabel="return in training", title=name)
-    legend(figure, drawn, loc="outside upper center", ncols=5)
+    legend(figure, drawn, columns=5)
     figure.savefig(path, dpi=130)
 
 
@@ -70,13 +70,14 @@ def _curve(axes: plt.Axes, seeds: list[dict]) -> None:
     axes.plot(grid / 1e6, lines.mean(0), color=color, linewidth=1.8, label=algorithm.upper())
 
 
-def legend(where: Any, panels: Iterable[plt.Axes], **options: Any) -> None:
-    """Show the labels of all panels once each, in a figure or one of its panels."""
+def legend(figure: plt.Figure, panels: Iterable[plt.Axes], columns: int) -> None:
+    """Show the labels of all panels once each, above them."""
     named: dict[str, Any] = {}
     for panel in panels:
         handles, labels = panel.get_legend_handles_labels()
         named |= zip(labels, handles, strict=True)
-    where.legend(named.values(), named.keys(), fontsize=8, **options)
+    where = {"loc": "outside upper center", "ncols": columns}
+    figure.legend(named.values(), named.keys(), fontsize=8, **where)
 
 
 def leaderboard(entries: list[dict], published: dict[str, dict], path: Path) -> None:
@@ -110,7 +111,7 @@ def leaderboard(entries: list[dict], published: dict[str, dict], path: Path) -> 
             axes.grid(alpha=0.3)
             if task.startswith("dmc_"):
                 axes.set_ylim(0, 1050)
-    legend(figure, panels.flat, loc="outside upper center", ncols=4)
+    legend(figure, panels.flat, columns=4)
     figure.savefig(path, dpi=110)
 
 
@@ -139,6 +140,6 @@ def speed(file: Path) -> None:
         panel.set(title=title(task), xlabel="environments", ylabel="steps a second")
         panel.yaxis.set_major_formatter("{x:,.0f}")
     panels[0].set_ylim(bottom=0)  # of all, which share it
-    legend(figure, panels, loc="outside upper center", ncols=2)
+    legend(figure, panels, columns=2)
     figure.savefig(file.with_suffix(".png"), dpi=130)
     plt.close(figure)

@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[2]
+from tests.two_devices import run_on_two_devices
 
 SCRIPT = """
 import json, re, sys
@@ -66,19 +62,7 @@ print(json.dumps({
     scope="module", params=["toy", pytest.param("inverted_pendulum", marks=pytest.mark.slow)]
 )
 def told(request):
-    # Without the tests' own flags, which turn optimisation off.
-    flags = "--xla_force_host_platform_device_count=2"
-    done = subprocess.run(
-        [sys.executable, "-c", SCRIPT, request.param],
-        env=os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"},
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=300,
-    )
-    assert done.returncode == 0, done.stderr[-2000:]
-    return json.loads(done.stdout.strip().splitlines()[-1])
+    return json.loads(run_on_two_devices(SCRIPT, request.param).strip().splitlines()[-1])
 
 
 def test_environments_are_the_same(told):

@@ -53,7 +53,7 @@ def _speeds(rows: list[Row]) -> plt.Figure:
                         label=f"{label}, {policy}", markersize=4,
                     )  # fmt: skip
         panel.set(title=title(task), xlabel="environments", ylabel="steps a second")
-    legend(figure, panels, loc="outside upper center", ncols=4)
+    legend(figure, panels, columns=4)
     return figure
 
 
