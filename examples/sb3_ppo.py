@@ -14,7 +14,7 @@ import os
 import time
 from pathlib import Path
 
-# JAX and PyTorch take turns on the same cores; see docs/sb3.md.
+# JAX and PyTorch take turns on the same cores; see docs/troubleshooting.md.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 from stable_baselines3 import PPO

@@ -285,7 +285,9 @@ def why_no_cache() -> str:
             folder = folder.parent
     except OSError as error:
         return str(error)
-    return "" if os.access(folder, os.W_OK) else f"{folder} cannot be written"
+    if not folder.is_dir():
+        return f"{folder} is no folder"
+    return "" if os.access(folder, os.W_OK | os.X_OK) else f"{folder} cannot be written"
 
 
 def _attempt(check: Callable[[], Any]) -> Any:

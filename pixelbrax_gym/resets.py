@@ -79,6 +79,8 @@ def read_options(options: Any, seed: Any, num_envs: int | None = None) -> dict[s
                 f"reset() takes a seed or options['state'], got both (seed={seed!r}): a state "
                 "contains its own random keys; omit one of them."
             )
+        if options["state"] is None:
+            raise TypeError("options['state'] must be an EnvState of get_state(), got None.")
         read["state"] = options["state"]
     return read
 
@@ -89,7 +91,8 @@ def as_mask(what: str, given: Any, shape: tuple[int | None, ...]) -> np.ndarray:
     if dtype != "bool":
         kind = f"{dtype} array" if dtype else type(given).__name__
         raise TypeError(f"{what} must be an array or tensor of bool, got {kind}.")
-    mask = np.asarray(given.cpu() if hasattr(given, "cpu") else given)
+    # A copy, because a program may read it after the caller has changed it.
+    mask = np.asarray(given.cpu() if hasattr(given, "cpu") else given).copy()
     if mask.shape != shape:
         raise ValueError(f"{what} must have shape {shape}, got {mask.shape}.")
     return mask

@@ -125,7 +125,7 @@ class StatefulEnv:
         if state is not None:
             return self.set_state(state, mask)
         seeds = seeds_of(seed, self.num_envs)
-        where = np.ones(self.num_envs, bool) if mask is None else mask.copy()
+        where = np.ones(self.num_envs, bool) if mask is None else mask
         if self._snapshot is None:
             if not where.all():
                 raise error.ResetNeeded("the first reset must be of all environments.")
@@ -191,7 +191,8 @@ class StatefulEnv:
         return self._replace(self._programs.start(state, self.params, packed, mask))
 
     def set_time_limit(self, control_steps: int) -> None:
-        """Set the time limit of current and later episodes, at least 1."""
+        """Set the time limit, at least 1, of current and later episodes; a shorter task's holds."""
+        control_steps = min(filter(None, (control_steps, self.env.physics.time_limit)))
         if control_steps == self.episode_length:
             return
         limit: Any = np.int32(control_steps)

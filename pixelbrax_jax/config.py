@@ -67,7 +67,8 @@ class ProgramConfig:
     times as long to render."""
     distractors: Distractors = ()
     """Changes of the image: a distractor, the name of a preset, or several of them. A dictionary of
-    ``plain.to_plain`` may stand for a distractor."""
+    ``plain.to_plain`` may stand for a distractor. Where only the state is observed, they, their
+    clips and split are left out."""
 
     def __post_init__(self) -> None:
         for name in ("height", "width", "frame_stack", "action_repeat"):

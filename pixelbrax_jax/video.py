@@ -32,8 +32,7 @@ def write_frames(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> 
     which loops forever. Folders are created. After an error or Ctrl-C the earlier frames are kept.
     """
     path = Path(path)
-    if path.suffix.lower() not in SUFFIXES:
-        raise ValueError(f"a video must be one of {', '.join(SUFFIXES)}, got {str(path)!r}.")
+    check_suffix(path)
     if not 0 < fps < math.inf:
         raise ValueError(f"fps must be a positive number, got {fps!r}.")
     try:
@@ -64,6 +63,12 @@ def write_frames(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> 
     return path
 
 
+def check_suffix(path: Path) -> None:
+    """Raise a ValueError unless a video can be written to a file of this name."""
+    if path.suffix.lower() not in SUFFIXES:
+        raise ValueError(f"a video must be one of {', '.join(SUFFIXES)}, got {str(path)!r}.")
+
+
 def _check_frame(frame: np.ndarray, first: tuple[int, ...]) -> None:
     shape, dtype = np.shape(frame), getattr(frame, "dtype", None)
     if len(shape) != 3 or shape[2] != 3 or 0 in shape or dtype != np.uint8:
@@ -79,14 +84,16 @@ def _gif(path: Path, fps: float) -> Iterator[Callable[[np.ndarray], None]]:
     images: list[Any] = []
     times: list[int] = []
     count = shown = 0
+    last: Any = None
 
     def append(frame: np.ndarray) -> None:
-        nonlocal count, shown
+        nonlocal count, shown, last
         count += 1
         # A GIF counts hundredths of a second. Rounded one by one, they would not add up.
         end = 10 * round(100 * count / fps)
         image, time = Image.fromarray(frame), end - shown
         if time < _SHORTEST:
+            last = image
             return
         shown = end
         # Older releases of Pillow lose the time of equal images; newer ones add it up.
@@ -107,8 +114,8 @@ def _gif(path: Path, fps: float) -> Iterator[Callable[[np.ndarray], None]]:
     try:
         yield append
     finally:
-        if images:
-            _save_gif(path, images, times)
+        if images or last:
+            _save_gif(path, images or [last], times or [_SHORTEST])
 
 
 def _save_gif(path: Path, images: list[Any], times: list[int]) -> None:

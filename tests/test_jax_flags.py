@@ -15,7 +15,7 @@ from pixelbrax_jax.agents.registry import ALGORITHMS
 from pixelbrax_jax.distractors.presets import PRESETS
 from pixelbrax_jax.flags import PRNG, under_default_flags
 from pixelbrax_jax.tasks import TASKS
-from tests.under_flags import SIZE, TASK, play
+from tests.under_flags import KEY, SIZE, TASK, make, play
 
 CHECKS = {
     "jax_debug_infs": True,
@@ -23,7 +23,7 @@ CHECKS = {
     "jax_transfer_guard": "disallow",
 }
 RULES = {
-    "jax_default_matmul_precision": "highest",
+    "jax_default_matmul_precision": "bfloat16",
     "jax_default_prng_impl": "rbg",
     "jax_numpy_dtype_promotion": "strict",
     "jax_numpy_rank_promotion": "raise",
@@ -43,7 +43,7 @@ ALONE = [
         if hasattr(jax.config, name)
     ),
     {"jax_cpu_enable_async_dispatch": False},
-    {"jax_default_matmul_precision": "bfloat16"},
+    {"jax_default_matmul_precision": "highest"},
     {"jax_default_prng_impl": "unsafe_rbg"},
     {"jax_explicit_x64_dtypes": "error"},
     {"jax_legacy_prng_key": "error"},
@@ -54,10 +54,6 @@ PARTS = (
     *(f"env:{TASK}", "env:dmc_cartpole_swingup,color"),
     *("gymnasium", "sb3", "torchrl", "train:ppo"),
 )
-
-
-# What matrices are multiplied with is written into a program.
-TRACED = {name: value for name, value in (X64 | RULES).items() if "precision" not in name}
 
 
 def under(flags: dict[str, object], *parts: str) -> dict[str, str]:
@@ -82,7 +78,7 @@ def without(*parts: str) -> dict[str, str]:
 @pytest.mark.parametrize(
     ("flags", "part"),
     [
-        (TRACED, "program:dmc_pendulum_swingup,color"),
+        (X64 | RULES, "program:dmc_pendulum_swingup,color"),
         pytest.param(X64 | RULES, f"env:{TASK}", marks=pytest.mark.slow),
         pytest.param(CHECKS, "gymnasium", marks=pytest.mark.slow),
     ],
@@ -111,7 +107,7 @@ def test_other_agents_learn_the_same(algorithm):
 @pytest.mark.parametrize("first", range(0, len(TASKS), 6))
 def test_every_task_is_the_same_program(first):
     parts = [f"program:{task}" for task in sorted(TASKS)[first : first + 6]]
-    assert under(TRACED, *parts) == without(*parts)
+    assert under(X64 | RULES, *parts) == without(*parts)
 
 
 @pytest.mark.slow
@@ -119,12 +115,25 @@ def test_every_task_is_the_same_program(first):
 def test_every_distractor_and_renderer_is_the_same_program():
     parts = [f"program:{TASK},{distractor}" for distractor in PRESETS]
     parts += [f"program:{TASK}/{renderer}" for renderer in ("fused", "reference")]
-    assert under(TRACED, *parts) == without(*parts)
+    assert under(X64 | RULES, *parts) == without(*parts)
     # Its loops count, and index, with 64 bits. It is interpreted until the process ends.
     kernel = f"env:{TASK}/pallas"
     wanted = under({}, kernel)
     assert not any("Error" in found for found in wanted.values())
-    assert under(TRACED, kernel) == wanted
+    assert under(X64 | RULES, kernel) == wanted
+
+
+@pytest.mark.parametrize(
+    ("platform", "name"), [("cuda", f"{TASK},camera"), ("tpu", "dmc_pendulum_swingup")]
+)
+def test_accelerators_round_no_factor_of_a_product(platform, name):
+    env, params = make(name)
+    envs = pb.VectorPixelEnv(env, 2)
+    with jax.default_matmul_precision("bfloat16"):
+        program = type(envs).reset.trace(envs, KEY, params).lower(lowering_platforms=(platform,))
+    products = [line for line in program.as_text().splitlines() if "dot_general" in line]
+    assert len(products) > 5
+    assert all("[HIGHEST, HIGHEST]" in line for line in products)
 
 
 def test_what_a_user_made_of_64_bits_is_rounded():

@@ -87,6 +87,14 @@ def test_odd_sides_are_padded_with_their_last_pixels(tmp_path, height, width):
     assert still.shape == frame.shape
 
 
+def test_a_gif_of_less_than_its_shortest_time_shows_its_frame_that_long(tmp_path):
+    path = tmp_path / "a.gif"
+    path.write_bytes(b"an older file")
+    write_frames(path, [np.full((8, 8, 3), 255, np.uint8)], 100)
+    assert imageio.imread(path, index=0)[0, 0, 0] == 255
+    assert imageio.immeta(path)["duration"] == 20, "milliseconds"
+
+
 def test_a_still_gif_lasts_as_long(tmp_path):
     path = write_frames(tmp_path / "a.gif", [np.zeros((8, 8, 3), np.uint8)] * 10, 25)
     assert imageio.immeta(path)["duration"] == 400, "milliseconds"

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import arg
 
-from pixelbrax_gym.cli import CommandError
+from pixelbrax_gym.cli import CommandError, UsageError
 from pixelbrax_jax.extras import needs_extra
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ def load(options: AgentOptions, folder: str | None) -> Trained:
         except CheckpointError as error:
             raise CommandError(str(error)) from error
     if folder is not None or options.pretrained is None:
-        raise ValueError("give either the folder of a run or --pretrained with a name.")
+        raise UsageError("give either the folder of a run or --pretrained with a name.")
     if steps is not None or best or run:
-        raise ValueError("--steps, --best and --run need the folder of a run, not --pretrained.")
+        raise UsageError("--steps, --best and --run need the folder of a run, not --pretrained.")
     return load_pretrained(options.pretrained)

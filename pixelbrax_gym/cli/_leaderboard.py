@@ -30,8 +30,8 @@ Entry = dict[str, Any]
 def entry(folder: str | Path, agent: str | None = None) -> Entry:
     """Read the entry of a run from its output folder; ``agent`` names it, default its algorithm.
 
-    Seconds are those of training: without evaluations, and without the compilation, which is the
-    excess of the first iteration over the second.
+    Seconds are those of training: without evaluations, and without the compilation at the start,
+    which is the excess of the first iteration over the second. What a resumed run compiles counts.
     """
     folder = Path(folder)
     about = read_about(folder / "checkpoints")
@@ -41,6 +41,11 @@ def entry(folder: str | Path, agent: str | None = None) -> Entry:
     if config["distractors"]:
         raise ValueError(
             f"{folder} trained with distractors={config['distractors']}; the leaderboard has runs "
+            "without."
+        )
+    if config.get("dynamics"):
+        raise ValueError(
+            f"{folder} trained with dynamics={config['dynamics']!r}; the leaderboard has runs "
             "without."
         )
     if config.get("num_starts"):

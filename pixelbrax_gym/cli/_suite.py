@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from hashlib import sha256
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pixelbrax_gym.cli import say
+import jax
+import numpy as np
+
+from pixelbrax_gym.cli import UsageError, say
 from pixelbrax_gym.cli._agents import AgentOptions, load
 from pixelbrax_jax.extras import needs_extra
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
-
-    import numpy as np
 
     from pixelbrax_jax.agents.runner.trained import Trained
     from pixelbrax_jax.generalisation.making import LevelEnv, Levels
@@ -31,7 +34,7 @@ def evaluate(
 ) -> str:
     """Play the levels of a suite with all runs; return their table in Markdown."""
     if options.run_index:
-        raise ValueError("--suite plays all runs of a folder; leave out --run.")
+        raise UsageError("--suite plays all runs of a folder; leave out --run.")
     agents = _load(options, runs)
     with needs_extra("train"):
         from pixelbrax_gym.generalisation.scores import RETURNS, ROWS, SHEET, play
@@ -54,18 +57,20 @@ def _load(options: AgentOptions, runs: Sequence[str]) -> Mapping[str, Trained]:
     if options.pretrained is not None:
         return {options.pretrained: load(options, next(iter(runs), None))}
     if not runs:
-        raise ValueError("--suite needs the folders of one or several runs, or --pretrained.")
+        raise UsageError("--suite needs the folders of one or several runs, or --pretrained.")
     from pixelbrax_jax.agents.config import describe
     from pixelbrax_jax.agents.runner.trained import num_runs
 
     agents: dict[str, Trained] = {}
+    given: set[Path] = set()
     for folder in runs:
+        if (path := Path(folder).resolve()) in given:
+            raise UsageError(f"run {folder} is given twice.")
+        given.add(path)
         first = load(options, folder)
         for index in range(num_runs(folder)):
             agent = first if index == 0 else load(replace(options, run_index=index), folder)
-            name = f"{folder}, seed {agent.seed}, {agent.steps} steps"
-            if name in agents:
-                raise ValueError(f"run {folder} is given twice.")
+            name = f"{Path(folder)}, seed {agent.seed}, {agent.steps} steps, {_digest(agent)}"
             agents[name] = agent
     (first_name, first), *others = agents.items()
     for name, agent in others:
@@ -83,6 +88,14 @@ def _load(options: AgentOptions, runs: Sequence[str]) -> Mapping[str, Trained]:
 
 def _name(agent: Trained) -> str:
     return type(agent.algorithm).__name__
+
+
+def _digest(agent: Trained) -> str:
+    """Return a hash of the networks: a run may be trained again in the same folder."""
+    found = sha256()
+    for leaf in jax.tree.leaves(agent.networks):
+        found.update(np.ascontiguousarray(leaf).data)
+    return found.hexdigest()[:8]
 
 
 def _returns(agent: Trained, episodes: int, level: LevelEnv) -> np.ndarray:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from pixelbrax_gym.cli import parse, say
+from pixelbrax_gym.cli import UsageError, parse, say
 from pixelbrax_gym.cli._agents import AgentOptions, load
 from pixelbrax_jax.validation import check_choice
 
@@ -61,15 +61,15 @@ def run(arguments: Sequence[str]) -> int:
     agent = [options.folder, options.pretrained, options.steps, options.best, options.run_index]
     if options.task is not None:
         if any(agent):
-            raise ValueError("--task is for random actions; leave out the agent and its options.")
+            raise UsageError("--task is for random actions; leave out the agent and its options.")
         policy, name, env = None, "uniform", {"task": options.task, **size}
     elif not any(agent[:2]):
-        raise ValueError(
+        raise UsageError(
             "who acts? Give the folder of a run, --pretrained with a name, or --task for random "
             "actions."
         )
     elif size:
-        raise ValueError(f"--{next(iter(size))} is only for --task; an agent has its own size.")
+        raise UsageError(f"--{next(iter(size))} is only for --task; an agent has its own size.")
     else:
         policy, name, env = _played(load(options, options.folder), options)
     path = record_pairs(

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from pixelbrax_gym.cli import CommandError, parse, say
+from pixelbrax_gym.cli import CommandError, UsageError, parse, say
 from pixelbrax_gym.cli._agents import AgentOptions, load
 from pixelbrax_gym.cli._suite import evaluate
 from pixelbrax_jax.tasks import SUITES
@@ -56,14 +56,14 @@ def run(arguments: Sequence[str]) -> int:
     if options.suite is not None:
         for name, value in (("split", options.split), ("in", options.where)):
             if value:
-                raise ValueError(f"--suite plays its own levels; leave out --{name}.")
+                raise UsageError(f"--suite plays its own levels; leave out --{name}.")
         episodes, folder = options.episodes, options.output_dir
         sys.stdout.write(evaluate(options, options.runs, options.suite, episodes, folder) + "\n")
         return 0
     if options.output_dir is not None:
-        raise ValueError("--output-dir needs --suite.")
+        raise UsageError("--output-dir needs --suite.")
     if len(options.runs) > 1:
-        raise ValueError(f"give one run, or --suite for several; got {', '.join(options.runs)}.")
+        raise UsageError(f"give one run, or --suite for several; got {', '.join(options.runs)}.")
     agent = load(options, next(iter(options.runs), None))
     from pixelbrax_jax.agents.runner.evaluate import Evaluator
     from pixelbrax_jax.agents.runner.settings import place_of

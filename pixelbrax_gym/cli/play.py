@@ -9,6 +9,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from importlib.util import find_spec
 from itertools import islice
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
@@ -69,11 +70,13 @@ class Options:
 def run(arguments: Sequence[str]) -> int:
     """Run the command; after Ctrl-C the file is complete."""
     options = parse("play", Options, arguments)
-    from pixelbrax_jax.video import NO_WRITER, write_frames
+    from pixelbrax_jax.video import NO_WRITER, check_suffix, write_frames
 
     check_positive_int("size", options.size)
     check_positive_int("num_frames", options.num_frames)
     check_seed(options.seed)
+    if options.gif is not None:
+        check_suffix(Path(options.gif))
     try:
         env, act = _make(options)
     except TypeError as error:

@@ -13,6 +13,7 @@ from tyro.conf import Positional, arg
 
 from pixelbrax_gym.cli import parse, say
 from pixelbrax_gym.cli._agents import AgentOptions, load
+from pixelbrax_gym.resets import check_seed
 from pixelbrax_jax.validation import check_choice, check_positive_int
 from pixelbrax_jax.video import write_frames
 
@@ -51,6 +52,7 @@ def run(arguments: Sequence[str]) -> int:
 
     for name in ("grid", "size", "num_frames"):
         check_positive_int(name, getattr(options, name))
+    check_seed(options.seed)
     has_train = "train" in splits_of(agent.algorithm.config)
     split = options.split or ("train" if has_train else "clean")
     check_choice("split", split, SPLITS)

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 
 from pixelbrax_gym.cli import parse, say
-from pixelbrax_jax.extras import install_extra
 from pixelbrax_jax.tasks import TASKS
 
 
@@ -24,5 +23,7 @@ def run(arguments: Sequence[str]) -> int:
     for name, row in TASKS.items():
         sys.stdout.write(f"{name:{width}}  {row.gymnasium_id}: {row.summary}\n")
     if find_spec("dm_control") is None:
-        say("tasks", f"tasks named dmc need dm_control: {install_extra('dmc')}")
+        from pixelbrax_jax.physics.dmc.models import how_to_install
+
+        say("tasks", f"tasks named dmc need dm_control: {how_to_install()}")
     return 0

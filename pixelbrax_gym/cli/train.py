@@ -160,6 +160,8 @@ def _names_for_objects() -> ConstructorRegistry:
 
     types, registry = get_type_hints(EnvConfig), ConstructorRegistry()
     metavars = {
+        types["camera"]: "NAME ...",
+        types["distractors"]: "[NAME ...]",
         types["look"]: "NAME",
         types["clips"]: "FOLDER",
         types["dynamics"]: "NAME=LOW:HIGH,...",
@@ -171,30 +173,17 @@ def _names_for_objects() -> ConstructorRegistry:
     ) -> PrimitiveConstructorSpec | UnsupportedTypeAnnotationError | None:
         if info.type == types["camera_sizes"]:
             return UnsupportedTypeAnnotationError(())  # agents see images of one size
-        if info.type not in {types["distractors"], types["camera"], *metavars}:
+        if info.type not in metavars:
             return None
-        if info.type == types["camera"]:
-            return PrimitiveConstructorSpec(
-                nargs="*",
-                metavar="NAME ...",
-                instance_from_str=lambda args: args[0] if len(args) == 1 else tuple(args),
-                is_instance=lambda value: isinstance(value, (str, tuple)),
-                str_from_instance=lambda value: [value] if isinstance(value, str) else list(value),
-            )
-        if info.type == types["distractors"]:
-            return PrimitiveConstructorSpec(
-                nargs="*",
-                metavar="[NAME ...]",
-                instance_from_str=tuple,
-                is_instance=lambda value: isinstance(value, tuple),
-                str_from_instance=list,
-            )
+        several = info.type in (types["camera"], types["distractors"])
         return PrimitiveConstructorSpec(
-            nargs=1,
+            nargs="*" if several else 1,
             metavar=metavars[info.type],
-            instance_from_str=lambda args: args[0],
-            is_instance=lambda value: value is None or isinstance(value, str),
-            str_from_instance=lambda value: [str(value)],
+            instance_from_str=tuple if several else lambda args: args[0],
+            is_instance=lambda value: value is None or isinstance(value, (str, tuple)),
+            str_from_instance=lambda value: (
+                list(value) if isinstance(value, tuple) else [str(value)]
+            ),
         )
 
     return registry

@@ -165,7 +165,7 @@ class GymnasiumEnv(StatefulAdapter, gymnasium.Env):
         if calls is not None and calls > self._stateful.max_episode_steps:
             self._stateful.set_time_limit(calls * self._stateful.env.action_repeat)
             if self._spec is not None:
-                self._spec.max_episode_steps = calls
+                self._spec.max_episode_steps = self._stateful.max_episode_steps
 
     def _show(self) -> None:
         if self._window is not None:

@@ -42,7 +42,7 @@ def as_actions(action: Any, shape: tuple[int, ...], device: jax.Device) -> Any:
                 f"action must be an array of shape {shape}, got rows of different lengths."
             ) from error
         _check_shape(given.shape, shape)
-        _check_floating(given.dtype.kind == "f", given.dtype)
+        _check_floating(jnp.issubdtype(given.dtype, jnp.floating), given.dtype)
         # A copy: JAX may read it after the caller has begun to fill in the next action.
         with np.errstate(over="ignore"):  # infinity is clipped like all beyond the limits
             values = np.array(given, np.float32)

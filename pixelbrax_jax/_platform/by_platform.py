@@ -37,10 +37,12 @@ def by_platform(
     """
     leaves, tree = jax.tree.flatten(arguments)
     shapes, result_tree = jax.tree.flatten(like)
+    # The context of this call has ended when the program is lowered.
+    precision = getattr(jax.config, "jax_default_matmul_precision", None)
 
     def flat(form: _Form) -> _Form:
         def of_leaves(*leaves: Any) -> list[Any]:
-            with default_flags():
+            with default_flags(), jax.default_matmul_precision(precision):
                 return jax.tree.leaves(form(*jax.tree.unflatten(tree, leaves)))
 
         return of_leaves

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import Annotated, Any, ClassVar, Self, get_type_hints
+from typing import Annotated, Any, ClassVar, Self, get_args, get_type_hints
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from pixelbrax_jax.observations import IMAGES
 from pixelbrax_jax.ranges import Ranges, check_ranges
 from pixelbrax_jax.types import EnvParams
 from pixelbrax_jax.validation import (
+    check_bool,
     check_choice,
     check_count,
     check_finite,
@@ -35,15 +36,18 @@ NotNegative = Annotated[float, check_not_negative]
 
 
 def check_annotated(settings: Any) -> None:
-    """Check the fields whose types carry a check, such as ``PositiveInt``."""
+    """Check bools and fields whose types carry a check, and store them as Python's own types."""
     for name, kind in get_type_hints(type(settings), include_extras=True).items():
-        for check in getattr(kind, "__metadata__", ()):
-            check(name, getattr(settings, name))
+        value, checks = getattr(settings, name), getattr(kind, "__metadata__", ())
+        if value is None and type(None) in get_args(getattr(kind, "__origin__", kind)):
+            continue
+        for check in (check_bool,) if kind is bool else checks:
+            object.__setattr__(settings, name, check(name, value))
 
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Settings of every algorithm; a setting out of range is a ValueError."""
+    """Settings of every algorithm; one out of range is a ValueError, a wrong type a TypeError."""
 
     env: EnvConfig = EnvConfig()  # noqa: RUF009 (it is frozen)
     """Sets the environment's options; cameras, look, clips and distractors are names."""
@@ -76,7 +80,7 @@ class TrainConfig:
     """Adam's epsilon."""
     max_grad_norm: NotNegative = 0.5
     """Clips the gradient of each network to this global norm; 0 disables clipping."""
-    memory_budget_gb: float | None = None
+    memory_budget_gb: Annotated[float | None, check_positive] = None
     """Memory limit of stored frames and state in GB (10^9 bytes); None uses the device's memory."""
 
     def __post_init__(self) -> None:
@@ -85,8 +89,6 @@ class TrainConfig:
         check_annotated(self)
         object.__setattr__(self, "test_dynamics", check_ranges("test_dynamics", self.test_dynamics))
         check_choice("encoder", self.encoder, ENCODERS)
-        if self.memory_budget_gb is not None:
-            check_positive("memory_budget_gb", self.memory_budget_gb)
         smallest = SMALLEST[self.encoder]
         if min(self.env.height, self.env.width) < smallest:
             raise ValueError(

@@ -12,7 +12,7 @@ from flax import struct
 from pixelbrax_jax import spatial
 from pixelbrax_jax.distractors.base import Distractor
 from pixelbrax_jax.types import CameraRig, EnvParams
-from pixelbrax_jax.validation import check_fraction
+from pixelbrax_jax.validation import check_bool, check_fraction
 
 _RADIUS = 4.0
 """Distance from the target in metres for the suite's speeds; other distances scale them."""
@@ -65,6 +65,7 @@ class MovingCamera(Distractor):
 
     Raises:
         ValueError: the scale is out of range.
+        TypeError: ``dynamic`` is no bool.
     """
 
     scale: float = 0.1
@@ -75,6 +76,7 @@ class MovingCamera(Distractor):
 
     def __post_init__(self) -> None:
         check_fraction("scale of MovingCamera", self.scale)
+        check_bool("dynamic of MovingCamera", self.dynamic)
 
     def reset(self, key: jax.Array, params: EnvParams) -> CameraState:
         """Sample a position from the box, and a velocity."""

@@ -76,10 +76,12 @@ class ClipBank:
         if len(shape) != 4 or shape[-1] != 3 or dtype != np.uint8:
             raise ValueError(f"frames must be (T, H, W, 3) uint8, got {shape} {dtype}.")
         length = np.asarray(self.length)
-        if length.shape != (len(self.names),) or length.size == 0 or length.min() < 1:
+        whole = length.dtype.kind in "iu" and length.shape == (len(self.names),)
+        if not whole or length.size == 0 or length.min() < 1:
             raise ValueError(f"length must have a number of at least 1 for each of {self.names}.")
         if length.sum() != shape[0]:
             raise ValueError(f"lengths add up to {length.sum()}, but there are {shape[0]} frames.")
+        object.__setattr__(self, "length", length.astype(np.int32))
 
     @cached_property
     def digest(self) -> str:
@@ -105,7 +107,7 @@ class ClipBank:
         return Clips(
             packed=jnp.asarray(pixels.view("<u4")[..., 0]),
             first=jnp.asarray(self.first),
-            length=jnp.asarray(self.length, jnp.int32),
+            length=jnp.asarray(self.length),
         )
 
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from pixelbrax_jax.distractors.base import Distractor
 from pixelbrax_jax.types import EnvParams, Frame
-from pixelbrax_jax.validation import check_choice, check_fraction
+from pixelbrax_jax.validation import check_bool, check_choice, check_fraction
 
 MODES = ("frame", "geom")
 DYNAMICS = ("iid", "walk", "static")
@@ -56,6 +56,7 @@ class Color(Distractor):
 
     Raises:
         ValueError: an option is unknown or out of range; the message says what is allowed.
+        TypeError: ``sky`` is no bool.
     """
 
     mode: str = "frame"
@@ -73,6 +74,7 @@ class Color(Distractor):
         check_choice("dynamics of Color", self.dynamics, DYNAMICS)
         check_choice("distribution of Color", self.distribution, DISTRIBUTIONS)
         check_fraction("scale of Color", self.scale)
+        check_bool("sky of Color", self.sky)
         if self.mode == "frame" and (self.sky or self.materials is not None):
             raise ValueError("sky and materials of Color are only for mode='geom'.")
         if self.materials is not None and not _are_names(self.materials):

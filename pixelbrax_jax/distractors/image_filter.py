@@ -14,7 +14,7 @@ from pixelbrax_jax._platform.by_platform import by_platform
 from pixelbrax_jax._platform.conditional import in_a_conditional
 from pixelbrax_jax.distractors.base import Distractor, levels
 from pixelbrax_jax.types import EnvParams, Frame
-from pixelbrax_jax.validation import check_fraction
+from pixelbrax_jax.validation import check_finite, check_fraction
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class ImageFilter(Distractor):
         return self.blur > 0.0
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.blur <= 0.1:
+        if not 0.0 <= check_finite("blur of ImageFilter", self.blur) <= 0.1:
             raise ValueError(f"blur of ImageFilter must lie in [0, 0.1], got {self.blur}.")
         check_fraction("contrast of ImageFilter", self.contrast)
         check_fraction("noise of ImageFilter", self.noise)

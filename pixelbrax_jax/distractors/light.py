@@ -12,7 +12,7 @@ from flax import struct
 from pixelbrax_jax import spatial
 from pixelbrax_jax.distractors.base import Distractor
 from pixelbrax_jax.types import CameraRig, EnvParams
-from pixelbrax_jax.validation import check_fraction
+from pixelbrax_jax.validation import check_finite, check_fraction
 
 _COEFFICIENTS = ("ambient", "diffuse", "specular", "highlight", "headlight", "headlight_highlight")
 """Coefficients of a look's light."""
@@ -60,7 +60,7 @@ class Light(Distractor):
     stream: ClassVar[int] = 5
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.direction <= 180.0:
+        if not 0.0 <= check_finite("direction of Light", self.direction) <= 180.0:
             raise ValueError(
                 f"direction of Light must lie in [0, 180] degrees, got {self.direction}."
             )

@@ -12,7 +12,7 @@ from flax import struct
 
 from pixelbrax_jax.distractors.base import Distractor, levels
 from pixelbrax_jax.types import FAR, Clips, EnvParams, Frame
-from pixelbrax_jax.validation import check_choice, check_fraction, check_positive_int
+from pixelbrax_jax.validation import check_bool, check_choice, check_fraction, check_positive_int
 
 MODES = ("overlay", "background")
 DYNAMICS = ("pingpong", "loop", "static")
@@ -65,6 +65,7 @@ class Video(Distractor):
 
     Raises:
         ValueError: an option is unknown or out of range; the message says what is allowed.
+        TypeError: ``random_start`` is no bool.
     """
 
     mode: str = "background"
@@ -82,6 +83,7 @@ class Video(Distractor):
         check_choice("dynamics of Video", self.dynamics, DYNAMICS)
         check_fraction("alpha of Video", self.fraction)
         check_fraction("ground_alpha of Video", self.ground_alpha)
+        check_bool("random_start of Video", self.random_start)
         if self.mode == "overlay" and self.ground_alpha != 1.0:
             raise ValueError("ground_alpha of Video is only for mode='background'.")
         if self.num_clips is not None:

@@ -80,7 +80,7 @@ class BraxEnv(Env):
         The state's ``pipeline_state`` is the pixel environment's ``EnvState``. Raises TypeError if
         ``rng`` is not one key.
         """
-        if not is_key(rng.dtype):
+        if isinstance(rng, jax.Array | np.ndarray) and not is_key(rng.dtype):
             rng = jax.random.wrap_key_data(rng)
         state, timestep = self.env.reset(rng, self.sys)
         return State(pipeline_state=state, **self._fields(timestep))

@@ -181,7 +181,8 @@ def _clips(config: EnvConfig, env: PixelEnv) -> Clips | None:
     videos = [link for link in env.chain.links if isinstance(link, Video)]
     if clips is not None and not videos and env.obs_mode != "state":
         raise ValueError("clips are given without a video: add 'video' to the distractors.")
-    if split != "train" and not config.distractors:
+    # A state has no images, and so no distractors.
+    if split != "train" and not videos and (env.images or not config.distractors):
         raise ValueError(
             f"split={split!r} is given without a distractor that has splits: add one, such as "
             "'video', to the distractors."

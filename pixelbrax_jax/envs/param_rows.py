@@ -27,6 +27,7 @@ _NAMES: dict[tuple[int | str, ...], str] = {
     ("G", 4): "geoms.quat",
     ("P", 4): "geoms.planes",
     ("M", 3): "geoms.rgb",
+    (6, "N", "N", 3): "look.sky_texture",
     ("C",): "clips.first clips.length",
     ("T", "H", "W"): "clips.packed",
 }
@@ -87,10 +88,7 @@ def _has_rows(
     path: tuple[Any, ...], shape: tuple[int, ...], num_envs: int, sizes: Mapping[str, int]
 ) -> bool:
     names = [key.name for key in path if hasattr(key, "name")]
-    by_name = _SHAPES.get(".".join(names))
-    if by_name is None:
-        return False
-    wanted = tuple(sizes.get(str(size), size) for size in by_name)
+    wanted = tuple(sizes.get(str(size), size) for size in _SHAPES[".".join(names)])
     if _fits(shape, wanted):
         return False
     if _fits(shape, (num_envs, *wanted)):

@@ -14,7 +14,7 @@ from pixelbrax_jax.config import ProgramConfig
 from pixelbrax_jax.distractors.base import Chain
 from pixelbrax_jax.distractors.presets import as_tuple
 from pixelbrax_jax.envs.arguments import check_action, check_key
-from pixelbrax_jax.flags import under_default_flags
+from pixelbrax_jax.flags import under_environment_flags
 from pixelbrax_jax.memory import check_fits
 from pixelbrax_jax.observations import IMAGES, MAX_DEPTH, image_of, parts_of
 from pixelbrax_jax.physics.base import Physics, check_physics
@@ -46,7 +46,7 @@ class PixelEnv(ProgramConfig):
 
     Attributes:
         physics: the physics with its task; further fields are those of ``ProgramConfig``.
-            ``distractors`` may have one object of each kind and no names, and must be empty without
+            ``distractors`` may have one object of each kind and no names, and are left out without
             images.
         num_cameras: number of rigs in ``EnvParams.rig``.
 
@@ -155,7 +155,7 @@ class PixelEnv(ProgramConfig):
         check_fits(what, num_bytes)
 
     @partial(jax.jit, static_argnums=0)
-    @under_default_flags
+    @under_environment_flags
     def reset(self, key: jax.Array, params: EnvParams) -> tuple[EnvState, Timestep]:
         """Reset to episode 0 of the environment with a typed PRNG key, ``jax.random.key(seed)``.
 
@@ -165,7 +165,7 @@ class PixelEnv(ProgramConfig):
         return self._reset(key, jnp.uint32(0), params)
 
     @partial(jax.jit, static_argnums=0)
-    @under_default_flags
+    @under_environment_flags
     def step(
         self, state: EnvState, action: jax.Array, params: EnvParams
     ) -> tuple[EnvState, Timestep]:
@@ -202,13 +202,13 @@ class PixelEnv(ProgramConfig):
         return state, self.timestep(state, reward, params)
 
     @partial(jax.jit, static_argnums=0)
-    @under_default_flags
+    @under_environment_flags
     def next_episode(self, state: EnvState, params: EnvParams) -> tuple[EnvState, Timestep]:
         """Reset to the environment's next episode."""
         return self._reset(state.key, state.sim.episode + 1, params)
 
     @partial(jax.jit, static_argnums=0)
-    @under_default_flags
+    @under_environment_flags
     def from_qpos(
         self, qpos: jax.Array, qvel: jax.Array | None, key: jax.Array, params: EnvParams
     ) -> tuple[EnvState, Timestep]:
@@ -239,7 +239,7 @@ class PixelEnv(ProgramConfig):
         return state, self.timestep(state, jnp.float32(0.0), params)
 
     @partial(jax.jit, static_argnums=(0, 3, 4))
-    @under_default_flags
+    @under_environment_flags
     def render(
         self,
         state: EnvState,
@@ -258,7 +258,7 @@ class PixelEnv(ProgramConfig):
         return self.chain.change_frame(distractor_state, params, frame, rows, height, width)
 
     @partial(jax.jit, static_argnums=(0, 3, 4))
-    @under_default_flags
+    @under_environment_flags
     def image(
         self,
         state: EnvState,

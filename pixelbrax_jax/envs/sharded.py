@@ -13,7 +13,7 @@ from jax.sharding import AxisType, Mesh, PartitionSpec
 from pixelbrax_jax.envs.param_rows import split_params
 from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.envs.vector import VectorPixelEnv
-from pixelbrax_jax.flags import under_default_flags
+from pixelbrax_jax.flags import under_environment_flags
 from pixelbrax_jax.types import EnvParams, EnvState, Timestep
 from pixelbrax_jax.validation import check_positive_int
 
@@ -57,7 +57,7 @@ class ShardedVectorEnv:
         _ = self._local  # It checks the other fields.
 
     @partial(jax.jit, static_argnums=0)
-    @under_default_flags
+    @under_environment_flags
     def reset(self, key: jax.Array, params: EnvParams) -> tuple[EnvState, Timestep]:
         """See ``VectorPixelEnv.reset``."""
         keys = self._local.env_keys(key, self.num_envs)
@@ -65,7 +65,7 @@ class ShardedVectorEnv:
         return result
 
     @partial(jax.jit, static_argnums=0)
-    @under_default_flags
+    @under_environment_flags
     def step(
         self, state: EnvState, action: jax.Array, params: EnvParams
     ) -> tuple[EnvState, Timestep]:

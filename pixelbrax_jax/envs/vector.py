@@ -14,7 +14,7 @@ from pixelbrax_jax._platform.resets import replace_rows, reset_rows
 from pixelbrax_jax.envs.arguments import check_action, check_key
 from pixelbrax_jax.envs.param_rows import ParamRows, split_params
 from pixelbrax_jax.envs.pixel_env import PixelEnv, push_each
-from pixelbrax_jax.flags import under_default_flags
+from pixelbrax_jax.flags import under_environment_flags
 from pixelbrax_jax.types import EnvParams, EnvState, SimState, Timestep
 from pixelbrax_jax.validation import check_choice, check_positive_int
 
@@ -65,7 +65,7 @@ class VectorPixelEnv:
         self.env.check_memory(self.num_envs)
 
     @partial(jax.jit, static_argnums=0)
-    @under_default_flags
+    @under_environment_flags
     def reset(self, key: jax.Array, params: EnvParams) -> tuple[EnvState, Timestep]:
         """Reset all environments to episode 0; return the states and the first timesteps.
 
@@ -87,7 +87,7 @@ class VectorPixelEnv:
         return state, self._timestep(state, jnp.zeros(self.num_envs), rows)
 
     @partial(jax.jit, static_argnums=0)
-    @under_default_flags
+    @under_environment_flags
     def reset_where(
         self,
         state: EnvState,
@@ -107,6 +107,7 @@ class VectorPixelEnv:
             TypeError: ``key`` has another type.
             ValueError: ``mask`` is not (N,) bool, or an array of ``params`` has another shape.
         """
+        mask = jnp.asarray(mask)
         if mask.shape != (self.num_envs,) or mask.dtype != bool:
             raise ValueError(
                 f"mask must be bool of shape ({self.num_envs},), got {mask.dtype} of shape "
@@ -121,7 +122,7 @@ class VectorPixelEnv:
         return state, self._timestep(state, jnp.zeros(self.num_envs), rows)
 
     @partial(jax.jit, static_argnums=0)
-    @under_default_flags
+    @under_environment_flags
     def step(
         self, state: EnvState, action: jax.Array, params: EnvParams
     ) -> tuple[EnvState, Timestep]:

@@ -24,6 +24,7 @@ from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.flags import default_flags
 from pixelbrax_jax.generalisation.changes import Change, changes_params_alone
 from pixelbrax_jax.generalisation.suites import EPISODES, SUITES, Level, levels_of
+from pixelbrax_jax.observations import parts_of
 from pixelbrax_jax.registry import find_task
 from pixelbrax_jax.scene.cameras import seen_from
 from pixelbrax_jax.types import EnvParams
@@ -105,8 +106,10 @@ def make_levels(
     level draws for it have a key that no training has. ``clips`` is a folder or ``procedural``;
     ``report`` takes lines about replaced clips.
     """
-    if config.obs_mode == "state":
-        raise ValueError("a suite changes the image, but obs_mode='state' shows none; take pixels.")
+    if "pixels" not in parts_of(config.obs_mode):
+        raise ValueError(
+            f"a suite changes colors, but obs_mode={config.obs_mode!r} shows none; add pixels."
+        )
     config = replace(config, **UNDISTURBED)
     levels = levels_of(suite, find_task(config.task))
     episodes = SUITES[suite].episodes if episodes is None else episodes
@@ -143,7 +146,9 @@ def _make(config: EnvConfig, level: Level, bank: ClipBank | None) -> tuple[Pixel
     links = [link for link in level.changes if isinstance(link, Distractor)]
     own = tuple(link for link in links if not changes_params_alone(link))
     shown = {"distractors": own, "clips": bank if level.clips else None}
-    return make(config, **shown)
+    env, base = make(config, **shown)
+    replace(env, distractors=tuple(links))  # raises an error for one that does not fit
+    return env, base
 
 
 def _draw(changes: Sequence[Change | Distractor], base: EnvParams, keys: jax.Array) -> EnvParams:

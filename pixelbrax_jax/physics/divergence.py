@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from pixelbrax_jax.flags import under_default_flags
+from pixelbrax_jax.flags import under_environment_flags
 from pixelbrax_jax.physics.base import Physics
 from pixelbrax_jax.spatial import quat_normalize
 from pixelbrax_jax.types import PhysicsState
@@ -68,13 +68,13 @@ class GuardedPhysics(Physics):
     # Traced once for equal objects in all programs.
 
     @partial(jax.jit, static_argnums=0, inline=True)
-    @under_default_flags
+    @under_environment_flags
     def reset(self, key: jax.Array, *dynamics: jax.Array) -> PhysicsState:
         """See ``Physics.reset``."""
         return self._guard_first(self._reset(key, *dynamics))
 
     @partial(jax.jit, static_argnums=0, inline=True)
-    @under_default_flags
+    @under_environment_flags
     def step(self, state: PhysicsState, action: jax.Array) -> PhysicsState:
         """See ``Physics.step``."""
         if jnp.shape(action) != (self.action_size,):

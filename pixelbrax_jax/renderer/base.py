@@ -14,7 +14,7 @@ import numpy as np
 
 from pixelbrax_jax._platform.by_platform import by_platform
 from pixelbrax_jax._platform.conditional import in_a_conditional
-from pixelbrax_jax.flags import under_default_flags
+from pixelbrax_jax.flags import under_environment_flags
 from pixelbrax_jax.observations import IMAGES
 from pixelbrax_jax.renderer import choice, fused, reference, shading
 from pixelbrax_jax.types import Frame, Scene
@@ -51,7 +51,7 @@ def check_samples(samples: object) -> int:
     return int(samples)
 
 
-@under_default_flags
+@under_environment_flags
 def render(
     scene: Scene,
     height: int,
@@ -90,6 +90,7 @@ def render(
     return _render(scene, first_row, height, width, rows, check_renderer(renderer), times)
 
 
+@partial(jax.custom_jvp, nondiff_argnums=(2, 3, 4, 5, 6))
 def _render(
     scene: Scene,
     first_row: jax.Array,
@@ -102,11 +103,79 @@ def _render(
     """``render`` with ``times`` by ``times`` samples, for whatever device it is compiled."""
     if times > 1:
         frame = _render(scene, first_row, height, width, num_rows, renderer)
-        r, g, b = _means(scene, first_row, height, width, num_rows, renderer, times)
+        size, first, rows = (height * times, width * times), first_row * times, num_rows * times
+        r, g, b = (_shrunk(x, times) for x in _colors(scene, first, *size, rows, renderer))
         return frame.replace(r=r, g=g, b=b)
+
+    def plain(scene: Scene, first_row: jax.Array) -> Frame:
+        return fused.render(scene, height, width, first_row, num_rows)
+
+    def by_kernel(scene: Scene, first_row: jax.Array) -> Frame:
+        from pixelbrax_jax.renderer import kernel
+
+        return kernel.render(scene, height, width, first_row, num_rows)
+
     if renderer == "reference":
         return reference.render(scene, height, width, first_row, num_rows)
-    return _fast(scene, first_row, height, width, num_rows, renderer)
+    if renderer == "pallas":
+        return by_kernel(scene, first_row)
+    if renderer == "fused" or choice.why_no_kernel() is not None:
+        return plain(scene, first_row)
+    plane: Any = jax.ShapeDtypeStruct((num_rows, width), jnp.float32)
+    seg, ground = plane.update(dtype=jnp.int32), plane.update(dtype=bool)
+    like = Frame(r=plane, g=plane, b=plane, depth=plane, seg=seg, ground=ground)
+    drawn: Frame = by_platform((scene, first_row), like, cuda=by_kernel, default=plain)
+    return drawn
+
+
+@_render.defjvp
+@under_environment_flags
+def _render_jvp(
+    height: int,
+    width: int,
+    num_rows: int,
+    renderer: str,
+    times: int,
+    primals: tuple,
+    tangents: tuple,
+) -> tuple[Frame, Frame]:
+    scene, first_row = primals
+
+    def floats(scene: Scene) -> Frame:
+        frame = large = reference.render(scene, height, width, first_row, num_rows)
+        if times > 1:
+            size = height * times, width * times
+            large = reference.render(scene, *size, first_row * times, num_rows * times)
+        r, g, b = (_shrunk(plane, times) for plane in (large.r, large.g, large.b))
+        return frame.replace(r=r, g=g, b=b, seg=None, ground=None)
+
+    _, tangent = jax.jvp(floats, (scene,), tangents[:1])
+    frame = _render(scene, first_row, height, width, num_rows, renderer, times)
+    none = np.zeros(frame.seg.shape, jax.dtypes.float0)
+    return frame, tangent.replace(seg=none, ground=none)
+
+
+def _colors(
+    scene: Scene, first_row: jax.Array, height: int, width: int, num_rows: int, renderer: str
+) -> list[jax.Array]:
+    """Return red, green and blue of a band of rows, one ray per pixel."""
+    if renderer == "pallas":
+        from pixelbrax_jax.renderer import kernel
+
+        return kernel.colors(scene, height, width, first_row, num_rows)
+
+    def planes() -> list[jax.Array]:
+        frame = _render(scene, first_row, height, width, num_rows, renderer)
+        return [frame.r, frame.g, frame.b]
+
+    return shading.computed_apart(planes)
+
+
+def _shrunk(plane: jax.Array, times: int) -> jax.Array:
+    """Return the means of blocks of ``times`` by ``times`` pixels."""
+    places = [(row, column) for row in range(times) for column in range(times)]
+    total = sum([plane[row::times, column::times] for row, column in places], jnp.zeros(()))
+    return total / len(places)
 
 
 def draw(
@@ -236,61 +305,6 @@ class _Drawing:
         return tuple(planes[name] for name in self.images)
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(2, 3, 4, 5, 6))
-def _means(
-    scene: Scene,
-    first_row: jax.Array,
-    height: int,
-    width: int,
-    num_rows: int,
-    renderer: str,
-    times: int,
-) -> list[jax.Array]:
-    """Return red, green and blue of a band of rows, means over ``times`` by ``times`` rays."""
-    size, first, rows = (height * times, width * times), first_row * times, num_rows * times
-    if renderer == "pallas":
-        from pixelbrax_jax.renderer import kernel
-
-        planes = kernel.colors(scene, *size, first, rows)
-    else:
-
-        def large() -> list[jax.Array]:
-            frame = _render(scene, first, *size, rows, renderer)
-            return [frame.r, frame.g, frame.b]
-
-        planes = shading.computed_apart(large)
-    return [_shrunk(plane, times) for plane in planes]
-
-
-@_means.defjvp
-@under_default_flags
-def _means_jvp(
-    height: int,
-    width: int,
-    num_rows: int,
-    renderer: str,
-    times: int,
-    primals: tuple,
-    tangents: tuple,
-) -> tuple[list[jax.Array], list[jax.Array]]:
-    scene, first_row = primals
-
-    def colors(scene: Scene) -> list[jax.Array]:
-        size = (height * times, width * times)
-        frame = reference.render(scene, *size, first_row * times, num_rows * times)
-        return [_shrunk(plane, times) for plane in (frame.r, frame.g, frame.b)]
-
-    _, tangent = jax.jvp(colors, (scene,), tangents[:1])
-    return _means(scene, first_row, height, width, num_rows, renderer, times), tangent
-
-
-def _shrunk(plane: jax.Array, times: int) -> jax.Array:
-    """Return the means of blocks of ``times`` by ``times`` pixels."""
-    places = [(row, column) for row in range(times) for column in range(times)]
-    total = sum([plane[row::times, column::times] for row, column in places], jnp.zeros(()))
-    return total / len(places)
-
-
 def pack(frame: Frame) -> jax.Array:
     """Pack a frame into (H, W) uint32: red in the low byte, then green, then blue.
 
@@ -301,44 +315,3 @@ def pack(frame: Frame) -> jax.Array:
         return (plane * 255.0 + 0.5).astype(jnp.uint32)
 
     return level(frame.r) | level(frame.g) << 8 | level(frame.b) << 16
-
-
-@partial(jax.custom_jvp, nondiff_argnums=(2, 3, 4, 5))
-def _fast(
-    scene: Scene, first_row: jax.Array, height: int, width: int, num_rows: int, renderer: str
-) -> Frame:
-    def plain(scene: Scene, first_row: jax.Array) -> Frame:
-        return fused.render(scene, height, width, first_row, num_rows)
-
-    def by_kernel(scene: Scene, first_row: jax.Array) -> Frame:
-        from pixelbrax_jax.renderer import kernel
-
-        return kernel.render(scene, height, width, first_row, num_rows)
-
-    if renderer == "pallas":
-        return by_kernel(scene, first_row)
-    if renderer == "fused" or choice.why_no_kernel() is not None:
-        return plain(scene, first_row)
-    plane: Any = jax.ShapeDtypeStruct((num_rows, width), jnp.float32)
-    seg, ground = plane.update(dtype=jnp.int32), plane.update(dtype=bool)
-    like = Frame(r=plane, g=plane, b=plane, depth=plane, seg=seg, ground=ground)
-    frame: Frame = by_platform((scene, first_row), like, cuda=by_kernel, default=plain)
-    return frame
-
-
-@_fast.defjvp
-@under_default_flags
-def _fast_jvp(
-    height: int, width: int, num_rows: int, renderer: str, primals: tuple, tangents: tuple
-) -> tuple[Frame, Frame]:
-    scene, first_row = primals
-
-    def floats(scene: Scene) -> Frame:
-        return reference.render(scene, height, width, first_row, num_rows).replace(
-            seg=None, ground=None
-        )
-
-    _, tangent = jax.jvp(floats, (scene,), tangents[:1])
-    frame = _fast(scene, first_row, height, width, num_rows, renderer)
-    none = np.zeros(frame.seg.shape, jax.dtypes.float0)
-    return frame, tangent.replace(seg=none, ground=none)

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pixelbrax_jax import spatial
-from pixelbrax_jax.flags import default_flags
+from pixelbrax_jax.flags import PRECISION, default_flags
 from pixelbrax_jax.renderer import fused
 from pixelbrax_jax.types import Camera, Frame, GeomKind, Geoms, Lamp, Look, Scene
 
@@ -143,7 +143,7 @@ def _compare(draw: Draw) -> KernelCheck:
         frames = jax.jit(jax.vmap(lambda scene: draw(scene, _HEIGHT, _WIDTH)))(scenes)
         return jax.tree.map(np.asarray, frames)
 
-    with default_flags(), jax.disable_jit(False):
+    with default_flags(), jax.default_matmul_precision(PRECISION), jax.disable_jit(False):
         scenes = jax.jit(jax.vmap(_scene))(np.array(_EYES))
         wanted = images(plain)
         try:

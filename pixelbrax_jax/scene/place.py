@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pixelbrax_jax import spatial
-from pixelbrax_jax.flags import under_default_flags
+from pixelbrax_jax.flags import under_environment_flags
 from pixelbrax_jax.scene.cameras import aim
 from pixelbrax_jax.spatial import look_at
 from pixelbrax_jax.types import CameraRig, Geoms, Look, Scene, String
@@ -15,7 +15,7 @@ from pixelbrax_jax.types import CameraRig, Geoms, Look, Scene, String
 _NEWTON_STEPS = 8
 
 
-@under_default_flags
+@under_environment_flags
 def place(geoms: Geoms, rig: CameraRig, look: Look, xpos: jax.Array, xquat: jax.Array) -> Scene:
     """Move geoms and lamps with their links, hang the strings and aim the camera.
 

@@ -229,6 +229,7 @@ def test_a_run_is_evaluated_and_recorded(tmp_path, capsys):
         ("--split tset", "Did you mean 'test'?"),
         ("--steps 3", "existing checkpoints have 16 steps"),
         ("--output a.avi", "one of .gif, .mp4, got 'a.avi'"),
+        ("--seed 4294967296", "seeds must lie in [0, 2**32), got 4294967296"),
     ):
         assert main(["record", folder, *wrong.split()]) == 1
         assert told in capsys.readouterr().err

@@ -42,14 +42,15 @@ POSITIVE_OR_0 = (
     "dynamics_coef", "saturation_coef",
 )  # fmt: skip
 CHOICES = ("encoder", "policy", "normalize_advantage", "layout", "critic")
+BOOLS = (
+    "state_critic", "anneal", "normalize_reward", "clip_value", "decoupled", "checkpoint_replay",
+    "layer_norm", "bfloat16",
+)  # fmt: skip
 UNCHECKED = {
     # Options of the environment, checked with those of every other one.
     "task", "backend", "engine", "reward_preset", "distractors", "clips", "camera", "look",
     "shadows", "samples", "split", "obs_mode", "renderer", "dynamics", "test_dynamics",
     "camera_sizes",
-    # Truth values.
-    "state_critic", "anneal", "normalize_reward", "clip_value", "decoupled",
-    "checkpoint_replay", "layer_norm", "bfloat16",
 }  # fmt: skip
 NAN, INF = float("nan"), float("inf")
 
@@ -60,6 +61,7 @@ BAD = [
     (POSITIVE, "a positive number", (0, -1.0, NAN, INF, "1")),
     (POSITIVE_OR_0, "at least 0", (-1.0, NAN, INF, "1")),
     (FINITE, "a finite number", (NAN, INF, True, "1")),
+    (BOOLS, "True or False", ("False", 0, None)),
     (CHOICES, "unknown .*llowed: .*, ", ("Nonesuch", None, 3)),
 ]
 
@@ -71,7 +73,7 @@ def test_a_bad_setting_is_named_with_its_value_and_what_is_allowed(config):
     for settings, allowed, values in BAD:
         for name in names.intersection(settings):
             for value in values:
-                with pytest.raises(ValueError, match=allowed) as info:
+                with pytest.raises((ValueError, TypeError), match=allowed) as info:
                     default.replace(**{name: value})
                 assert name in str(info.value)
                 assert repr(value) in str(info.value)
@@ -148,6 +150,14 @@ def test_a_description_is_json_and_gives_the_settings_back(config):
     assert config().replace(**settings) == changed
 
 
+def test_numbers_of_numpy_become_those_of_python():
+    given = {"num_envs": np.int64(4), "gamma": np.float32(0.5), "anneal": np.bool_(True)}
+    described = describe(PPOConfig(**given, target_kl=np.float64(0.25)))
+    wanted = {"num_envs": 4, "gamma": 0.5, "anneal": True, "target_kl": 0.25}
+    assert {name: json.loads(json.dumps(described))[name] for name in wanted} == wanted
+    assert type(RunConfig(seed=np.int64(3)).seed) is int
+
+
 def test_the_environment_is_the_one_that_is_described():
     wanted = EnvConfig(
         task="inverted_pendulum", height=20, width=24, frame_stack=2, action_repeat=3,
@@ -209,8 +219,9 @@ def test_environments_come_with_their_parameters():
         ({"checkpoint_minutes": -1}, "checkpoint_minutes must be a number of at least 0, got -1"),
         ({"seed": 2**32 - 1, "seeds": 2}, "seeds must be below 2**32"),
         ({"resume": "last"}, "Did you mean 'latest'"),
+        ({"progress": "no"}, "progress must be True or False, got 'no'"),
     ],
 )
 def test_options_of_a_run_out_of_range_are_told(settings, message):
-    with pytest.raises(ValueError, match=re.escape(message)):
+    with pytest.raises((ValueError, TypeError), match=re.escape(message)):
         RunConfig(**settings)

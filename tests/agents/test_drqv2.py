@@ -69,6 +69,9 @@ def test_noise_follows_its_schedule():
         state, facts = LATE.iterate(state)
         found.append(float(facts["policy/std"]))
     np.testing.assert_allclose(found, [0.8, 0.5, 0.2, 0.2], rtol=1e-6)
+    # Of 32 steps each, which are 2**32 together.
+    _, facts = LATE.iterate(LATE.init().replace(iteration=jnp.uint32(2**27)))
+    assert float(facts["policy/std"]) == pytest.approx(0.2)
 
 
 @pytest.mark.slow

@@ -6,6 +6,7 @@ import json
 import zipfile
 from pathlib import Path
 
+import jax
 import pytest
 
 from pixelbrax_jax.agents.on_policy.ppo import PPO, PPOConfig
@@ -67,6 +68,8 @@ def test_a_run_of_0_2_0_goes_on(folder):
     assert read_about(folder / "checkpoints")["versions"]["pixelbrax"] == "0.2.0"
     before = restore(folder, ppo())
     assert int(before.iteration) == 1
+    # As in a new run, whose compiled programs are used again.
+    assert not any(leaf.committed for leaf in jax.tree.leaves(before))
     lines = []
     options = RunConfig(str(folder), resume="latest", progress=False)
     outcome = run(ppo(), PARAMS, options, report=lines.append)

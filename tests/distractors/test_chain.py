@@ -322,3 +322,16 @@ def test_make_shares_clips_and_warns_of_procedural_ones():
 def test_options_are_checked(distractor, options, message):
     with pytest.raises(ValueError, match=message):
         distractor(**options)
+
+
+@pytest.mark.parametrize(
+    ("distractor", "options", "message"),
+    [
+        (Color, {"mode": "geom", "sky": "no"}, "sky of Color must be True or False, got 'no'"),
+        (MovingCamera, {"dynamic": "false"}, "dynamic of MovingCamera must be True or False"),
+        (Video, {"random_start": "no"}, "random_start of Video must be True or False"),
+    ],
+)
+def test_words_are_no_bools(distractor, options, message):
+    with pytest.raises(TypeError, match=message):
+        distractor(**options)

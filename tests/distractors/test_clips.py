@@ -227,12 +227,23 @@ def test_a_cached_video_obeys_the_limit_too(tmp_path):
         ({"frames": np.zeros((3, 4, 4, 3))}, r"\(T, H, W, 3\) uint8, got .*float64"),
         ({"length": np.array([1, 1])}, "add up to 2, but there are 3 frames"),
         ({"length": np.array([3, 0])}, "at least 1 for each"),
+        ({"length": [1.5, 1.5]}, "at least 1 for each"),
     ],
 )
 def test_banks_are_checked(changes, message):
     parts = {"frames": np.zeros((3, 4, 4, 3), np.uint8), "length": np.array([1, 2])}
     with pytest.raises(ValueError, match=message):
         distractors.ClipBank(**(parts | changes), names=("a", "b"), source="x", split="train")
+
+
+def test_lengths_may_be_a_list():
+    frames = np.zeros((3, 4, 4, 3), np.uint8)
+    array, given = (
+        distractors.ClipBank(frames, length, ("a", "b"), "x", "train")
+        for length in (np.array([1, 2]), [1, 2])
+    )
+    assert given.digest == array.digest
+    assert given.first.tolist() == [0, 1]
 
 
 def test_subfolders_are_splits(tmp_path):

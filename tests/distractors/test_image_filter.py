@@ -101,6 +101,8 @@ def test_noise_is_uniform_and_new_in_every_pixel_channel_and_frame(clean):
 def test_blur_is_bounded():
     with pytest.raises(ValueError, match=r"blur of ImageFilter must lie in \[0, 0.1\], got 0.2"):
         ImageFilter(blur=0.2)
+    with pytest.raises(ValueError, match=r"blur of ImageFilter must be a finite number, got '0.1'"):
+        ImageFilter(blur="0.1")
 
 
 @pytest.mark.parametrize("options", [{"contrast": 1.5}, {"noise": -0.1}])

@@ -95,6 +95,7 @@ def test_the_lights_of_a_model_and_of_several_cameras_turn():
     ("options", "message"),
     [
         ({"direction": 181.0}, r"direction of Light must lie in \[0, 180\] degrees, got 181.0"),
+        ({"direction": "40"}, "direction of Light must be a finite number, got '40'"),
         ({"intensity": 1.5}, r"intensity of Light must lie in \[0, 1\], got 1.5"),
         ({"color": -0.1}, r"color of Light must lie in \[0, 1\], got -0.1"),
     ],

@@ -104,6 +104,8 @@ def test_a_raw_key_means_the_typed_one():
     np.testing.assert_array_equal(env.reset(raw).obs, env.reset(typed).obs)
     with pytest.raises(TypeError, match="key must have shape"):
         env.reset(keys(2))
+    with pytest.raises(TypeError, match="key must come from"):
+        env.reset(0)
 
 
 @pytest.mark.parametrize("obs_mode", ["pixels", "state", "both"])

@@ -192,6 +192,8 @@ def test_bad_options_and_arguments():
         venv.step(state, jnp.zeros((5, 1), int), PARAMS)
     with pytest.raises(ValueError, match="mask must be bool of shape"):
         venv.reset_where(state, jnp.ones(4, bool), PARAMS)
+    with pytest.raises(ValueError, match="mask must be bool of shape"):
+        venv.reset_where(state, [True], PARAMS)
     with pytest.raises(TypeError, match=r"key must have shape \(5,\)"):
         venv.reset(jax.random.split(jax.random.key(0), 4), PARAMS)
 
@@ -304,9 +306,11 @@ def test_a_parameter_of_another_shape_is_named(part, field, shape, wanted, rows)
 
 
 def test_the_shape_of_every_parameter_is_known():
-    # It has strings, lamps and a headlight; with clips these are all fields but a light.
+    # One has strings, the other a mirror; with clips these are all fields but a light.
     options = {"height": 12, "width": 12, "distractors": ("video",), "clips": "procedural"}
-    for known in (PARAMS, pb.make("dmc_ball_in_cup_catch", **options)[1]):
+    dmc = options | {"look": "dmc"}
+    cup, cartpole = pb.make("dmc_ball_in_cup_catch", **dmc), pb.make("dmc_cartpole_swingup", **dmc)
+    for known in (PARAMS, cup[1], cartpole[1]):
         for path, leaf in jax.tree_util.tree_leaves_with_path(known):
             name = ".".join(key.name for key in path if hasattr(key, "name"))
             assert param_rows._fits(np.shape(leaf), param_rows._SHAPES[name]), name

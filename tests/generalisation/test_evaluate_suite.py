@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import get_args, get_type_hints
 
 import jax.numpy as jnp
@@ -88,7 +89,7 @@ def test_episodes_are_those_of_the_command(runs, capsys, tmp_path):
     assert told.out.splitlines()[0].startswith("| level")
     assert len(told.out.splitlines()) == 6
     written = json.loads((tmp_path / "returns.json").read_text())
-    ours = written["returns"]["a, seed 0, 16 steps"]
+    ours = written["returns"]["a, seed 0, 16 steps, e3b0c442"]
     options = TINY | {"clips": "procedural", "episodes": 3}
     theirs = evaluate_suite(of_numpy, TASK, "paper", **options).returns["policy"]
     assert list(ours) == list(theirs)
@@ -166,19 +167,37 @@ def test_errors_of_a_call(policy, more, error, message):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["a", "tall", "--clips", "procedural"], "but height is 18 in a, seed 0, 16 steps and 20"),
+        (["a", "tall", "--clips", "procedural"], "but height is 18 in a, seed 0, 16 steps, e3b0c"),
         (["a", "ant", "--clips", "procedural"], "but task is 'ball_of_suites' in a, seed 0"),
-        (["a", "a"], "run a is given twice"),
         (["a"], "suite 'paper' shows videos: give their folder"),
-        (["a", "--split", "clean"], "leave out --split"),
-        (["a", "--run", "1"], "leave out --run"),
-        ([], "--suite needs the folders of one or several runs"),
     ],
 )
 def test_errors_of_the_command(runs, capsys, arguments, message):
     runs |= {"a": [agent()], "tall": [agent(height=20)], "ant": [agent(task="ant")]}
     assert command(*arguments) == 1
     assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["a", "a"], "run a is given twice"),
+        (["a", "./a/"], "run ./a/ is given twice"),
+        (["a", "--split", "clean"], "leave out --split"),
+        (["a", "--run", "1"], "leave out --run"),
+        ([], "--suite needs the folders of one or several runs"),
+    ],
+)
+def test_a_wrong_command_line(runs, capsys, arguments, message):
+    runs["a"] = [agent()]
+    assert command(*arguments) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_a_run_that_was_trained_again_has_another_name():
+    first, again = (replace(agent(), networks={"actor": np.full(3, x)}) for x in (0.0, 1.0))
+    assert _suite._digest(first) == _suite._digest(replace(first))
+    assert _suite._digest(first) != _suite._digest(again)
 
 
 def test_clips_of_training_are_no_test(runs, capsys):
@@ -192,7 +211,7 @@ def test_options_of_a_suite_need_one(capsys):
         (["a", "b"], "give one run, or --suite for several; got a, b."),
         (["a", "--output-dir", "x"], "--output-dir needs --suite."),
     ):
-        assert main(["evaluate", *arguments]) == 1
+        assert main(["evaluate", *arguments]) == 2
         assert message in capsys.readouterr().err
     with pytest.raises(SystemExit):
         main(["evaluate", "a", "--suite", "dmcgb3"])

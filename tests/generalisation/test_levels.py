@@ -205,6 +205,18 @@ def test_a_level_that_cannot_be_made_is_told():
         levels("dmcgb", clips="procedural", config=EnvConfig(task="gym_hopper", **TINY))
 
 
+@pytest.mark.parametrize(
+    ("suite", "options", "message"),
+    [
+        ("axes", {"camera": ("front", "top")}, "'camera' moves one camera, but there are 2"),
+        ("dmcgb2", {"obs_mode": "depth+state"}, "obs_mode='depth.state' shows none; add pixels"),
+    ],
+)
+def test_what_changes_nothing_that_is_seen_is_refused(suite, options, message):
+    with pytest.raises(ValueError, match=message):
+        levels(suite, clips="procedural", config=EnvConfig(task=TASK, **TINY, **options))
+
+
 def test_other_clips_that_are_shown_are_told():
     told = []
     levels("paper", clips="procedural", report=told.append)

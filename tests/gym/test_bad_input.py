@@ -27,6 +27,7 @@ from tests.gym.conftest import ID, TASK
         ({"camera": "nowhere"}, "camera"),
         ({"look": "nice"}, "unknown look"),
         ({"split": "test"}, "split='test' is given without a distractor that has splits: add"),
+        ({"split": "test", "distractors": "color"}, "without a distractor that has splits"),
         (
             {"backend": "mjx"},
             "only for Brax.s tasks, .* choose it where it was registered",

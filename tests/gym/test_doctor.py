@@ -208,6 +208,9 @@ def test_a_variable_is_not_blamed_for_another(monkeypatch):
 def test_a_cache_that_cannot_be_written(monkeypatch, tmp_path):
     monkeypatch.setenv("PIXELBRAX_CACHE", str(tmp_path / "made" / "later"))
     assert doctor.why_no_cache() == ""
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("PIXELBRAX_CACHE", str(tmp_path / "file"))
+    assert doctor.why_no_cache() == f"{tmp_path / 'file'} is no folder"
     monkeypatch.delenv("PIXELBRAX_CACHE")
     monkeypatch.delenv("HOME", raising=False)
     monkeypatch.setattr("pwd.getpwuid", lambda uid: {}[uid])

@@ -117,6 +117,7 @@ def test_another_run_is_not_overwritten(tmp_path, capsys):
     [
         ({"seeds": 2}, "seeds=2"),
         ({"distractors": ["color"]}, "distractors="),
+        ({"dynamics": "mass=0.5:2"}, "dynamics='mass=0.5:2'"),
         ({"returns": (1.0,)}, "--num-evals"),
     ],
 )

@@ -111,6 +111,13 @@ def test_ctrl_c_leaves_a_whole_file(tmp_path, monkeypatch):
     assert imageio.imread(tmp_path / "a.gif", index=0).shape == (8, 8, 3)
 
 
+def test_a_file_of_another_kind_is_told_first(capsys):
+    assert main(["play", "ant", "--gif", "ant.png"]) == 1
+    told = capsys.readouterr().err
+    assert "one of .gif, .mp4, got 'ant.png'" in told
+    assert "compiling" not in told
+
+
 @pytest.mark.parametrize(
     ("line", "told"),
     [

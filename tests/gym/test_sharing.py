@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from pixelbrax_gym.interop import dlpack
+from pixelbrax_gym.resets import as_mask
 
 ACTIONS = np.array([[-0.2], [0.9], [1.0]], np.float32)
 
@@ -53,6 +54,13 @@ def test_actions_are_rounded_to_float32(dtype):
     converted = dlpack.actions_to_jax(actions, jax.devices("cpu")[0])
     assert converted.dtype == np.float32
     np.testing.assert_array_equal(converted, [0.5, 0.5])
+
+
+def test_masks_are_copied():
+    array, tensor = np.ones(4, bool), torch.ones(4, dtype=bool)
+    read = [as_mask("mask", given, (4,)) for given in (array, tensor)]
+    array[:], tensor[:] = False, False
+    assert all(mask.all() for mask in read)
 
 
 def test_refilling_the_action_buffer_at_once_is_harmless(make_vector):

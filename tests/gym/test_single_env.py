@@ -86,7 +86,10 @@ def test_other_outputs_hold_the_same_numbers(make_single, output, kind):
 
 @pytest.mark.parametrize(
     "convert",
-    [list, np.float64, np.float16, torch.as_tensor, torch.DoubleTensor, jax.numpy.asarray],
+    [
+        *(list, np.float64, np.float16, torch.as_tensor, torch.DoubleTensor, jax.numpy.asarray),
+        lambda action: np.asarray(action, jax.numpy.bfloat16),
+    ],
 )
 def test_actions_of_any_floating_kind(make_single, convert):
     action = np.array([0.25], np.float32)

@@ -48,6 +48,16 @@ def test_a_limit_beyond_the_default_is_heeded(options, expected):
     assert truncated.all()
 
 
+def test_a_limit_of_the_task_holds_at_every_door():
+    single = gymnasium.make("PixelBrax/Gym-Reacher-v5", obs_mode="state", max_episode_steps=120)
+    assert until_truncated(single) == 50
+    assert single.unwrapped.spec.max_episode_steps == 50
+    many = gymnasium.make_vec(
+        "PixelBrax/Gym-Reacher-v5", num_envs=2, obs_mode="state", max_episode_steps=120
+    )
+    assert many.spec.max_episode_steps == 50
+
+
 def test_a_time_limit_of_ones_own():
     bare = pixelbrax_gym.GymnasiumEnv(TASK, obs_mode="state")
     outer = TimeLimit(gymnasium.wrappers.TransformReward(TimeLimit(bare, 1300), abs), 1100)

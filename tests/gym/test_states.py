@@ -91,6 +91,8 @@ def test_what_is_refused(make_single, make_vector):
     state = env.get_state()
     with pytest.raises(TypeError, match="must be an EnvState from get_state"):
         env.set_state({"frames": state.frames})
+    with pytest.raises(TypeError, match=r"must be an EnvState of get_state\(\), got None"):
+        env.reset(options={"state": None})
     with pytest.raises(ValueError, match=r"takes a seed or options\['state'\], got both"):
         env.reset(seed=1, options={"state": state})
     with pytest.raises(ValueError, match=r"state\.frames must be uint8 of shape \(3, 12, 12, 6\)"):

@@ -108,8 +108,10 @@ class DrQv2(Algorithm):
     def iterate(self, state: OffPolicyState, env_params: EnvParams) -> tuple[TrainState, Metrics]:
         """Collect steps into the replay and, once it holds enough, learn from it."""
         config = self.config
-        # Steps of all environments so far.
-        steps = state.iteration * jnp.uint32(config.num_envs * config.num_steps)
+        # Steps of all environments so far, up to where nothing depends on them, within 32 bits.
+        per_iteration = config.num_envs * config.num_steps
+        enough = -(-max(config.std_steps, config.learning_starts) // per_iteration)
+        steps = jnp.minimum(state.iteration, jnp.uint32(enough)) * jnp.uint32(per_iteration)
         schedule = optax.linear_schedule(config.initial_std, config.final_std, config.std_steps)
         std = jnp.float32(schedule(steps))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import jax
 
@@ -36,15 +36,13 @@ class PPOConfig(OnPolicyConfig):
     """Weight of the value loss, which is half the mean squared error."""
     clip_value: bool = False
     """Limits the change of the value with ``clip_coef``, like that of the policy."""
-    target_kl: float | None = None
+    target_kl: Annotated[float | None, check_positive] = None
     """Stops an update early above this approximate KL divergence."""
 
     def __post_init__(self) -> None:
         """Check the settings."""
         super().__post_init__()
         check_choice("layout", self.layout, LAYOUTS)
-        if self.target_kl is not None:
-            check_positive("target_kl", self.target_kl)
         if self.state_critic and self.layout == "shared":
             raise ValueError(
                 "state_critic needs layout='separate', got 'shared': a critic of the simulator's "

@@ -306,14 +306,14 @@ def _read(folder: Path, steps: int, template: Tree, *, whole: bool, advice: str 
             more = f" and {len(other) - 3} more" if len(other) > 3 else ""
             found = "; ".join(other[:3]) + more
             raise CheckpointError(f"the checkpoint in {folder} has other arrays: {found}{advice}.")
-        placed = {n: ocp.ArrayRestoreArgs(sharding=_sharding(x)) for n, x in leaves.items()}
+        placed = {n: _restore_args(x) for n, x in leaves.items()}
         arguments = ocp.args.PyTreeRestore(wanted, restore_args=placed, partial_restore=True)
         restored = reader.restore(path, args=arguments)
 
     def leaf(path: Any, like: Any) -> Any:
-        if not like.size:
-            return jax.device_put(np.zeros(like.shape, like.dtype), _sharding(like))
-        value = restored[_name(path)]
+        value = restored[_name(path)] if like.size else np.zeros(like.shape, like.dtype)
+        # Without a sharding it may go to any device, as in a new run: its program is the same.
+        value = jax.device_put(value, like.sharding)
         return jax.random.wrap_key_data(value) if is_key(like.dtype) else value
 
     return jax.tree_util.tree_map_with_path(leaf, template)
@@ -333,10 +333,10 @@ def _numbers(leaf: jax.Array) -> jax.Array:
     return jax.random.key_data(leaf) if is_key(leaf.dtype) else leaf
 
 
-def _sharding(leaf: Any) -> Any:
-    """Return the sharding of a leaf; the default is the first device."""
-    default = jax.sharding.SingleDeviceSharding(jax.devices()[0])
-    return getattr(leaf, "sharding", None) or default
+def _restore_args(leaf: Any) -> ocp.RestoreArgs:
+    if leaf.sharding:
+        return ocp.ArrayRestoreArgs(sharding=leaf.sharding)
+    return ocp.RestoreArgs(restore_type=np.ndarray)
 
 
 @contextmanager

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from pixelbrax_jax.flags import as_by_default, default_flags, is_key, under_default_flags
+from pixelbrax_jax.flags import as_by_default, default_flags, is_key, under_environment_flags
 from pixelbrax_jax.physics.base import Kinematics, RewardFn
 from pixelbrax_jax.physics.divergence import GuardedPhysics
 from pixelbrax_jax.physics.mujoco.compatibility import (
@@ -153,7 +153,7 @@ class BraxPhysics(GuardedPhysics):
         """See ``Physics.reset``. ``key`` may be typed, or uint32 like Brax's."""
         return self._first_state(self._env, key)
 
-    @under_default_flags
+    @under_environment_flags
     def from_qpos(
         self, q: jax.Array, qd: jax.Array | None = None, *, key: jax.Array | None = None
     ) -> PhysicsState:

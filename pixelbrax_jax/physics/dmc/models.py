@@ -70,11 +70,17 @@ def _suite_folder() -> Path:
     for folder in (spec and spec.submodule_search_locations) or ():
         if Path(folder, "suite").is_dir():
             return Path(folder, "suite")
-    newer = f" (from Python {_NO_WHEELS[0]}.{_NO_WHEELS[1]} on: pip install --no-deps dm_control)"
     raise ImportError(
         "dm_control is not installed, from which tasks of the DM Control Suite read their models; "
-        f"try: {install_extra('dmc')}{newer if sys.version_info >= _NO_WHEELS else ''}"
+        f"try: {how_to_install()}"
     )
+
+
+def how_to_install() -> str:
+    """Return the command that installs dm_control, which the extra omits on newer Pythons."""
+    if sys.version_info >= _NO_WHEELS:
+        return "pip install --no-deps dm_control"
+    return install_extra("dmc")
 
 
 def _warn_if_unknown(domain: str, files: dict[str, bytes]) -> None:

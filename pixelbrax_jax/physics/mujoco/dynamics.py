@@ -189,9 +189,7 @@ class Dynamics:
                     "engine='mujoco' computes on a CPU alone; for programs of other devices choose "
                     "engine='xla', or engine='auto'."
                 )
-            # Accelerators round what they multiply by default, a GPU to ten bits.
-            with jax.default_matmul_precision("highest"):
-                return list(getattr(self.xla, method)(*options, *row))
+            return list(getattr(self.xla, method)(*options, *row))
 
         if self.engine in ("xla", "mjx") or (method == "step" and self._steps_by_xla):
             return by_xla(*arrays)

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pixelbrax_jax.flags import default_flags, under_default_flags
+from pixelbrax_jax.flags import default_flags, under_environment_flags
 from pixelbrax_jax.memory import check_fits
 from pixelbrax_jax.physics.divergence import GuardedPhysics
 from pixelbrax_jax.physics.mujoco.dynamics import Dynamics, Readings, State
@@ -143,7 +143,7 @@ class MujocoPhysics(GuardedPhysics):
         """Sample an initial state; return it and its readings."""
         return self._settle(self._start(key), dynamics)
 
-    @under_default_flags
+    @under_environment_flags
     def from_qpos(
         self,
         q: jax.Array,
