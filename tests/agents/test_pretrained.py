@@ -50,14 +50,25 @@ def test_a_pretrained_policy_earns_what_its_table_says(name, capsys):
             ["--pretrained", "cheetah"],
             "unknown pretrained policy: 'cheetah'. Did you mean 'halfcheetah'? Allowed: ",
         ),
-        ([], "give either the folder of a run or --pretrained"),
-        (["runs/ppo", "--pretrained", "halfcheetah"], "give either the folder of a run or"),
-        (["--pretrained", "halfcheetah", "--best"], "--steps, --best and --run need the folder"),
         (["--pretrained", "halfcheetah", "--split", "test"], "its splits: 'clean'."),
     ],
 )
 def test_a_wrong_choice_is_told(command, arguments, message, capsys):
     assert main([command, *arguments]) == 1
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["evaluate", "record"])
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "give either the folder of a run or --pretrained"),
+        (["runs/ppo", "--pretrained", "halfcheetah"], "give either the folder of a run or"),
+        (["--pretrained", "halfcheetah", "--best"], "--steps, --best and --run need the folder"),
+    ],
+)
+def test_a_wrong_command_line_is_told(command, arguments, message, capsys):
+    assert main([command, *arguments]) == 2
     assert message in capsys.readouterr().err
 
 

@@ -221,5 +221,5 @@ def test_another_simulation_under_the_level_is_told(tmp_path, monkeypatch):
 )
 def test_the_command_tells_who_may_act(more, told, tmp_path, capsys):
     where = ["--suite", "tiny", "--level", "painted", "--output-dir", str(tmp_path)]
-    assert main(["dataset", *more, *where]) == 1
+    assert main(["dataset", *more, *where]) == 2
     assert told in capsys.readouterr().err
