@@ -8,15 +8,14 @@ from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import jax
-import numpy as np
-
 from pixelbrax_gym.cli import UsageError, say
 from pixelbrax_gym.cli._agents import AgentOptions, load
 from pixelbrax_jax.extras import needs_extra
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
+
+    import numpy as np
 
     from pixelbrax_jax.agents.runner.trained import Trained
     from pixelbrax_jax.generalisation.making import LevelEnv, Levels
@@ -92,6 +91,9 @@ def _name(agent: Trained) -> str:
 
 def _digest(agent: Trained) -> str:
     """Return a hash of the networks: a run may be trained again in the same folder."""
+    import jax
+    import numpy as np
+
     found = sha256()
     for leaf in jax.tree.leaves(agent.networks):
         found.update(np.ascontiguousarray(leaf).data)
