@@ -38,16 +38,11 @@ def entry(folder: str | Path, agent: str | None = None) -> Entry:
     config = about["config"]
     if config["seeds"] > 1:
         raise ValueError(f"{folder} has seeds={config['seeds']} in one program; an entry has one.")
-    if config["distractors"]:
-        raise ValueError(
-            f"{folder} trained with distractors={config['distractors']}; the leaderboard has runs "
-            "without."
-        )
-    if config.get("dynamics"):
-        raise ValueError(
-            f"{folder} trained with dynamics={config['dynamics']!r}; the leaderboard has runs "
-            "without."
-        )
+    for name in ("distractors", "dynamics"):
+        if value := config.get(name):
+            raise ValueError(
+                f"{folder} trained with {name}={value!r}; the leaderboard has runs without."
+            )
     if config.get("num_starts"):
         raise ValueError(
             f"{folder} trained with num_starts={config['num_starts']}, so it was evaluated from "
