@@ -70,10 +70,12 @@ def make_physics(task: str, **options: Any) -> Physics:
     for name, value in options.items():
         if suite is None or not suite.takes(name):
             takers = [other.title for other in SUITES.values() if other.takes(name)]
+            if not takers:
+                raise ValueError(f"there is no option {name!r}, given as {value!r}: leave it out.")
             fix = "leave it out" if own is None else "choose it where it was registered"
             raise ValueError(
-                f"{name}={value!r} is only for {' and '.join(takers) or 'no task'}, not for task "
-                f"{task!r}: {fix}."
+                f"{name}={value!r} is only for {' and '.join(takers)}, not for task {task!r}: "
+                f"{fix}."
             )
     if own is not None:
         return own[0]()

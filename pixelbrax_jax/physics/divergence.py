@@ -83,15 +83,8 @@ class GuardedPhysics(Physics):
             )
         after = self._step(state, action)
         finite = self._is_finite(after)
-
-        def keep(name: str) -> Any:
-            return _select(finite, getattr(after, name), getattr(state, name))
-
-        return PhysicsState(
-            engine=keep("engine"),
-            xpos=keep("xpos"),
-            xquat=keep("xquat"),
-            obs=keep("obs"),
+        kept: PhysicsState = _select(finite, after, state)
+        return kept.replace(
             reward=jnp.where(finite, after.reward, 0.0),
             terminated=~finite | after.terminated,
             non_finite=~finite,

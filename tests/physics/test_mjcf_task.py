@@ -102,6 +102,46 @@ def test_formulas(cart):
     assert cart.step(leaning, action).terminated
 
 
+def test_sensors_that_are_disabled_read_0_and_poses_do_not(compiled):
+    """Nor is a sensor's reading another's, with names or without."""
+    sensors = '<sensor><jointpos joint="slide"/><jointpos joint="hinge" name="pos"/></sensor>'
+
+    def angles(seen):
+        kind = mujoco.mjtSensor.mjSENS_JOINTPOS
+        return jnp.concatenate([seen.sensor("pos"), seen.sensors_of(kind), seen.xpos("knob")])
+
+    with_sensors = CART.replace("</mujoco>", f"{sensors}</mujoco>")
+    off = '<option timestep="0.01"><flag sensor="disable"/></option>'
+    without = with_sensors.replace('<option timestep="0.01"/>', off)
+    there, here = (
+        compiled(build(xml, observe=angles)).from_qpos(np.array([0.3, 0.4], np.float32))
+        for xml in (with_sensors, without)
+    )
+    np.testing.assert_allclose(there.obs[:3], [0.4, 0.3, 0.4], atol=1e-6)
+    np.testing.assert_array_equal(here.obs[:3], 0)
+    np.testing.assert_array_equal(here.xpos, there.xpos)
+    np.testing.assert_array_equal(here.obs[3:], there.obs[3:])
+    assert np.abs(here.xpos[2]).max() > 0.1
+
+
+def test_any_name_of_a_body_can_be_used():
+    names = [*build(CART.replace('"cart">', '"body/2">', 1)).link_names]
+    assert names == ["body/2", "link/1", "knob"]
+
+
+def test_a_camera_of_a_body_without_mass_follows_the_body(compiled):
+    camera = '<body name="tip" pos="0 0 .7"><camera name="c" mode="trackcom"/></body>'
+    xml = CART.replace('<body name="knob"', f'{camera}<body name="knob"')
+    physics = build(xml)
+    model = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(model)
+    data.qpos = 0.3, 0.4
+    mujoco.mj_forward(model, data)
+    state = compiled(physics).from_qpos(np.array([0.3, 0.4], np.float32))
+    com = state.xpos[physics.link_names.index("camera/com")]
+    np.testing.assert_allclose(com, data.subtree_com[model.body("tip").id], atol=1e-6)
+
+
 def test_file_that_includes_another(tmp_path):
     (tmp_path / "cart.xml").write_text(CART)
     (tmp_path / "scene.xml").write_text('<mujoco><include file="cart.xml"/></mujoco>')
@@ -150,9 +190,17 @@ def test_start_and_every_feature_of_mujoco(compiled):
 
 
 def test_missing_file(tmp_path):
-    for path in (tmp_path / "arm.xml", "arm.xml"):
-        with pytest.raises(FileNotFoundError, match=r"there is no MJCF file '.*arm\.xml'"):
+    for path in (tmp_path / "arm.xml", "arm.xml", "a" * 9999 + "arm.xml"):
+        with pytest.raises(FileNotFoundError, match=r"there is no MJCF file '/.*arm\.xml'"):
             build(path)
+    with pytest.raises(FileNotFoundError, match=r"'; XML itself begins with '<'\.$"):
+        build("")
+
+
+def test_file_in_the_home_folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / "cart.xml").write_text(CART)
+    assert build("~/cart.xml").action_size == 2
 
 
 def test_meshes_are_convex_hulls():
@@ -173,6 +221,10 @@ HILLS = """<asset><hfield name="h" nrow="3" ncol="3" size="1 1 1 1"/></asset>
         ("<mujoco><wrldbody/></mujoco>", r"MuJoCo cannot compile the given XML: (.|\n)*wrldbody"),
         (CART[: CART.index("<actuator>")] + "</mujoco>", "the model has no actuator"),
         ('<mujoco><worldbody><geom size=".1"/></worldbody></mujoco>', "the model has no joint"),
+        (
+            CART.replace("</mujoco>", '<sensor><clock name="now"/><clock/></sensor></mujoco>'),
+            "sensor 'now', 'sensor/1' reads a clock, which no state has: remove it",
+        ),
         (CART.replace("<worldbody>", HILLS), "cannot be rendered: hfield 'hills'"),
     ],
 )

@@ -30,6 +30,7 @@ ARM = """
       <geom name="ball" size=".1"/>
     </body>
   </worldbody>
+  <tendon><fixed name="rope"><joint joint="elbow" coef="1"/></fixed></tendon>
   <actuator><motor name="push" joint="elbow" gear="2"/></actuator>
 </mujoco>
 """
@@ -43,7 +44,7 @@ def more(place):
 OPTION = '<option timestep=".005"'
 option, elbow = more(OPTION), more('"elbow" axis="0 1 0"')
 motor, hand = more('<motor name="push" joint="elbow"'), more('<geom name="hand"')
-floor = more('<geom name="floor"')
+floor, rope = more('<geom name="floor"'), more('<fixed name="rope"')
 
 
 def flag(name):
@@ -56,6 +57,8 @@ SPRING, WATERY = elbow('stiffness="3"'), option('density="1000"')
 FEATURES = [
     ("polynomial damping (joint 'elbow')", elbow('damping="1 .5 .3"'), elbow('damping="1"')),
     ("polynomial stiffness (joint 'elbow')", elbow('stiffness="3 .5 9"'), SPRING),
+    ("polynomial damping (tendon 'rope')", rope('damping="1 .5 .3"'), rope('damping="1"')),
+    ("polynomial stiffness (tendon 'rope')", rope('stiffness="3 .5 9"'), rope('stiffness="3"')),
     ("armature (actuator 'push')", motor('armature=".1"'), []),
     ("damping (actuator 'push')", motor('damping=".5"'), []),
     ("option actuatorgroupdisable (actuator 'push')", option('actuatorgroupdisable="0"'), []),

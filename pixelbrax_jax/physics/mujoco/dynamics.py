@@ -150,9 +150,13 @@ class Dynamics:
         state = state.replace(**dict(zip(names, results, strict=False)))
         return state, self._readings(state, results[4], results[5:])
 
-    def first(self, state: State) -> Readings:
-        """Return the readings of a first state; actuators are off, as in DM Control's resets."""
-        results = self._call("first", [state.qpos, state.qvel, state.multipliers], self._shapes)
+    def first(self, state: State, *, is_sampled: bool = True) -> Readings:
+        """Return the readings of a first state; actuators are off, as in DM Control's resets.
+
+        ``is_sampled``: whether the task has sampled it; ``Needs.starts_with_forces`` is of such.
+        """
+        arrays = [state.qpos, state.qvel, state.multipliers]
+        results = self._call("first", arrays, self._shapes, int(is_sampled))
         return self._readings(state, jnp.zeros_like(state.qpos), results)
 
     def _readings(self, state: State, moved: jax.Array, results: list[jax.Array]) -> Readings:

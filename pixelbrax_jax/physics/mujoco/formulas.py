@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -63,17 +63,19 @@ class Snapshot:
 
     def sensor(self, *names: str) -> jax.Array:
         """Return the readings of sensors, concatenated."""
-        rows: list[int] = []
-        for name in names:
-            sensor = self.model.sensor(name)
-            rows.extend(range(sensor.adr[0], sensor.adr[0] + sensor.dim[0]))
-        return self.data.sensordata[np.array(rows)]
+        return self._sensors(self.model.sensor(name).id for name in names)
 
     def sensors_of(self, *kinds: mujoco.mjtSensor) -> jax.Array:
         """Return the readings of all sensors of some types, in the model's order."""
         wanted = {int(kind) for kind in kinds}
-        rows = [i for i, kind in enumerate(self.model.sensor_type) if int(kind) in wanted]
-        return self.sensor(*(self.model.sensor(i).name for i in rows))
+        return self._sensors(
+            i for i, kind in enumerate(self.model.sensor_type) if int(kind) in wanted
+        )
+
+    def _sensors(self, indices: Iterable[int]) -> jax.Array:
+        adr, dim = self.model.sensor_adr, self.model.sensor_dim
+        rows = [row for i in indices for row in range(adr[i], adr[i] + dim[i])]
+        return self.data.sensordata[np.array(rows, int)]
 
     def xpos(self, body: str) -> jax.Array:
         """Return (3,), the origin of a body."""

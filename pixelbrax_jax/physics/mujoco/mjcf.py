@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import asdict
 from operator import attrgetter
@@ -69,7 +70,7 @@ def mjcf_physics(
     colors: Mapping[str, Color] | None = None,
     geom_groups: Collection[int] = VISIBLE_GROUPS,
 ) -> MjcfPhysics:
-    """Make physics of a model in MuJoCo's MJCF (or URDF) format.
+    """Make physics of a model in MuJoCo's MJCF format.
 
     MuJoCo itself simulates it in programs for a CPU, MuJoCo XLA in others. An action in [-1, 1] is
     mapped linearly to an actuator's control range, or passed unchanged if the actuator has none.
@@ -141,9 +142,13 @@ def mjcf_physics(
 
 def _load(source: str | Path) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
     is_xml = isinstance(source, str) and source.lstrip().startswith("<")
-    what = "the given XML" if is_xml else f"{str(source)!r}"
-    if not is_xml and not Path(source).is_file():
-        raise FileNotFoundError(f"there is no MJCF file {str(Path(source).absolute())!r}")
+    what = "the given XML"
+    if not is_xml:
+        source = Path(source).expanduser().absolute()
+        what = repr(str(source))
+        # ``Path.is_file`` fails with a name that is too long.
+        if not os.path.isfile(source):  # noqa: PTH113
+            raise FileNotFoundError(f"there is no MJCF file {what}; XML itself begins with '<'.")
     read = mujoco.MjSpec.from_string if is_xml else mujoco.MjSpec.from_file
     try:
         with loading_silenced():

@@ -54,6 +54,11 @@ class Native:
         self._still.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
         if mujoco.mj_stateSize(model, _STATE) != 1 + model.nq + model.nv + model.na:
             raise ValueError("MuJoCo's plugins and delays are not simulated: remove them.")
+        clocks = np.flatnonzero(model.sensor_type == int(mujoco.mjtSensor.mjSENS_CLOCK))
+        if len(clocks):
+            names = ", ".join(repr(model.sensor(i).name or f"sensor/{i}") for i in clocks)
+            raise ValueError(f"sensor {names} reads a clock, which no state has: remove it.")
+        self._senses = not model.opt.disableflags & _OFF.mjDSBL_SENSOR
         stages = np.repeat(model.sensor_needstage, model.sensor_dim)
         self._is_force = stages == int(mujoco.mjtStage.mjSTAGE_ACC)
         self._rest = np.concatenate([[0], model.qpos0, np.zeros(model.nv + model.na)])
@@ -93,7 +98,7 @@ class Native:
         moved[:] = (last - first)[:, edges[0] : edges[1]]
         with self._models(self._still, multipliers) as models:
             _, found = self._roll(self._still, models, last, 1)
-        _read(found[:, 0], xpos, xquat, sensordata)
+        self._read(found[:, 0], xpos, xquat, sensordata)
         sensordata[:, self._is_force] = sensors[:, self._is_force]
 
     def _step_all(
@@ -136,15 +141,24 @@ class Native:
         return last, qacc, sensors
 
     def first(
-        self, qpos: np.ndarray, qvel: np.ndarray, multipliers: np.ndarray, *results: np.ndarray
+        self,
+        is_sampled: int,
+        qpos: np.ndarray,
+        qvel: np.ndarray,
+        multipliers: np.ndarray,
+        *results: np.ndarray,
     ) -> None:
-        """Fill readings of ``qpos`` and ``qvel`` with actuators off, as DM Control's resets do."""
+        """Fill readings of ``qpos`` and ``qvel`` with actuators off, as DM Control's resets do.
+
+        The forces of any state are computed, whether the task has sampled it or not.
+        """
+        del is_sampled
         xpos, xquat, sensordata, *fields = results
         parts = [np.zeros((len(qpos), 1)), qpos, qvel, np.zeros((len(qpos), self._moving.na))]
         first = np.concatenate(parts, 1, dtype=np.float64)
         with self._models(self._resting, multipliers) as models:
             _, found = self._roll(self._resting, models, first, 1)
-        _read(found[:, 0], xpos, xquat, sensordata)
+        self._read(found[:, 0], xpos, xquat, sensordata)
         if fields:
             with self._models(self._moving, multipliers) as models:
                 self._fill(fields, first, partial(self._look, models))
@@ -181,6 +195,15 @@ class Native:
             wait(others)
         for other in others:
             other.result()
+
+    def _read(
+        self, found: np.ndarray, xpos: np.ndarray, xquat: np.ndarray, own: np.ndarray
+    ) -> None:
+        """Fill poses and sensors from the sensors of a model ``with_poses``."""
+        own[:] = found[:, : own.shape[1]] if self._senses else 0
+        poses = found[:, own.shape[1] :].reshape(len(found), -1, 7)
+        xpos[:, 0], xquat[:, 0] = 0, (1, 0, 0, 0)
+        xpos[:, 1:], xquat[:, 1:] = poses[..., :3], poses[..., 3:]
 
     def clearances(self, qpos: np.ndarray, found: np.ndarray) -> None:
         """Fill (N, G) metres, by which each geom overlaps another, negative; infinity for none."""
@@ -245,14 +268,6 @@ class Native:
             yield data[:count]
 
 
-def _read(found: np.ndarray, xpos: np.ndarray, xquat: np.ndarray, own: np.ndarray) -> None:
-    """Fill poses and sensors from the sensors of a model ``with_poses``."""
-    own[:] = found[:, : own.shape[1]]
-    poses = found[:, own.shape[1] :].reshape(len(found), -1, 7)
-    xpos[:, 0], xquat[:, 0] = 0, (1, 0, 0, 0)
-    xpos[:, 1:], xquat[:, 1:] = poses[..., :3], poses[..., 3:]
-
-
 def compile_model(spec: mujoco.MjSpec) -> mujoco.MjModel:
     """Compile a model without MuJoCo's known warnings."""
     with loading_silenced():
@@ -270,10 +285,11 @@ def without_textures(spec: mujoco.MjSpec) -> mujoco.MjSpec:
 
 
 def with_poses(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """Compile a model that also senses the poses of all bodies but the world."""
+    """Compile a model that senses the poses of all bodies but the world, whatever its flags."""
     spec = spec.copy()
+    spec.option.disableflags &= ~int(_OFF.mjDSBL_SENSOR)
     for i, body in enumerate(spec.bodies):
-        body.name = body.name or f"body/{i}"
+        body.name = body.name or f"pixelbrax/body/{i}"
     for body in spec.bodies[1:]:
         for kind in (mujoco.mjtSensor.mjSENS_FRAMEPOS, mujoco.mjtSensor.mjSENS_FRAMEQUAT):
             spec.add_sensor(type=kind, objtype=mujoco.mjtObj.mjOBJ_XBODY, objname=body.name)

@@ -13,7 +13,7 @@ class Needs:
         target_body: name of the body, fixed to the world, that ``Start.target`` moves; empty for
             none.
         reads_forces: whether observations use sensors of forces or accelerations.
-        starts_with_forces: whether these sensors are not 0 in an initial state.
+        starts_with_forces: whether these sensors are not 0 in an initial state that it samples.
         prefers_xla: whether "auto" steps by MuJoCo XLA on a CPU, too, because it is faster.
         out_of_reach: geoms that never touch anything, which MuJoCo XLA then skips.
         reads: fields of ``MjData`` that the formulas see as MuJoCo leaves them after its last step,

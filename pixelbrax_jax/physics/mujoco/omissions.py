@@ -42,6 +42,8 @@ def _features(model: mujoco.MjModel) -> Iterator[tuple[str, str, Any]]:
 
     yield "polynomial damping", "joint", joints(model.dof_dampingpoly)
     yield "polynomial stiffness", "joint", model.jnt_stiffnesspoly
+    yield "polynomial damping", "tendon", model.tendon_dampingpoly
+    yield "polynomial stiffness", "tendon", model.tendon_stiffnesspoly
     yield "armature", "actuator", model.actuator_armature
     yield "damping", "actuator", model.actuator_damping
     yield "polynomial damping", "actuator", model.actuator_dampingpoly

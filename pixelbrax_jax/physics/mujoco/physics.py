@@ -108,7 +108,7 @@ class MujocoPhysics(GuardedPhysics):
         self._control_range = low, high
         # By an initial state of its own, which needs none of ``num_starts``.
         self._first = jax.eval_shape(
-            lambda key: self.observe(*self._settle(formulas.start(self.dynamics, key), None)),
+            lambda key: self.observe(*self._settle(formulas.start(self.dynamics, key))),
             jax.random.key(0),
         )
         self.state_size = int(self._first.obs.shape[0])
@@ -156,7 +156,7 @@ class MujocoPhysics(GuardedPhysics):
         q, qd = check_pose(self._model, q, qd)
         start = self._start(jax.random.key(0) if key is None else key)
         start = start.replace(qpos=with_unit_rotations(self._model, q), qvel=qd)
-        return self._guard_first(self.observe(*self._settle(start, dynamics)))
+        return self._guard_first(self.observe(*self._settle(start, dynamics, is_sampled=False)))
 
     def _start(self, key: jax.Array) -> Start:
         if not self._num_starts:
@@ -175,9 +175,11 @@ class MujocoPhysics(GuardedPhysics):
             made: Start = jax.device_get(jax.jit(sample)(keys))
         return made
 
-    def _settle(self, start: Start, dynamics: jax.Array | None) -> tuple[State, Readings]:
+    def _settle(
+        self, start: Start, dynamics: jax.Array | None = None, *, is_sampled: bool = True
+    ) -> tuple[State, Readings]:
         state = self.dynamics.state(start.qpos, start.qvel, start.target, dynamics)
-        readings = self.dynamics.first(state)
+        readings = self.dynamics.first(state, is_sampled=is_sampled)
         remembered = self._formulas.remember(Snapshot(self._model, state, readings))
         return state.replace(remembered=remembered), readings
 

@@ -61,10 +61,15 @@ def body_names(model: mujoco.MjModel) -> tuple[str, ...]:
 
 
 def masses_below(model: mujoco.MjModel, root: int) -> np.ndarray:
-    """Return (bodies - 1,) float32, each body's fraction of the mass of ``root``'s subtree."""
+    """Return (bodies - 1,) float32, each body's fraction of the mass of ``root``'s subtree.
+
+    The center of a subtree without mass is that of ``root``, as in MuJoCo.
+    """
     below = np.zeros(model.nbody, bool)
     below[root] = True
     for body in range(1, model.nbody):
         below[body] |= below[model.body_parentid[body]]
-    masses = np.where(below, model.body_mass, 0.0)[1:]
-    return (masses / masses.sum()).astype(np.float32)
+    masses = np.where(below, model.body_mass, 0.0)
+    if masses.sum() < mujoco.mjMINVAL:
+        masses = np.arange(model.nbody) == root
+    return (masses[1:] / masses.sum()).astype(np.float32)

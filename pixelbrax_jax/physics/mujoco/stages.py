@@ -19,18 +19,19 @@ from pixelbrax_jax.physics.mujoco.solver import solve
 
 with import_silenced():
     from mujoco import mjx
+    from mujoco.mjx._src import derivative, scan, smooth, support
     from mujoco.mjx._src import forward as mjx_forward
-    from mujoco.mjx._src import scan, smooth, support
 
 _PLANE, _CAPSULE = int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_CAPSULE)
 _EULER, _RK4 = int(mujoco.mjtIntegrator.mjINT_EULER), int(mujoco.mjtIntegrator.mjINT_RK4)
+_IMPLICITFAST = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
 
 
 def is_supported(model: mujoco.MjModel) -> bool:
     """Return whether the step is for a model: Newton's solver, pyramids or cones of one condim."""
     dimensions = {*model.geom_condim.tolist(), *model.pair_dim.tolist()}
     return bool(
-        model.opt.integrator in (_EULER, _RK4)
+        model.opt.integrator in (_EULER, _RK4, _IMPLICITFAST)
         and model.opt.solver == mujoco.mjtSolver.mjSOL_NEWTON
         and (model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL or len(dimensions) == 1)
     )
@@ -40,6 +41,8 @@ def step(model: Any, data: Any) -> Any:
     """Advance by one time step, as ``mjx.step`` does."""
     if int(model.opt.integrator) == _EULER:
         return _euler(model, forward(model, data))
+    if int(model.opt.integrator) == _IMPLICITFAST:
+        return _implicit(model, forward(model, data))
     # Traced once, used four times.
     compute = jax.jit(lambda data: forward(model, data))
     return _runge_kutta(model, compute(data), compute)
@@ -95,11 +98,7 @@ def _euler(model: Any, data: Any) -> Any:
     """Advance as ``mjx.euler`` does: with damping that is implicit in the velocity."""
     acceleration = data.qacc
     if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP:
-        damping = model.opt.timestep * model.dof_damping
-        # On a CPU jaxlib 0.10.0 to 0.11.0 distribute a batch of factorisations among XLA's threads,
-        # and hang if as many batches as threads run at once: this one waits for the solver. XLA
-        # does not know that the sum is 0, because it might be NaN.
-        damping += (0 * acceleration).sum()
+        damping = model.opt.timestep * model.dof_damping + _after(acceleration)
         inertia = data._impl.M
         if support.is_sparse(model):
             diagonal = model.M_rowadr + model.M_rownnz - 1
@@ -109,6 +108,28 @@ def _euler(model: Any, data: Any) -> Any:
         force = data.qfrc_smooth + data.qfrc_constraint
         acceleration = _solve_inertia(model, data, inertia, force)
     return mjx_forward._advance(model, data, data.act_dot, acceleration)
+
+
+def _implicit(model: Any, data: Any) -> Any:
+    """Advance as ``mjx.implicit`` does: with forces that are implicit in the velocity."""
+    acceleration = data.qacc
+    slope = derivative.deriv_smooth_vel(model, data)
+    if slope is not None:
+        inertia = support.full_m(model, data) if support.is_sparse(model) else data._impl.M
+        inertia += _after(acceleration) - model.opt.timestep * slope
+        force = data.qfrc_smooth + data.qfrc_constraint
+        acceleration = elimination.solve(inertia, force)
+    return mjx_forward._advance(model, data, data.act_dot, acceleration)
+
+
+def _after(acceleration: jax.Array) -> jax.Array:
+    """Return 0, when the solver is done.
+
+    On a CPU jaxlib 0.10.0 to 0.11.0 distribute a batch of factorisations among XLA's threads, and
+    hang if as many batches as threads run at once: one waits for the other. XLA does not know that
+    the sum is 0, because it might be NaN.
+    """
+    return (0 * acceleration).sum()
 
 
 def _runge_kutta(model: Any, data: Any, compute: Callable[[Any], Any]) -> Any:

@@ -39,6 +39,7 @@ class Xla:
         load_onto_own_device(mjx_io)
         check_simulated(model)
         self._model = model
+        self._reads_forces = needs.reads_forces or bool(needs.reads)
         self._starts_with_forces = needs.starts_with_forces or bool(needs.reads)
         self._fields = needs.reads
         # What a step leaves, by its names of `MjData`.
@@ -99,11 +100,13 @@ class Xla:
         del multipliers
         return partial(self._stages.step, model)
 
-    def first(self, qpos: jax.Array, qvel: jax.Array, multipliers: jax.Array) -> Arrays:
-        """See ``Native.first``; without forces where no observation of a first state has any."""
+    def first(
+        self, is_sampled: int, qpos: jax.Array, qvel: jax.Array, multipliers: jax.Array
+    ) -> Arrays:
+        """See ``Native.first``; without forces where no observation of such a state has any."""
         data = self._data(qpos, qvel)
         left: Arrays = ()
-        if self._starts_with_forces:
+        if self._starts_with_forces if is_sampled else self._reads_forces:
             model = changed(self._passive, multipliers)
             forward = self._stages.forward(model, data)
             data = data.replace(sensordata=forward.sensordata)

@@ -15,7 +15,8 @@ from pixelbrax_jax.physics.mujoco.needs import Needs
 from pixelbrax_jax.physics.mujoco.stages import is_supported
 from pixelbrax_jax.physics.mujoco.xla import Xla
 
-# Two arms with dry friction, limits and a joint that follows another; a ball that slides and rolls.
+# Two arms with dry friction, damping, limits, a brake and a joint that follows another; a ball that
+# slides and rolls.
 MODEL = """
 <mujoco>
   <option solver="Newton" cone="{cone}" tolerance="1e-12" iterations="200"/>
@@ -23,7 +24,7 @@ MODEL = """
   <worldbody>
     <geom type="plane" size="5 5 1"/>
     <body pos="0 0 .32">
-      <joint name="a" axis="0 1 0" range="-40 40" limited="true" frictionloss=".4"/>
+      <joint name="a" axis="0 1 0" range="-40 40" limited="true" frictionloss=".4" damping=".3"/>
       <geom type="capsule" size=".05" fromto="0 0 0 .4 0 0"/>
       <body pos=".4 0 0">
         <joint name="b" axis="0 1 0" frictionloss=".05"/>
@@ -34,6 +35,7 @@ MODEL = """
     <body pos="1 1 .1"><freejoint/><geom type="sphere" size=".1" condim="{condim}"/></body>
   </worldbody>
   <equality><joint joint1="c" joint2="a" polycoef="0 2 0 0 0"/></equality>
+  <actuator><velocity joint="b" kv=".2"/></actuator>
 </mujoco>
 """
 NUM_STATES = 64
@@ -198,7 +200,14 @@ def test_matrices_of_other_kinds_have_no_solution(solve, unknowns):
 STAGES = ("collide", "solve", "_solve_inertia")
 
 
-@pytest.mark.parametrize("integrator", ["Euler", pytest.param("RK4", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "integrator",
+    [
+        "Euler",
+        pytest.param("RK4", marks=pytest.mark.slow),
+        pytest.param("implicitfast", marks=pytest.mark.slow),
+    ],
+)
 def test_each_stage_of_our_own_is_used_and_agrees_with_mujoco_xlas(integrator, monkeypatch):
     xml = MODEL.format(cone="pyramidal", condim=3, arms=3)
     model = mujoco.MjModel.from_xml_string(

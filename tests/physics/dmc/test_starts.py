@@ -51,6 +51,18 @@ def test_a_target_belongs_to_its_state():
     assert any(np.array_equal(posed.target, row[2:]) for row in rows)
 
 
+@pytest.mark.slow
+def test_a_pose_has_the_forces_that_mujoco_computes():
+    """Also where sampled states have none."""
+    ours, theirs = (
+        make(0, "dmc_finger_spin", engine=engine)[0].physics for engine in ("mujoco", "xla")
+    )
+    pose = np.array([0.25, -0.8, 1.0])
+    expected, found = (jax.jit(p.from_qpos)(pose).obs for p in (ours, theirs))
+    assert expected[-2:].max() > 0.1, "the finger touches the spinner"
+    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-3)
+
+
 def test_equal_options_are_equal_physics_and_none_is_made_before_an_episode():
     one, other = make(NUM_STARTS)[0].physics, make(NUM_STARTS)[0].physics
     assert one == other == pickle.loads(pickle.dumps(one))

@@ -171,8 +171,7 @@ def _observe_swimmer(seen: Snapshot) -> jax.Array:
     * ``2`` from the nose to the target in the head's frame: x and y, m
     * ``3 * (model.nbody - 1)`` of each body: x and y of its velocity (m/s), z of its turn (rad/s)
     """
-    names = [seen.model.sensor(i).name for i in range(seen.model.nsensor)]
-    readings = seen.sensor(*names)[_SWIMMER_BODY_SENSORS:].reshape(-1, 6)
+    readings = seen.data.sensordata[_SWIMMER_BODY_SENSORS:].reshape(-1, 6)
     return joined(seen.state.qpos[3:], _swimmer_to_target(seen), readings[:, jnp.array([0, 1, 5])])
 
 
