@@ -3,8 +3,8 @@
     python -m tests.benchmarks.generalisation --seeds 1              all of one seed, half a day
     python -m tests.benchmarks.generalisation --seeds 1 ball_in_cup  those with this in their names
 
-Returns go to docs/benchmarks/generalisation, and are not computed again; a stopped training goes
-on. ``python -m tests.benchmarks.figures`` then writes the tables.
+Returns go to docs/benchmarks/generalisation; seeds that are there are neither trained nor played
+again. A stopped training goes on. ``python -m tests.benchmarks.figures`` then writes the tables.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 from pixelbrax_gym.bench.tables import table
@@ -70,23 +71,24 @@ def train(task: str, training: str, seed: int, folder: Path) -> int:
     return run(command, folder, math.inf)
 
 
-def play(task: str, training: str, suite: str, runs: list[Path], folder: Path) -> int:
-    """Play levels that have not been played, keep all returns, and return the exit status."""
+def play(task: str, training: str, suite: str, seed: int, run: Path) -> int:
+    """Play the levels with a run, add its returns to those of other seeds; return the status."""
+    before, folder = kept(task, training, suite), run.parent / f"{run.name}-{suite}"
     command = ["nice", "-n", "19", sys.executable, "-m", "pixelbrax_gym.cli", "evaluate"]
-    command += [*map(str, runs), "--suite", suite, "--clips", "procedural"]
-    command += ["--episodes", str(EPISODES)]
+    command += [str(run), "--suite", suite, "--clips", "procedural"]
+    command += ["--episodes", str(before.options["episodes"] if before else EPISODES)]
     command += ["--output-dir", str(folder)]
     if status := subprocess.run(command, check=False, stdout=subprocess.DEVNULL).returncode:
         return status
     found = json.loads((folder / RETURNS).read_text("utf-8"))
-    found["returns"] = {
-        f"seed {seed}": next(
-            levels for name, levels in found["returns"].items() if name.startswith(f"{made}, seed ")
-        )
-        for seed, made in enumerate(runs)
-    }
+    path = kept_at(task, training, suite)
+    if before and before.options != found["options"]:
+        print(f"{path} is of other options; move it away to play all seeds anew", file=sys.stderr)
+        return 1
+    (played,) = found["returns"].values()
+    found["returns"] = (before.returns if before else {}) | {f"seed {seed}": played}
     KEPT.mkdir(parents=True, exist_ok=True)
-    kept_at(task, training, suite).write_text(json.dumps(found) + "\n", "utf-8")
+    path.write_text(json.dumps(found) + "\n", "utf-8")
     shutil.copyfile(folder / SHEET, KEPT / f"{task}-{suite}.png")
     return 0
 
@@ -179,32 +181,24 @@ def main() -> int:
     if not chosen:
         parser.error(f"no agent has {options.name!r} in its name")
     failed = []
-    for task, training in chosen:
-        missing = [
-            suite
-            for suite in suites_of(task)
-            if (before := kept(task, training, suite)) is None
-            or len(before.returns) < options.seeds
-        ]
-        if not missing:
-            continue
-        folder = options.output_dir / f"revision-{REVISION}" / f"{task}-{training}"
-        runs = [folder / str(seed) for seed in range(options.seeds)]
-        trainings = {
-            str(made): partial(train, task, training, seed, made) for seed, made in enumerate(runs)
-        }
+    for (task, training), seed in product(chosen, range(options.seeds)):
+        made = options.output_dir / f"revision-{REVISION}" / f"{task}-{training}" / str(seed)
         plays = {
-            f"{suite} of {folder}": partial(play, task, training, suite, runs, folder / suite)
-            for suite in missing
+            f"{suite} of {made}": partial(play, task, training, suite, seed, made)
+            for suite in suites_of(task)
+            if not (before := kept(task, training, suite)) or f"seed {seed}" not in before.returns
         }
-        for name, job in (trainings | plays).items():
+        if not plays:
+            continue
+        training_first = {str(made): partial(train, task, training, seed, made)}
+        for name, job in (training_first | plays).items():
             status = job()
             if status > 128 or status < 0:
                 print(f"stopped in {name}; the same command goes on", file=sys.stderr)
                 return status
             if status:
                 failed.append(name)
-                if name in trainings:
+                if name in training_first:
                     break
     if failed:
         print(f"failed: {', '.join(failed)}", file=sys.stderr)
