@@ -55,8 +55,7 @@ def read_pretrained(name: str) -> dict[str, Any]:
     evaluation, and ``versions`` of the packages.
     """
     check_choice("pretrained policy", name, list_pretrained())
-    about: dict[str, Any] = json.loads((FOLDER / f"{name}.json").read_text("utf-8"))
-    return about
+    return json.loads((FOLDER / f"{name}.json").read_text("utf-8"))
 
 
 def load_policy(path: str | Path) -> Policy:

@@ -91,8 +91,7 @@ def parts_not_kept(state: TrainState) -> tuple[str, ...]:
 
 def kept(state: State) -> State:
     """Return the state with None for the fields that checkpoints skip."""
-    without: State = state.replace(**dict.fromkeys(parts_not_kept(state)))
-    return without
+    return state.replace(**dict.fromkeys(parts_not_kept(state)))
 
 
 def stream_key(state: TrainState, stream: int) -> jax.Array:

@@ -40,8 +40,7 @@ def convolve(
     def on_cpu(x: jax.Array, kernel: jax.Array) -> jax.Array:
         return _by_image(x, kernel, stride, pads, before)
 
-    result: jax.Array = jax.lax.platform_dependent(x, kernel, cpu=on_cpu, default=native)
-    return result
+    return jax.lax.platform_dependent(x, kernel, cpu=on_cpu, default=native)
 
 
 # The patches of one image fit into a cache, those of a batch do not. XLA's own convolutions are as

@@ -74,8 +74,7 @@ def orthogonal(gain: float) -> Initializer:
     def sample(key: jax.Array, shape: tuple[int, ...], dtype: Any = jnp.float32) -> jax.Array:
         # The batched QR decomposition of jaxlib 0.10 can deadlock on a CPU with few cores.
         one_by_one = jax.custom_batching.sequential_vmap(lambda key: initializer(key, shape, dtype))
-        matrix: jax.Array = one_by_one(key)
-        return matrix
+        return one_by_one(key)
 
     return sample
 

@@ -19,8 +19,7 @@ from pixelbrax_jax.memory import device_memory
 
 def mesh_of(algorithm: Algorithm) -> Mesh | None:
     """Return the device mesh of an algorithm's environments, or None."""
-    mesh: Mesh | None = getattr(algorithm.envs, "mesh", None)
-    return mesh
+    return getattr(algorithm.envs, "mesh", None)
 
 
 def state_shardings(mesh: Mesh, template: Any, num_seeds: int = 1) -> Any:

@@ -108,8 +108,7 @@ def load_trained(
 
 def num_runs(folder: str | Path) -> int:
     """Return the number of runs in the latest checkpoint of an output folder."""
-    seeds: int = read_about(Path(folder) / "checkpoints")["config"].get("seeds", 1)
-    return seeds
+    return read_about(Path(folder) / "checkpoints")["config"].get("seeds", 1)
 
 
 def with_clips(agent: Trained, clips: str | None) -> tuple[TrainConfig, Sequence[str] | None]:
