@@ -17,8 +17,6 @@ from pixelbrax_jax.agents.config import (
 from pixelbrax_jax.agents.networks.encoders import LAYERS
 from pixelbrax_jax.validation import check_choice
 
-CRITICS = ("clipped", "c51")
-
 
 @dataclass(frozen=True)
 class DrQv2Config(TrainConfig):
@@ -96,7 +94,7 @@ class DrQv2Config(TrainConfig):
         """Check the settings."""
         super().__post_init__()
         check_choice("encoder", self.encoder, LAYERS)
-        check_choice("critic", self.critic, CRITICS)
+        check_choice("critic", self.critic, ("clipped", "c51"))
         if self.state_critic:
             raise ValueError("state_critic must be False for drqv2, whose critic sees pixels.")
         if self.critic == "c51" and not (self.v_min < self.v_max and self.num_atoms > 1):

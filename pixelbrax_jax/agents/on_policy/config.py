@@ -18,8 +18,6 @@ from pixelbrax_jax.agents.config import (
 from pixelbrax_jax.agents.networks.actor_critic import LOG_STD_RANGE, POLICIES
 from pixelbrax_jax.validation import check_choice
 
-ADVANTAGE_NORMS = ("batch", "minibatch", "none")
-
 
 @dataclass(frozen=True)
 class OnPolicyConfig(TrainConfig):
@@ -54,7 +52,8 @@ class OnPolicyConfig(TrainConfig):
         super().__post_init__()
         check_divides("num_steps", self.num_steps, "num_minibatches", self.num_minibatches)
         check_choice("policy", self.policy, POLICIES)
-        check_choice("normalize_advantage", self.normalize_advantage, ADVANTAGE_NORMS)
+        norms = ("batch", "minibatch", "none")
+        check_choice("normalize_advantage", self.normalize_advantage, norms)
         low, high = (math.exp(x) for x in LOG_STD_RANGE)
         if not low < self.initial_std < high:
             raise ValueError(

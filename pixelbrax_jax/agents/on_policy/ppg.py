@@ -17,8 +17,6 @@ from pixelbrax_jax.agents.on_policy.phasic import Chunk, Phasic, PhasicConfig
 from pixelbrax_jax.agents.train_state import UPDATES, Metrics, Networks, stream_key
 from pixelbrax_jax.validation import check_choice
 
-LAYOUTS = ("dual", "detach", "shared")
-
 
 @dataclass(frozen=True)
 class PPGConfig(PhasicConfig):
@@ -39,7 +37,7 @@ class PPGConfig(PhasicConfig):
     def __post_init__(self) -> None:
         """Check the settings."""
         super().__post_init__()
-        check_choice("layout", self.layout, LAYOUTS)
+        check_choice("layout", self.layout, ("dual", "detach", "shared"))
         if self.layout != "dual" and self.policy_epochs != self.value_epochs:
             raise ValueError(
                 f"policy_epochs={self.policy_epochs} and value_epochs={self.value_epochs} may "

@@ -21,8 +21,6 @@ from pixelbrax_jax.agents.on_policy.losses import (
 from pixelbrax_jax.agents.train_state import UPDATES, Metrics, Networks, stream_key
 from pixelbrax_jax.validation import check_choice, check_positive
 
-LAYOUTS = ("separate", "shared")
-
 
 @dataclass(frozen=True)
 class PPOConfig(OnPolicyConfig):
@@ -42,7 +40,7 @@ class PPOConfig(OnPolicyConfig):
     def __post_init__(self) -> None:
         """Check the settings."""
         super().__post_init__()
-        check_choice("layout", self.layout, LAYOUTS)
+        check_choice("layout", self.layout, ("separate", "shared"))
         if self.state_critic and self.layout == "shared":
             raise ValueError(
                 "state_critic needs layout='separate', got 'shared': a critic of the simulator's "

@@ -26,8 +26,6 @@ from pixelbrax_jax.processor import name_cpu
 from pixelbrax_jax.types import Clips
 from pixelbrax_jax.validation import check_choice
 
-RESUME = ("never", "latest")
-
 OF_RUNS = ("seed", "seeds")
 """Settings of ``RunConfig`` that affect the result of a run."""
 
@@ -75,7 +73,7 @@ class RunConfig:
 
     def __post_init__(self) -> None:
         """Check the settings."""
-        check_choice("resume", self.resume, RESUME)
+        check_choice("resume", self.resume, ("never", "latest"))
         check_annotated(self)
         if self.seed + self.seeds > 2**32:
             raise ValueError(
