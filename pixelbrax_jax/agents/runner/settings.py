@@ -35,9 +35,6 @@ _PACKAGES = ("pixelbrax", "jax", "jaxlib", "brax", "mujoco", "flax", "optax")
 _GONE = {"physics_batching"}
 """Settings of former releases that did not affect results."""
 
-_FREE = ("total_steps", "memory_budget_gb")
-"""Settings that may change when a run continues."""
-
 
 @dataclass(frozen=True)
 class RunConfig:
@@ -129,9 +126,11 @@ def unknown_settings(about: Mapping[str, Any], known: Mapping[str, Any]) -> str:
 def differences(about: Mapping[str, Any], own: Mapping[str, Any]) -> list[str]:
     """List what prevents a run ``own`` from continuing ``about``, both from ``describe_run``."""
     old, new = about["config"], own["config"]
-    free = {name for name in _FREE if name != "total_steps" or not new.get("anneal")}
+    ignored = _GONE | {"memory_budget_gb", "clips"}
+    if not new.get("anneal"):
+        ignored |= {"total_steps"}
     found = []
-    for name in sorted((old.keys() | new.keys()) - free - _GONE - {"clips"}):
+    for name in sorted((old.keys() | new.keys()) - ignored):
         if name not in new:
             found.append(f"{name}: {old[name]!r} there, unknown here")
         elif old.get(name) != new[name]:
