@@ -82,7 +82,13 @@ class DrQv2(Algorithm):
         config, env = self.config, self.envs.env
         spec, _ = split_obs(env.obs_spec)
         frame = jax.ShapeDtypeStruct((*spec.shape[:-1], config.frame_channels), spec.dtype)
-        networks = self._init_networks(jax.random.fold_in(key, NETWORKS))
+        networks_key = jax.random.fold_in(key, NETWORKS)
+        keys = {name: jax.random.fold_in(networks_key, i) for i, name in enumerate(self.modules)}
+        pixels = jnp.zeros((1, *spec.shape), spec.dtype)
+        features, encoder = self.modules["encoder"].init_with_output(keys["encoder"], pixels)
+        action, actor = self.modules["actor"].init_with_output(keys["actor"], features)
+        critic = self.modules["critic"].init(keys["critic"], features, action)
+        networks = {"encoder": encoder, "actor": actor, "critic": critic}
         env_state, _ = self.envs.reset(jax.random.fold_in(key, ENVS), env_params)
         kind = WithReplay if config.checkpoint_replay else OffPolicyState
         return kind(
@@ -91,18 +97,9 @@ class DrQv2(Algorithm):
             env_state=env_state,
             key=key,
             iteration=jnp.uint32(0),
-            target=networks["critic"],
+            target=critic,
             replay=Replay.empty(config.num_envs, config.slots, frame, env.action_size),
         )
-
-    def _init_networks(self, key: jax.Array) -> Networks:
-        spec, _ = split_obs(self.envs.env.obs_spec)
-        keys = {name: jax.random.fold_in(key, i) for i, name in enumerate(self.modules)}
-        pixels = jnp.zeros((1, *spec.shape), spec.dtype)
-        features, encoder = self.modules["encoder"].init_with_output(keys["encoder"], pixels)
-        action, actor = self.modules["actor"].init_with_output(keys["actor"], features)
-        critic = self.modules["critic"].init(keys["critic"], features, action)
-        return {"encoder": encoder, "actor": actor, "critic": critic}
 
     @under_default_flags
     def iterate(self, state: OffPolicyState, env_params: EnvParams) -> tuple[TrainState, Metrics]:

@@ -154,16 +154,15 @@ def dynamics_loss(params: Networks, features: jax.Array, chunk: Chunk, key: jax.
     of the authors' code. Pairs across an episode's end have no weight. ``features`` are (N C, F).
     """
 
-    def in_time(rows: jax.Array) -> jax.Array:
-        return rows.reshape(-1, chunk.num_steps, *rows.shape[1:])
-
-    def flat(rows: jax.Array) -> jax.Array:
+    def part(rows: jax.Array, steps: slice) -> jax.Array:
+        rows = rows.reshape(-1, chunk.num_steps, *rows.shape[1:])[:, steps]
         return rows.reshape(-1, *rows.shape[2:])
 
-    now, following = flat(in_time(features)[:, :-1]), flat(in_time(features)[:, 1:])
-    action = flat(in_time(chunk.unclipped_action)[:, :-1])
+    before, after = slice(None, -1), slice(1, None)
+    now, following = part(features, before), part(features, after)
+    action = part(chunk.unclipped_action, before)
     # A step that ends an episode returns its last observation; the next step resets the episode.
-    weight = flat(in_time(chunk.weight)[:, :-1])
+    weight = part(chunk.weight, before)
     action_key, following_key = jax.random.split(key)
     others = jax.random.permutation(action_key, len(action))
     strangers = jax.random.permutation(following_key, len(following))
