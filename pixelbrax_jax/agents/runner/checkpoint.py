@@ -18,7 +18,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from pixelbrax_jax.agents.runner.devices import any_process
-from pixelbrax_jax.agents.runner.progress import Report, silent
+from pixelbrax_jax.agents.runner.progress import Report, reason, silent
 from pixelbrax_jax.agents.runner.settings import differences, unknown_settings, versions
 from pixelbrax_jax.flags import is_key
 
@@ -55,9 +55,8 @@ def latest_steps(folder: str | Path) -> int | None:
 
 def best_steps(folder: str | Path) -> int | None:
     """Return the control steps of the checkpoint with the highest score, or None."""
-    scores = {steps: read_about(folder, steps)["score"] for steps in all_steps(Path(folder))}
-    scores = {steps: score for steps, score in scores.items() if score is not None}
-    return max(scores, key=lambda steps: (scores[steps], steps), default=None)
+    scored = [(read_about(folder, steps)["score"], steps) for steps in all_steps(Path(folder))]
+    return max((row for row in scored if row[0] is not None), default=(None, None))[1]
 
 
 def read_about(folder: str | Path, steps: int | None = None) -> dict[str, Any]:
@@ -118,8 +117,7 @@ class Checkpoints:
             TemporaryFile(dir=self.folder).close()
         except OSError as error:
             raise CheckpointError(
-                f"cannot write to {self.folder}: {error.strerror or error}. Use another "
-                "--output-dir."
+                f"cannot write to {self.folder}: {reason(error)}. Use another --output-dir."
             ) from error
         policy = ocp.checkpoint_managers
         best = policy.BestN(
@@ -260,11 +258,8 @@ class Checkpoints:
             with suppress(OSError):
                 self._manager.reload()
             # TensorStore's messages end with the message of the operating system.
-            reason = str(error).partition("\n")[0].rsplit(": ", 1)[-1]
-            reason = getattr(error, "strerror", None) or reason or type(error).__name__
-            raise CheckpointError(
-                f"cannot write a checkpoint to {self.folder}: {reason}."
-            ) from error
+            why = reason(error).rsplit(": ", 1)[-1]
+            raise CheckpointError(f"cannot write a checkpoint to {self.folder}: {why}.") from error
 
     def _check(self, about: dict[str, Any]) -> None:
         own = self._about
