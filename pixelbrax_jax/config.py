@@ -121,7 +121,6 @@ class ProgramConfig:
         object.__setattr__(self, name, value)
 
 
-_LONGEST_EPISODE = 2**31 - 1
 _SUITE_OPTIONS = (*fields(BraxOptions), *fields(MujocoOptions))
 
 
@@ -166,7 +165,7 @@ class EnvConfig(BraxOptions, MujocoOptions, ProgramConfig):
         MujocoOptions.__post_init__(self)
         self._store("dynamics", check_ranges("dynamics", self.dynamics))
         episode_length = check_positive_int("episode_length", self._static("episode_length"))
-        if episode_length > _LONGEST_EPISODE:
+        if episode_length >= 2**31:
             raise ValueError(f"episode_length must be below 2**31, got {episode_length}.")
         self._store("episode_length", episode_length)
         if self.shadows is not None:
@@ -193,8 +192,8 @@ class EnvConfig(BraxOptions, MujocoOptions, ProgramConfig):
 
     def suite_options(self) -> dict[str, Any]:
         """Return the options that belong to one suite and differ from their defaults."""
-        values = {option.name: getattr(self, option.name) for option in _SUITE_OPTIONS}
-        return {o.name: values[o.name] for o in _SUITE_OPTIONS if values[o.name] != o.default}
+        given = ((option, getattr(self, option.name)) for option in _SUITE_OPTIONS)
+        return {option.name: value for option, value in given if value != option.default}
 
 
 def _check_camera(camera: Any) -> Any:

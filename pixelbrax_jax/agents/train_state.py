@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import fields
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
 from flax import struct
@@ -68,9 +68,6 @@ class TrainState(struct.PyTreeNode):
     iteration: jax.Array = without_envs()
 
 
-State = TypeVar("State", bound=TrainState)
-
-
 def env_axes(tree: Any) -> Any:
     """Replace each leaf of a dataclass with declared fields by its environment axis, or -1."""
     found = {}
@@ -89,7 +86,7 @@ def parts_not_kept(state: TrainState) -> tuple[str, ...]:
     return tuple(f.name for f in fields(state) if not f.metadata.get(_KEPT, True))
 
 
-def kept(state: State) -> State:
+def kept(state: TrainState) -> TrainState:
     """Return the state with None for the fields that checkpoints skip."""
     return state.replace(**dict.fromkeys(parts_not_kept(state)))
 
