@@ -22,7 +22,7 @@ from pixelbrax_jax.agents.on_policy.algorithm import (
 from pixelbrax_jax.agents.on_policy.config import OnPolicyConfig
 from pixelbrax_jax.agents.on_policy.losses import mean, value_loss
 from pixelbrax_jax.agents.optimizer import Optimizer
-from pixelbrax_jax.agents.rollout import Frames, observations
+from pixelbrax_jax.agents.rollout import Frames, at_times, observations
 from pixelbrax_jax.agents.train_state import (
     AUXILIARY,
     Metrics,
@@ -162,9 +162,9 @@ class Phasic(OnPolicy):
 
         def step(carry: Any, inputs: tuple[jax.Array, jax.Array]) -> tuple[Any, Metrics]:
             networks, opt_state = carry
-            (which,), key = inputs
-            mean, std = (_of_each(x, which) for x in old)
-            chunk = self._chunk(state.buffer, which, Normal(mean, std, squash))
+            which, key = inputs
+            mean, std = (at_times(x, which).reshape(-1, x.shape[-1]) for x in old)
+            chunk = self._chunk(state.buffer, which[0], Normal(mean, std, squash))
             gradients, metrics = jax.grad(self.auxiliary_loss, has_aux=True)(networks, chunk, key)
             gradients = {name: gradients[name] for name in opt_state}
             networks, opt_state, norms = optimizer.step(networks, opt_state, gradients, iteration)
@@ -232,9 +232,3 @@ def _entry(experience: Experience) -> Buffer:
     rollout = experience.rollout
     action = rollout.choice.unclipped_action
     return Buffer(rollout.frames, action, experience.returns, rollout.done, rollout.valid)
-
-
-def _of_each(chunks: jax.Array, which: jax.Array) -> jax.Array:
-    """Map (Q, N, C, ...) and (N,) to (N C, ...), with another chunk for each environment."""
-    picked = jax.vmap(lambda x, i: x[i], in_axes=(1, 0))(chunks, which)
-    return picked.reshape(-1, *picked.shape[2:])
