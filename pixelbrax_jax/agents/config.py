@@ -150,7 +150,8 @@ def _check_env(env: EnvConfig) -> None:
     if not isinstance(env, EnvConfig):
         raise TypeError(f"env must be an EnvConfig, got {env!r}.")
     cameras = (("camera", camera) for camera in env.cameras)
-    for name, value in (*cameras, ("look", env.look), ("clips", env.clips or "")):
+    clips = "" if env.clips is None else env.clips
+    for name, value in (*cameras, ("look", env.look), ("clips", clips)):
         if not isinstance(value, str):
             raise TypeError(f"{name} of training settings must be a name, got {value!r}.")
     if not all(isinstance(item, str) for item in as_tuple(env.distractors)):
