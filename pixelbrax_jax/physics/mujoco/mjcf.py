@@ -50,7 +50,7 @@ class MjcfPhysics(MujocoPhysics):
         before = Snapshot(self._model, state.engine, state.engine.remembered)
         engine, readings = self.move(state.engine, action)
         reward = self._reward(before, Snapshot(self._model, engine, readings), action)
-        reward = _checked("reward", "a scalar number", reward, _is_number)
+        reward = _checked("reward", "a scalar number", reward, 0, jnp.number)
         return self.observe(engine, readings).replace(reward=reward.astype(jnp.float32))
 
 
@@ -126,9 +126,13 @@ def mjcf_physics(
     senses_forces = bool((model.sensor_needstage == _FORCES).any())
     formulas = Formulas(
         start=_start(model, reset, init_q, noise),
-        observe=lambda seen: _checked("observe", "a flat float array", observe(seen), _is_flat),
+        observe=lambda seen: _checked(
+            "observe", "a flat float array", observe(seen), 1, jnp.floating
+        ),
         reward=_reward_of_a_step,
-        terminated=lambda seen: _checked("terminated", "a scalar bool", terminated(seen), _is_bool),
+        terminated=lambda seen: _checked(
+            "terminated", "a scalar bool", terminated(seen), 0, jnp.bool_
+        ),
         remember=attrgetter("data"),
         camera=None,
         substeps=substeps,
@@ -193,27 +197,13 @@ def _reward_of_a_step(seen: Snapshot) -> jax.Array:
     return jnp.zeros(())  # ``MjcfPhysics`` knows more: the snapshot before it, and the action.
 
 
-def _is_number(dtype: Any, shape: tuple[int, ...]) -> bool:
-    return bool(shape == () and jnp.issubdtype(dtype, jnp.number))
-
-
-def _is_bool(dtype: Any, shape: tuple[int, ...]) -> bool:
-    return bool(shape == () and dtype == jnp.bool_)
-
-
-def _is_flat(dtype: Any, shape: tuple[int, ...]) -> bool:
-    return len(shape) == 1 and shape[0] > 0 and jnp.issubdtype(dtype, jnp.floating)
-
-
-def _checked(
-    name: str, expected: str, result: Any, fits: Callable[[Any, tuple[int, ...]], bool]
-) -> jax.Array:
-    """Return a function's result; raise ValueError if its shape or dtype is wrong."""
+def _checked(name: str, expected: str, result: Any, ndim: int, kind: Any) -> jax.Array:
+    """Return a function's result; raise ValueError if it is empty or has another shape or dtype."""
     if isinstance(result, (bool, int, float)):
         result = jnp.asarray(result)
     shape, dtype = getattr(result, "shape", None), getattr(result, "dtype", None)
     if shape is None or dtype is None:
         raise ValueError(f"{name} must return {expected}, got {result!r}")
-    if not fits(dtype, shape):
+    if len(shape) != ndim or 0 in shape or not jnp.issubdtype(dtype, kind):
         raise ValueError(f"{name} must return {expected}, got shape {shape} and dtype {dtype}")
     return jnp.asarray(result)
