@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import asdict
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -129,7 +128,8 @@ def mjcf_physics(
         observe=lambda seen: _checked(
             "observe", "a flat float array", observe(seen), 1, jnp.floating
         ),
-        reward=_reward_of_a_step,
+        # ``MjcfPhysics`` computes it: it knows the snapshot before the step, and the action.
+        reward=lambda _: jnp.zeros(()),
         terminated=lambda seen: _checked(
             "terminated", "a scalar bool", terminated(seen), 0, jnp.bool_
         ),
@@ -140,7 +140,7 @@ def mjcf_physics(
         starts_with_forces=senses_forces,
     )
     return MjcfPhysics(
-        reward, formulas, spec, colors=colors, geom_groups=geom_groups, **asdict(options)
+        reward, formulas, spec, colors=colors, geom_groups=geom_groups, **vars(options)
     )
 
 
@@ -190,11 +190,6 @@ def _start(
         return Start(with_unit_rotations(model, qpos), qvel)
 
     return start
-
-
-def _reward_of_a_step(seen: Snapshot) -> jax.Array:
-    del seen
-    return jnp.zeros(())  # ``MjcfPhysics`` knows more: the snapshot before it, and the action.
 
 
 def _checked(name: str, expected: str, result: Any, ndim: int, kind: Any) -> jax.Array:
