@@ -171,17 +171,10 @@ def _within(x: jax.Array, low: float, high: float) -> jax.Array:
     return (low < x) & (x < high)
 
 
-def _speed(seen: Snapshot, substeps: int) -> jax.Array:
-    """Return the velocity of the first joint over the control step."""
-    return seen.data.moved[0] / (seen.model.opt.timestep * substeps)
-
-
-def _lagging_speed(
-    seen: Snapshot, place: Callable[[Snapshot], jax.Array], substeps: int
-) -> jax.Array:
-    """Return the velocity along x of what lags behind the root's joint by one physics step."""
+def _lagging_speed(seen: Snapshot, place: Callable[[Snapshot], jax.Array]) -> jax.Array:
+    """Return the velocity along x of what lags behind the root's joint by one physics step of 5."""
     lag = place(seen) - seen.state.remembered
-    return (seen.data.moved[0] + lag[0]) / (seen.model.opt.timestep * substeps)
+    return (seen.data.moved[0] + lag[0]) / (seen.model.opt.timestep * 5)
 
 
 def _torso(seen: Snapshot) -> jax.Array:
@@ -199,7 +192,8 @@ def _center_of_mass(seen: Snapshot) -> jax.Array:
 
 def _reward_runner(seen: Snapshot, *, substeps: int, effort: float) -> jax.Array:
     """Return ``v - {effort!g} * sum(u ** 2)``; v: velocity along x, m/s; u: the controls."""
-    return _speed(seen, substeps) - _effort(seen, effort)
+    speed = seen.data.moved[0] / (seen.model.opt.timestep * substeps)
+    return speed - _effort(seen, effort)
 
 
 def _ant_fell(seen: Snapshot) -> jax.Array:
@@ -215,7 +209,7 @@ def _reward_ant(seen: Snapshot) -> jax.Array:
     bodies, clipped to [-1, 1].
     """
     forces = jnp.clip(seen.data.fields["cfrc_ext"], -1, 1)
-    forward = _lagging_speed(seen, _torso, 5)
+    forward = _lagging_speed(seen, _torso)
     healthy = jnp.where(_ant_fell(seen), 0.0, 1.0)
     return forward + healthy - _effort(seen, 0.5) - 5e-4 * jnp.sum(forces**2)
 
@@ -241,8 +235,8 @@ def _humanoid_fell(seen: Snapshot) -> jax.Array:
     return ~_within(seen.state.qpos[2], 1.0, 2.0)
 
 
-def _impact(seen: Snapshot, weight: float) -> jax.Array:
-    return jnp.minimum(weight * jnp.sum(seen.data.fields["cfrc_ext"] ** 2), 10.0)
+def _impact(seen: Snapshot) -> jax.Array:
+    return jnp.minimum(5e-7 * jnp.sum(seen.data.fields["cfrc_ext"] ** 2), 10.0)
 
 
 def _reward_humanoid(seen: Snapshot) -> jax.Array:
@@ -251,9 +245,9 @@ def _reward_humanoid(seen: Snapshot) -> jax.Array:
     v: velocity of the center of mass along x, m/s; u: the controls; c: external torques and forces
     on the bodies. The 5 is missing at the episode's end.
     """
-    forward = 1.25 * _lagging_speed(seen, _center_of_mass, 5)
+    forward = 1.25 * _lagging_speed(seen, _center_of_mass)
     healthy = jnp.where(_humanoid_fell(seen), 0.0, 5.0)
-    return forward + healthy - _effort(seen, 0.1) - _impact(seen, 5e-7)
+    return forward + healthy - _effort(seen, 0.1) - _impact(seen)
 
 
 def _reward_standup(seen: Snapshot) -> jax.Array:
@@ -263,7 +257,7 @@ def _reward_standup(seen: Snapshot) -> jax.Array:
     of the torso, m; u: the controls; c: external torques and forces on the bodies.
     """
     height = seen.state.qpos[2] / seen.model.opt.timestep
-    return height - _effort(seen, 0.1) - _impact(seen, 5e-7) + 1
+    return height - _effort(seen, 0.1) - _impact(seen) + 1
 
 
 def _pole_fell(seen: Snapshot) -> jax.Array:
