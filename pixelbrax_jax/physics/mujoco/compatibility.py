@@ -100,13 +100,10 @@ def accept_device_put_replicated(module: ModuleType) -> None:
 
     def device_put_replicated(x: Any, devices: Sequence[jax.Device]) -> Any:
         """Return ``x`` with a new leading axis, one row on each device."""
+        count = len(devices)
+        rows = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *jnp.shape(leaf))), x)
         sharding = NamedSharding(Mesh(np.array(devices), ("row",)), PartitionSpec("row"))
-
-        def put(leaf: jax.typing.ArrayLike) -> jax.Array:
-            rows = jnp.broadcast_to(leaf, (len(devices), *jnp.shape(leaf)))
-            return jax.device_put(rows, sharding)
-
-        return jax.tree.map(put, x)
+        return jax.device_put(rows, sharding)
 
     _replace_in(module, "jax", jax, device_put_replicated=device_put_replicated)
 
