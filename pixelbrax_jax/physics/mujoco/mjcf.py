@@ -19,7 +19,6 @@ from pixelbrax_jax.physics.mujoco.compatibility import loading_silenced
 from pixelbrax_jax.physics.mujoco.dynamics import Dynamics
 from pixelbrax_jax.physics.mujoco.formulas import Formulas, Snapshot, Start, never, observe_joints
 from pixelbrax_jax.physics.mujoco.geometry import VISIBLE_GROUPS
-from pixelbrax_jax.physics.mujoco.omissions import check_simulated
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
 from pixelbrax_jax.physics.mujoco.options import MujocoOptions
 from pixelbrax_jax.physics.mujoco.physics import MujocoPhysics
@@ -116,8 +115,6 @@ def mjcf_physics(
         raise ValueError(f"reset_noise must be finite and not negative, got {reset_noise}")
     substeps = check_positive_int("n_frames", n_frames)
     spec, model = _load(source)
-    if engine in ("xla", "mjx", "warp"):
-        check_simulated(model)
     if model.nv == 0:
         raise ValueError("the model has no joint, so nothing can move")
     if model.nu == 0:
