@@ -46,9 +46,8 @@ class SuiteEnv:
         self._env = _import_suite().load(row.domain, row.task, task_kwargs=options)
         self._env.reset()  # gives targets their sizes
         self._physics = self._env.physics
-        self._low, self._high = (
-            getattr(self._env.action_spec(), end) for end in ("minimum", "maximum")
-        )
+        actions = self._env.action_spec()
+        self._low, self._high = actions.minimum, actions.maximum
         model = self._physics.model.ptr
         names = [camera_name(model, i) for i in range(model.ncam)]
         if camera == "default":
