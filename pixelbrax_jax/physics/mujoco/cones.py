@@ -8,14 +8,12 @@ cone, D_0 (N - mu T)^2 / (2 mu^2 (1 + mu^2)).
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
-
-FREE, STICKING, SLIPPING = range(3)
 
 _NEGLECTED = 1e-5
 """Accepted error of Newton's last step, as a fraction of a contact's force."""
@@ -47,27 +45,27 @@ class Cones(NamedTuple):
         square = self._mu**2
         return self.stiffness[:, 0] / jnp.maximum(square * (1 + square), mujoco.mjMINVAL)
 
-    def zone(self, residual: jax.Array) -> jax.Array:
-        """Return (C,) int32, ``FREE``, ``STICKING`` or ``SLIPPING``, for residuals (C, k)."""
+    def _by_zone(self, residual: jax.Array, sticking: jax.Array, slipping: jax.Array) -> jax.Array:
+        """Return 0 for free contacts, else what is for those that stick or slip: (C, ...)."""
         normal, length, _ = self._parts(residual)
-        slips = jnp.where(self._mu * normal + length <= 0, STICKING, SLIPPING)
-        return jnp.where(normal >= self._mu * length, FREE, slips).astype(jnp.int32)
+        axes = range(1, sticking.ndim)
+        is_free = jnp.expand_dims(normal >= self._mu * length, axes)
+        sticks = jnp.expand_dims(self._mu * normal + length <= 0, axes)
+        return jnp.where(is_free, 0.0, jnp.where(sticks, sticking, slipping))
 
     def cost(self, residual: jax.Array) -> jax.Array:
         """Return the sum of all costs for residuals (C, k)."""
         normal, length, _ = self._parts(residual)
         sticking = 0.5 * jnp.sum(self.stiffness * residual**2, axis=1)
         slipping = 0.5 * self._slip_stiffness * (normal - self._mu * length) ** 2
-        return jnp.sum(_by_zone(self.zone(residual), sticking, slipping))
+        return jnp.sum(self._by_zone(residual, sticking, slipping))
 
     def slope(self, residual: jax.Array) -> jax.Array:
         """Return derivatives (C, k) of the cost by residuals (C, k)."""
         normal, length, tangent = self._parts(residual)
-        outward = self._outward(tangent)
         slipping = self._slip_stiffness * (normal - self._mu * length)
-        return _by_zone(
-            self.zone(residual)[:, None], self.stiffness * residual, slipping[:, None] * outward
-        )
+        slipping = slipping[:, None] * self._outward(tangent)
+        return self._by_zone(residual, self.stiffness * residual, slipping)
 
     def curvature_times(self, residual: jax.Array, rows: jax.Array) -> jax.Array:
         """Return second derivatives at residuals (C, k) times rows (C, k, V)."""
@@ -81,11 +79,8 @@ class Cones(NamedTuple):
         across = self.scale[:, 1:, None] * (across - tangent[..., None] * along)
         curved = jnp.pad(turning[:, None, None] * across, [(0, 0), (1, 0), (0, 0)])
         straight = outward * jnp.sum(outward * rows, axis=1, keepdims=True)
-        return _by_zone(
-            self.zone(residual)[:, None, None],
-            self.stiffness[..., None] * rows,
-            self._slip_stiffness[:, None, None] * (straight + curved),
-        )
+        slipping = self._slip_stiffness[:, None, None] * (straight + curved)
+        return self._by_zone(residual, self.stiffness[..., None] * rows, slipping)
 
     def stay(self, residual: jax.Array, change: jax.Array) -> jax.Array:
         """Return () bool, whether a change of residuals (C, k) changes slopes as predicted."""
@@ -99,7 +94,3 @@ class Cones(NamedTuple):
         return self.scale * jnp.concatenate(
             [jnp.ones_like(self._mu)[:, None], -self._mu[:, None] * tangent], axis=1
         )
-
-
-def _by_zone(zone: jax.Array, sticking: Any, slipping: Any) -> jax.Array:
-    return jnp.where(zone == STICKING, sticking, jnp.where(zone == SLIPPING, slipping, 0.0))
