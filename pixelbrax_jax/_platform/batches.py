@@ -35,10 +35,7 @@ def step_rows(step: Step, state: Any, rows: Any, shared: Any) -> tuple[Any, jax.
         return together(state, rows, shared)
     in_chunks = partial(_step_chunks, step)
     like = (state, jax.ShapeDtypeStruct((num_rows,), jnp.float32))
-    moved: tuple[Any, jax.Array] = by_platform(
-        (state, rows, shared), like, cpu=in_chunks, default=together
-    )
-    return moved
+    return by_platform((state, rows, shared), like, cpu=in_chunks, default=together)
 
 
 def draw_rows(draw: Callable[..., Any], arguments: tuple[Any, ...], rays: int) -> Any:
@@ -96,8 +93,7 @@ def one_run_after_the_other(function: Callable[..., Any]) -> Callable[..., Any]:
         result = map_runs(lambda one: function(*one), arguments)
         return result, jax.tree.map(lambda _: True, result)
 
-    called: Callable[..., Any] = mapped
-    return called
+    return mapped
 
 
 def _step_chunks(step: Step, state: Any, rows: Any, shared: Any) -> tuple[Any, jax.Array]:

@@ -21,5 +21,4 @@ def in_a_conditional(compute: Callable[[jax.Array], _Result], like: Any) -> _Res
     zero = jax.lax.optimization_barrier(jnp.int32(0))
     blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
     # JAX batches a branch twice under ``jax.vmap``, and a program of ``jax.jit`` once.
-    taken: _Result = jax.lax.cond(zero == 0, lambda: jax.jit(compute)(zero), lambda: blank)
-    return taken
+    return jax.lax.cond(zero == 0, lambda: jax.jit(compute)(zero), lambda: blank)

@@ -21,10 +21,7 @@ def push(frames: jax.Array, newest: jax.Array, is_first: jax.Array) -> jax.Array
     is 3 C; otherwise numbers of the stack's dtype, where c is C. With ``is_first``, () bool, the
     stack becomes K copies of the frame.
     """
-    pushed: jax.Array = by_platform(
-        (frames, newest, is_first), frames, cpu=_concatenate, default=_shift
-    )
-    return pushed
+    return by_platform((frames, newest, is_first), frames, cpu=_concatenate, default=_shift)
 
 
 def _concatenate(frames: jax.Array, newest: jax.Array, is_first: jax.Array) -> jax.Array:

@@ -90,13 +90,12 @@ class ImageFilter(Distractor):
 def _stored(planes: list[jax.Array]) -> list[jax.Array]:
     """Return the planes, which XLA computes once: it would render a pixel again for each reader."""
     like = [jax.ShapeDtypeStruct(plane.shape, plane.dtype) for plane in planes]
-    stored: list[jax.Array] = by_platform(
+    return by_platform(
         (planes,),
         like,
         cpu=lambda planes: in_a_conditional(lambda _: planes, like),
         default=jax.lax.optimization_barrier,
     )
-    return stored
 
 
 def _blurred(plane: jax.Array, blur: float) -> jax.Array:

@@ -50,8 +50,7 @@ class ParamRows:
         rest = iter(self.shared if shared is None else shared)
         rows = iter(own)
         leaves = [next(rows) if is_own else next(rest) for is_own in self.is_own]
-        params: EnvParams = jax.tree.unflatten(self.tree, leaves)
-        return params
+        return jax.tree.unflatten(self.tree, leaves)
 
     def of_row(self, function: Callable[..., Any]) -> Callable[..., Any]:
         """Return ``function`` with an environment's rows as last argument, its parameters."""

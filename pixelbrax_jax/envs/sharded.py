@@ -61,8 +61,7 @@ class ShardedVectorEnv:
     def reset(self, key: jax.Array, params: EnvParams) -> tuple[EnvState, Timestep]:
         """See ``VectorPixelEnv.reset``."""
         keys = self._local.env_keys(key, self.num_envs)
-        result: tuple[EnvState, Timestep] = self._shard(self._local.reset, 1, params)(keys, params)
-        return result
+        return self._shard(self._local.reset, 1, params)(keys, params)
 
     @partial(jax.jit, static_argnums=0)
     @under_environment_flags
@@ -70,9 +69,7 @@ class ShardedVectorEnv:
         self, state: EnvState, action: jax.Array, params: EnvParams
     ) -> tuple[EnvState, Timestep]:
         """See ``VectorPixelEnv.step``."""
-        shard = self._shard(self._local.step, 2, params)
-        result: tuple[EnvState, Timestep] = shard(state, action, params)
-        return result
+        return self._shard(self._local.step, 2, params)(state, action, params)
 
     def obs(self, state: EnvState) -> Any:
         """Return the observations of the states, with a leading axis N."""

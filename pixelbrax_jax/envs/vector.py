@@ -177,9 +177,7 @@ class VectorPixelEnv:
         return split_params(params, self.num_envs)
 
     def _timestep(self, state: EnvState, reward: jax.Array, params: ParamRows) -> Timestep:
-        see = jax.vmap(params.of_row(self.env.timestep))
-        timestep: Timestep = see(state, reward, params.own)
-        return timestep
+        return jax.vmap(params.of_row(self.env.timestep))(state, reward, params.own)
 
     def _push_frames(
         self, frames: Any, sim: SimState, params: ParamRows, is_first: jax.Array
@@ -202,8 +200,7 @@ class VectorPixelEnv:
     ) -> SimState:
         """Return the simulation states, reset where ``mask`` is set."""
         reset, rows = params.of_row(self.env.reset_sim), (state.key, episode, params.own)
-        sim: SimState = reset_rows(reset, rows, mask, state.sim)
-        return sim
+        return reset_rows(reset, rows, mask, state.sim)
 
     def _reset_and_draw(
         self, state: EnvState, mask: jax.Array, episode: jax.Array, params: ParamRows

@@ -124,8 +124,7 @@ def _render(
     plane: Any = jax.ShapeDtypeStruct((num_rows, width), jnp.float32)
     seg, ground = plane.update(dtype=jnp.int32), plane.update(dtype=bool)
     like = Frame(r=plane, g=plane, b=plane, depth=plane, seg=seg, ground=ground)
-    drawn: Frame = by_platform((scene, first_row), like, cuda=by_kernel, default=plain)
-    return drawn
+    return by_platform((scene, first_row), like, cuda=by_kernel, default=plain)
 
 
 @_render.defjvp
@@ -218,7 +217,7 @@ def draw(
     if renderer == "pallas":
         return form(_Drawing.by_kernel)(scene, given)
     has_kernel = renderer == "auto" and choice.why_no_kernel() is None
-    drawn: tuple[jax.Array, ...] = by_platform(
+    return by_platform(
         (scene, given),
         tuple(jax.ShapeDtypeStruct((height, width), IMAGES[name].drawn) for name in images),
         cpu=form(_Drawing.conditionally),
@@ -226,7 +225,6 @@ def draw(
         tpu=form(_Drawing.behind_a_barrier),
         default=form(_Drawing.in_bands),
     )
-    return drawn
 
 
 @dataclass(frozen=True)
@@ -258,10 +256,7 @@ class _Drawing:
 
     def behind_a_barrier(self) -> tuple[jax.Array, ...]:
         # A TPU's compiler keeps the barrier, which needs less memory than a loop over bands.
-        drawn: tuple[jax.Array, ...] = jax.lax.optimization_barrier(
-            self._draw_rows(jnp.int32(0), self.height)
-        )
-        return drawn
+        return jax.lax.optimization_barrier(self._draw_rows(jnp.int32(0), self.height))
 
     def in_bands(self) -> tuple[jax.Array, ...]:
         num_rows = -(-self.height // _BANDS)
