@@ -144,16 +144,15 @@ class VectorPixelEnv:
 
         own = state.key, action, rows.own
         sim, reward = step_rows(advance, state.sim, own, rows.shared)
-        state = state.replace(sim=sim)
-        if self.autoreset_mode == "next_step":
-            state = state.replace(sim=self._reset_rows(state, ended, sim.episode + 1, rows))
-            frames = self._push_frames(state.frames, state.sim, rows, ended)
-            state = state.replace(frames=frames)
-            return state, self._timestep(state, jnp.where(ended, 0.0, reward), rows)
-        frames = self._push_frames(state.frames, sim, rows, jnp.zeros(self.num_envs, bool))
-        state = state.replace(frames=frames)
+        next_step = self.autoreset_mode == "next_step"
+        if next_step:
+            sim = self._reset_rows(state.replace(sim=sim), ended, sim.episode + 1, rows)
+        is_first = ended if next_step else jnp.zeros(self.num_envs, bool)
+        frames = self._push_frames(state.frames, sim, rows, is_first)
+        state = state.replace(sim=sim, frames=frames)
+        reward = jnp.where(ended, 0.0, reward) if next_step else reward
         timestep = self._timestep(state, reward, rows)
-        if self.autoreset_mode == "disabled":
+        if self.autoreset_mode != "same_step":
             return state, timestep
         state = self._reset_and_draw(state, state.done, state.sim.episode + 1, rows)
         first = self._timestep(state, reward, rows)
