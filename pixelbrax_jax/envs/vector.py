@@ -77,7 +77,7 @@ class VectorPixelEnv:
             TypeError: ``key`` is neither.
             ValueError: an array of ``params`` has another shape; the message has its name.
         """
-        keys, rows = self.env_keys(key, self.num_envs), self._rows(params)
+        keys, rows = self.env_keys(key, self.num_envs), split_params(params, self.num_envs)
         reset = jax.vmap(rows.of_row(self.env.reset_sim))
         sim = reset(keys, jnp.zeros(self.num_envs, jnp.uint32), rows.own)
         blank = self.env.blank_frames()
@@ -113,7 +113,7 @@ class VectorPixelEnv:
                 f"mask must be bool of shape ({self.num_envs},), got {mask.dtype} of shape "
                 f"{tuple(mask.shape)}."
             )
-        episode, rows = state.sim.episode + 1, self._rows(params)
+        episode, rows = state.sim.episode + 1, split_params(params, self.num_envs)
         if key is not None:
             keys = self.env_keys(key, self.num_envs)
             state = state.replace(key=jnp.where(mask, keys, state.key))
@@ -136,7 +136,7 @@ class VectorPixelEnv:
             TypeError: ``action`` is not floating point.
         """
         action = check_action(action, (self.num_envs, self.env.action_size))
-        ended, rows = state.done, self._rows(params)
+        ended, rows = state.done, split_params(params, self.num_envs)
 
         def advance(sim: SimState, own: Any, shared: Any) -> tuple[SimState, jax.Array]:
             key, action, own_params = own
@@ -171,9 +171,6 @@ class VectorPixelEnv:
             return key
         check_key(key)
         return jax.vmap(partial(jax.random.fold_in, key))(jnp.arange(num_envs))
-
-    def _rows(self, params: EnvParams) -> ParamRows:
-        return split_params(params, self.num_envs)
 
     def _timestep(self, state: EnvState, reward: jax.Array, params: ParamRows) -> Timestep:
         return jax.vmap(params.of_row(self.env.timestep))(state, reward, params.own)

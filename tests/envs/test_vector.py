@@ -204,7 +204,8 @@ def test_a_step_that_ends_no_episode_computes_no_first_state():
     state, _ = jax.eval_shape(venv.reset, jax.random.key(0), params)
 
     def reset_rows(state, params):
-        return venv._reset_rows(state, state.done, state.sim.episode, venv._rows(params))
+        rows = param_rows.split_params(params, venv.num_envs)
+        return venv._reset_rows(state, state.done, state.sim.episode, rows)
 
     program = jax.jit(reset_rows).lower(state, params).compile().as_text()
     # XLA may take out of a loop what its turns have in common, such as physics at the first pose;
