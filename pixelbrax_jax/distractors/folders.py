@@ -135,7 +135,10 @@ def _plain(folder: Path, split: str) -> tuple[list[Source], str]:
         own = "; it has images itself, so give the folder above it" if _pictures(folder) else ""
         raise ValueError(f"{folder} has neither videos ({kinds}) nor folders of images{own}.")
     present = _present(folder, split, list(parts) or [ALL])
-    return [_source(p) for p in (parts[present] if parts else clips)], present
+    return [
+        _sequence(clip) if clip.is_dir() else Source(clip.stem, (clip,))
+        for clip in (parts[present] if parts else clips)
+    ], present
 
 
 def _present(folder: Path, split: str, splits: list[str]) -> str:
@@ -156,10 +159,6 @@ def _clips(folder: Path) -> list[Path]:
         for entry in _entries(folder)
         if (_pictures(entry) if entry.is_dir() else entry.suffix.lower() in VIDEOS)
     ]
-
-
-def _source(clip: Path) -> Source:
-    return _sequence(clip) if clip.is_dir() else Source(clip.stem, (clip,))
 
 
 def _sequence(folder: Path) -> Source:

@@ -23,9 +23,7 @@ _GROUND_ALPHA = {
     "dmc_walker": 1.0,
     "dmc_cheetah": 1.0,
 }
-"""The Distracting Control Suite's values; those of DM Control's tasks are by domain."""
-
-_OTHER_GROUND_ALPHA = 0.3
+"""The Distracting Control Suite's values, by domain for DM Control's tasks; others keep 0.3."""
 
 _FIXED: dict[str, tuple[Distractor, ...]] = {
     "color": (Color(),),
@@ -89,7 +87,7 @@ def _ground_alpha(task: str) -> float:
     for name, alpha in _GROUND_ALPHA.items():
         if task == name or (name.startswith("dmc_") and task.startswith(f"{name}_")):
             return alpha
-    return _OTHER_GROUND_ALPHA
+    return 0.3
 
 
 def as_tuple(

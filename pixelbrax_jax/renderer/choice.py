@@ -18,6 +18,8 @@ from pixelbrax_jax.flags import PRECISION, default_flags
 from pixelbrax_jax.renderer import fused
 from pixelbrax_jax.types import Camera, Frame, GeomKind, Geoms, Lamp, Look, Scene
 
+_PLUGINS = "jax_cuda12_plugin", "jax_cuda13_plugin"
+
 _CAPABILITY = 8.0
 """Least compute capability of XLA's Triton kernels: Ampere."""
 
@@ -77,7 +79,7 @@ def why_unsupported() -> str | None:
     """
     platform = jax.default_backend()
     # Without a plugin nothing for GPUs is imported or traced.
-    if platform != "gpu" and not _has_plugin():
+    if platform != "gpu" and not any(map(find_spec, _PLUGINS)):
         return f"JAX computes on a {platform}; the kernel is for NVIDIA GPUs"
     device = jax.devices()[0]
     if platform == "gpu" and "rocm" in _driver(device).lower():
@@ -225,8 +227,3 @@ def _scene(eye: jax.Array) -> Scene:
 
 def _driver(device: jax.Device) -> str:
     return getattr(device.client, "platform_version", "")
-
-
-@cache
-def _has_plugin() -> bool:
-    return any(map(find_spec, ("jax_cuda12_plugin", "jax_cuda13_plugin")))

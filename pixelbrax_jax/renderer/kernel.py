@@ -181,8 +181,9 @@ def _call(
         index = start + jnp.arange(BLOCK, dtype=jnp.int32)
         # The last block may have more pixels than are left.
         inside = index < num_pixels
-        read, rest = iter(_unpacked(of_few, few)), iter(of_arrays)
-        leaves = [next(read) if is_packed else _scalar(next(rest)) for is_packed in packed]
+        read = _unpacked(of_few, few)
+        rest = (ref if ref.shape else ref[()] for ref in of_arrays)
+        leaves = [next(read if is_packed else rest) for is_packed in packed]
         view, numbers, first_row = jax.tree.unflatten(inputs_tree, leaves)
         images = [triton.load(ref.at[:], mask=inside, other=0) for ref in of_images]
         row = jax.lax.div(index, np.int32(width)) + first_row
@@ -219,10 +220,6 @@ def _unpacked(ref: Any, arrays: Sequence[jax.Array]) -> Iterator[Any]:
         numbers = tuple(ref[start + i] for i in range(array.size))
         yield numbers if array.ndim else numbers[0]
         start += array.size
-
-
-def _scalar(ref: Any) -> Any:
-    return ref if ref.shape else ref[()]
 
 
 def window_of(

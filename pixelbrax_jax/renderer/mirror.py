@@ -25,8 +25,7 @@ def reflection(view: View, ray: Vector, t: jax.Array, in_kernel: bool) -> list[j
     mirror is not reflected.
     """
     mirrored, geoms = view.mirrored, view.geoms
-    if mirrored is None:
-        raise ValueError("the view has no mirror")
+    assert mirrored is not None
     behind = view.replace(pos=mirrored.pos, xmat=mirrored.xmat)
     count, shape = len(view.order), ray[0].shape
     hits = {}
