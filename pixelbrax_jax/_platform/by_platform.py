@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,7 @@ from jax.interpreters import ad, batching, mlir
 from pixelbrax_jax.flags import default_flags, is_key
 
 _Form = Callable[..., Any]
+_Result = TypeVar("_Result")
 
 
 def by_platform(
@@ -59,6 +60,34 @@ def by_platform(
             *arrays, forms=all_forms, shapes=tuple((x.shape, x.dtype) for x in shapes)
         )
     return jax.tree.unflatten(result_tree, results)
+
+
+def computed_once(
+    compute: Callable[..., _Result], arguments: tuple[Any, ...], like: Any
+) -> _Result:
+    """Return ``compute(*arguments)``, which XLA would else compute again for each reader.
+
+    ``compute`` and ``like`` are as in ``by_platform``.
+    """
+    return by_platform(
+        arguments,
+        like,
+        cpu=lambda *given: in_a_conditional(lambda _: compute(*given), like),
+        default=lambda *given: jax.lax.optimization_barrier(compute(*given)),
+    )
+
+
+def in_a_conditional(compute: Callable[[jax.Array], _Result], like: Any) -> _Result:
+    """Return ``compute(zero)``, which XLA for CPUs does not fuse into what reads it.
+
+    It fuses across barriers but not across conditionals. ``zero`` is () int32 behind a barrier,
+    which hides from the compiler that the conditional is always taken; otherwise the compiler would
+    remove it. ``like`` has the shapes and dtypes of the result.
+    """
+    zero = jax.lax.optimization_barrier(jnp.int32(0))
+    blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
+    # JAX batches a branch twice under ``jax.vmap``, and a program of ``jax.jit`` once.
+    return jax.lax.cond(zero == 0, lambda: jax.jit(compute)(zero), lambda: blank)
 
 
 class Traced(NamedTuple):

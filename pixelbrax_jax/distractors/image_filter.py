@@ -10,8 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pixelbrax_jax._platform.by_platform import by_platform
-from pixelbrax_jax._platform.conditional import in_a_conditional
+from pixelbrax_jax._platform.by_platform import computed_once
 from pixelbrax_jax.distractors.base import Distractor, levels
 from pixelbrax_jax.types import EnvParams, Frame
 from pixelbrax_jax.validation import check_finite, check_fraction
@@ -76,7 +75,9 @@ class ImageFilter(Distractor):
         """Return the frame, blurred, with other contrast and noise."""
         planes = [frame.r, frame.g, frame.b]
         if self.blur:
-            planes = [_blurred(plane, self.blur) for plane in _stored(planes)]
+            like = [jax.ShapeDtypeStruct(plane.shape, plane.dtype) for plane in planes]
+            planes = computed_once(lambda planes: planes, (planes,), like)
+            planes = [_blurred(plane, self.blur) for plane in planes]
         planes = [0.5 + self.contrast * (plane - 0.5) for plane in planes]
         if backdrop is not None:
             planes = [
@@ -85,17 +86,6 @@ class ImageFilter(Distractor):
             ]
         r, g, b = (jnp.clip(plane, 0.0, 1.0) for plane in planes)
         return frame.replace(r=r, g=g, b=b)
-
-
-def _stored(planes: list[jax.Array]) -> list[jax.Array]:
-    """Return the planes, which XLA computes once: it would render a pixel again for each reader."""
-    like = [jax.ShapeDtypeStruct(plane.shape, plane.dtype) for plane in planes]
-    return by_platform(
-        (planes,),
-        like,
-        cpu=lambda planes: in_a_conditional(lambda _: planes, like),
-        default=jax.lax.optimization_barrier,
-    )
 
 
 def _blurred(plane: jax.Array, blur: float) -> jax.Array:

@@ -12,8 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pixelbrax_jax._platform.by_platform import by_platform
-from pixelbrax_jax._platform.conditional import in_a_conditional
+from pixelbrax_jax._platform.by_platform import by_platform, in_a_conditional
 from pixelbrax_jax.flags import under_environment_flags
 from pixelbrax_jax.observations import IMAGES
 from pixelbrax_jax.renderer import choice, fused, reference, shading

@@ -9,8 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from pixelbrax_jax._platform.by_platform import by_platform, traced
-from pixelbrax_jax._platform.conditional import in_a_conditional
+from pixelbrax_jax._platform.by_platform import computed_once, traced
 from pixelbrax_jax.renderer.intersect import Vector, at_least, at_most, between, dot
 from pixelbrax_jax.types import Lamp, Look
 
@@ -54,13 +53,7 @@ def computed_apart(compute: Callable[[], list[jax.Array]]) -> list[jax.Array]:
     def words(consts: list[jax.Array]) -> list[jax.Array]:
         return to_words(compute_values(consts))
 
-    found = by_platform(
-        (program.consts,),
-        like,
-        cpu=lambda consts: in_a_conditional(lambda _: words(consts), like),
-        default=lambda consts: jax.lax.optimization_barrier(words(consts)),
-    )
-    return from_words(found, len(values))
+    return from_words(computed_once(words, (program.consts,), like), len(values))
 
 
 def to_words(values: Sequence[jax.Array]) -> list[jax.Array]:
