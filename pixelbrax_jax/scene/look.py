@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 from pixelbrax_jax.spatial import f32
 from pixelbrax_jax.types import Look
 from pixelbrax_jax.validation import check_bool, check_choice
@@ -70,6 +68,4 @@ def make_look(look: str | Look = "default", *, shadows: bool | None = None) -> L
         look = LOOKS[check_choice("look", look, LOOKS)]
     elif not isinstance(look, Look):
         raise TypeError(f"look must be a name or a pixelbrax_jax.Look, got {type(look).__name__}.")
-    if shadows is None:
-        return look
-    return dataclasses.replace(look, shadows=check_bool("shadows", shadows))
+    return look if shadows is None else look.replace(shadows=check_bool("shadows", shadows))
