@@ -90,20 +90,16 @@ def _check_timestep(env: PixelEnv, timestep: Timestep, origin: str) -> None:
         f"{origin} must not be terminated and truncated at once",
     )
     for path, leaf in jax.tree_util.tree_leaves_with_path((timestep.obs, timestep.reward)):
-        finite = bool(jnp.all(jnp.isfinite(leaf))) if leaf.dtype == jnp.float32 else True
+        finite = bool(jnp.isfinite(leaf).all())
         _require(finite, f"{origin} must be finite, {jax.tree_util.keystr(path)} is not")
 
 
 def _check_stack(env: PixelEnv, first: Timestep) -> None:
-    parts = first.obs if isinstance(first.obs, dict) else {"": first.obs}
-    for part in parts.values():
-        if part.ndim != 3:
-            continue
-        frames = np.asarray(part).reshape(*part.shape[:2], env.frame_stack, -1)
-        _require(
-            bool((frames == frames[:, :, :1]).all()),
-            "the first observation must be copies of the first frame",
-        )
+    for part in jax.tree.leaves(first.obs):
+        if part.ndim == 3:
+            frames = np.asarray(part).reshape(*part.shape[:2], env.frame_stack, -1)
+            alike = bool((frames == frames[:, :, :1]).all())
+            _require(alike, "the first observation must be copies of the first frame")
 
 
 def _check_determinism(env: PixelEnv, params: EnvParams, key: jax.Array, first: Timestep) -> None:
