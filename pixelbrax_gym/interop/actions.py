@@ -19,14 +19,26 @@ def as_actions(action: Any, shape: tuple[int, ...], device: jax.Device) -> Any:
     shares no memory that the caller can write to. JAX arrays and GPU tensors are not searched for
     NaN, which would wait for the device; it ends the episode with ``info["non_finite"]``.
     """
-    if type(action).__module__.partition(".")[0] == "torch":
+    is_torch = type(action).__module__.partition(".")[0] == "torch"
+    if not is_torch and not isinstance(action, jax.Array):
+        try:
+            action = np.asarray(action)
+        except ValueError as error:
+            raise ValueError(
+                f"action must be an array of shape {shape}, got rows of different lengths."
+            ) from error
+    if tuple(action.shape) != shape:
+        raise ValueError(f"action must have shape {shape}, got {tuple(action.shape)}.")
+    if is_torch:
         from pixelbrax_gym.interop import dlpack
 
-        _check_shape(tuple(action.shape), shape)
         values = dlpack.actions_to_jax(action, device)
+    elif not jnp.issubdtype(action.dtype, jnp.floating):
+        raise TypeError(
+            f"action must be floating point in [-1, 1], got {action.dtype}; convert it to float32, "
+            "e.g. with .astype('float32')."
+        )
     elif isinstance(action, jax.Array):
-        _check_shape(action.shape, shape)
-        _check_floating(jnp.issubdtype(action.dtype, jnp.floating), action.dtype)
         if action.devices() != {device}:
             names = ", ".join(sorted(str(place) for place in action.devices()))
             raise ValueError(
@@ -35,33 +47,12 @@ def as_actions(action: Any, shape: tuple[int, ...], device: jax.Device) -> Any:
             )
         return action if action.dtype == np.float32 else action.astype(np.float32)
     else:
-        try:
-            given = np.asarray(action)
-        except ValueError as error:
-            raise ValueError(
-                f"action must be an array of shape {shape}, got rows of different lengths."
-            ) from error
-        _check_shape(given.shape, shape)
-        _check_floating(jnp.issubdtype(given.dtype, jnp.floating), given.dtype)
         # A copy: JAX may read it after the caller has begun to fill in the next action.
         with np.errstate(over="ignore"):  # infinity is clipped like all beyond the limits
-            values = np.array(given, np.float32)
+            values = np.array(action, np.float32)
     if isinstance(values, np.ndarray):
         _check_nan(values)
     return values
-
-
-def _check_shape(actual: tuple[int, ...], expected: tuple[int, ...]) -> None:
-    if actual != expected:
-        raise ValueError(f"action must have shape {expected}, got {actual}.")
-
-
-def _check_floating(is_floating: bool, dtype: Any) -> None:
-    if not is_floating:
-        raise TypeError(
-            f"action must be floating point in [-1, 1], got {dtype}; convert it to float32, "
-            "e.g. with .astype('float32')."
-        )
 
 
 def _check_nan(values: np.ndarray) -> None:
