@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import accumulate
 from typing import Any, NamedTuple
 
@@ -38,7 +38,7 @@ class Stepped(NamedTuple):
     """The result of a program.
 
     ``ended``, () or (N,) bool, tells whether a step has ended the episode. ``outputs`` may be
-    handed out: parts of a ``Timestep``, and for many environments ``done``, (N,) bool, and
+    handed out: the fields of a ``Timestep``, and for many environments ``done``, (N,) bool, and
     ``reported``, (N,) bool, the environments that ``info`` describes.
     """
 
@@ -180,13 +180,7 @@ class Programs:
         self, state: EnvState, timestep: Timestep, reported: Array | None = None
     ) -> Stepped:
         ended = timestep.terminated | timestep.truncated
-        outputs = {
-            "obs": timestep.obs,
-            "reward": timestep.reward,
-            "terminated": timestep.terminated,
-            "truncated": timestep.truncated,
-            "info": timestep.info,
-        }
+        outputs = dict(vars(timestep))
         if self.single:
             return Stepped(pack(state), ended[0], jax.tree.map(lambda x: x[0], outputs))
         if reported is None:
@@ -227,11 +221,10 @@ def unpack(packed: Packed, like: EnvState) -> EnvState:
 
 
 def _where(mask: Array, state: EnvState, otherwise: EnvState) -> EnvState:
-    def choose(new: jax.Array, old: jax.Array) -> jax.Array:
-        return jnp.where(mask.reshape(mask.shape + (1,) * (new.ndim - 1)), new, old)
+    def choose(here: Array, new: EnvState, old: EnvState) -> EnvState:
+        return jax.tree.map(partial(jnp.where, here), new, old)
 
-    chosen: EnvState = jax.tree.map(choose, state, otherwise)
-    return chosen
+    return jax.vmap(choose)(mask, state, otherwise)
 
 
 def _with_offsets(state: EnvState, offsets: Array | None) -> EnvState:
@@ -252,12 +245,9 @@ def _from_data(data: jax.Array, like: Any) -> jax.Array:
 
 def _words(part: jax.Array) -> jax.Array:
     """Return the bits of an array as (W,) uint32, one word per element of a narrow dtype."""
-    if part.dtype == bool:
-        part = part.astype(jnp.uint8)
-    bits = part.dtype.itemsize * 8
-    if bits < 32:
-        part = jax.lax.bitcast_convert_type(part, f"uint{bits}").astype(jnp.uint32)
-    return jax.lax.bitcast_convert_type(part, jnp.uint32).ravel()
+    if (size := part.dtype.itemsize) < 4:
+        part = part.view(f"uint{8 * size}").astype(jnp.uint32)
+    return part.ravel().view(jnp.uint32)
 
 
 def _from_words(words: jax.Array, like: Any) -> jax.Array:
@@ -265,10 +255,6 @@ def _from_words(words: jax.Array, like: Any) -> jax.Array:
     if is_key(like.dtype):
         data = jax.eval_shape(jax.random.key_data, like)
         return _from_data(words.reshape(data.shape), like)
-    if like.dtype == bool:
-        return words.reshape(like.shape).astype(bool)
-    bits = like.dtype.itemsize * 8
-    if bits < 32:
-        words = words.astype(f"uint{bits}")
-    shape = (*like.shape, bits // 32) if bits > 32 else like.shape
-    return jax.lax.bitcast_convert_type(words.reshape(shape), like.dtype)
+    if (size := like.dtype.itemsize) < 4:
+        words = words.astype(f"uint{8 * size}")
+    return words.view(like.dtype).reshape(like.shape)
