@@ -5,12 +5,12 @@ from __future__ import annotations
 import inspect
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import struct
 from gymnasium import error
 
 from pixelbrax_gym.interop.actions import as_actions, name_rows
@@ -34,14 +34,14 @@ _made: deque[tuple[EnvConfig, PixelEnv, EnvParams]] = deque(maxlen=64)
 """The latest environments, which forks of this process can use without JAX."""
 
 
-@dataclass(frozen=True)
-class _Snapshot:
+class _Snapshot(struct.PyTreeNode):
     """Data stored between two calls; it is replaced only as a whole."""
 
     packed: Packed
     ended: Any  # () or (N,) bool, whether episodes have ended
     spare: Any = None  # frames that are not read again
-    shared: bool = False  # whether a copy or the caller may read `packed`
+    # Whether a copy or the caller may read `packed`.
+    shared: bool = struct.field(default=False, pytree_node=False)
     extra: Any = None  # data of the adapter
 
 
@@ -171,12 +171,12 @@ class StatefulEnv:
 
     def replace_extra(self, extra: Any) -> None:
         """Replace ``extra`` only."""
-        self._snapshot = replace(self._latest, extra=extra)
+        self._snapshot = self._latest.replace(extra=extra)
 
     def get_state(self) -> EnvState:
         """Return the current states; ``set_state`` continues from them bit for bit."""
         self._check_ready("get_state")
-        self._snapshot = replace(self._latest, shared=True)
+        self._snapshot = self._latest.replace(shared=True)
         return self._programs.state(self._latest.packed, self.params)
 
     def set_state(self, state: Any, mask: np.ndarray | None = None) -> dict[str, Any]:
@@ -234,22 +234,21 @@ class StatefulEnv:
         """Share arrays that neither the copy nor the original writes to."""
         copied = memo[id(self)] = object.__new__(type(self))
         if self._snapshot is not None:
-            self._snapshot = replace(self._snapshot, shared=True, spare=None)
+            self._snapshot = self._snapshot.replace(shared=True, spare=None)
         copied.__dict__.update(self.__dict__)
         if self._snapshot is not None:
             # The receiver may write to it.
             extra = jax.tree.map(lambda x: x.copy(), self._snapshot.extra)
-            copied._snapshot = replace(self._snapshot, extra=extra)
+            copied._snapshot = self._snapshot.replace(extra=extra)
         return copied
 
     def __getstate__(self) -> dict[str, Any]:
         """Pickle arrays in host memory, without a device."""
         snapshot = self._snapshot
         if snapshot is not None:
-            arrays = jax.device_get((snapshot.packed, snapshot.ended, snapshot.extra))
-            snapshot = _Snapshot(arrays[0], arrays[1], extra=arrays[2])
-        params = jax.device_get(self.params)
-        return self.__dict__ | {"_snapshot": snapshot, "_device": None, "params": params}
+            snapshot = snapshot.replace(spare=None, shared=False)
+        arrays = jax.device_get({"_snapshot": snapshot, "params": self.params})
+        return self.__dict__ | arrays | {"_device": None}
 
     def _check_usable(self) -> None:
         check_not_forked()
@@ -287,11 +286,7 @@ class StatefulEnv:
         """Put unpickled arrays on the default device and store that device."""
         if self._device is not None:
             return
-        snapshot = self._snapshot
-        if snapshot is not None:
-            packed, ended, extra = jax.device_put((snapshot.packed, snapshot.ended, snapshot.extra))
-            self._snapshot = _Snapshot(packed, ended, extra=extra)
-        self.params = jax.device_put(self.params)
+        self._snapshot, self.params = jax.device_put((self._snapshot, self.params))
         self._device = next(iter(self.params.episode_length.devices()))
 
     def _check_ready(self, what: str) -> None:
