@@ -93,19 +93,12 @@ def check_bool(what: str, value: object) -> bool:
     raise TypeError(f"{what} must be True or False, got {value!r}.")
 
 
-def _check_int(fits: Callable[[int], bool], wanted: str, what: str, value: Any) -> int:
-    """Return an integer that fits as a Python int; raise ValueError for anything else."""
-    if isinstance(value, Integral) and not isinstance(value, bool) and fits(int(value)):
-        return int(value)
-    raise ValueError(f"{what} must {wanted}, got {value!r}.")
-
-
-def _check_float(fits: Callable[[float], bool], wanted: str, what: str, value: Any) -> float:
-    """Return a finite number that fits as a Python float; raise ValueError for anything else."""
-    if isinstance(value, Real) and not isinstance(value, bool):
+def _check(kind: type, fits: Callable[[Any], bool], wanted: str, what: str, value: Any) -> Any:
+    """Return an int or finite float that fits; raise ValueError for anything else."""
+    if isinstance(value, Integral if kind is int else Real) and not isinstance(value, bool):
         with suppress(OverflowError):  # an integer beyond all floats
-            number = float(value)
-            if math.isfinite(number) and fits(number):
+            number = kind(value)
+            if abs(number) < math.inf and fits(number):
                 return number
     raise ValueError(f"{what} must {wanted}, got {value!r}.")
 
@@ -113,11 +106,11 @@ def _check_float(fits: Callable[[float], bool], wanted: str, what: str, value: A
 _Check = Callable[[str, object], _T]
 """``check(what, value)`` returns the value; if it does not fit, a ValueError names ``what``."""
 
-check_positive_int: _Check[int] = partial(_check_int, lambda x: x >= 1, "be a positive integer")
-check_count: _Check[int] = partial(_check_int, lambda x: x >= 0, "be a whole number of at least 0")
-check_fraction: _Check[float] = partial(_check_float, lambda x: 0 <= x <= 1, "lie in [0, 1]")
-check_positive: _Check[float] = partial(_check_float, lambda x: x > 0, "be a positive number")
+check_positive_int: _Check[int] = partial(_check, int, lambda x: x >= 1, "be a positive integer")
+check_count: _Check[int] = partial(_check, int, lambda x: x >= 0, "be a whole number of at least 0")
+check_fraction: _Check[float] = partial(_check, float, lambda x: 0 <= x <= 1, "lie in [0, 1]")
+check_positive: _Check[float] = partial(_check, float, lambda x: x > 0, "be a positive number")
 check_not_negative: _Check[float] = partial(
-    _check_float, lambda x: x >= 0, "be a number of at least 0"
+    _check, float, lambda x: x >= 0, "be a number of at least 0"
 )
-check_finite: _Check[float] = partial(_check_float, lambda _: True, "be a finite number")
+check_finite: _Check[float] = partial(_check, float, lambda _: True, "be a finite number")
