@@ -129,7 +129,8 @@ class TorchRLEnv(EnvBase):
         if self._seeds is not None:
             later = [None if here else seed for seed, here in zip(self._seeds, mask, strict=True)]
             self._seeds = later if any(seed is not None for seed in later) else None
-        return self._tensordict(self._observations(to_torch(first_obs)) | self._flags())
+        obs = entries(to_torch(first_obs), self._stateful.env.images)
+        return self._tensordict({**obs, **self.full_done_spec.zero()})
 
     @property
     def _begun(self) -> tuple[Any, np.ndarray]:
@@ -190,7 +191,7 @@ class TorchRLEnv(EnvBase):
         )
         self.infos = {name: x.to(self.device) for name, x in exported["infos"].items()}
         values = {name: exported[name][:, None] for name in names}
-        values |= self._observations(exported["obs"])
+        values |= entries(exported["obs"], self._stateful.env.images)
         if where is not None:
             values = _keep_unstepped(values, tensordict, where.reshape(self._num_envs))
         return self._tensordict(values)
@@ -224,14 +225,6 @@ class TorchRLEnv(EnvBase):
         """Name the task, the number of environments and the device."""
         name = type(self).__name__
         return f"{name}({self._task!r}, num_envs={self._num_envs}, device={self.device})"
-
-    def _observations(self, obs: Any) -> dict[str, torch.Tensor]:
-        return entries(obs, self._stateful.env.images)
-
-    def _flags(self) -> dict[str, torch.Tensor]:
-        names = ("done", "terminated", "truncated")
-        shape = (self._num_envs, 1)
-        return {name: torch.zeros(shape, dtype=torch.bool, device=self.device) for name in names}
 
     def _tensordict(self, values: dict[str, torch.Tensor]) -> TensorDict:
         return TensorDict(values, batch_size=self.batch_size, device=self.device)
