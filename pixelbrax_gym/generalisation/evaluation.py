@@ -71,8 +71,15 @@ def evaluate_suite(
         raise TypeError(f"{own[0]} is decided by the levels of a suite; leave it out.")
     config = env_config(task, options, ("episodes", "clips", "output", "output_dir", "report"))
     levels = make_levels(config, suite, episodes, clips, report)
-    envs = _Envs(levels, output)
-    players = {name: partial(envs.play, policy=one) for name, one in policies.items()}
+    # Levels with one program share their environments.
+    made: dict[Any, GymnasiumVectorEnv] = {}
+
+    def play_level(level: LevelEnv, policy: Policy) -> np.ndarray:
+        if level.env not in made:
+            made[level.env] = make_level_envs(levels, level, levels.episodes, output)
+        return _returns(made[level.env], level.params, policy)
+
+    players = {name: partial(play_level, policy=one) for name, one in policies.items()}
     return play(levels, players, output_dir, report)
 
 
@@ -96,31 +103,20 @@ def begin(envs: GymnasiumVectorEnv, keys: jax.Array, params: EnvParams) -> Any:
     return envs.reset(options={"state": state})[0]
 
 
-class _Envs:
-    """Vector environments of a suite's levels; levels with one program share one."""
-
-    def __init__(self, levels: Levels, output: str) -> None:
-        self._levels, self._output = levels, output
-        self._made: dict[Any, GymnasiumVectorEnv] = {}
-
-    def play(self, one: LevelEnv, policy: Policy) -> np.ndarray:
-        """Play the episodes of a level; return their (E,) returns."""
-        num = self._levels.episodes
-        if one.env not in self._made:
-            self._made[one.env] = make_level_envs(self._levels, one, num, self._output)
-        envs = self._made[one.env]
-        with default_flags():
-            key = jax.random.key(EPISODES)
-        obs = begin(envs, key, one.params)
-        shape = (num, one.env.action_size)
-        over, returns = np.zeros(num, bool), np.zeros(num)
-        while not over.all():
-            actions = checked(policy(obs), shape)
-            obs, _, terminated, truncated, infos = envs.step(actions)
-            # Later episodes of an environment are ignored.
-            returns = np.where(over, returns, numpy_of(infos["episode_return"]))
-            over |= numpy_of(terminated) | numpy_of(truncated)
-        return returns
+def _returns(envs: GymnasiumVectorEnv, params: EnvParams, policy: Policy) -> np.ndarray:
+    """Play an episode in each of E environments; return their (E,) returns."""
+    with default_flags():
+        key = jax.random.key(EPISODES)
+    obs = begin(envs, key, params)
+    shape = (envs.num_envs, envs._stateful.env.action_size)
+    over, returns = np.zeros(shape[0], bool), np.zeros(shape[0])
+    while not over.all():
+        actions = checked(policy(obs), shape)
+        obs, _, terminated, truncated, infos = envs.step(actions)
+        # Later episodes of an environment are ignored.
+        returns = np.where(over, returns, numpy_of(infos["episode_return"]))
+        over |= numpy_of(terminated) | numpy_of(truncated)
+    return returns
 
 
 def checked(actions: Any, shape: tuple[int, ...]) -> Any:
