@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -62,19 +63,14 @@ def _measure(options: Options) -> None:
         f"{num_envs} environments, 84 x 84, three frames\n"
     )
     found: dict[str, Any] = {"machine": here, "task": task, "num_envs": num_envs}
-    frames, steps = "frames_per_second", "steps_per_second"
-    loops: dict[str, tuple[str, str, Callable[..., dict[str, Any]], tuple[str, ...]]] = {
-        frames: ("frames, from link poses", frames, throughput.renderer, ()),
-        f"state_{steps}": (
-            "steps without images, a compiled loop",
-            steps,
-            throughput.scan,
-            ("state",),
-        ),
-        steps: ("steps with images, a compiled loop", steps, throughput.scan, ()),
+    scan_state = partial(throughput.scan, obs_mode="state")
+    measures: dict[str, tuple[str, Callable[..., dict[str, Any]]]] = {
+        "frames_per_second": ("frames, from link poses", throughput.renderer),
+        "state_steps_per_second": ("steps without images, a compiled loop", scan_state),
+        "steps_per_second": ("steps with images, a compiled loop", throughput.scan),
     }
-    for key, (name, value, measure, more) in loops.items():
-        found[key] = measure(task, num_envs, *more)[value]
+    for key, (name, measure) in measures.items():
+        found[key] = measure(task, num_envs)[key.removeprefix("state_")]
         _write(options.output, found)
         _say(f"{name:<40}{number(found[key]):>9} a second")
     found["adapters"] = adapters.compare(task, num_envs, SECONDS)
