@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -225,13 +226,13 @@ def inspect() -> Machine:
     versions = {name: installed_version(name) for name in (*PACKAGES, *EXTRAS)}
     broken = broken_variables()
     # XLA would abort this process because of its flags.
-    first: Any = broken.get("XLA_FLAGS") or _attempt(_first_device)
+    first: Any = broken.get("XLA_FLAGS") or _attempt(lambda: import_module("jax").devices()[0])
     renderer = torch_cuda = to_torch = to_jax = None
     has_jax = not isinstance(first, str)
     if has_jax and isinstance(renderer := _attempt(_renderer), str):
         renderer = "unknown", f"its check fails with {renderer}"
     if versions["torch"] is not None:
-        torch_cuda = _attempt(_torch_has_cuda)
+        torch_cuda = _attempt(lambda: import_module("torch").cuda.is_available())
         if has_jax and first.platform in ("cpu", *_GPUS) and not isinstance(torch_cuda, str):
             to_torch, to_jax = _attempt(_shares_to_torch), _attempt(_shares_to_jax)
     return Machine(
@@ -298,22 +299,10 @@ def _attempt(check: Callable[[], Any]) -> Any:
         return f"{type(error).__name__}: {error}"
 
 
-def _first_device() -> Any:
-    import jax
-
-    return jax.devices()[0]
-
-
 def _renderer() -> tuple[str, str]:
     from pixelbrax_jax.renderer.choice import auto_renderer
 
     return auto_renderer()
-
-
-def _torch_has_cuda() -> bool:
-    import torch
-
-    return bool(torch.cuda.is_available())
 
 
 def _shares_to_torch() -> bool:
