@@ -87,14 +87,10 @@ def _clock(records: Iterable[Mapping[str, float]]) -> tuple[list[float], list[fl
     return steps, [0.0, *np.cumsum(durations)], compilation
 
 
-def file_name(of: Entry) -> str:
-    agent = "".join(c if c.isalnum() else "-" for c in of["agent"].lower())
-    return f"{agent}-{of['task']}-{of['seed']}.json"
-
-
 def add(of: Entry, folder: str | Path) -> Path:
     """Write an entry into a folder that has no other of its name; return its file."""
-    path = Path(folder) / file_name(of)
+    agent = "".join(c if c.isalnum() else "-" for c in of["agent"].lower())
+    path = Path(folder) / f"{agent}-{of['task']}-{of['seed']}.json"
     if path.exists() and json.loads(path.read_text("utf-8")) != of:
         raise FileExistsError(
             f"{path} is another run of this agent, task and seed: delete it, or name the agent "
