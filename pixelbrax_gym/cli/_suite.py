@@ -73,8 +73,10 @@ def _load(options: AgentOptions, runs: Sequence[str]) -> Mapping[str, Trained]:
             agents[name] = agent
     (first_name, first), *others = agents.items()
     for name, agent in others:
-        here = {"algorithm": _name(first), **describe(first.algorithm.config)}
-        there = {"algorithm": _name(agent), **describe(agent.algorithm.config)}
+        here, there = (
+            {"algorithm": type(one.algorithm).__name__, **describe(one.algorithm.config)}
+            for one in (first, agent)
+        )
         for setting in [*here, *there]:
             if setting not in _MAY_DIFFER and here.get(setting) != there.get(setting):
                 raise ValueError(
@@ -83,10 +85,6 @@ def _load(options: AgentOptions, runs: Sequence[str]) -> Mapping[str, Trained]:
                     "evaluate them in separate calls."
                 )
     return agents
-
-
-def _name(agent: Trained) -> str:
-    return type(agent.algorithm).__name__
 
 
 def _digest(agent: Trained) -> str:
