@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -149,22 +148,20 @@ def changes_params_alone(distractor: Distractor) -> bool:
 
 
 def _turn_cameras(params: EnvParams, axis: jax.Array, angle: jax.Array) -> EnvParams:
-    """Turn cameras at their places about an axis in their own frames, by radians."""
-    turn = partial(turned, axis=axis, angle=angle)
-    rig = jax.tree.map(turn, params.rig, is_leaf=lambda x: isinstance(x, CameraRig))
-    return params.replace(rig=rig)
-
-
-def turned(rig: CameraRig, axis: jax.Array, angle: jax.Array) -> CameraRig:
-    """Return a rig turned at its place by radians about a unit axis (3,) in the camera's frame."""
-    away = jnp.asarray(rig.eye - rig.target)
-    right, up, back = spatial.look_at(jnp.asarray(rig.eye), rig.target, rig.up).T
+    """Turn cameras at their places about a unit axis (3,) in their own frames, by radians."""
     quat = spatial.axis_angle(axis, angle)
 
-    def in_world(own: list[float]) -> jax.Array:
-        x, y, z = spatial.rotate(quat, jnp.array(own))
-        return x * right + y * up + z * back
+    def turn(rig: CameraRig) -> CameraRig:
+        away = jnp.asarray(rig.eye - rig.target)
+        right, up, back = spatial.look_at(jnp.asarray(rig.eye), rig.target, rig.up).T
 
-    distance = jnp.sqrt(jnp.sum(away * away))
-    target = rig.eye - distance * in_world([0.0, 0.0, 1.0])
-    return rig.replace(target=target, up=in_world([0.0, 1.0, 0.0]))
+        def in_world(own: list[float]) -> jax.Array:
+            x, y, z = spatial.rotate(quat, jnp.array(own))
+            return x * right + y * up + z * back
+
+        distance = jnp.sqrt(jnp.sum(away * away))
+        target = rig.eye - distance * in_world([0.0, 0.0, 1.0])
+        return rig.replace(target=target, up=in_world([0.0, 1.0, 0.0]))
+
+    rig = jax.tree.map(turn, params.rig, is_leaf=lambda x: isinstance(x, CameraRig))
+    return params.replace(rig=rig)
