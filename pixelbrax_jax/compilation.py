@@ -60,6 +60,10 @@ def compiler_options(env: Any = None, platform: str | None = None) -> dict[str, 
     Raises:
         ValueError: the platform is unknown.
     """
+    if platform is None:
+        platform = _default_platform()
+    else:
+        check_choice("platform", platform, _PLATFORMS)
     return _options(_physics(env), platform)
 
 
@@ -75,8 +79,8 @@ def jit(**options: Any) -> Callable[[Callable[_P, _T]], Callable[_P, _T]]:
         traced = under_default_flags(function)
 
         @cache
-        def program(physics: Any) -> Any:
-            return jax.jit(traced, compiler_options=_options(physics), **options)
+        def program(physics: Any, platform: str) -> Any:
+            return jax.jit(traced, compiler_options=_options(physics, platform), **options)
 
         @wraps(function)
         def call(*args: _P.args, **kwargs: _P.kwargs) -> _T:
@@ -85,7 +89,7 @@ def jit(**options: Any) -> Callable[[Callable[_P, _T]], Callable[_P, _T]]:
             # JAX gives loop counters 64 bits if jax_enable_x64 is set while it lowers, after
             # `under_default_flags` has ended. XLA then rounds otherwise in loops of convolutions.
             with jax.enable_x64(False):
-                return program(_physics(args[0]))(*args, **kwargs)
+                return program(_physics(args[0]), _default_platform())(*args, **kwargs)
 
         return call
 
@@ -101,11 +105,14 @@ def _physics(env: Any) -> Any:
     return getattr(getattr(env, "env", env), "physics", None)
 
 
-def _options(physics: Any, platform: str | None = None) -> dict[str, Any]:
-    if platform is None:
-        platform = jax.default_backend()
-    else:
-        platform = _PLATFORMS[check_choice("platform", platform, _PLATFORMS)]
+def _default_platform() -> str:
+    """Return the platform of JAX's default device, which ``jax.default_device`` may change."""
+    device = getattr(jax.config, "jax_default_device", None)
+    return getattr(device, "platform", device) or jax.default_backend()
+
+
+def _options(physics: Any, platform: str) -> dict[str, Any]:
+    platform = _PLATFORMS.get(platform, platform)
     flags = os.environ.get("XLA_FLAGS", "")
     if platform == "gpu" and _COMMANDS not in flags:
         chosen: dict[str, Any] = {_COMMANDS: _CAPTURED}

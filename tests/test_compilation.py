@@ -27,6 +27,15 @@ def test_vectors_are_wide_unless_the_user_says_otherwise(monkeypatch, flags, wid
         assert float(program(jnp.ones(64))) == 128
 
 
+def test_options_are_those_of_the_default_device(monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "")
+    monkeypatch.setattr(jax, "default_backend", lambda: "tpu")
+    assert pb.compiler_options() == {}
+    for device in ("cpu", jax.devices("cpu")[0]):
+        with jax.default_device(device):
+            assert pb.compiler_options() == pb.compiler_options(platform="cpu") != {}
+
+
 def test_a_platform_that_is_not_there_is_named(monkeypatch):
     monkeypatch.setenv("JAX_PLATFORMS", "cuda")
     code = (
@@ -72,10 +81,10 @@ def test_scenes_of_many_geoms_have_the_older_emitters(monkeypatch):
             geoms=SimpleNamespace(kind=(GeomKind.SPHERE,) * geoms, num_planes=()),
             look=SimpleNamespace(lamps=(None,) * lamps),
         )
-        options = compilation._options(physics)
+        options = compilation._options(physics, "cpu")
         assert options.get("xla_cpu_use_fusion_emitters") is expected
     physics.look = None  # only some physics has one
-    assert compilation._options(physics).get("xla_cpu_use_fusion_emitters") is None
+    assert compilation._options(physics, "cpu").get("xla_cpu_use_fusion_emitters") is None
 
 
 def test_an_xla_without_the_option_is_left_alone(monkeypatch):
