@@ -12,6 +12,7 @@ import pytest
 import pixelbrax_jax as pb
 from pixelbrax_jax._platform import batches
 from pixelbrax_jax._platform.batches import chunk_size, draw_rows, map_runs, step_rows
+from pixelbrax_jax.envs.param_rows import split_params
 
 
 @pytest.mark.parametrize(
@@ -92,7 +93,7 @@ def test_only_images_of_several_are_drawn_in_turns(look, loops, monkeypatch):
     state, _ = jax.eval_shape(envs.reset, jax.random.key(0), params)
 
     def push(frames, sim):
-        return envs._push_frames(frames, sim, envs._rows(params), jnp.ones(7, bool))
+        return envs._push_frames(frames, sim, split_params(params, 7), jnp.ones(7, bool))
 
     traced = jax.jit(push).trace(state.frames, state.sim)
     assert traced.lower(lowering_platforms=("cpu",)).as_text().count("stablehlo.while") == loops
