@@ -72,7 +72,9 @@ def make_physics(task: str, **options: Any) -> Physics:
             takers = [other.title for other in SUITES.values() if other.takes(name)]
             if not takers:
                 raise ValueError(f"there is no option {name!r}, given as {value!r}: leave it out.")
-            fix = "leave it out" if own is None else "choose it where it was registered"
+            fix = "leave it out"
+            if own is not None:
+                fix += ", or give it where the task's physics is made, if that takes it"
             raise ValueError(
                 f"{name}={value!r} is only for {' and '.join(takers)}, not for task {task!r}: "
                 f"{fix}."

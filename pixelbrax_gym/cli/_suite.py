@@ -44,8 +44,23 @@ def evaluate(
     levels = make_levels(config, suite, episodes, options.clips, report)
     _check_new_clips(agents, levels, report)
     report(f"{len(levels.levels)} levels in {levels.num_programs} programs")
-    players = {name: partial(_returns, agent, levels.episodes) for name, agent in agents.items()}
-    scores = play(levels, players, output_dir, report)
+    compiled: set[object] = set()
+
+    def returns(agent: Trained, level: LevelEnv) -> np.ndarray:
+        if level.env not in compiled:
+            compiled.add(level.env)
+            number = f"{len(compiled)} of {levels.num_programs}"
+            report(f"{level.level.name}: compiling program {number}")
+        return _returns(agent, levels.episodes, level)
+
+    players = {name: partial(returns, agent) for name, agent in agents.items()}
+    try:
+        scores = play(levels, players, output_dir, report)
+    except KeyboardInterrupt:
+        lost = "nothing is kept without --output-dir"
+        kept = f"the same command goes on with the returns in {output_dir}"
+        report(f"stopped; {kept if output_dir else lost}")
+        raise
     if output_dir is not None:
         report(f"wrote {RETURNS}, {ROWS} and {SHEET} in {output_dir}")
     return scores.markdown()

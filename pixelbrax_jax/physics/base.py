@@ -139,8 +139,8 @@ def check_physics(physics: object) -> Physics:
     kind = type(physics).__name__
     if not isinstance(physics, Physics):
         raise TypeError(
-            f"physics must be a pixelbrax_jax.Physics, got a {kind}: make its class a subclass, "
-            "class MyPhysics(pixelbrax_jax.Physics)."
+            f"physics must be a pixelbrax_jax.Physics, got {kind}: return what mjcf_physics "
+            "makes, a BraxPhysics or an object of a class MyPhysics(pixelbrax_jax.Physics)."
         )
     missing = [name for name in Physics.__annotations__ if not hasattr(physics, name)]
     if missing:

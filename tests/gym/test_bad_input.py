@@ -30,7 +30,7 @@ from tests.gym.conftest import ID, TASK
         ({"split": "test", "distractors": "color"}, "without a distractor that has splits"),
         (
             {"backend": "mjx"},
-            "only for Brax.s tasks, .* choose it where it was registered",
+            "only for Brax.s tasks, .* leave it out, or give it where the task's physics is made",
         ),
         ({"max_episode_steps": 0}, "max_episode_steps must be a positive integer"),
         ({"max_episode_steps": -2}, "max_episode_steps must be a positive integer"),

@@ -223,7 +223,7 @@ HILLS = """<asset><hfield name="h" nrow="3" ncol="3" size="1 1 1 1"/></asset>
         ('<mujoco><worldbody><geom size=".1"/></worldbody></mujoco>', "the model has no joint"),
         (
             CART.replace("</mujoco>", '<sensor><clock name="now"/><clock/></sensor></mujoco>'),
-            "sensor 'now', 'sensor/1' reads a clock, which no state has: remove it",
+            "sensor 'now', 'sensor/1' is a clock, and states have no time: remove it",
         ),
         (CART.replace("<worldbody>", HILLS), "cannot be rendered: hfield 'hills'"),
     ],

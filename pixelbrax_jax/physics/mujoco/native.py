@@ -57,7 +57,7 @@ class Native:
         clocks = np.flatnonzero(model.sensor_type == int(mujoco.mjtSensor.mjSENS_CLOCK))
         if len(clocks):
             names = ", ".join(repr(model.sensor(i).name or f"sensor/{i}") for i in clocks)
-            raise ValueError(f"sensor {names} reads a clock, which no state has: remove it.")
+            raise ValueError(f"sensor {names} is a clock, and states have no time: remove it.")
         self._senses = not model.opt.disableflags & _OFF.mjDSBL_SENSOR
         stages = np.repeat(model.sensor_needstage, model.sensor_dim)
         self._is_force = stages == int(mujoco.mjtStage.mjSTAGE_ACC)
