@@ -140,6 +140,18 @@ def test_a_stopped_call_continues_with_equal_returns(tmp_path):
             evaluate(policy, output_dir=tmp_path)
 
 
+@pytest.mark.parametrize(("keeps", "said"), [(True, "goes on with"), (False, "nothing is kept")])
+def test_a_stopped_command_says_what_it_keeps(keeps, said, runs, capsys, monkeypatch, tmp_path):
+    def stop(levels, players, folder, report):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("pixelbrax_gym.generalisation.scores.play", stop)
+    runs["a"] = [agent()]
+    where = ["--output-dir", tmp_path] if keeps else []
+    assert command("a", "--clips", "procedural", *where) == 130
+    assert f"stopped; {'the same command ' if keeps else ''}{said}" in capsys.readouterr().err
+
+
 def test_several_policies_are_seeds():
     found = evaluate({"one": of_numpy, "two": lambda obs: -of_numpy(obs)})
     assert list(found.returns) == ["one", "two"]
