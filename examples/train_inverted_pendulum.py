@@ -3,8 +3,8 @@
     python examples/train_inverted_pendulum.py --output-dir runs/demo
 
 The frames stay where JAX put them: ``make_vec(..., output="torch")`` hands them over by DLPack
-without a copy. Training ends when an evaluation shows the task solved. Written into the output
-folder: ``learning_curve.png``, ``trained_agent.mp4`` and ``figures.json``.
+without a copy. Training ends when an evaluation shows the task solved, or with Ctrl-C. Written into
+the output folder: ``learning_curve.png``, ``trained_agent.mp4`` and ``figures.json``.
 
 The algorithm is proximal policy optimisation (Schulman et al., arXiv 1707.06347) with
 generalised advantage estimation (arXiv 1506.02438), a Gaussian policy, and a shared CNN.
@@ -16,7 +16,10 @@ import argparse
 import json
 import os
 import platform
+import signal
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
 from importlib.metadata import version
 from pathlib import Path
@@ -230,6 +233,25 @@ class Evaluation:
         return returns.tolist()
 
 
+@contextmanager
+def stop_requests() -> Iterator[list[int]]:
+    """Collects Ctrl-C and SIGTERM, after which training ends with an evaluation."""
+    asked: list[int] = []
+
+    def ask(number: int, *_: object) -> None:
+        if asked and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        asked.append(number)
+        tqdm.write("Stopping with an evaluation and a video; a second Ctrl-C stops at once.")
+
+    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield asked
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
 def train(config: Config, device: torch.device) -> tuple[Agent, dict]:
     """Trains an agent; returns it with the figures and the learning curve of the run."""
     started = time.perf_counter()
@@ -246,7 +268,8 @@ def train(config: Config, device: torch.device) -> tuple[Agent, dict]:
     curve: dict[str, list[float]] = {"steps": [], "return": []}
     evaluations: list[dict] = []
     started = time.perf_counter()
-    with tqdm(total=num_iterations * batch_size, unit="step", unit_scale=True) as bar:
+    bar = tqdm(total=num_iterations * batch_size, unit="step", unit_scale=True)
+    with bar, stop_requests() as asked:
         for iteration in range(num_iterations):
             for group in optimizer.param_groups:
                 group["lr"] = config.learning_rate * (1 - iteration / num_iterations)
@@ -257,10 +280,10 @@ def train(config: Config, device: torch.device) -> tuple[Agent, dict]:
                 curve["steps"].append(steps)
                 curve["return"].append(float(np.mean(recent)))
                 bar.set_postfix({"return": f"{curve['return'][-1]:.0f}"})
-            last = iteration + 1 == num_iterations
+            last = asked or iteration + 1 == num_iterations
             if last or steps // config.eval_every > (steps - batch_size) // config.eval_every:
                 evaluations.append({"steps": steps, "returns": evaluation.play(agent)})
-                if np.mean(evaluations[-1]["returns"]) >= config.solved_return:
+                if asked or np.mean(evaluations[-1]["returns"]) >= config.solved_return:
                     break
     seconds = time.perf_counter() - started
     rollouts.envs.close()
@@ -295,6 +318,7 @@ def record(agent: Agent, config: Config, device: torch.device, path: Path) -> No
         frames.append(env.render())
         if terminated or truncated:
             obs, _ = env.reset()
+            frames.append(env.render())
     write_frames(path, frames, env.metadata["render_fps"])
     env.close()
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import itertools
 import json
+import signal
 import sys
 from pathlib import Path
 
@@ -48,6 +49,30 @@ def test_train_inverted_pendulum(tmp_path, solved, steps):
     assert json.loads((tmp_path / "figures.json").read_text()) == figures
     for name in ("learning_curve.png", "trained_agent.mp4"):
         assert (tmp_path / name).stat().st_size > 1000
+
+
+@pytest.mark.slow
+def test_a_stopped_demo_leaves_what_it_has(tmp_path, monkeypatch):
+    demo = load("train_inverted_pendulum")
+    update = demo.update
+
+    def stop(*arguments):
+        update(*arguments)
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(demo, "update", stop)
+    handler = signal.getsignal(signal.SIGTERM)
+    figures = demo.main(
+        [
+            *("--output-dir", str(tmp_path), "--num-envs", "8", "--num-steps", "16"),
+            *("--total-steps", "512", "--eval-episodes", "2", "--video-steps", "10"),
+        ]
+    )
+    assert figures["train_steps"] == 128
+    assert [one["steps"] for one in figures["evaluations"]] == [128]
+    names = {"figures.json", "learning_curve.png", "trained_agent.mp4"}
+    assert {path.name for path in tmp_path.iterdir()} == names
+    assert signal.getsignal(signal.SIGTERM) is handler
 
 
 SMALL = ("--num-envs", "8", "--eval-episodes", "2")
