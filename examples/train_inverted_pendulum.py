@@ -336,7 +336,7 @@ def plot(curve: dict[str, list[float]], evaluations: list[dict], path: Path) -> 
     )
     axes.set(xlabel="environment steps", ylabel="return", title="Inverted pendulum from pixels")
     axes.set_ylim(bottom=0)
-    axes.legend(loc="lower right")
+    axes.legend()
     axes.grid(alpha=0.3)
     figure.savefig(path, dpi=150)
     plt.close(figure)
