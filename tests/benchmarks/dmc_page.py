@@ -253,7 +253,6 @@ def parts() -> str:
 
 WHOLE = partial(whole, "peers.dm_control_envs")
 FIGURES = {
-    "transfer": transfer,
     "whole": WHOLE,
     "whole-share": partial(whole, "dmc.with_look", look="dmc-plain"),
     "pictures": pictures,
@@ -267,6 +266,7 @@ FIGURES = {
     "states": states,
     "part": part,
 }
+TRANSFER = {"transfer": transfer}
 ALL = {"speed": speed, "looks": looks, "parts": parts, "physics": physics}
 
 

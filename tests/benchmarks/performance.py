@@ -302,13 +302,15 @@ PERFORMANCE = {
 }
 
 ACCELERATORS = {
+    "traffic": lambda: span(traffic("renderer")),
+    "traffic-plain": lambda: f"{max(traffic('plain renderer')):.0f}",
+    "pixel-launches": pixel_launches,
+}
+COMPILED_PROGRAMS = {
     "gpu-programs": programs,
     "mujoco-programs": partial(these_programs, MUJOCO_STEPS),
     "training-programs": partial(these_programs, TRAINING),
     "tpu-programs": tpu_programs,
-    "traffic": lambda: span(traffic("renderer")),
-    "traffic-plain": lambda: f"{max(traffic('plain renderer')):.0f}",
-    "pixel-launches": pixel_launches,
     "launch-seconds": lambda: f"{LAUNCH_SECONDS * 1e6:.1f}",
     "tpu-moved": partial(tpu_megabytes, "accessed_bytes"),
     "tpu-frames": partial(tpu_megabytes, "output_bytes"),

@@ -1,4 +1,4 @@
-"""Plays trained policies of the DM Control Suite here and in dm_control, for docs/dmc.md.
+"""Plays trained policies of the DM Control Suite in dm_control, for docs/howto/dm-control.md.
 
     MUJOCO_GL=egl python -m tests.benchmarks.transfer             the package's policies, 5 min each
     MUJOCO_GL=egl python -m tests.benchmarks.transfer RUN...      those of runs
