@@ -194,6 +194,7 @@ _CPU_DRQV2_TASKS: dict[str, dict[str, Any]] = {
     "dmc_cartpole_swingup_sparse": _CPU_CARTPOLE,
     "dmc_finger_spin": {"look": "dmc"},
     "dmc_walker_walk": {"look": "dmc"},
+    "halfcheetah": {"backend": "spring"},
 }
 _CPU_SHARES = {"ppo": 1.0, "ppg": 0.7, "dcpg": 0.6}
 """Number of steps relative to PPO, whose updates are faster."""

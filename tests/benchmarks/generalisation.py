@@ -32,7 +32,7 @@ TASKS = {
     "dmc_cartpole_swingup": "drqv2",
     "dmc_finger_spin": "drqv2",
     "dmc_walker_walk": "drqv2",
-    "halfcheetah": "ppo",
+    "halfcheetah": "drqv2",
 }
 """The agent of each task, with its preset `cpu`."""
 DISTRACTED = {
