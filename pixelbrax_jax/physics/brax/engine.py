@@ -18,7 +18,7 @@ from flax import struct
 
 from pixelbrax_jax.flags import as_by_default, default_flags, is_key, under_environment_flags
 from pixelbrax_jax.physics.base import Kinematics, RewardFn
-from pixelbrax_jax.physics.divergence import GuardedPhysics
+from pixelbrax_jax.physics.divergence import GuardedPhysics, Recipe
 from pixelbrax_jax.physics.mujoco.compatibility import (
     accept_old_clip,
     import_silenced,
@@ -113,7 +113,7 @@ class BraxPhysics(GuardedPhysics):
                 the action to a scalar.
             identity: objects with equal identities are equal, and share compiled programs; with
                 None an object equals only itself and its pickles. If it is a ``Recipe``, a pickle
-                contains nothing else.
+                contains nothing else, and ``step`` is not checked.
 
         Raises:
             ValueError: ``env`` is wrapped for training, has no MuJoCo model, does not observe one
@@ -147,7 +147,10 @@ class BraxPhysics(GuardedPhysics):
         self._reward = reward
         self._control_range = _control_range(model) if unscale_actions else None
         self._identity = uuid4() if identity is None else identity
-        self._check_shapes()
+        self._read_shapes()
+        # Tests do that for tasks of the package; it takes a second.
+        if not isinstance(identity, Recipe):
+            self._check_step()
 
     def _reset(self, key: jax.Array) -> PhysicsState:
         """See ``Physics.reset``. ``key`` may be typed, or uint32 like Brax's."""
@@ -240,10 +243,9 @@ class BraxPhysics(GuardedPhysics):
         q = with_unit_rotations(self._model, q)
         return self._source.unwrapped.pipeline_init(q, qd, *args, **kwargs)
 
-    def _check_shapes(self) -> None:
-        key = jax.random.key(0)
+    def _read_shapes(self) -> None:
         with _explained(self.backend), known_warnings_silenced():
-            first = jax.eval_shape(self._env.reset, key)
+            first = jax.eval_shape(self._env.reset, jax.random.key(0))
         if not hasattr(first.obs, "shape") or len(first.obs.shape) != 1:
             raise ValueError(
                 "the environment must observe one flat array, got "
@@ -256,7 +258,8 @@ class BraxPhysics(GuardedPhysics):
         self._obs_dtype = first.obs.dtype
         self._dtypes = jax.tree.map(lambda leaf: leaf.dtype, _carry(first))
 
-        state = jax.eval_shape(self.reset, key)
+    def _check_step(self) -> None:
+        state = jax.eval_shape(self.reset, jax.random.key(0))
         with _explained(self.backend):
             after = jax.eval_shape(self.step, state, jnp.zeros(self.action_size))
         if after.reward.shape != ():
