@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from pixelbrax_jax.physics.mujoco.hulls import mesh_hull
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
 from pixelbrax_jax.physics.task import Color
 from pixelbrax_jax.types import GeomKind, Geoms
@@ -150,6 +149,9 @@ def _shown(model: mujoco.MjModel, element: str, groups: Collection[int]) -> Iter
         kind = GeomKind[kind_name.upper()]
         size, planes, error = np.array(field("size"), np.float32), None, 0.0
         if kind == GeomKind.MESH:
+            # SciPy takes a third of a second to import.
+            from pixelbrax_jax.physics.mujoco.hulls import mesh_hull
+
             planes, size[0], error = mesh_hull(model, int(field("dataid")))
         size[kind.num_sizes :] = 0
         yield Shape(
