@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pixelbrax_jax import spatial
+from pixelbrax_jax._platform.by_platform import computed_once
 from pixelbrax_jax.renderer import opengl, shading
 from pixelbrax_jax.renderer.intersect import (
     Hit,
@@ -32,7 +33,7 @@ from pixelbrax_jax.renderer.view import (
     vector,
     view_of,
 )
-from pixelbrax_jax.types import FAR, Frame, GeomKind, Look, Scene
+from pixelbrax_jax.types import FAR, Camera, Frame, GeomKind, Look, Scene
 
 _INF_BITS = np.uint32(0x7F800000)
 
@@ -47,12 +48,17 @@ def sky_of(
     if scene.look.sky_texture is None:
         return []
     xmat = scene.camera.xmat if scene.sky_xmat is None else scene.sky_xmat
-    camera = scene.camera.replace(xmat=xmat)
-    rows = first_row + jnp.arange(num_rows)
-    ways = pixel_rays(camera, height, width, rows).reshape(-1, 3)
-    added = shading.sky_texture(scene.look.sky_texture, *ways.T)
-    # The barrier keeps XLA from looking texels up for each image of a batch.
-    added = jax.lax.optimization_barrier(added)
+
+    def look_up(texture: jax.Array, camera: Camera, first_row: jax.Array) -> jax.Array:
+        ways = pixel_rays(camera, height, width, first_row + jnp.arange(num_rows)).reshape(-1, 3)
+        return shading.sky_texture(texture, *ways.T)
+
+    # Else XLA would look texels up in the loop over pixels, slowly, and for each image of a batch.
+    # No position, which would make the directions of a batch differ.
+    camera = scene.camera.replace(pos=jnp.zeros(3), xmat=xmat)
+    given = scene.look.sky_texture, camera, jnp.asarray(first_row)
+    like = jax.ShapeDtypeStruct((num_rows * width, 3), jnp.float32)
+    added = computed_once(look_up, given, like)
     return [added[:, c] for c in range(3)]
 
 
