@@ -26,6 +26,7 @@ from tests.benchmarks import (
     performance,
     report,
     results,
+    suite_minutes,
     task_pages,
 )
 from tests.benchmarks.cases import GROUPS
@@ -101,7 +102,7 @@ PAGES: dict[str, Figures] = {
     "docs/dmc.md": dmc_page.FIGURES,
     "docs/benchmarks/dmc.md": dmc_page.ALL,
     "docs/howto/dm-control.md": dmc_page.TRANSFER,
-    "docs/benchmarks/generalisation.md": generalisation.FIGURES,
+    "docs/benchmarks/generalisation.md": generalisation.FIGURES | suite_minutes.FIGURES,
     "docs/gym-tasks.md": gym_page.FIGURES,
     "docs/tasks.md": {"tasks": brax_tasks},
     **{f"docs/tasks/{suite}.md": figures for suite, figures in task_pages.FIGURES.items()},
