@@ -53,8 +53,8 @@ def sky_of(
         ways = pixel_rays(camera, height, width, first_row + jnp.arange(num_rows)).reshape(-1, 3)
         return shading.sky_texture(texture, *ways.T)
 
-    # Else XLA would look texels up in the loop over pixels, slowly, and for each image of a batch.
-    # No position, which would make the directions of a batch differ.
+    # XLA would else look texels up in the loop over pixels, slowly, and for each image of a batch.
+    # The position is 0, because those of a batch may differ where its directions do not.
     camera = scene.camera.replace(pos=jnp.zeros(3), xmat=xmat)
     given = scene.look.sky_texture, camera, jnp.asarray(first_row)
     like = jax.ShapeDtypeStruct((num_rows * width, 3), jnp.float32)

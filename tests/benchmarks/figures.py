@@ -22,11 +22,11 @@ from pixelbrax_jax.tasks import BRAX_TASKS
 from tests.benchmarks import (
     dmc_page,
     generalisation,
+    generalisation_minutes,
     gym_page,
     performance,
     report,
     results,
-    suite_minutes,
     task_pages,
 )
 from tests.benchmarks.cases import GROUPS
@@ -102,7 +102,8 @@ PAGES: dict[str, Figures] = {
     "docs/dmc.md": dmc_page.FIGURES,
     "docs/benchmarks/dmc.md": dmc_page.ALL,
     "docs/howto/dm-control.md": dmc_page.TRANSFER,
-    "docs/benchmarks/generalisation.md": generalisation.FIGURES | suite_minutes.FIGURES,
+    "docs/benchmarks/generalisation.md": generalisation.FIGURES | generalisation_minutes.FIGURES,
+    "docs/howto/generalisation.md": {"minutes": generalisation_minutes.minutes},
     "docs/gym-tasks.md": gym_page.FIGURES,
     "docs/tasks.md": {"tasks": brax_tasks},
     **{f"docs/tasks/{suite}.md": figures for suite, figures in task_pages.FIGURES.items()},

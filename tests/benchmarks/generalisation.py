@@ -115,18 +115,18 @@ def levels_page() -> str:
 
 
 def axes_page() -> str:
-    """One table of all axes, a column for each task and training; sizes are in one cell."""
-    found = {
-        f"{task.removeprefix('dmc_').replace('_', ' ')}, {name}": rows
-        for task in TASKS
-        for name, rows in columns(task, "axes").items()
-    }
-    axes: dict[str, list[list[str]]] = {}
-    for rows in zip(*found.values(), strict=True):
-        axis = rows[0].level.rstrip("-123").replace("-", " ")
-        axes.setdefault(axis, []).append([f"{row.mean:.0f}" for row in rows])
-    lines = [[axis, *map(", ".join, zip(*sizes, strict=True))] for axis, sizes in axes.items()]
-    return table(["axis", *found], lines)
+    """A table of all axes for each task, a column for each training; sizes are in one cell."""
+    parts = []
+    for task, agent in TASKS.items():
+        if not (found := columns(task, "axes")):
+            continue
+        axes: dict[str, list[list[str]]] = {}
+        for rows in zip(*found.values(), strict=True):
+            axis = rows[0].level.rstrip("-123").replace("-", " ")
+            axes.setdefault(axis, []).append([f"{row.mean:.0f}" for row in rows])
+        lines = [[axis, *map(", ".join, zip(*sizes, strict=True))] for axis, sizes in axes.items()]
+        parts.append(f"**`{task}`**, {agent}\n\n{table(['axis', *found], lines)}")
+    return "\n\n".join(parts)
 
 
 def published(task: str) -> dict[str, dict[str, str]]:
@@ -145,13 +145,9 @@ def _cell(row: Row) -> str:
     return f"{row.mean:.0f}{spread}"
 
 
-def largest_error() -> str:
+def largest_error(*tasks: str) -> str:
     """The largest standard error of a mean on one of the axes."""
-    found = [
-        kept(task, training, "axes")
-        for task, agent in TASKS.items()
-        for training in TRAININGS[agent]
-    ]
+    found = [kept(task, training, "axes") for task in tasks for training in TRAININGS[TASKS[task]]]
     errors = [row.standard_error for scores in found if scores for row in scores.rows()]
     return f"{max(error for error in errors if not math.isnan(error)):.0f}"
 
@@ -159,7 +155,8 @@ def largest_error() -> str:
 FIGURES: dict[str, Callable[[], str]] = {
     "dmcgb2": levels_page,
     "axes": axes_page,
-    "axes-error": largest_error,
+    "axes-error": partial(largest_error, *(task for task in TASKS if task in DMC_TASKS)),
+    "axes-error-halfcheetah": partial(largest_error, "halfcheetah"),
 }
 
 

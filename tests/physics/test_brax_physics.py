@@ -191,10 +191,11 @@ def test_wrong_action_shape(slider):
 
 QUIET = """
 from pixelbrax_jax.registry import make_physics
-physics = make_physics("halfcheetah")
 import jax
-jax.eval_shape(physics.reset, jax.random.key(0))
-make_physics("reacher", backend="mjx")
+import jax.numpy as jnp
+for physics in make_physics("halfcheetah"), make_physics("reacher", backend="mjx"):
+    state = jax.eval_shape(physics.reset, jax.random.key(0))
+    jax.eval_shape(physics.step, state, jnp.zeros(physics.action_size))
 """
 
 

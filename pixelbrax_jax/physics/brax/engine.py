@@ -148,9 +148,11 @@ class BraxPhysics(GuardedPhysics):
         self._control_range = _control_range(model) if unscale_actions else None
         self._identity = uuid4() if identity is None else identity
         self._read_shapes()
-        # Tests do that for tasks of the package; it takes a second.
+        # Tests check the steps of the package's tasks; each takes a second.
         if not isinstance(identity, Recipe):
-            self._check_step()
+            with _explained(self.backend):
+                state = jax.eval_shape(self.reset, jax.random.key(0))
+                jax.eval_shape(self.step, state, jnp.zeros(self.action_size))
 
     def _reset(self, key: jax.Array) -> PhysicsState:
         """See ``Physics.reset``. ``key`` may be typed, or uint32 like Brax's."""
@@ -195,6 +197,9 @@ class BraxPhysics(GuardedPhysics):
             now = kinematics(after.pipeline_state)
             reward = self._reward(kinematics(carry.pipeline), now, action)
         done = jnp.asarray(after.done)
+        for name, value in (("the reward", jnp.asarray(reward)), ("done", done)):
+            if value.shape != ():
+                raise ValueError(f"{name} must be a scalar, got shape {value.shape}")
         # A NaN in the done flag makes the reward NaN, which the guard watches.
         reward = jnp.where(jnp.abs(done) < jnp.inf, jnp.asarray(reward, jnp.float32), jnp.nan)
         return self._state(after, reward, done > 0.5)
@@ -257,15 +262,6 @@ class BraxPhysics(GuardedPhysics):
         self.state_size = int(first.obs.shape[0])
         self._obs_dtype = first.obs.dtype
         self._dtypes = jax.tree.map(lambda leaf: leaf.dtype, _carry(first))
-
-    def _check_step(self) -> None:
-        state = jax.eval_shape(self.reset, jax.random.key(0))
-        with _explained(self.backend):
-            after = jax.eval_shape(self.step, state, jnp.zeros(self.action_size))
-        if after.reward.shape != ():
-            raise ValueError(f"the reward must be a scalar, got shape {after.reward.shape}")
-        if after.terminated.shape != ():
-            raise ValueError(f"done must be a scalar, got shape {after.terminated.shape}")
 
 
 def kinematics(pipeline_state: Any) -> Kinematics:

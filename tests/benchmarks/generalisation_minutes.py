@@ -1,6 +1,6 @@
 """Times a suite of levels, and dm_control with the same policy.
 
-MUJOCO_GL=egl python -m tests.benchmarks.suite_minutes    ten minutes on an idle machine
+MUJOCO_GL=egl python -m tests.benchmarks.generalisation_minutes    six minutes, on an idle machine
 """
 
 from __future__ import annotations
@@ -85,6 +85,12 @@ def hours() -> str:
     return f"{kept['episodes'] * kept['seconds_of_an_episode_in_dm_control'] / 3600:.1f}"
 
 
+def where() -> str:
+    """The cores that both had."""
+    machine = _read()["machine"]
+    return f"{machine['cores']} cores with {machine['vectors']}"
+
+
 def _read() -> dict:
     found: dict = json.loads(MINUTES.read_text("utf-8"))
     return found
@@ -94,6 +100,8 @@ FIGURES = {
     "minutes": minutes,
     "hours": hours,
     "episodes": lambda: f"{_read()['episodes']:,}",
+    "where": where,
+    "timed": lambda: str(TIMED),
     "episode-seconds": lambda: f"{_read()['seconds_of_an_episode_in_dm_control']:.1f}",
 }
 
