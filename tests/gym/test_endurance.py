@@ -39,11 +39,16 @@ def test_nothing_leaks(num_calls, name):
     adapter = ADAPTERS[name](episode_length=6)
     adapter.reset()
     arrays, memory = run(adapter, 500)
-    arrays_later, memory_later = run(adapter, num_calls)
-    # TorchRL's adapter holds a few more where a step has ended an episode.
-    assert abs(arrays_later - arrays) < 10
-    # A single leaked observation a step would be 2.6 kB.
-    assert memory_later - memory < 4 + num_calls * 0.2e-3
+    window, grown = num_calls // 2, []
+    for _ in range(3):
+        arrays_later, memory_later = run(adapter, window)
+        # TorchRL's adapter holds a few more where a step has ended an episode.
+        assert abs(arrays_later - arrays) < 10
+        grown.append(memory_later - memory)
+        memory = memory_later
+    # A single leaked observation a step would be 2.6 kB. Other threads of the process may take
+    # memory meanwhile, but not in every window.
+    assert min(grown) < 0.5 + window * 0.2e-3
 
 
 DIGEST = """
