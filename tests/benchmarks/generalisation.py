@@ -101,32 +101,43 @@ def columns(task: str, suite: str) -> dict[str, list[Row]]:
 
 def levels_page() -> str:
     """A table of DMC-GB2 for each task, a column for each training, in Markdown."""
-    parts = []
-    for task, agent in TASKS.items():
-        if not (found := columns(task, "dmcgb2")):
-            continue
+
+    def rows_of(task: str, found: dict[str, list[Row]]) -> tuple[list[str], list[list[str]]]:
         lines = [[rows[0].level, *map(_cell, rows)] for rows in zip(*found.values(), strict=True)]
         heads = ["level", *found]
         for name, returns in published(task).items():
             heads.append(name)
             lines = [[*line, returns.get(line[0], "")] for line in lines]
-        parts.append(f"**`{task}`**, {agent}\n\n{table(heads, lines)}")
-    return "\n\n".join(parts)
+        return heads, lines
+
+    return _tables("dmcgb2", rows_of)
 
 
 def axes_page() -> str:
     """A table of all axes for each task, a column for each training; sizes are in one cell."""
-    parts = []
-    for task, agent in TASKS.items():
-        if not (found := columns(task, "axes")):
-            continue
+
+    def rows_of(_: str, found: dict[str, list[Row]]) -> tuple[list[str], list[list[str]]]:
         axes: dict[str, list[list[str]]] = {}
         for rows in zip(*found.values(), strict=True):
             axis = rows[0].level.rstrip("-123").replace("-", " ")
             axes.setdefault(axis, []).append([f"{row.mean:.0f}" for row in rows])
         lines = [[axis, *map(", ".join, zip(*sizes, strict=True))] for axis, sizes in axes.items()]
-        parts.append(f"**`{task}`**, {agent}\n\n{table(['axis', *found], lines)}")
-    return "\n\n".join(parts)
+        return ["axis", *found], lines
+
+    return _tables("axes", rows_of)
+
+
+def _tables(
+    suite: str,
+    rows_of: Callable[[str, dict[str, list[Row]]], tuple[list[str], list[list[str]]]],
+) -> str:
+    """A table for each task with returns; ``rows_of`` makes its head and its rows."""
+    found = {task: columns(task, suite) for task in TASKS}
+    return "\n\n".join(
+        f"**`{task}`**, {TASKS[task]}\n\n{table(*rows_of(task, scores))}"
+        for task, scores in found.items()
+        if scores
+    )
 
 
 def published(task: str) -> dict[str, dict[str, str]]:

@@ -13,6 +13,7 @@ from contextlib import closing
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 from pixelbrax_gym.generalisation.scores import RETURNS, Scores
 from pixelbrax_jax.agents.runner.splits import make_split
@@ -21,6 +22,7 @@ from pixelbrax_jax.agents.runner.transfer import play_in
 from pixelbrax_jax.physics.dmc.suite import SuiteEnv
 from pixelbrax_jax.processor import describe_cpu
 from tests.benchmarks.generalisation import KEPT
+from tests.benchmarks.performance import read
 
 POLICY = "dmc_walker_walk"
 SUITE = "dmcgb2"
@@ -91,8 +93,8 @@ def where() -> str:
     return f"{machine['cores']} cores with {machine['vectors']}"
 
 
-def _read() -> dict:
-    found: dict = json.loads(MINUTES.read_text("utf-8"))
+def _read() -> dict[str, Any]:
+    found: dict[str, Any] = read("benchmarks/generalisation/minutes.json")
     return found
 
 

@@ -47,8 +47,8 @@ def test_nothing_leaks(num_calls, name):
         grown.append(memory_later - memory)
         memory = memory_later
     # A single leaked observation a step would be 2.6 kB. Other threads of the process may take
-    # memory meanwhile, but not in every window.
-    assert min(grown) < 0.5 + window * 0.2e-3
+    # memory meanwhile, but not in most windows.
+    assert sorted(grown)[1] < 0.5 + window * 0.2e-3
 
 
 DIGEST = """
