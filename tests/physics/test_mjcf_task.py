@@ -249,8 +249,9 @@ def test_models_that_are_no_task(xml, message):
         ({"init_q": np.zeros(3)}, r"init_q must have shape \(2,\), got \(3,\)"),
         ({"n_frames": 0}, "n_frames must be a positive integer, got 0"),
         ({"n_frames": 1.5}, "n_frames must be a positive integer, got 1.5"),
-        ({"reset_noise": -1.0}, "reset_noise must be finite and not negative"),
-        ({"reset_noise": float("nan")}, "reset_noise must be finite and not negative"),
+        ({"reset_noise": -1.0}, "reset_noise must be a number of at least 0, got -1.0"),
+        ({"reset_noise": float("nan")}, "reset_noise must be a number of at least 0, got nan"),
+        ({"reset_noise": "small"}, "reset_noise must be a number of at least 0, got 'small'"),
         ({"engine": "mujco"}, "unknown engine: 'mujco'. Did you mean 'mujoco'"),
         ({"reset": lambda key: jnp.zeros(4)}, r"reset must return .* \(2,\) and velocities \(2,\)"),
         ({"reset": lambda key: (jnp.zeros(2), jnp.zeros(3))}, r"got \(\(2,\), \(3,\)\)"),
@@ -265,6 +266,22 @@ def test_models_that_are_no_task(xml, message):
 def test_bad_arguments(change, message):
     with pytest.raises(ValueError, match=message):
         build(**change)
+
+
+def test_what_is_rendered_opaque_is_named():
+    pane = '<geom name="pane" type="box" size=".1 .1 .1" rgba="1 0 0 {}" group="{}"/>'
+    fog = '<asset><material name="fog" rgba="1 1 1 .5"/></asset>'
+    body = '<body name="cart">'
+    model = CART.replace(body, body + pane.format(0.5, 0) + '<site material="fog"/>')
+    model = model.replace("<worldbody>", fog + "<worldbody>")
+    with pytest.warns(
+        UserWarning, match=r"geom 'pane', site 0\. Give each .* \(0, 1, 2\)"
+    ) as found:
+        build(model)
+    assert found[0].filename == __file__
+    for alpha, group in ((0, 0), (1, 0), (0.5, 3)):
+        # Warnings are errors.
+        build(CART.replace(body, body + pane.format(alpha, group)))
 
 
 def test_models_beyond_mujoco_xla():

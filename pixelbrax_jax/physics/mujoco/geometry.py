@@ -133,6 +133,18 @@ def site_shapes(model: mujoco.MjModel, groups: Collection[int] = VISIBLE_GROUPS)
     return list(_shown(model, "site", groups))
 
 
+def translucent(model: mujoco.MjModel, groups: Collection[int]) -> list[str]:
+    """Return what is visible with an alpha below 1, such as ``geom 'glass'``, in model order."""
+    found = []
+    for element in ("geom", "site"):
+        elements = [getattr(model, element)(i) for i in range(getattr(model, f"n{element}"))]
+        for i, it in enumerate(elements):
+            alpha = resolve_rgba(model, it.rgba, it.matid.item())[3]
+            if it.group.item() in groups and 0 < alpha < 1:
+                found.append(f"{element} {it.name or i!r}")
+    return found
+
+
 def _shown(model: mujoco.MjModel, element: str, groups: Collection[int]) -> Iterator[Shape]:
     """Yield the visible elements, ``geom`` or ``site``, in the model's order."""
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import os
+import warnings
 from collections.abc import Callable, Collection, Mapping
 from operator import attrgetter
 from pathlib import Path
@@ -18,7 +18,7 @@ from pixelbrax_jax.physics.base import ResetFn
 from pixelbrax_jax.physics.mujoco.compatibility import loading_silenced
 from pixelbrax_jax.physics.mujoco.dynamics import Dynamics
 from pixelbrax_jax.physics.mujoco.formulas import Formulas, Snapshot, Start, never, observe_joints
-from pixelbrax_jax.physics.mujoco.geometry import VISIBLE_GROUPS
+from pixelbrax_jax.physics.mujoco.geometry import VISIBLE_GROUPS, translucent
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
 from pixelbrax_jax.physics.mujoco.options import MujocoOptions
 from pixelbrax_jax.physics.mujoco.physics import MujocoPhysics
@@ -26,7 +26,7 @@ from pixelbrax_jax.physics.mujoco.poses import with_unit_rotations
 from pixelbrax_jax.physics.mujoco.viewpoints import followed_body
 from pixelbrax_jax.physics.task import Color
 from pixelbrax_jax.types import PhysicsState
-from pixelbrax_jax.validation import check_positive_int
+from pixelbrax_jax.validation import check_not_negative, check_positive_int
 
 RewardFn = Callable[[Snapshot, Snapshot, jax.Array], jax.Array]
 
@@ -72,9 +72,10 @@ def mjcf_physics(
 
     MuJoCo itself simulates it in programs for a CPU, MuJoCo XLA in others. An action in [-1, 1] is
     mapped linearly to an actuator's control range, or passed unchanged if the actuator has none.
-    What is seen are the model's geoms and sites (``site/<name>``), lights and sky. Its cameras are
-    viewpoints by name, see ``named_rigs``; without one named ``default``, a view from a corner
-    follows the first moving body with an actuator.
+    What is seen are the model's geoms and sites (``site/<name>``), lights and sky; a UserWarning
+    names the translucent ones, which are rendered opaque. Its cameras are viewpoints by name, see
+    ``named_rigs``; without one named ``default``, a view from a corner follows the first moving
+    body with an actuator.
 
     The functions are pure and take ONE environment, as a ``Snapshot``: ``seen.xpos("hand")``,
     ``seen.sensor("touch")``, ``seen.state.qvel``.
@@ -110,15 +111,20 @@ def mjcf_physics(
             "reset samples the whole initial state: leave reset_noise and init_q out, and add the "
             "noise in reset."
         )
-    noise = 0.01 if reset_noise is None else float(reset_noise)
-    if not math.isfinite(noise) or noise < 0:
-        raise ValueError(f"reset_noise must be finite and not negative, got {reset_noise}")
+    noise = 0.01 if reset_noise is None else check_not_negative("reset_noise", reset_noise)
     substeps = check_positive_int("n_frames", n_frames)
     spec, model = _load(source)
     if model.nv == 0:
         raise ValueError("the model has no joint, so nothing can move")
     if model.nu == 0:
         raise ValueError("the model has no actuator, so an agent could not act on it")
+    if names := translucent(model, geom_groups):
+        warnings.warn(
+            f"rendered opaque, because translucent things cannot be rendered: {', '.join(names)}. "
+            "Give each an alpha of 1, or hide it with an alpha of 0 or a group outside "
+            f"{tuple(geom_groups)}.",
+            stacklevel=3,
+        )
     senses_forces = bool((model.sensor_needstage == _FORCES).any())
     formulas = Formulas(
         start=_start(model, reset, init_q, noise),
