@@ -99,6 +99,18 @@ def columns(task: str, suite: str) -> dict[str, list[Row]]:
     return {f"{name} ({len(found.returns)})": found.rows() for name, found in scores.items()}
 
 
+def summary() -> str:
+    """A row for each training: clean, and the last rows of both suites, in Markdown."""
+    lines = []
+    for task, training in [(task, name) for task, by in TASKS.items() for name in TRAININGS[by]]:
+        scores = [kept(task, training, suite) for suite in SUITES]
+        found = [suite.rows() if suite else [] for suite in scores]
+        if clean := next((rows[0] for rows in found if rows), None):
+            disturbed = [_cell(rows[-1]) if rows else "" for rows in found]
+            lines.append([f"`{task}`", training, str(clean.runs), _cell(clean), *disturbed])
+    return table(["task", "trained with", "seeds", "clean", "DMC-GB2", "axes"], lines)
+
+
 def levels_page() -> str:
     """A table of DMC-GB2 for each task, a column for each training, in Markdown."""
 
@@ -164,6 +176,7 @@ def largest_error(*tasks: str) -> str:
 
 
 FIGURES: dict[str, Callable[[], str]] = {
+    "summary": summary,
     "dmcgb2": levels_page,
     "axes": axes_page,
     "axes-error": partial(largest_error, *(task for task in TASKS if task in DMC_TASKS)),
