@@ -30,6 +30,7 @@ def evaluate(
     suite: str,
     episodes: int | None,
     output_dir: str | None,
+    success_return: float | None,
 ) -> str:
     """Play the levels of a suite with all runs; return their table in Markdown."""
     if options.run_index:
@@ -55,7 +56,7 @@ def evaluate(
 
     players = {name: partial(returns, agent) for name, agent in agents.items()}
     try:
-        scores = play(levels, players, output_dir, report)
+        scores = play(levels, players, output_dir, report, success_return)
     except KeyboardInterrupt:
         lost = "nothing is kept without --output-dir"
         kept = f"the same command goes on with the returns in {output_dir}"

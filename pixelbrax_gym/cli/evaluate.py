@@ -39,6 +39,8 @@ class Options(AgentOptions):
     output_dir: str | None = None
     """Folder for the suite's returns.json, table.csv and levels.png. Levels whose returns it has
     are not played again."""
+    success_return: float | None = None
+    """With --suite an episode with at least this return is a success; default: the task's."""
     split: tuple[Literal["clean", "train", "test"], ...] = ()
     """Splits to evaluate; default: clean, with distractors also train, and test if it has clips
     that training does not show."""
@@ -57,11 +59,15 @@ def run(arguments: Sequence[str]) -> int:
         for name, value in (("split", options.split), ("in", options.where)):
             if value:
                 raise UsageError(f"--suite plays its own levels; leave out --{name}.")
-        episodes, folder = options.episodes, options.output_dir
-        sys.stdout.write(evaluate(options, options.runs, options.suite, episodes, folder) + "\n")
+        own = options.episodes, options.output_dir, options.success_return
+        sys.stdout.write(evaluate(options, options.runs, options.suite, *own) + "\n")
         return 0
-    if options.output_dir is not None:
-        raise UsageError("--output-dir needs --suite.")
+    for name, given in (
+        ("output-dir", options.output_dir),
+        ("success-return", options.success_return),
+    ):
+        if given is not None:
+            raise UsageError(f"--{name} needs --suite.")
     if len(options.runs) > 1:
         raise UsageError(f"give one run, or --suite for several; got {', '.join(options.runs)}.")
     agent = load(options, next(iter(options.runs), None))

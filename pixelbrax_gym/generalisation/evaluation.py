@@ -21,6 +21,8 @@ from pixelbrax_jax.validation import check_choice
 
 Policy = Callable[[Any], Any]
 
+_OWN_OPTIONS = ("episodes", "clips", "output", "output_dir", "report", "success_return")
+
 
 def evaluate_suite(
     policy: Policy | Mapping[str, Policy],
@@ -32,6 +34,7 @@ def evaluate_suite(
     output: str = "numpy",
     output_dir: str | PathLike[str] | None = None,
     report: Callable[[str], object] = lambda _: None,
+    success_return: float | None = None,
     **options: Any,
 ) -> Scores:
     """Play every level of a suite with a policy; ``print(scores.markdown())`` shows the table.
@@ -51,6 +54,7 @@ def evaluate_suite(
             ``levels.png``. Levels that the file has are not played again; it knows policies by
             name alone.
         report: takes a line after each level.
+        success_return: an episode with at least this return is a success; None for the task's.
         **options: other options of ``pixelbrax_jax.make``, such as ``action_repeat``.
 
     Raises:
@@ -69,7 +73,7 @@ def evaluate_suite(
     check_choice("suite", suite, SUITES)
     if own := [name for name in LEFT_OUT if name in options]:
         raise TypeError(f"{own[0]} is decided by the levels of a suite; leave it out.")
-    config = env_config(task, options, ("episodes", "clips", "output", "output_dir", "report"))
+    config = env_config(task, options, _OWN_OPTIONS)
     levels = make_levels(config, suite, episodes, clips, report)
     # Levels with one program share their environments.
     made: dict[Any, GymnasiumVectorEnv] = {}
@@ -80,7 +84,7 @@ def evaluate_suite(
         return _returns(made[level.env], level.params, policy)
 
     players = {name: partial(play_level, policy=one) for name, one in policies.items()}
-    return play(levels, players, output_dir, report)
+    return play(levels, players, output_dir, report, success_return)
 
 
 def make_level_envs(

@@ -21,6 +21,8 @@ from pixelbrax_jax.generalisation.frames import write_sheet
 from pixelbrax_jax.generalisation.intervals import interquartile_mean
 from pixelbrax_jax.generalisation.making import UNDISTURBED, LevelEnv, Levels
 from pixelbrax_jax.plain import to_plain
+from pixelbrax_jax.tasks import TASKS
+from pixelbrax_jax.validation import check_finite
 
 RETURNS, ROWS, SHEET = "returns.json", "table.csv", "levels.png"
 """Files in the output folder."""
@@ -44,7 +46,8 @@ class Row:
     ``low`` and ``high`` are the ends of its 95 % stratified bootstrap interval, NaN for one run.
     ``standard_error`` is that of a run's mean over its episodes, averaged over runs; NaN for one
     episode and for the last row. ``ratio`` is ``mean`` over that of the level clean; NaN if that is
-    not positive.
+    not positive. ``success`` is the share of all episodes whose return reaches a threshold; NaN
+    without one.
     """
 
     level: str
@@ -55,16 +58,21 @@ class Row:
     high: float
     standard_error: float
     ratio: float
+    success: float
 
 
 @dataclass
 class Scores:
-    """The (E,) ``returns`` of a suite's episodes by run and level, and all that decides them."""
+    """The (E,) ``returns`` of a suite's episodes by run and level, and all that decides them.
+
+    An episode with at least ``success_return`` is a success; None takes the task's, if it has one.
+    """
 
     suite: str
     task: str
     options: dict[str, Any]
     returns: Returns = field(default_factory=dict)
+    success_return: float | None = None
 
     def rows(self) -> list[Row]:
         """Return a row for each level that all runs have, and one for all but the first level."""
@@ -76,22 +84,30 @@ class Scores:
             errors = np.full(len(runs), math.nan)
             if returns.shape[1] > 1:
                 errors = returns.std(axis=1, ddof=1) / math.sqrt(returns.shape[1])
-            rows.append(self._row(name, returns.mean(axis=1)[None], float(errors.mean()), rows))
+            rows.append(self._row(name, returns[None], float(errors.mean()), rows))
         if len(names) > 2:
-            means = np.stack([arrays[name].mean(axis=1) for name in names[1:]])
-            rows.append(self._row(ALL, means, math.nan, rows))
+            rows.append(self._row(ALL, np.stack([*arrays.values()][1:]), math.nan, rows))
         return rows
 
-    def _row(self, name: str, scores: np.ndarray, error: float, rows: Sequence[Row]) -> Row:
-        """Return the row of (S, R) scores."""
-        low = high = math.nan
+    def _row(self, name: str, returns: np.ndarray, error: float, rows: Sequence[Row]) -> Row:
+        """Return the row of (S, R, E) returns of S levels."""
+        low = high = success = math.nan
+        if (threshold := self._threshold()) is not None:
+            success = float((returns >= threshold).mean())
+        scores = returns.mean(axis=2)
         mean = float(scores.mean())
         if scores.shape[1] > 1:
             mean, low, high = interquartile_mean(scores)
         clean = rows[0].mean if rows else mean
         ratio = mean / clean if clean > 0 else math.nan
         episodes = int(self.options["episodes"])
-        return Row(name, scores.shape[1], episodes, mean, low, high, error, ratio)
+        return Row(name, scores.shape[1], episodes, mean, low, high, error, ratio, success)
+
+    def _threshold(self) -> float | None:
+        if self.success_return is not None:
+            return self.success_return
+        task = TASKS.get(self.task)
+        return None if task is None else task.success_return
 
     def markdown(self) -> str:
         """Return the table in Markdown."""
@@ -100,11 +116,12 @@ class Scores:
         heads = ["level", "return (IQM)" if several else "return"]
         heads += ["95 % interval"] if several else []
         heads += ["standard error", "ratio to clean"]
+        heads += ["success"] if self._threshold() is not None else []
         lines = []
         for row in rows:
             interval = [f"{row.low:.1f} to {row.high:.1f}"] if several else []
-            numbers = [_text(row.standard_error, 1), _text(row.ratio, 2)]
-            lines.append([row.level, f"{row.mean:.1f}", *interval, *numbers])
+            numbers = [_text(row.standard_error, 1), _text(row.ratio, 2), _text(row.success, 2)]
+            lines.append([row.level, f"{row.mean:.1f}", *interval, *numbers][: len(heads)])
         return table(heads, lines)
 
     def csv(self) -> str:
@@ -135,13 +152,17 @@ def play(
     players: Mapping[str, Callable[[LevelEnv], np.ndarray]],
     folder: str | PathLike[str] | None,
     report: Callable[[str], object],
+    success_return: float | None = None,
 ) -> Scores:
     """Play all levels with all runs, functions that return the (E,) returns of a level.
 
     The folder gets the contact sheet first and the returns after each level; levels whose returns
     it has are not played again.
     """
-    scores = Scores(levels.suite, levels.config.task, options_of(levels))
+    if success_return is not None:
+        success_return = check_finite("success_return", success_return)
+    options = options_of(levels)
+    scores = Scores(levels.suite, levels.config.task, options, success_return=success_return)
     path = None if folder is None else Path(folder)
     known: Returns = {}
     if path is not None:
@@ -183,7 +204,7 @@ def read(scores: Scores, folder: Path) -> Returns:
     wanted = json.loads(_json(scores, {}))
     there, here = ({**one, **one["options"]} for one in (found, wanted))
     for name in [*here, *there]:
-        if name in ("returns", "options") or there.get(name) == here.get(name):
+        if name in ("returns", "options", "success_return") or there.get(name) == here.get(name):
             continue
         raise ValueError(
             f"{file} has {name}={there.get(name)!r}, this call {here.get(name)!r}: its levels "

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TypeVar
 
@@ -13,11 +13,19 @@ Color = tuple[float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """One row of a suite's table; ``summary`` names the goal, and what ends an episode early."""
+    """One row of a suite's table.
+
+    Attributes:
+        name: name of the task.
+        gymnasium_id: its id in Gymnasium.
+        summary: the goal, and what ends an episode early.
+        success_return: an episode with at least this return is a success; None for no such number.
+    """
 
     name: str
     gymnasium_id: str
     summary: str
+    success_return: float | None = field(default=None, kw_only=True)
 
     def other_names(self) -> tuple[str, ...]:
         """Return other libraries' names of the task, for the message about an unknown one."""

@@ -103,7 +103,10 @@ PAGES: dict[str, Figures] = {
     "docs/benchmarks/dmc.md": dmc_page.ALL,
     "docs/howto/dm-control.md": dmc_page.TRANSFER,
     "docs/benchmarks/generalisation.md": generalisation.FIGURES | generalisation_minutes.FIGURES,
-    "docs/howto/generalisation.md": {"minutes": generalisation_minutes.minutes},
+    "docs/howto/generalisation.md": {
+        "example": generalisation.example,
+        "minutes": generalisation_minutes.minutes,
+    },
     "docs/gym-tasks.md": gym_page.FIGURES,
     "docs/tasks.md": {"tasks": brax_tasks},
     **{f"docs/tasks/{suite}.md": figures for suite, figures in task_pages.FIGURES.items()},

@@ -12,10 +12,12 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import re
 import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -107,8 +109,21 @@ def summary() -> str:
         found = [suite.rows() if suite else [] for suite in scores]
         if clean := next((rows[0] for rows in found if rows), None):
             disturbed = [_cell(rows[-1]) if rows else "" for rows in found]
-            lines.append([f"`{task}`", training, str(clean.runs), _cell(clean), *disturbed])
-    return table(["task", "trained with", "seeds", "clean", "DMC-GB2", "axes"], lines)
+            ends = [clean, *(rows[-1] if rows else None for rows in found)]
+            success = ", ".join(f"{100 * row.success:.0f}" if row else "-" for row in ends)
+            seeds = str(clean.runs)
+            lines.append([f"`{task}`", training, seeds, _cell(clean), *disturbed, success])
+    return table(["task", "trained with", "seeds", "clean", "DMC-GB2", "axes", "success, %"], lines)
+
+
+def example() -> str:
+    """The first and the last rows of the table that `pixelbrax evaluate` prints of one seed."""
+    found = kept("dmc_walker_walk", "shifts", "dmcgb2")
+    assert found is not None, "its returns are in this repository"
+    one = replace(found, returns={"seed 0": found.returns["seed 0"]})
+    head, rule, *lines = one.markdown().splitlines()
+    gap = "| ..." + re.sub(r"[^|]", " ", head)[5:]
+    return "\n".join([head, rule, *lines[:3], gap, lines[-1]])
 
 
 def levels_page() -> str:

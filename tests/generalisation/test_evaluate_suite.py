@@ -130,6 +130,11 @@ def test_a_stopped_call_continues_with_equal_returns(tmp_path):
     assert len(calls) == first * 3 // 2
     assert [line.endswith("from the file") for line in lines] == [True, True, False]
     assert (tmp_path / "table.csv").read_text() == whole.csv()
+    # What counts as a success changes no return.
+    lowest = min(min(returns) for returns in whole.returns["policy"].values())
+    again = evaluate(policy, output_dir=tmp_path, success_return=lowest)
+    assert [row.success for row in again.rows()] == [1.0] * 4
+    assert len(calls) == first * 3 // 2
     with pytest.raises(ValueError, match=r"has episodes=3, this call 4: .* Choose another folder"):
         evaluate(policy, output_dir=tmp_path, episodes=4)
     with pytest.raises(ValueError, match="has action_repeat=1, this call 2"):
@@ -142,7 +147,7 @@ def test_a_stopped_call_continues_with_equal_returns(tmp_path):
 
 @pytest.mark.parametrize(("keeps", "said"), [(True, "goes on with"), (False, "nothing is kept")])
 def test_a_stopped_command_says_what_it_keeps(keeps, said, runs, capsys, monkeypatch, tmp_path):
-    def stop(levels, players, folder, report):
+    def stop(*arguments):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("pixelbrax_gym.generalisation.scores.play", stop)
@@ -169,6 +174,7 @@ def test_several_policies_are_seeds():
         (of_numpy, {"obs_mode": "state"}, ValueError, "obs_mode='state' shows none"),
         (of_numpy, {"heigth": 3}, TypeError, "unexpected keyword argument 'heigth'"),
         (of_numpy, {"episodes": 0}, ValueError, "episodes must be a positive integer"),
+        (of_numpy, {"success_return": "9"}, ValueError, "success_return must be a finite number"),
     ],
 )
 def test_errors_of_a_call(policy, more, error, message):
@@ -222,6 +228,7 @@ def test_options_of_a_suite_need_one(capsys):
     for arguments, message in (
         (["a", "b"], "give one run, or --suite for several; got a, b."),
         (["a", "--output-dir", "x"], "--output-dir needs --suite."),
+        (["a", "--success-return", "9"], "--success-return needs --suite."),
     ):
         assert main(["evaluate", *arguments]) == 2
         assert message in capsys.readouterr().err

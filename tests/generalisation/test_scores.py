@@ -92,6 +92,34 @@ def test_rows_of_several_runs():
     assert float(lines[1]["low"]) == rows["easy"].low
 
 
+@pytest.mark.parametrize(("task", "given"), [("ball", 105.0), ("dmc_walker_walk", None)])
+def test_success_is_the_share_of_episodes_at_the_threshold(task, given):
+    found = scores(3)
+    if given is None:
+        given, found.returns["run 0"]["easy"][0] = 500.0, 500.0
+    else:
+        found.success_return = given
+    found.task = task
+    rows = {row.level: row for row in found.rows()}
+    for name, levels in (*((name, [name]) for name in LEVELS), (ALL, LEVELS[1:])):
+        of_each = [x for run in found.returns.values() for level in levels for x in run[level]]
+        assert rows[name].success == sum(x >= given for x in of_each) / len(of_each)
+    assert rows["easy"].success > 0
+    head, _, *lines = found.markdown().splitlines()
+    assert head.split("|")[-2].strip() == "success"
+    assert [line.split("|")[-2].strip() for line in lines] == [
+        f"{row.success:.2f}" for row in rows.values()
+    ]
+
+
+def test_a_task_without_a_threshold_has_no_success():
+    for task in ("ball", "walker2d"):
+        found = scores(1)
+        found.task = task
+        assert all(math.isnan(row.success) for row in found.rows())
+        assert "success" not in found.markdown()
+
+
 def test_a_ratio_to_nothing_is_left_out():
     found = Scores("tiny", "ball", {"episodes": 1}, {"run": {"clean": [-2.0], "hard": [-3.0]}})
     clean, hard = found.rows()

@@ -108,7 +108,8 @@ _SWIMMER = Viewpoint((2.4, 2.4, 1.25), (0.0, 0.0, 0.0), 50.0, link=1)
 _LYING = Viewpoint((2.2, -2.2, 1.7), (0.0, 0.0, 0.55), 50.0, link=0)
 
 # Default backends are the paper's, which names none for ant, humanoid and humanoidstandup and lacks
-# the double pendulum.
+# the double pendulum. ``success_return`` of the pendulums is Gymnasium's ``reward_threshold``, and
+# of tasks that PPO learns from pixels halfway between no action and PPO (docs/results.md).
 TASKS = by_name(
     [
         BraxTask(
@@ -120,6 +121,7 @@ TASKS = by_name(
             # Brax's reset noise puts feet below the ground, and the positional backend then throws
             # the ant into the air: a quarter of the episodes ends within four steps.
             backends=("generalized", "mjx", "spring"),
+            success_return=1600.0,
             reward="``v + 1 - 0.5 * sum(a ** 2)``; v: velocity of the torso along x, m/s",
             ends="when the torso's height is outside [0.2, 1] m",
             observation=("``qpos[2:]``", "``qvel``"),
@@ -130,6 +132,7 @@ TASKS = by_name(
             "A planar two-legged body runs along x; never ends early.",
             "spring",
             _PLANAR,
+            success_return=1500.0,
             reward="``v - 0.1 * sum(a ** 2)``; v: velocity of the torso along x, m/s",
             observation=("``qpos[1:]``", "``qvel``"),
         ),
@@ -151,6 +154,7 @@ TASKS = by_name(
             "spring",
             _HUMANOID,
             paper_unscaled=True,
+            success_return=750.0,
             reward="``1.25 * v + 5 - 0.1 * sum(u ** 2)``; v: velocity of the center of mass along "
             "x, m/s",
             ends="when the torso's height is outside [1, 2] m",
@@ -174,6 +178,7 @@ TASKS = by_name(
             "generalized",
             None,
             camera=Viewpoint((0.0, -3.0, 0.6), (0.0, 0.0, 0.6), 55.0),
+            success_return=9100.0,
             reward="``10 - 0.01 * x ** 2 - (z - 2) ** 2 - 0.001 * w1 ** 2 - 0.005 * w2 ** 2``, "
             "without the 10 at the end; x, z: the tip, m; w1, w2: velocities of the hinges, rad/s",
             ends="when the tip's height is at most 1 m",
@@ -191,6 +196,7 @@ TASKS = by_name(
             "generalized",
             _CART,
             paper_unscaled=True,
+            success_return=950.0,
             reward="1 a control step, also at the end",
             ends="when the pole's angle is beyond 0.2 rad",
             observation=("``qpos``", "``qvel``"),

@@ -27,7 +27,15 @@ class DmcTask(Task):
 def _dmc(domain: str, task: str, summary: str) -> DmcTask:
     words = f"{domain}_{task}".split("_")
     camel = "".join(word[:1].upper() + word[1:] for word in words)
-    return DmcTask(f"dmc_{domain}_{task}", f"PixelBrax/DMC-{camel}-v0", summary, domain, task)
+    # A step's reward is at most 1, and an episode has 1,000 steps.
+    return DmcTask(
+        f"dmc_{domain}_{task}",
+        f"PixelBrax/DMC-{camel}-v0",
+        summary,
+        domain,
+        task,
+        success_return=500.0,
+    )
 
 
 # All of them last until the time limit.

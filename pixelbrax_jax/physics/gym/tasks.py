@@ -33,17 +33,18 @@ class GymTask(Task):
         return (*super().other_names(), self.original)
 
 
-def _gym(name: str, original: str, model: str, summary: str, **camera: object) -> GymTask:
+def _gym(name: str, original: str, model: str, summary: str, **options: object) -> GymTask:
     return GymTask(
         f"gym_{name}",
         f"PixelBrax/Gym-{original}-v5",
         summary,
         f"{original}-v5",
         model,
-        **camera,  # type: ignore[arg-type]
+        **options,  # type: ignore[arg-type]
     )
 
 
+# ``success_return`` is Gymnasium's ``reward_threshold``.
 TASKS = by_name(
     [
         _gym(
@@ -51,6 +52,7 @@ TASKS = by_name(
             "Ant",
             "ant.xml",
             "A four-legged body runs along x, until it falls or jumps.",
+            success_return=6000.0,
             distance=4.0,
         ),
         _gym(
@@ -58,6 +60,7 @@ TASKS = by_name(
             "HalfCheetah",
             "half_cheetah.xml",
             "A planar two-legged body runs along x.",
+            success_return=4800.0,
             distance=4.0,
         ),
         _gym(
@@ -65,6 +68,7 @@ TASKS = by_name(
             "Hopper",
             "hopper.xml",
             "A planar one-legged body hops along x, until it falls.",
+            success_return=3800.0,
             lookat=(0.0, 0.0, 1.15),
             distance=3.0,
             elevation=-20.0,
@@ -92,12 +96,14 @@ TASKS = by_name(
             "InvertedDoublePendulum",
             "inverted_double_pendulum.xml",
             "A cart balances two poles in a row, until they fall.",
+            success_return=9100.0,
         ),
         _gym(
             "inverted_pendulum",
             "InvertedPendulum",
             "inverted_pendulum.xml",
             "A cart balances a pole, until it falls.",
+            success_return=950.0,
             distance=2.04,
         ),
         _gym(
@@ -105,13 +111,25 @@ TASKS = by_name(
             "Pusher",
             "pusher_v5.xml",
             "An arm pushes a cylinder to a goal.",
+            success_return=0.0,
             distance=4.0,
             time_limit=100,
         ),
         _gym(
-            "reacher", "Reacher", "reacher.xml", "A planar arm reaches for a target.", time_limit=50
+            "reacher",
+            "Reacher",
+            "reacher.xml",
+            "A planar arm reaches for a target.",
+            success_return=-3.75,
+            time_limit=50,
         ),
-        _gym("swimmer", "Swimmer", "swimmer.xml", "A planar chain of three bodies swims along x."),
+        _gym(
+            "swimmer",
+            "Swimmer",
+            "swimmer.xml",
+            "A planar chain of three bodies swims along x.",
+            success_return=360.0,
+        ),
         _gym(
             "walker2d",
             "Walker2d",
