@@ -33,6 +33,7 @@ TASKS = {
     "dmc_ball_in_cup_catch": "ppo",
     "dmc_cartpole_swingup": "drqv2",
     "dmc_finger_spin": "drqv2",
+    "dmc_walker_stand": "drqv2",
     "dmc_walker_walk": "drqv2",
     "halfcheetah": "drqv2",
 }
