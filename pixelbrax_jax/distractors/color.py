@@ -53,10 +53,11 @@ class Color(Distractor):
         sky: whether the sky shifts too; only with ``mode="geom"``.
         materials: the model's names of the materials that shift, only with ``mode="geom"``; None
             for all. If materials have no names, all shift.
+        ground: whether the ground's material shifts; it does in ``mode="frame"``.
 
     Raises:
         ValueError: an option is unknown or out of range; the message says what is allowed.
-        TypeError: ``sky`` is no bool.
+        TypeError: ``sky`` or ``ground`` is no bool.
     """
 
     mode: str = "frame"
@@ -65,6 +66,7 @@ class Color(Distractor):
     distribution: str = "normal"
     sky: bool = False
     materials: tuple[str, ...] | None = None
+    ground: bool = True
 
     kind: ClassVar[str] = "color"
     stream: ClassVar[int] = 1
@@ -75,8 +77,9 @@ class Color(Distractor):
         check_choice("distribution of Color", self.distribution, DISTRIBUTIONS)
         check_fraction("scale of Color", self.scale)
         check_bool("sky of Color", self.sky)
-        if self.mode == "frame" and (self.sky or self.materials is not None):
-            raise ValueError("sky and materials of Color are only for mode='geom'.")
+        check_bool("ground of Color", self.ground)
+        if self.mode == "frame" and (self.sky or self.materials is not None or not self.ground):
+            raise ValueError("sky, materials and ground of Color are only for mode='geom'.")
         if self.materials is not None and not _are_names(self.materials):
             raise ValueError(
                 f"materials of Color must be a tuple of names, such as ('self', 'grid'), or None, "
@@ -153,7 +156,8 @@ class Color(Distractor):
         if plane is not None:
             # Planes show the ground's colors instead of their own.
             ground = jnp.asarray(params.look.ground_rgb)
-            low, high = low.at[plane].set(-ground.min(0)), high.at[plane].set(1 - ground.max(0))
+            down, up = (-ground.min(0), 1 - ground.max(0)) if self.ground else (0.0, 0.0)
+            low, high = low.at[plane].set(down), high.at[plane].set(up)
         names = params.geoms.material_name
         if self.materials is not None and names:
             if not set(self.materials) & set(names):

@@ -1,4 +1,4 @@
-"""Presets: the distractors of published benchmarks."""
+"""Presets: distractors of published benchmarks, and of one axis alone."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from pixelbrax_jax.distractors.base import Distractor
 from pixelbrax_jax.distractors.camera import MovingCamera
 from pixelbrax_jax.distractors.color import Color
+from pixelbrax_jax.distractors.image_filter import ImageFilter
 from pixelbrax_jax.distractors.light import Light
 from pixelbrax_jax.distractors.video import Video
 from pixelbrax_jax.validation import check_choice
@@ -43,6 +44,24 @@ _FIXED |= {
     for level, scale in (("easy", 0.1), ("hard", 0.2))
 }
 
+# What each axis of the suite ``axes`` changes, at its middle size.
+_FIXED |= {
+    f"axis-{axis}": (link,)
+    for axis, link in {
+        "background": Video(ground_alpha=1.0, dynamics="loop", random_start=False),
+        "palette": Color("geom", "static", 0.2, sky=True),
+        "body-color": Color("geom", "static", 0.2, ground=False),
+        "light-direction": Light(40.0, intensity=0.0, color=0.0),
+        "light-intensity": Light(0.0, intensity=0.4, color=0.0),
+        "light-color": Light(0.0, intensity=0.0, color=0.4),
+        "camera": MovingCamera(0.2, dynamic=False),
+        "blur": ImageFilter(blur=0.02),
+        "contrast": ImageFilter(contrast=0.5),
+        "noise": ImageFilter(noise=0.1),
+        "tint": Color("frame", "static", 0.2),
+    }.items()
+}
+
 PRESETS = (
     *_FIXED,
     *(f"dcs-{level}{suffix}" for level in _SCALES for suffix in ("", "-static")),
@@ -59,6 +78,9 @@ def preset(name: str, task: str) -> tuple[Distractor, ...]:
       the ground the video covers.
     * ``"color-easy"``, ``"color-hard"``, ``"video-easy"``, ``"video-hard"``: of the DMControl
       Generalization Benchmark, arXiv 2011.13389; colors are sampled, see ``Color``.
+    * ``"axis-..."``: ``background``, ``palette``, ``body-color``, ``light-direction``,
+      ``light-intensity``, ``light-color``, ``camera``, ``blur``, ``contrast``, ``noise`` or
+      ``tint`` alone, to train for that axis of the suite ``axes``.
     """
     check_choice("distractor", name, PRESETS)
     if name in _FIXED:

@@ -316,7 +316,8 @@ def test_make_shares_clips_and_warns_of_procedural_ones():
         (Video, {"mode": "overlay", "ground_alpha": 0.0}, "only for mode='background'"),
         (Video, {"num_clips": 0}, "num_clips of Video must be a positive integer, got 0"),
         (MovingCamera, {"scale": -1}, r"scale of MovingCamera must lie in \[0, 1\], got -1"),
-        (Color, {"sky": True}, r"sky and materials of Color are only for mode='geom'"),
+        (Color, {"sky": True}, r"sky, materials and ground of Color are only for mode='geom'"),
+        (Color, {"ground": False}, r"sky, materials and ground of Color are only for mode='geom'"),
     ],
 )
 def test_options_are_checked(distractor, options, message):
@@ -328,6 +329,7 @@ def test_options_are_checked(distractor, options, message):
     ("distractor", "options", "message"),
     [
         (Color, {"mode": "geom", "sky": "no"}, "sky of Color must be True or False, got 'no'"),
+        (Color, {"mode": "geom", "ground": 1}, "ground of Color must be True or False, got 1"),
         (MovingCamera, {"dynamic": "false"}, "dynamic of MovingCamera must be True or False"),
         (Video, {"random_start": "no"}, "random_start of Video must be True or False"),
     ],

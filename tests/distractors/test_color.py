@@ -149,6 +149,17 @@ def test_only_some_materials_shift():
         assert (shifts != 0).any(axis=1).tolist() == moves
 
 
+def test_the_ground_can_stay():
+    color = distractors.Color("geom", "static", 0.3, ground=False)
+    shifts = starts(color)[:100]
+    plane = PARAMS.geoms.material[0]
+    assert PARAMS.geoms.is_ground(0)
+    assert (shifts[:, plane] == 0).all()
+    assert (np.delete(shifts, plane, axis=1) != 0).all()
+    changed = color.change_params(shifts[0], PARAMS)
+    np.testing.assert_array_equal(changed.look.ground_rgb, PARAMS.look.ground_rgb)
+
+
 def test_materials_that_a_model_has_not():
     color = distractors.Color("geom", "static", 0.3, "uniform", materials=("gird",))
     params = PARAMS.replace(geoms=PARAMS.geoms.replace(material_name=("floor", "skin")))

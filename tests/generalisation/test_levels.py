@@ -12,7 +12,8 @@ from pixelbrax_jax.config import EnvConfig
 from pixelbrax_jax.distractors.base import Chain
 from pixelbrax_jax.distractors.clips import load_clips
 from pixelbrax_jax.distractors.color import Color
-from pixelbrax_jax.distractors.presets import preset
+from pixelbrax_jax.distractors.light import Light
+from pixelbrax_jax.distractors.presets import PRESETS, preset
 from pixelbrax_jax.distractors.video import Video
 from pixelbrax_jax.generalisation.changes import Radius, Rotation, Shift
 from pixelbrax_jax.generalisation.making import make_levels
@@ -74,6 +75,24 @@ def test_dcs_has_its_presets_on_both_splits():
         8,
         None,
     ]
+
+
+def test_an_agent_can_train_on_each_axis():
+    """Under the distractor of the middle level, or one that draws up to its change."""
+    rows = {level.name: level for level in levels_of("axes", "dmc_walker_walk")}
+    axes = [name.removesuffix("-2") for name in rows if name.endswith("-2")]
+    assert [f"axis-{axis}" for axis in axes] == [n for n in PRESETS if n.startswith("axis-")]
+    for axis in axes:
+        (trained,), (tested,) = preset(f"axis-{axis}", "dmc_walker_walk"), rows[f"{axis}-2"].changes
+        if isinstance(trained, Light):
+            sizes = {"direction": 0.0, "intensity": 0.0, "color": 0.0}
+            sizes[axis.removeprefix("light-")] = next(iter(vars(tested).values()))
+            assert vars(trained) == sizes
+        elif axis == "body-color":
+            assert (trained.scale, trained.ground, trained.sky) == (tested.scale, False, False)
+        else:
+            assert trained == tested
+    assert rows["background-2"].clips == ("test",)
 
 
 def test_subtle_has_five_sizes():
