@@ -15,21 +15,21 @@ from typing import Any, NamedTuple
 
 from pixelbrax_gym.bench.machine import PACKAGES, installed_version
 from pixelbrax_jax.cache import cache_folder
-from pixelbrax_jax.extras import install_extra
+from pixelbrax_jax.extras import install_extra, lacking
 from pixelbrax_jax.processor import name_cpu
 
 EXTRAS = {
     "torch": "torch",
     "torchrl": "torchrl",
-    "stable-baselines3": "sb3",
-    "dm-control": "dmc",
-    "orbax-checkpoint": "train",
-    "tqdm": "clips",
-    "moviepy": "video",
-    "pygame": "human",
-    "minari": "dataset",
+    "sb3": "stable-baselines3",
+    "dmc": "dm-control",
+    "train": "orbax-checkpoint",
+    "clips": "imageio-ffmpeg",
+    "video": "moviepy",
+    "human": "pygame",
+    "dataset": "minari",
 }
-"""Package -> the extra that installs it."""
+"""Extra -> its package whose version is shown."""
 
 _JAX_ON_CUDA = install_extra("cuda12", "cuda13")
 _GPUS = ("gpu", "cuda", "rocm")
@@ -78,6 +78,7 @@ class Machine:
     """Facts about a machine, as ``inspect`` collects them."""
 
     versions: dict[str, str | None]  # package -> installed version, or None
+    lacking: dict[str, list[str]]  # extra -> its packages that are not installed, if any
     jax_device: str | None  # JAX's default device, such as cuda:0
     jax_platform: str | None  # cpu, gpu, tpu, ...
     jax_error: str | None  # why JAX has no device
@@ -113,10 +114,9 @@ def _findings(m: Machine) -> Iterator[Finding]:
     yield _ok(f"{platform.platform()}, {name_cpu()}")
     here = ", ".join(f"{name} {release}" for name, release in m.versions.items() if release)
     yield _ok(f"Python {platform.python_version()}, {here}")
-    lacking = [extra for name, extra in EXTRAS.items() if m.versions[name] is None]
-    if lacking:
-        what = f"{', '.join(lacking)} {'are' if len(lacking) > 1 else 'is'} not installed"
-        yield _note(f"extras: {what}", f"optional: {install_extra(','.join(lacking))}")
+    if m.lacking:
+        each = [f"{extra} lacks {', '.join(names)}" for extra, names in m.lacking.items()]
+        yield _note(f"extras: {'; '.join(each)}", f"optional: {install_extra(','.join(m.lacking))}")
 
     on_cpu, on_gpu = m.jax_platform == "cpu", m.jax_platform in _GPUS
     if m.jax_error is None:
@@ -223,7 +223,7 @@ def report(findings: list[Finding]) -> str:
 
 def inspect() -> Machine:
     """Inspect this machine; starts JAX and takes a second or two."""
-    versions = {name: installed_version(name) for name in (*PACKAGES, *EXTRAS)}
+    versions = {name: installed_version(name) for name in (*PACKAGES, *EXTRAS.values())}
     broken = broken_variables()
     # XLA would abort this process because of its flags.
     first: Any = broken.get("XLA_FLAGS") or _attempt(lambda: import_module("jax").devices()[0])
@@ -237,6 +237,7 @@ def inspect() -> Machine:
             to_torch, to_jax = _attempt(_shares_to_torch), _attempt(_shares_to_jax)
     return Machine(
         versions=versions,
+        lacking={extra: names for extra in EXTRAS if (names := lacking(extra))},
         jax_device=str(first) if has_jax else None,
         jax_platform=first.platform if has_jax else None,
         jax_error=None if has_jax else first,

@@ -6,6 +6,7 @@ import importlib
 import re
 import sys
 import tomllib
+from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,7 @@ from pixelbrax_gym import cli, doctor
 from pixelbrax_gym.gymnasium import window
 from pixelbrax_jax import load_clips
 from pixelbrax_jax.distractors import media
-from pixelbrax_jax.extras import install_extra
+from pixelbrax_jax.extras import install_extra, lacking
 from pixelbrax_jax.video import write_frames
 
 ROOT = Path(__file__).parents[1]
@@ -36,9 +37,9 @@ def test_there_is_one_place_that_says_how():
 def test_extras_that_are_named_exist():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     sources = "".join(path.read_text("utf-8") for path in SOURCES)
-    calls = re.findall(r"(?:install|needs)_extra\(([^)]*)\)", sources)
+    calls = re.findall(r"(?:install|needs|check)_extra\(([^)]*)\)", sources)
     named = {name for call in calls for name in re.findall(r"""["'](\w+)["']""", call)}
-    named |= set(doctor.EXTRAS.values())
+    named |= set(doctor.EXTRAS)
     assert {"torch", "clips", "cuda13"} <= named
     assert named <= set(project["optional-dependencies"])
 
@@ -80,6 +81,27 @@ def test_a_video_needs_an_extra(monkeypatch, tmp_path):
         monkeypatch.setitem(sys.modules, absent, None)
         with pytest.raises(ImportError, match=r"needs imageio-ffmpeg and Pillow; try: .*\[video\]"):
             write_frames(tmp_path / name, [], 20)
+
+
+def test_training_needs_every_package_of_its_extra(monkeypatch, capsys):
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    for extra in doctor.EXTRAS:
+        packages = project["optional-dependencies"][extra]
+        own = {re.split(r"[^\w.-]", line)[0] for line in packages} - {"pixelbrax"}
+        with monkeypatch.context() as without:
+            without.setattr(metadata, "version", absent)
+            assert own <= {name.replace("-", "_") for name in lacking(extra)} | set(lacking(extra))
+    monkeypatch.setattr(
+        metadata, "version", lambda name: absent(name) if name in ("psutil", "tqdm") else "1"
+    )
+    assert cli.main(["train", "ppo", "--preset", "ci"]) == 1
+    told = capsys.readouterr().err
+    assert "training an agent needs psutil, tqdm, which are not installed" in told
+    assert '"pixelbrax[train]"' in told
+
+
+def absent(name):
+    raise metadata.PackageNotFoundError(name)
 
 
 @pytest.mark.parametrize("command", ["train", "evaluate", "record"])

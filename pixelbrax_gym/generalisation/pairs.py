@@ -126,7 +126,8 @@ def record_pairs(
         "sees": sees,
         "policy": "uniform" if policy is None else policy_name,
     }
-    storage = _storage(Path(output_dir), pairs, settings)
+    # Minari joins a relative folder to itself.
+    storage = _storage(Path(output_dir).absolute(), pairs, settings)
     first = storage.total_episodes
     size = pairs.bytes_per_episode * (episodes - first) / 1e9
     report(f"{episodes - first} episodes, at most {size:.2f} GB before compression")

@@ -94,6 +94,9 @@ _SUBTLE = {
 }
 
 
+_OTHERS = "The suites axes, dcs and paper have levels for any task."
+
+
 def _video(name: str, hard: bool, ground: bool, *others: Change | Distractor) -> Level:
     video = _VIDEO_EASY if ground else _VIDEO_HARD
     clips, num = (_HARD_CLIPS, 100) if hard else (_EASY_CLIPS, 10)
@@ -133,7 +136,7 @@ def _dmcgb2(task: str) -> tuple[Level, ...]:
     if domain is None:
         raise ValueError(
             f"suite 'dmcgb2' has no levels for task {task!r}, only for tasks of "
-            f"{', '.join(_CORNERS)}, whose shifts of the camera it defines."
+            f"{', '.join(_CORNERS)}, whose shifts of the camera it defines. {_OTHERS}"
         )
     hard_shift = _CORNERS[domain]
     levels = [CLEAN]
@@ -182,7 +185,8 @@ def _paper(task: str) -> tuple[Level, ...]:
 def _subtle(task: str) -> tuple[Level, ...]:
     if task not in _SUBTLE:
         raise ValueError(
-            f"suite 'subtle' has no levels for task {task!r}, only for {', '.join(_SUBTLE)}."
+            f"suite 'subtle' has no levels for task {task!r}, only for {', '.join(_SUBTLE)}. "
+            f"{_OTHERS}"
         )
     return CLEAN, Level("subtle", (_SUBTLE[task],))
 

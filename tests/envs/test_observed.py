@@ -199,6 +199,7 @@ def test_the_order_of_parts_does_not_matter():
     [
         ({"obs_mode": "rgbd"}, "unknown obs_mode: 'rgbd'; allowed: both, depth, pixels, segm"),
         ({"obs_mode": "pixels+rgb"}, r"obs_mode='pixels\+rgb' must join different ones of pixels"),
+        ({"obs_mode": "pixels,depth"}, r"obs_mode='pixels,depth' must join .* by '\+'"),
         ({"obs_mode": "depth+depth"}, r"obs_mode='depth\+depth' must join different ones"),
         ({"obs_mode": 3}, "unknown obs_mode: 3"),
         ({"camera": ("front", "side", "front")}, "has 'front' twice; give each viewpoint once"),

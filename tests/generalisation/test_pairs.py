@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -73,7 +75,11 @@ def test_both_views_of_each_episode_are_stored_without_loss(tmp_path):
 
 
 @pytest.mark.parametrize("policy", [of_numpy, None])
-def test_a_stopped_recording_continues(policy, tmp_path):
+@pytest.mark.parametrize("relative", [False, True])
+def test_a_stopped_recording_continues(policy, relative, tmp_path, monkeypatch):
+    if relative:
+        monkeypatch.chdir(tmp_path)
+        tmp_path = Path("pairs")
     whole = record(tmp_path / "whole", policy)
     told = []
 

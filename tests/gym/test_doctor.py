@@ -10,7 +10,8 @@ import pytest
 from pixelbrax_gym import cli, doctor
 
 HEALTHY = doctor.Machine(
-    versions=dict.fromkeys(("jax", *doctor.EXTRAS), "1.0"),
+    versions=dict.fromkeys(("jax", *doctor.EXTRAS.values()), "1.0"),
+    lacking={},
     jax_device="cuda:0",
     jax_platform="gpu",
     jax_error=None,
@@ -117,10 +118,10 @@ def test_a_healthy_machine():
         ),
         ({"cache": "/home cannot be written"}, "note", "reads them again", "PIXELBRAX_CACHE"),
         (
-            {"versions": HEALTHY.versions | {"torchrl": None}},
+            {"lacking": {"torchrl": ["torchrl"], "train": ["flatbuffers", "psutil"]}},
             "note",
-            "extras: torchrl is not installed",
-            "pixelbrax[torchrl]",
+            "extras: torchrl lacks torchrl; train lacks flatbuffers, psutil",
+            "pixelbrax[torchrl,train]",
         ),
     ],
 )

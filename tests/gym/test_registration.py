@@ -10,6 +10,7 @@ import pytest
 
 import pixelbrax_gym
 import pixelbrax_jax
+from pixelbrax_jax import registry
 from tests.gym.conftest import ID, SIZE, TASK
 
 TASKS = {
@@ -42,13 +43,15 @@ def test_lazy_names():
         _ = pixelbrax_gym.nothing
 
 
-def test_register_rejects_unknown_tasks_and_taken_ids():
+def test_register_rejects_unknown_tasks_and_taken_ids(monkeypatch):
     with pytest.raises(ValueError, match=r"unknown task: 'toy_bal'.*Did you mean 'toy_ball'"):
         pixelbrax_gym.register("toy_bal")
     with pytest.raises(ValueError, match="'PixelBrax/Ant-v0' is already registered"):
         pixelbrax_gym.register(TASK, "PixelBrax/Ant-v0")
     assert pixelbrax_gym.register(TASK) == ID, "once more"
     assert pixelbrax_gym.register(TASK, "Mine/Ball-v3") == "Mine/Ball-v3"
+    monkeypatch.setitem(registry._OWN_TASKS, "glass arm/2", registry._OWN_TASKS[TASK])
+    assert pixelbrax_gym.register("glass arm/2") == "PixelBrax/GlassArm2-v0"
     assert gymnasium.spec("Mine/Ball-v3").kwargs == {"task": TASK}
 
 
