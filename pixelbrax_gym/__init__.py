@@ -60,7 +60,7 @@ def register(task: str, id: str | None = None) -> str:  # noqa: A002  # Gymnasiu
 
     check_choice("task", task, list_envs())
     if id is None:
-        name = "".join(part[:1].upper() + part[1:] for part in re.split(r"[\W_]+", task))
+        name = "".join(part[:1].upper() + part[1:] for part in re.split(r"[^\w:.-]+|_+", task))
         id = TASKS[task].gymnasium_id if task in TASKS else f"PixelBrax/{name}-v0"  # noqa: A001
     known = gym.registry.get(id)
     if known is None:

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 from pixelbrax_gym.bench.machine import PACKAGES, installed_version
 from pixelbrax_jax.cache import cache_folder
-from pixelbrax_jax.extras import install_extra, lacking
+from pixelbrax_jax.extras import install_extra, missing_packages
 from pixelbrax_jax.processor import name_cpu
 
 EXTRAS = {
@@ -78,7 +78,7 @@ class Machine:
     """Facts about a machine, as ``inspect`` collects them."""
 
     versions: dict[str, str | None]  # package -> installed version, or None
-    lacking: dict[str, list[str]]  # extra -> its packages that are not installed, if any
+    missing: dict[str, list[str]]  # extra -> its packages that are not installed, if any
     jax_device: str | None  # JAX's default device, such as cuda:0
     jax_platform: str | None  # cpu, gpu, tpu, ...
     jax_error: str | None  # why JAX has no device
@@ -114,9 +114,9 @@ def _findings(m: Machine) -> Iterator[Finding]:
     yield _ok(f"{platform.platform()}, {name_cpu()}")
     here = ", ".join(f"{name} {release}" for name, release in m.versions.items() if release)
     yield _ok(f"Python {platform.python_version()}, {here}")
-    if m.lacking:
-        each = [f"{extra} lacks {', '.join(names)}" for extra, names in m.lacking.items()]
-        yield _note(f"extras: {'; '.join(each)}", f"optional: {install_extra(','.join(m.lacking))}")
+    if m.missing:
+        each = [f"{extra} lacks {', '.join(names)}" for extra, names in m.missing.items()]
+        yield _note(f"extras: {'; '.join(each)}", f"optional: {install_extra(','.join(m.missing))}")
 
     on_cpu, on_gpu = m.jax_platform == "cpu", m.jax_platform in _GPUS
     if m.jax_error is None:
@@ -237,7 +237,7 @@ def inspect() -> Machine:
             to_torch, to_jax = _attempt(_shares_to_torch), _attempt(_shares_to_jax)
     return Machine(
         versions=versions,
-        lacking={extra: names for extra in EXTRAS if (names := lacking(extra))},
+        missing={extra: names for extra in EXTRAS if (names := missing_packages(extra))},
         jax_device=str(first) if has_jax else None,
         jax_platform=first.platform if has_jax else None,
         jax_error=None if has_jax else first,

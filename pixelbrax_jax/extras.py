@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import metadata
@@ -22,30 +21,16 @@ def needs_extra(extra: str, lacking: str = "") -> Iterator[None]:
         raise ImportError(f"{lacking or error}; try: {install_extra(extra)}") from error
 
 
-def lacking(extra: str) -> list[str]:
+def missing_packages(extra: str) -> list[str]:
     """Return the packages of an extra that are not installed, by PixelBrax's own metadata."""
-    try:
-        required = metadata.requires("pixelbrax") or []
-    except metadata.PackageNotFoundError:
-        # The sources are used without being installed.
-        return []
+    from packaging.requirements import Requirement
+
     found = []
-    for line in required:
-        package, _, condition = line.partition(";")
-        if re.search(rf"extra == ['\"]{extra}['\"]", condition):
-            name = re.split(r"[^\w.-]", package, maxsplit=1)[0]
+    for requirement in map(Requirement, metadata.requires("pixelbrax") or ()):
+        marker = requirement.marker
+        if marker and marker.evaluate({"extra": extra}) and not marker.evaluate({"extra": ""}):
             try:
-                metadata.version(name)
+                metadata.version(requirement.name)
             except metadata.PackageNotFoundError:
-                found.append(name)
+                found.append(requirement.name)
     return found
-
-
-def check_extra(extra: str, what: str) -> None:
-    """Raise an ImportError that names what an extra lacks; ``what`` needs it."""
-    if names := lacking(extra):
-        verb = "is" if len(names) == 1 else "are"
-        raise ImportError(
-            f"{what} needs {', '.join(names)}, which {verb} not installed; try: "
-            f"{install_extra(extra)}"
-        )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
@@ -86,10 +85,10 @@ def _items(value: Any) -> tuple[Any, ...]:
 
 def check_obs_mode(value: object) -> str:
     """Return an ``obs_mode`` with its parts ordered like ``PARTS``; "both" for pixels and state."""
-    parts = re.split("[+,]", value) if isinstance(value, str) else []
-    if len(parts) < 2:
+    parts = value.split("+") if isinstance(value, str) else []
+    if len(parts) < 2 and "," not in str(value):
         check_choice("obs_mode", value, ("both", *PARTS))
-    elif "," not in str(value) and set(parts) <= set(PARTS) and len(set(parts)) == len(parts):
+    elif set(parts) <= set(PARTS) and len(set(parts)) == len(parts):
         value = "+".join(sorted(parts, key=PARTS.index))
     else:
         raise ValueError(

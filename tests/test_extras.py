@@ -15,7 +15,7 @@ from pixelbrax_gym import cli, doctor
 from pixelbrax_gym.gymnasium import window
 from pixelbrax_jax import load_clips
 from pixelbrax_jax.distractors import media
-from pixelbrax_jax.extras import install_extra, lacking
+from pixelbrax_jax.extras import install_extra, missing_packages
 from pixelbrax_jax.video import write_frames
 
 ROOT = Path(__file__).parents[1]
@@ -37,7 +37,7 @@ def test_there_is_one_place_that_says_how():
 def test_extras_that_are_named_exist():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     sources = "".join(path.read_text("utf-8") for path in SOURCES)
-    calls = re.findall(r"(?:install|needs|check)_extra\(([^)]*)\)", sources)
+    calls = re.findall(r"(?:install|needs)_extra\(([^)]*)\)", sources)
     named = {name for call in calls for name in re.findall(r"""["'](\w+)["']""", call)}
     named |= set(doctor.EXTRAS)
     assert {"torch", "clips", "cuda13"} <= named
@@ -83,20 +83,31 @@ def test_a_video_needs_an_extra(monkeypatch, tmp_path):
             write_frames(tmp_path / name, [], 20)
 
 
-def test_training_needs_every_package_of_its_extra(monkeypatch, capsys):
+def test_missing_packages_are_those_of_the_project(monkeypatch):
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
-    for extra in doctor.EXTRAS:
-        packages = project["optional-dependencies"][extra]
-        own = {re.split(r"[^\w.-]", line)[0] for line in packages} - {"pixelbrax"}
-        with monkeypatch.context() as without:
-            without.setattr(metadata, "version", absent)
-            assert own <= {name.replace("-", "_") for name in lacking(extra)} | set(lacking(extra))
-    monkeypatch.setattr(
-        metadata, "version", lambda name: absent(name) if name in ("psutil", "tqdm") else "1"
-    )
-    assert cli.main(["train", "ppo", "--preset", "ci"]) == 1
+    lines = [
+        f"{line}; extra == '{x}'"
+        for x in ("train", "dataset")
+        for line in project["optional-dependencies"][x]
+    ]
+    lines += ["jax>=0.10", "dm-control>=1; (python_version < '3.13') and extra == 'dmc'"]
+    lines += ["later>=1; (python_version > '3.99') and extra == 'dmc'"]
+    monkeypatch.setattr(metadata, "requires", lambda _: lines)
+    monkeypatch.setattr(metadata, "version", absent)
+    names = [re.split(r"[^\w.-]", line)[0] for line in project["optional-dependencies"]["train"]]
+    assert missing_packages("train") == names
+    assert missing_packages("dmc") == (["dm-control"] if sys.version_info < (3, 13) else [])
+    monkeypatch.setattr(metadata, "version", lambda name: absent(name) if name == "psutil" else "1")
+    assert missing_packages("train") == ["psutil"]
+    assert missing_packages("dataset") == []
+
+
+def test_training_does_not_begin_without_what_its_end_needs(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "flatbuffers", None)
+    monkeypatch.delitem(sys.modules, "pixelbrax_jax.agents.runner.train", raising=False)
+    assert cli.main(["train", "ppo", "--preset", "ci", "--total-steps", "0"]) == 1
     told = capsys.readouterr().err
-    assert "training an agent needs psutil, tqdm, which are not installed" in told
+    assert "flatbuffers" in told
     assert '"pixelbrax[train]"' in told
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import closing
@@ -59,7 +60,10 @@ def run(arguments: Sequence[str]) -> int:
         for name, value in (("split", options.split), ("in", options.where)):
             if value:
                 raise UsageError(f"--suite plays its own levels; leave out --{name}.")
-        own = options.episodes, options.output_dir, options.success_return
+        threshold = options.success_return
+        if threshold is not None and not math.isfinite(threshold):
+            raise UsageError(f"--success-return must be a finite number, got {threshold}.")
+        own = options.episodes, options.output_dir, threshold
         sys.stdout.write(evaluate(options, options.runs, options.suite, *own) + "\n")
         return 0
     for name, given in (

@@ -17,7 +17,7 @@ from tyro.constructors import (
 )
 
 from pixelbrax_gym.cli import CommandError, UsageError, say
-from pixelbrax_jax.extras import check_extra, needs_extra
+from pixelbrax_jax.extras import needs_extra
 from pixelbrax_jax.validation import check_choice, check_positive_int
 
 if TYPE_CHECKING:
@@ -76,9 +76,8 @@ def _first(arguments: Sequence[str]) -> _First:
 
 def run(arguments: Sequence[str]) -> int:
     """Run the command."""
-    check_extra("train", "training an agent")
     with needs_extra("train"):
-        from pixelbrax_jax.agents.presets import PRESETS, preset_names
+        from pixelbrax_jax.agents.presets import PRESETS, check_preset
         from pixelbrax_jax.agents.registry import ALGORITHMS
         from pixelbrax_jax.agents.runner.checkpoint import CheckpointError, latest_steps
         from pixelbrax_jax.agents.runner.train import TrainingDivergedError, train
@@ -99,8 +98,7 @@ def run(arguments: Sequence[str]) -> int:
         )
     try:
         check_choice("algorithm", algorithm, ALGORITHMS)
-        if (name := _first(rest).preset) not in PRESETS:
-            check_choice("preset", name, preset_names(algorithm))
+        check_preset(algorithm, _first(rest).preset)
     except ValueError as error:
         raise UsageError(str(error)) from error
     launch, config, options = parse(algorithm, rest)

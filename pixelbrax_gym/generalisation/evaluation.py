@@ -17,7 +17,7 @@ from pixelbrax_jax.config import ENV_OPTIONS, env_config
 from pixelbrax_jax.flags import default_flags
 from pixelbrax_jax.generalisation.making import LevelEnv, Levels, make_levels
 from pixelbrax_jax.generalisation.suites import EPISODES, SUITES
-from pixelbrax_jax.validation import check_choice
+from pixelbrax_jax.validation import check_choice, check_finite
 
 Policy = Callable[[Any], Any]
 
@@ -54,12 +54,13 @@ def evaluate_suite(
             ``levels.png``. Levels that the file has are not played again; it knows policies by
             name alone.
         report: takes a line after each level.
-        success_return: an episode with at least this return is a success; None for the task's.
+        success_return: an episode with at least this return is a success; None for the task's, with
+            which ``episode_length`` and ``reward_preset`` must be the usual ones.
         **options: other options of ``pixelbrax_jax.make``, such as ``action_repeat``.
 
     Raises:
         ValueError: the suite is unknown or has no levels for the task, the policy returns another
-            shape, or the folder has returns of other options.
+            shape, the folder has returns of other options, or ``success_return`` is not finite.
         FileNotFoundError: clips are missing; the message says where to get them.
         TypeError: an option is unknown or the suite's own, or a policy cannot be called.
         ImportError: ``output_dir`` is given and Pillow is missing.
@@ -71,6 +72,8 @@ def evaluate_suite(
     if not policies:
         raise ValueError("policy must have at least one policy, got an empty mapping.")
     check_choice("suite", suite, SUITES)
+    if success_return is not None:
+        check_finite("success_return", success_return)
     if own := [name for name in LEFT_OUT if name in options]:
         raise TypeError(f"{own[0]} is decided by the levels of a suite; leave it out.")
     config = env_config(task, options, _OWN_OPTIONS)

@@ -16,13 +16,12 @@ import numpy as np
 
 from pixelbrax_gym.bench.tables import table
 from pixelbrax_jax.cache import replacing
-from pixelbrax_jax.config import ENV_OPTIONS
+from pixelbrax_jax.config import ENV_OPTIONS, EnvConfig
 from pixelbrax_jax.generalisation.frames import write_sheet
 from pixelbrax_jax.generalisation.intervals import interquartile_mean
 from pixelbrax_jax.generalisation.making import UNDISTURBED, LevelEnv, Levels
 from pixelbrax_jax.plain import to_plain
 from pixelbrax_jax.tasks import TASKS
-from pixelbrax_jax.validation import check_finite
 
 RETURNS, ROWS, SHEET = "returns.json", "table.csv", "levels.png"
 """Files in the output folder."""
@@ -46,8 +45,8 @@ class Row:
     ``low`` and ``high`` are the ends of its 95 % stratified bootstrap interval, NaN for one run.
     ``standard_error`` is that of a run's mean over its episodes, averaged over runs; NaN for one
     episode and for the last row. ``ratio`` is ``mean`` over that of the level clean; NaN if that is
-    not positive. ``success`` is the share of all episodes whose return reaches a threshold; NaN
-    without one.
+    not positive. ``success`` is the share of all episodes with at least the return
+    ``success_return``; both are NaN without one.
     """
 
     level: str
@@ -59,13 +58,15 @@ class Row:
     standard_error: float
     ratio: float
     success: float
+    success_return: float
 
 
 @dataclass
 class Scores:
     """The (E,) ``returns`` of a suite's episodes by run and level, and all that decides them.
 
-    An episode with at least ``success_return`` is a success; None takes the task's, if it has one.
+    An episode with at least ``success_return`` is a success. None takes the task's, if it has one
+    and ``options`` have the usual rewards and length of episodes.
     """
 
     suite: str
@@ -91,9 +92,9 @@ class Scores:
 
     def _row(self, name: str, returns: np.ndarray, error: float, rows: Sequence[Row]) -> Row:
         """Return the row of (S, R, E) returns of S levels."""
-        low = high = success = math.nan
-        if (threshold := self._threshold()) is not None:
-            success = float((returns >= threshold).mean())
+        low = high = math.nan
+        threshold = self._threshold()
+        success = math.nan if math.isnan(threshold) else float((returns >= threshold).mean())
         scores = returns.mean(axis=2)
         mean = float(scores.mean())
         if scores.shape[1] > 1:
@@ -101,13 +102,17 @@ class Scores:
         clean = rows[0].mean if rows else mean
         ratio = mean / clean if clean > 0 else math.nan
         episodes = int(self.options["episodes"])
-        return Row(name, scores.shape[1], episodes, mean, low, high, error, ratio, success)
+        runs = scores.shape[1]
+        return Row(name, runs, episodes, mean, low, high, error, ratio, success, threshold)
 
-    def _threshold(self) -> float | None:
+    def _threshold(self) -> float:
         if self.success_return is not None:
             return self.success_return
-        task = TASKS.get(self.task)
-        return None if task is None else task.success_return
+        task, usual = TASKS.get(self.task), EnvConfig()
+        if task is None or task.success_return is None:
+            return math.nan
+        decisive = {name: getattr(usual, name) for name in ("episode_length", "reward_preset")}
+        return task.success_return if decisive.items() <= self.options.items() else math.nan
 
     def markdown(self) -> str:
         """Return the table in Markdown."""
@@ -116,12 +121,14 @@ class Scores:
         heads = ["level", "return (IQM)" if several else "return"]
         heads += ["95 % interval"] if several else []
         heads += ["standard error", "ratio to clean"]
-        heads += ["success"] if self._threshold() is not None else []
+        succeeds = not math.isnan(threshold := self._threshold())
+        heads += [f"success (from {threshold:g})"] if succeeds else []
         lines = []
         for row in rows:
             interval = [f"{row.low:.1f} to {row.high:.1f}"] if several else []
-            numbers = [_text(row.standard_error, 1), _text(row.ratio, 2), _text(row.success, 2)]
-            lines.append([row.level, f"{row.mean:.1f}", *interval, *numbers][: len(heads)])
+            numbers = [_text(row.standard_error, 1), _text(row.ratio, 2)]
+            numbers += [f"{row.success:.2f}"] if succeeds else []
+            lines.append([row.level, f"{row.mean:.1f}", *interval, *numbers])
         return table(heads, lines)
 
     def csv(self) -> str:
@@ -159,8 +166,6 @@ def play(
     The folder gets the contact sheet first and the returns after each level; levels whose returns
     it has are not played again.
     """
-    if success_return is not None:
-        success_return = check_finite("success_return", success_return)
     options = options_of(levels)
     scores = Scores(levels.suite, levels.config.task, options, success_return=success_return)
     path = None if folder is None else Path(folder)
@@ -204,7 +209,7 @@ def read(scores: Scores, folder: Path) -> Returns:
     wanted = json.loads(_json(scores, {}))
     there, here = ({**one, **one["options"]} for one in (found, wanted))
     for name in [*here, *there]:
-        if name in ("returns", "options", "success_return") or there.get(name) == here.get(name):
+        if name in ("returns", "options") or there.get(name) == here.get(name):
             continue
         raise ValueError(
             f"{file} has {name}={there.get(name)!r}, this call {here.get(name)!r}: its levels "
@@ -214,4 +219,6 @@ def read(scores: Scores, folder: Path) -> Returns:
 
 
 def _json(scores: Scores, returns: Mapping[str, Any]) -> str:
-    return json.dumps(asdict(scores) | {"returns": returns}) + "\n"
+    kept = asdict(scores) | {"returns": returns}
+    del kept["success_return"]
+    return json.dumps(kept) + "\n"

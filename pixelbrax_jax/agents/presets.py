@@ -254,6 +254,17 @@ def preset_names(algorithm: str) -> list[str]:
     return [name for name, settings in PRESETS.items() if algorithm in settings]
 
 
+def check_preset(algorithm: str, name: str) -> None:
+    """Raise a ValueError unless a preset of this name has settings for an algorithm."""
+    of_others = name in list(PRESETS) and algorithm not in PRESETS[name]
+    if of_others:
+        raise ValueError(
+            f"the preset {name!r} has no settings for {algorithm}; use one of "
+            f"{', '.join(preset_names(algorithm))}."
+        )
+    check_choice("preset", name, preset_names(algorithm))
+
+
 def preset(
     algorithm: str, name: str = "default", task: str | None = None, **changes: Any
 ) -> TrainConfig:
@@ -267,13 +278,7 @@ def preset(
             or the task.
     """
     check_choice("algorithm", algorithm, ALGORITHMS)
-    known = preset_names(algorithm) if name not in list(PRESETS) else PRESETS
-    check_choice("preset", name, known)
-    if algorithm not in PRESETS[name]:
-        raise ValueError(
-            f"the preset {name!r} has no settings for {algorithm}; use one of "
-            f"{', '.join(preset_names(algorithm))}."
-        )
+    check_preset(algorithm, name)
     kind, settings = ALGORITHMS[algorithm].config_class, PRESETS[name][algorithm]
     if task is not None:
         settings = settings | {"task": task}

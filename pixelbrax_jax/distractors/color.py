@@ -53,7 +53,8 @@ class Color(Distractor):
         sky: whether the sky shifts too; only with ``mode="geom"``.
         materials: the model's names of the materials that shift, only with ``mode="geom"``; None
             for all. If materials have no names, all shift.
-        ground: whether the ground's material shifts; it does in ``mode="frame"``.
+        ground: whether the ground, planes with the look's checkers, shifts; False only with
+            ``mode="geom"`` and without ``materials``.
 
     Raises:
         ValueError: an option is unknown or out of range; the message says what is allowed.
@@ -80,6 +81,8 @@ class Color(Distractor):
         check_bool("ground of Color", self.ground)
         if self.mode == "frame" and (self.sky or self.materials is not None or not self.ground):
             raise ValueError("sky, materials and ground of Color are only for mode='geom'.")
+        if self.materials is not None and not self.ground:
+            raise ValueError("materials of Color name all that shifts: leave out ground.")
         if self.materials is not None and not _are_names(self.materials):
             raise ValueError(
                 f"materials of Color must be a tuple of names, such as ('self', 'grid'), or None, "

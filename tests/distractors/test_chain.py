@@ -317,6 +317,11 @@ def test_make_shares_clips_and_warns_of_procedural_ones():
         (Video, {"num_clips": 0}, "num_clips of Video must be a positive integer, got 0"),
         (MovingCamera, {"scale": -1}, r"scale of MovingCamera must lie in \[0, 1\], got -1"),
         (Color, {"sky": True}, r"sky, materials and ground of Color are only for mode='geom'"),
+        (
+            Color,
+            {"mode": "geom", "materials": ("self",), "ground": False},
+            "materials of Color name all that shifts: leave out ground",
+        ),
         (Color, {"ground": False}, r"sky, materials and ground of Color are only for mode='geom'"),
     ],
 )

@@ -134,6 +134,8 @@ def test_a_stopped_call_continues_with_equal_returns(tmp_path):
     lowest = min(min(returns) for returns in whole.returns["policy"].values())
     again = evaluate(policy, output_dir=tmp_path, success_return=lowest)
     assert [row.success for row in again.rows()] == [1.0] * 4
+    assert (tmp_path / "table.csv").read_text() == again.csv() != whole.csv()
+    assert "success" not in (tmp_path / "returns.json").read_text()
     assert len(calls) == first * 3 // 2
     with pytest.raises(ValueError, match=r"has episodes=3, this call 4: .* Choose another folder"):
         evaluate(policy, output_dir=tmp_path, episodes=4)
@@ -229,6 +231,10 @@ def test_options_of_a_suite_need_one(capsys):
         (["a", "b"], "give one run, or --suite for several; got a, b."),
         (["a", "--output-dir", "x"], "--output-dir needs --suite."),
         (["a", "--success-return", "9"], "--success-return needs --suite."),
+        (
+            ["a", "--suite", "axes", "--success-return", "nan"],
+            "--success-return must be a finite number, got nan",
+        ),
     ):
         assert main(["evaluate", *arguments]) == 2
         assert message in capsys.readouterr().err

@@ -89,7 +89,7 @@ def test_an_agent_can_train_on_each_axis():
             sizes[axis.removeprefix("light-")] = next(iter(vars(tested).values()))
             assert vars(trained) == sizes
         elif axis == "body-color":
-            assert (trained.scale, trained.ground, trained.sky) == (tested.scale, False, False)
+            assert trained == Color("geom", "static", tested.scale, ground=False)
         else:
             assert trained == tested
     assert rows["background-2"].clips == ("test",)

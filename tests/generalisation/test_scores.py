@@ -21,7 +21,8 @@ def scores(num_runs: int, episodes: int = 4) -> Scores:
         f"run {run}": {name: random.normal(100, 30, episodes).tolist() for name in LEVELS}
         for run in range(num_runs)
     }
-    return Scores("tiny", "ball", {"episodes": episodes}, returns)
+    usual = {"episode_length": 1000, "reward_preset": "brax"}
+    return Scores("tiny", "ball", {"episodes": episodes} | usual, returns)
 
 
 def middle_mean(numbers) -> float:
@@ -106,16 +107,22 @@ def test_success_is_the_share_of_episodes_at_the_threshold(task, given):
         assert rows[name].success == sum(x >= given for x in of_each) / len(of_each)
     assert rows["easy"].success > 0
     head, _, *lines = found.markdown().splitlines()
-    assert head.split("|")[-2].strip() == "success"
+    assert head.split("|")[-2].strip() == f"success (from {given:g})"
+    assert {row.success_return for row in rows.values()} == {given}
     assert [line.split("|")[-2].strip() for line in lines] == [
         f"{row.success:.2f}" for row in rows.values()
     ]
 
 
 def test_a_task_without_a_threshold_has_no_success():
-    for task in ("ball", "walker2d"):
+    for task, options in (
+        ("ball", {}),
+        ("walker2d", {}),
+        ("dmc_walker_walk", {"episode_length": 250}),
+        ("ant", {"reward_preset": "paper"}),
+    ):
         found = scores(1)
-        found.task = task
+        found.task, found.options = task, found.options | options
         assert all(math.isnan(row.success) for row in found.rows())
         assert "success" not in found.markdown()
 

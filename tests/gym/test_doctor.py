@@ -11,7 +11,7 @@ from pixelbrax_gym import cli, doctor
 
 HEALTHY = doctor.Machine(
     versions=dict.fromkeys(("jax", *doctor.EXTRAS.values()), "1.0"),
-    lacking={},
+    missing={},
     jax_device="cuda:0",
     jax_platform="gpu",
     jax_error=None,
@@ -118,7 +118,7 @@ def test_a_healthy_machine():
         ),
         ({"cache": "/home cannot be written"}, "note", "reads them again", "PIXELBRAX_CACHE"),
         (
-            {"lacking": {"torchrl": ["torchrl"], "train": ["flatbuffers", "psutil"]}},
+            {"missing": {"torchrl": ["torchrl"], "train": ["flatbuffers", "psutil"]}},
             "note",
             "extras: torchrl lacks torchrl; train lacks flatbuffers, psutil",
             "pixelbrax[torchrl,train]",

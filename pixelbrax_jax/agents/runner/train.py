@@ -9,6 +9,7 @@ from pathlib import Path
 from signal import Signals
 from typing import Any
 
+import flatbuffers  # noqa: F401  # exports the policy at the end
 import jax
 import numpy as np
 

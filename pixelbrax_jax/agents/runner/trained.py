@@ -32,7 +32,6 @@ from pixelbrax_jax.agents.train_state import Networks
 from pixelbrax_jax.cache import replacing
 from pixelbrax_jax.distractors.presets import as_tuple
 from pixelbrax_jax.envs.vector import VectorPixelEnv
-from pixelbrax_jax.extras import needs_extra
 from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.generalisation.making import UNDISTURBED
 from pixelbrax_jax.policy import Policy, load_policy, read_pretrained
@@ -161,8 +160,6 @@ def save_policy(algorithm: Algorithm, networks: Networks, path: str | Path) -> P
     )(jax.ShapeDtypeStruct((batch, *spec.shape), spec.dtype))
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with needs_extra("train"):
-        serialized = exported.serialize()
     with replacing(path) as part:
-        part.write_bytes(serialized)
+        part.write_bytes(exported.serialize())
     return path

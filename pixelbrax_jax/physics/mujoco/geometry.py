@@ -139,10 +139,14 @@ def translucent(model: mujoco.MjModel, groups: Collection[int]) -> list[str]:
     for element in ("geom", "site"):
         elements = [getattr(model, element)(i) for i in range(getattr(model, f"n{element}"))]
         for i, it in enumerate(elements):
-            alpha = resolve_rgba(model, it.rgba, it.matid.item())[3]
-            if it.group.item() in groups and 0 < alpha < 1:
+            rgba = resolve_rgba(model, it.rgba, it.matid.item())
+            if _is_visible(it.group.item(), rgba, groups) and rgba[3] < 1:
                 found.append(f"{element} {it.name or i!r}")
     return found
+
+
+def _is_visible(group: int, rgba: np.ndarray, groups: Collection[int]) -> bool:
+    return group in groups and rgba[3] > 0
 
 
 def _shown(model: mujoco.MjModel, element: str, groups: Collection[int]) -> Iterator[Shape]:
@@ -153,7 +157,7 @@ def _shown(model: mujoco.MjModel, element: str, groups: Collection[int]) -> Iter
 
     for i in range(getattr(model, f"n{element}")):
         rgba = resolve_rgba(model, field("rgba"), field("matid"))
-        if field("group") not in groups or not rgba[3] > 0:
+        if not _is_visible(field("group"), rgba, groups):
             continue
         kind_name, own_name = _kind_name(field("type")), getattr(model, element)(i).name
         prefix = "site" if element == "site" else kind_name
