@@ -268,6 +268,19 @@ def test_bad_arguments(change, message):
         build(**change)
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"reward": lambda after, action: 0.0}, r"reward must be a .* \(before, after, action\)"),
+        ({"observe": lambda: 0.0}, r"observe must be a function of \(snapshot\)"),
+        ({"terminated": 3}, "terminated must be a function, got 3"),
+    ],
+)
+def test_functions_of_other_arguments(change, message):
+    with pytest.raises(TypeError, match=message):
+        build(**change)
+
+
 def test_what_is_rendered_opaque_is_named():
     pane = '<geom name="pane" type="box" size=".1 .1 .1" rgba="1 0 0 {}" group="{}"/>'
     fog = '<asset><material name="fog" rgba="1 1 1 .5"/></asset>'

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import warnings
 from collections.abc import Callable, Collection, Mapping
@@ -104,6 +105,7 @@ def mjcf_physics(
         ValueError: the model cannot be compiled or rendered, has no joint or no actuator; ``reset``
             is given with ``init_q`` or ``reset_noise``; or a function returns a wrong shape or
             dtype.
+        TypeError: a function takes another number of arguments.
     """
     options = MujocoOptions(engine=engine, num_starts=num_starts)
     if reset is not None and (reset_noise is not None or init_q is not None):
@@ -125,6 +127,9 @@ def mjcf_physics(
             f"{tuple(geom_groups)}.",
             stacklevel=3,
         )
+    _check_takes("reward", reward, "before", "after", "action")
+    _check_takes("observe", observe, "snapshot")
+    _check_takes("terminated", terminated, "snapshot")
     senses_forces = bool((model.sensor_needstage == _FORCES).any())
     formulas = Formulas(
         start=_start(model, reset, init_q, noise),
@@ -193,6 +198,23 @@ def _start(
         return Start(with_unit_rotations(model, qpos), qvel)
 
     return start
+
+
+def _check_takes(name: str, function: Callable[..., Any], *arguments: str) -> None:
+    """Raise a TypeError if a function cannot be called with these arguments."""
+    try:
+        signature = inspect.signature(function)
+    except ValueError:
+        # Some functions written in C do not tell.
+        return
+    except TypeError as error:
+        raise TypeError(f"{name} must be a function, got {function!r}.") from error
+    try:
+        signature.bind(*arguments)
+    except TypeError as error:
+        raise TypeError(
+            f"{name} must be a function of ({', '.join(arguments)}), but got {function!r}: {error}."
+        ) from error
 
 
 def _checked(name: str, expected: str, result: Any, ndim: int, kind: Any) -> jax.Array:
