@@ -9,13 +9,15 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
-from importlib import import_module
+from importlib import import_module, metadata
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from packaging.requirements import Requirement
+
 from pixelbrax_gym.bench.machine import PACKAGES, installed_version
 from pixelbrax_jax.cache import cache_folder
-from pixelbrax_jax.extras import install_extra, missing_packages
+from pixelbrax_jax.extras import install_extra
 from pixelbrax_jax.processor import name_cpu
 
 EXTRAS = {
@@ -219,6 +221,19 @@ def report(findings: list[Finding]) -> str:
     problems = sum(finding.level == "problem" for finding in findings)
     end = f"{problems or 'No'} problem{'' if problems == 1 else 's'} found."
     return "\n".join([*lines, "", end])
+
+
+def missing_packages(extra: str) -> list[str]:
+    """Return the packages of an extra that are not installed, by PixelBrax's own metadata."""
+    found = []
+    for requirement in map(Requirement, metadata.requires("pixelbrax") or ()):
+        marker, name = requirement.marker, requirement.name
+        of_extra = (
+            marker and marker.evaluate({"extra": extra}) and not marker.evaluate({"extra": ""})
+        )
+        if of_extra and installed_version(name) is None:
+            found.append(name)
+    return found
 
 
 def inspect() -> Machine:

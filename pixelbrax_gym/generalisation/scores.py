@@ -93,7 +93,7 @@ class Scores:
     def _row(self, name: str, returns: np.ndarray, error: float, rows: Sequence[Row]) -> Row:
         """Return the row of (S, R, E) returns of S levels."""
         low = high = math.nan
-        threshold = self._threshold()
+        threshold = rows[0].success_return if rows else self._threshold()
         success = math.nan if math.isnan(threshold) else float((returns >= threshold).mean())
         scores = returns.mean(axis=2)
         mean = float(scores.mean())
@@ -121,8 +121,8 @@ class Scores:
         heads = ["level", "return (IQM)" if several else "return"]
         heads += ["95 % interval"] if several else []
         heads += ["standard error", "ratio to clean"]
-        succeeds = not math.isnan(threshold := self._threshold())
-        heads += [f"success (from {threshold:g})"] if succeeds else []
+        succeeds = bool(rows) and not math.isnan(rows[0].success_return)
+        heads += [f"success (from {rows[0].success_return:g})"] if succeeds else []
         lines = []
         for row in rows:
             interval = [f"{row.low:.1f} to {row.high:.1f}"] if several else []

@@ -256,8 +256,7 @@ def preset_names(algorithm: str) -> list[str]:
 
 def check_preset(algorithm: str, name: str) -> None:
     """Raise a ValueError unless a preset of this name has settings for an algorithm."""
-    of_others = name in list(PRESETS) and algorithm not in PRESETS[name]
-    if of_others:
+    if name in list(PRESETS) and algorithm not in PRESETS[name]:
         raise ValueError(
             f"the preset {name!r} has no settings for {algorithm}; use one of "
             f"{', '.join(preset_names(algorithm))}."

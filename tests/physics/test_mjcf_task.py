@@ -273,6 +273,7 @@ def test_bad_arguments(change, message):
     [
         ({"reward": lambda after, action: 0.0}, r"reward must be a .* \(before, after, action\)"),
         ({"observe": lambda: 0.0}, r"observe must be a function of \(snapshot\)"),
+        ({"reset": lambda: None}, r"reset must be a function of \(key\)"),
         ({"terminated": 3}, "terminated must be a function, got 3"),
     ],
 )

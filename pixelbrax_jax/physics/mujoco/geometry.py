@@ -137,8 +137,8 @@ def translucent(model: mujoco.MjModel, groups: Collection[int]) -> list[str]:
     """Return what is visible with an alpha below 1, such as ``geom 'glass'``, in model order."""
     found = []
     for element in ("geom", "site"):
-        elements = [getattr(model, element)(i) for i in range(getattr(model, f"n{element}"))]
-        for i, it in enumerate(elements):
+        for i in range(getattr(model, f"n{element}")):
+            it = getattr(model, element)(i)
             rgba = resolve_rgba(model, it.rgba, it.matid.item())
             if _is_visible(it.group.item(), rgba, groups) and rgba[3] < 1:
                 found.append(f"{element} {it.name or i!r}")

@@ -130,6 +130,8 @@ def mjcf_physics(
     _check_takes("reward", reward, "before", "after", "action")
     _check_takes("observe", observe, "snapshot")
     _check_takes("terminated", terminated, "snapshot")
+    if reset is not None:
+        _check_takes("reset", reset, "key")
     senses_forces = bool((model.sensor_needstage == _FORCES).any())
     formulas = Formulas(
         start=_start(model, reset, init_q, noise),
