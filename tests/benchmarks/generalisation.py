@@ -44,8 +44,7 @@ DISTRACTED = {
 }
 TRAININGS = {
     "ppo": {"clean": (), "shifts": ("--random-shift", "2"), **DISTRACTED},
-    # It always shifts images.
-    "drqv2": {"shifts": (), **DISTRACTED},
+    "drqv2": {"clean": ("--random-shift", "0"), "shifts": (), **DISTRACTED},
 }
 """Options by agent and by what it is trained with."""
 
