@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pixelbrax_jax import VectorPixelEnv, compilation
-from pixelbrax_jax.flags import is_key
+from pixelbrax_jax.flags import is_key, with_keys, without_keys
 from pixelbrax_jax.types import EnvParams, EnvState, Timestep
 
 _FEW = 32
@@ -198,9 +198,9 @@ def pack(state: EnvState) -> Packed:
     """Pack a state with a leading axis N."""
     parts = jax.tree.leaves(state.replace(frames=None))
     if len(state.key) > _FEW:
-        return Packed(state.frames, tuple(map(_data, parts)))
+        return Packed(state.frames, tuple(map(without_keys, parts)))
     # Without a barrier, XLA would fuse the computation of the parts into the loop that writes them.
-    parts = jax.lax.optimization_barrier([_data(part) for part in parts])
+    parts = jax.lax.optimization_barrier([without_keys(part) for part in parts])
     return Packed(state.frames, (jnp.concatenate([_words(part) for part in parts]),))
 
 
@@ -208,9 +208,11 @@ def unpack(packed: Packed, like: EnvState) -> EnvState:
     """Invert ``pack`` exactly; ``like`` has the shapes and dtypes of the state."""
     parts, tree = jax.tree.flatten(like.replace(frames=None))
     if like.key.shape[0] > _FEW:
-        restored = list(map(_from_data, packed.rest, parts))
+        restored = list(map(with_keys, packed.rest, parts))
     else:
-        sizes = [jax.eval_shape(lambda part: _words(_data(part)), part).size for part in parts]
+        sizes = [
+            jax.eval_shape(lambda part: _words(without_keys(part)), part).size for part in parts
+        ]
         (words,) = packed.rest
         restored = [
             _from_words(words[end - size : end], part)
@@ -233,16 +235,6 @@ def _with_offsets(state: EnvState, offsets: Array | None) -> EnvState:
     return state.replace(sim=state.sim.replace(time_limit_offset=offsets))
 
 
-def _data(part: jax.Array) -> jax.Array:
-    return jax.random.key_data(part) if is_key(part.dtype) else part
-
-
-def _from_data(data: jax.Array, like: Any) -> jax.Array:
-    if not is_key(like.dtype):
-        return data
-    return jax.random.wrap_key_data(data, impl=jax.random.key_impl(jnp.empty((), like.dtype)))
-
-
 def _words(part: jax.Array) -> jax.Array:
     """Return the bits of an array as (W,) uint32, one word per element of a narrow dtype."""
     if (size := part.dtype.itemsize) < 4:
@@ -254,7 +246,7 @@ def _from_words(words: jax.Array, like: Any) -> jax.Array:
     """Invert ``_words`` for an array with the shape and dtype of ``like``."""
     if is_key(like.dtype):
         data = jax.eval_shape(jax.random.key_data, like)
-        return _from_data(words.reshape(data.shape), like)
+        return with_keys(words.reshape(data.shape), like)
     if (size := like.dtype.itemsize) < 4:
         words = words.astype(f"uint{8 * size}")
     return words.view(like.dtype).reshape(like.shape)

@@ -87,6 +87,18 @@ def is_key(dtype: Any) -> bool:
     return jnp.issubdtype(dtype, jax.dtypes.prng_key)
 
 
+def without_keys(leaf: jax.Array) -> jax.Array:
+    """Return the uint32 words of typed keys; another array unchanged."""
+    return jax.random.key_data(leaf) if is_key(leaf.dtype) else leaf
+
+
+def with_keys(data: jax.Array, like: Any) -> jax.Array:
+    """Invert ``without_keys`` for an array with the dtype of ``like``, whatever JAX's default."""
+    if not is_key(like.dtype):
+        return data
+    return jax.random.wrap_key_data(data, impl=jax.random.key_impl(jnp.empty((), like.dtype)))
+
+
 def is_guarded(direction: str) -> bool:
     """Return whether ``jax.transfer_guard`` watches ``host_to_device`` or ``device_to_host``."""
     return getattr(jax.config, f"jax_transfer_guard_{direction}", None) is not None

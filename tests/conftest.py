@@ -4,6 +4,7 @@ import ctypes
 import gc
 import os
 import signal
+import time
 from pathlib import Path
 
 from tests.xla_flags import xla_flags
@@ -52,13 +53,20 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=task)
 
 
+_looked_at = 0.0
+
+
 def pytest_runtest_teardown() -> None:
-    """Forget compiled programs when there are too many.
+    """Forget compiled programs when there are too many; look at most once a second.
 
     Every program maps memory of its own, and a process may have some 65,000 maps on Linux
     (vm.max_map_count). The compiler crashes beyond them.
     """
+    global _looked_at
+    if (now := time.monotonic()) < _looked_at + 1.0:
+        return
     maps, taken = memory_of_this_process()
+    _looked_at = now
     if maps > MAX_MAPS or taken > MAX_BYTES:
         jax.clear_caches()
         gc.collect()

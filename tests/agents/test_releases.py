@@ -79,6 +79,12 @@ def test_a_run_of_0_2_0_goes_on(folder):
     assert load_config(read_about(folder / "checkpoints")) == ppo().config
 
 
+def test_keys_are_restored_whatever_jax_draws_numbers_with(folder):
+    expected = restore(folder, ppo())
+    with jax.default_prng_impl("rbg"):
+        assert same(restore(folder, ppo()), expected)
+
+
 def test_a_setting_that_a_run_lacks_has_the_default(folder):
     change(folder, without=("vf_coef", "clip_value"))
     restore(folder, ppo())

@@ -25,7 +25,7 @@ from tests.generalisation.conftest import TASK, TINY
 CONFIG = EnvConfig(task=TASK, **TINY)
 
 
-def levels(suite, episodes=3, clips=None, config=CONFIG, **more):
+def levels(suite, episodes=4, clips=None, config=CONFIG, **more):
     made = make_levels(config, suite, episodes, clips, **more)
     return made, {one.level.name: one for one in made.levels}
 
@@ -128,14 +128,14 @@ def test_levels_share_programs(suite, num_levels, num_programs):
 def test_what_a_level_does_not_change_has_no_rows():
     _, by_name = levels("tiny")
     params = by_name["turned"].params
-    assert params.rig.up.shape == (3, 3)
-    assert params.geoms.rgb.shape == (3, 2, 3)
+    assert params.rig.up.shape == (4, 3)
+    assert params.geoms.rgb.shape == (4, 2, 3)
     assert params.look.sky.shape == (2, 3)
     assert np.array_equal(by_name["painted"].params.rig.up[0], by_name["clean"].params.rig.up[0])
 
 
 def test_palettes_are_those_of_the_distractor_and_of_no_training():
-    _, by_name = levels("dmcgb", episodes=4, clips="procedural")
+    _, by_name = levels("dmcgb", clips="procedural")
     (color,) = preset("color-hard", TASK)
     assert isinstance(color, Color)
     _, base = make(CONFIG)
@@ -176,7 +176,7 @@ def test_one_folder_has_the_clips_of_both_benchmarks(tmp_path, monkeypatch):
     lists = data / "DAVIS" / "ImageSets" / "2017"
     lists.mkdir(parents=True)
     (lists / "train.txt").write_text("g\nf\n")
-    made, by_name = levels("dmcgb", episodes=4, clips=data)
+    made, by_name = levels("dmcgb", clips=data)
     shown = {name: [made.bank.names[i] for i in clips] for name, clips in made.splits.items()}
     assert shown == {"video_easy": ["a", "b", "c"], "video_hard": ["d", "e"], "train": ["g", "f"]}
     assert by_name["video-easy"].params.clips.first[:, 0].tolist() == [0, 2, 4, 0]

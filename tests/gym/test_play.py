@@ -91,10 +91,10 @@ def test_a_file_shows_what_the_environment_draws(tmp_path):
         env.step(np.zeros(1, np.float32))
 
 
-def test_the_observation_is_its_newest_frame_enlarged():
-    env = GymnasiumEnv(TASK, height=20, width=20, frame_stack=2, render_mode="rgb_array")
-    first, second = islice(play.images(env, lambda obs: np.ones(1, np.float32), 0, 60), 2)
-    assert second.shape == (60, 60, 3)
+def test_the_observation_is_its_newest_frame_enlarged(make_single):
+    env = make_single(render_mode="rgb_array")
+    first, second = islice(play.images(env, lambda obs: np.ones(1, np.float32), 0, 36), 2)
+    assert second.shape == (36, 36, 3)
     env.reset(seed=0)
     obs, *_ = env.step(np.ones(1, np.float32))
     np.testing.assert_array_equal(second[1::3, 2::3], obs[..., 3:])

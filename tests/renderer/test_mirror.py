@@ -40,8 +40,9 @@ def seen(*solids, look=EVEN, renderer="fused", **static):
 @pytest.mark.usefixtures("interpreted")
 @pytest.mark.parametrize("renderer", [*RENDERERS, "pallas"])
 def test_a_mirror_adds_a_part_of_what_mirrored_rays_see(renderer):
-    frame = seen(FLOOR, BALL, renderer=renderer)
-    bare = seen(FLOOR, BALL, look=EVEN.replace(reflectance=None), renderer=renderer)
+    frame = jax.tree.map(np.asarray, seen(FLOOR, BALL, renderer=renderer))
+    plain = EVEN.replace(reflectance=None)
+    bare = jax.tree.map(np.asarray, seen(FLOOR, BALL, look=plain, renderer=renderer))
     own = np.asarray(scene_of(FLOOR, BALL).geoms.rgb[1], float)
     view = camera(EYE, (0, 0, 0.2), 60.0)
     step = 2 * np.tan(np.deg2rad(30.0)) / SIZE

@@ -20,7 +20,7 @@ import orbax.checkpoint as ocp
 from pixelbrax_jax.agents.runner.devices import any_process
 from pixelbrax_jax.agents.runner.progress import Report, reason, silent
 from pixelbrax_jax.agents.runner.settings import differences, unknown_settings, versions
-from pixelbrax_jax.flags import is_key
+from pixelbrax_jax.flags import with_keys, without_keys
 
 FORMAT = 4
 """Number of the format, increased when the meaning of stored data changes."""
@@ -211,7 +211,7 @@ class Checkpoints:
             logging.getLogger("absl").removeFilter(_not_a_traceback)
 
     def _write(self, state: Any, steps: int, score: float | None) -> None:
-        leaves = {name: _numbers(leaf) for name, leaf in _leaves(state).items()}
+        leaves = {name: without_keys(leaf) for name, leaf in _leaves(state).items()}
         size = sum(leaf.nbytes for leaf in leaves.values())
         about = self._about | {"steps": steps, "score": score}
         arguments = ocp.args.Composite(
@@ -285,7 +285,7 @@ class Checkpoints:
 def _read(folder: Path, steps: int, template: Tree, *, whole: bool, advice: str = "") -> Tree:
     """Read the arrays of a tree, which are the ``whole`` checkpoint or some of it."""
     leaves = _leaves(template)
-    wanted = {name: jax.eval_shape(_numbers, leaf) for name, leaf in leaves.items()}
+    wanted = {name: jax.eval_shape(without_keys, leaf) for name, leaf in leaves.items()}
     shapes = {name: leaf.shape for name, leaf in wanted.items()}
     path = folder.absolute() / str(steps) / "state"
     reader = ocp.Checkpointer(ocp.PyTreeCheckpointHandler())
@@ -308,8 +308,7 @@ def _read(folder: Path, steps: int, template: Tree, *, whole: bool, advice: str 
     def leaf(path: Any, like: Any) -> Any:
         value = restored[_name(path)] if like.size else np.zeros(like.shape, like.dtype)
         # Without a sharding it may go to any device, as in a new run: its program is the same.
-        value = jax.device_put(value, like.sharding)
-        return jax.random.wrap_key_data(value) if is_key(like.dtype) else value
+        return with_keys(jax.device_put(value, like.sharding), like)
 
     return jax.tree_util.tree_map_with_path(leaf, template)
 
@@ -322,10 +321,6 @@ def _leaves(tree: Any) -> dict[str, Any]:
 
 def _name(path: Any) -> str:
     return jax.tree_util.keystr(path, simple=True, separator=".")
-
-
-def _numbers(leaf: jax.Array) -> jax.Array:
-    return jax.random.key_data(leaf) if is_key(leaf.dtype) else leaf
 
 
 def _restore_args(leaf: Any) -> ocp.RestoreArgs:

@@ -106,7 +106,7 @@ def initial_states(task: str, episodes: int, seed: int = 0) -> dict[str, float]:
     """
     theirs = oracle.starts(task, episodes, seed)
     keys = jax.random.split(jax.random.key(seed), episodes)
-    ours = _look(task)(*jax.jit(jax.vmap(make_physics(task).first))(keys))
+    ours = _look(task)(*_first(task)(keys))
     pairs = {
         "qpos": (ours.engine.qpos, theirs["qpos"]),
         "qvel": (ours.engine.qvel, theirs["qvel"]),
@@ -138,6 +138,11 @@ def _ours(task: str, states: dict[str, np.ndarray]) -> State:
     fields["target"] = fields["target"][:, : start.target.size]
     nothing = jnp.zeros((len(fields["qpos"]), 0))
     return State(**fields, multipliers=nothing, remembered=nothing)
+
+
+@cache
+def _first(task: str) -> Any:
+    return jax.jit(jax.vmap(make_physics(task).first))
 
 
 @cache
