@@ -66,12 +66,10 @@ def make_physics(task: str, **options: Any) -> Physics:
     """Make the physics of a task with options of its suite. Equal arguments give equal objects."""
     check_choice("task", task, list_envs(), meant=_meant(task))
     own = _OWN_TASKS.get(task)
-    suite = next((suite for suite in SUITES.values() if task in suite.tasks), None)
+    folder, suite = next(((f, s) for f, s in SUITES.items() if task in s.tasks), ("", None))
     for name, value in options.items():
-        if suite is None or not suite.takes(name):
-            takers = [other.title for other in SUITES.values() if other.takes(name)]
-            if not takers:
-                raise ValueError(f"there is no option {name!r}, given as {value!r}: leave it out.")
+        if suite is None or not hasattr(suite.options, name):
+            takers = [other.title for other in SUITES.values() if hasattr(other.options, name)]
             fix = "leave it out"
             if own is not None:
                 fix += ", or give it where the task's physics is made, if that takes it"
@@ -82,7 +80,7 @@ def make_physics(task: str, **options: Any) -> Physics:
     if own is not None:
         return own[0]()
     assert suite is not None
-    loader = importlib.import_module(suite.loader)
+    loader = importlib.import_module(f"pixelbrax_jax.physics.{folder}.loading")
     physics: Physics = loader.load(task, suite.options(**options))
     return physics
 
@@ -131,7 +129,8 @@ def _import(module: str, task: str) -> ModuleType:
 
 def _meant(task: object) -> str | None:
     """Return the only task that another library calls by this name, if there is exactly one."""
-    names = {own: map(_plain, row.other_names()) for own, row in TASKS.items()}
+    rows = TASKS.items()
+    names = {own: map(_plain, (row.gymnasium_id, *row.other_names)) for own, row in rows}
     found = [own for own, others in names.items() if _plain(task) in others]
     return found[0] if len(found) == 1 else None
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from types import MappingProxyType
 
 from pixelbrax_jax.physics.brax.tasks import TASKS as BRAX_TASKS
@@ -18,43 +18,25 @@ from pixelbrax_jax.physics.task import Task
 class Suite:
     """Tasks by name that one engine simulates.
 
-    ``loader`` is the module with ``load(task, options)``, and ``options`` the dataclass of the
-    options that only these tasks take.
+    ``options`` is the dataclass of the options that only these tasks take.
     """
 
     title: str
     tasks: Mapping[str, Task]
-    loader: str
     options: type[BraxOptions | MujocoOptions]
-
-    def takes(self, option: str) -> bool:
-        """Return whether the tasks have an option of this name."""
-        return option in {field.name for field in fields(self.options)}
 
 
 SUITES: Mapping[str, Suite] = MappingProxyType(
     {
-        "brax": Suite(
-            "Brax's tasks",
-            BRAX_TASKS,
-            "pixelbrax_jax.physics.brax.loading",
-            BraxOptions,
-        ),
-        "dmc": Suite(
-            "tasks of the DM Control Suite",
-            DMC_TASKS,
-            "pixelbrax_jax.physics.dmc.physics",
-            MujocoOptions,
-        ),
-        "gym": Suite(
-            "Gymnasium's MuJoCo tasks",
-            GYM_TASKS,
-            "pixelbrax_jax.physics.gym.physics",
-            MujocoOptions,
-        ),
+        "brax": Suite("Brax's tasks", BRAX_TASKS, BraxOptions),
+        "dmc": Suite("tasks of the DM Control Suite", DMC_TASKS, MujocoOptions),
+        "gym": Suite("Gymnasium's MuJoCo tasks", GYM_TASKS, MujocoOptions),
     }
 )
-"""Suites by the names that ``list_envs`` takes."""
+"""Suites by the names that ``list_envs`` takes.
+
+``load(task, options)`` of the module ``physics.<name>.loading`` makes the physics of a task.
+"""
 
 TASKS: Mapping[str, Task] = MappingProxyType(
     {name: task for suite in SUITES.values() for name, task in suite.tasks.items()}

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 
 from pixelbrax_gym.cli import UsageError, say
 from pixelbrax_gym.cli._agents import AgentOptions, load
-from pixelbrax_jax.extras import needs_extra
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -36,9 +35,9 @@ def evaluate(
     if options.run_index:
         raise UsageError("--suite plays all runs of a folder; leave out --run.")
     agents = _load(options, runs)
-    with needs_extra("train"):
-        from pixelbrax_gym.generalisation.scores import RETURNS, ROWS, SHEET, play
-        from pixelbrax_jax.generalisation.making import make_levels
+    from pixelbrax_gym.generalisation.scores import RETURNS, ROWS, SHEET, play
+    from pixelbrax_jax.agents.runner.evaluate import Evaluator
+    from pixelbrax_jax.generalisation.making import make_levels
 
     report = partial(say, "evaluate")
     config = next(iter(agents.values())).algorithm.config.env
@@ -52,7 +51,8 @@ def evaluate(
             compiled.add(level.env)
             number = f"{len(compiled)} of {levels.num_programs}"
             report(f"{level.level.name}: compiling program {number}")
-        return _returns(agent, levels.episodes, level)
+        own = Evaluator(agent.algorithm, level.env, level.params, num_episodes=levels.episodes)
+        return own(agent.networks).returns
 
     players = {name: partial(returns, agent) for name, agent in agents.items()}
     try:
@@ -112,13 +112,6 @@ def _digest(agent: Trained) -> str:
     for leaf in jax.tree.leaves(agent.networks):
         found.update(np.ascontiguousarray(leaf).data)
     return found.hexdigest()[:8]
-
-
-def _returns(agent: Trained, episodes: int, level: LevelEnv) -> np.ndarray:
-    from pixelbrax_jax.agents.runner.evaluate import Evaluator
-
-    evaluator = Evaluator(agent.algorithm, level.env, level.params, num_episodes=episodes)
-    return evaluator(agent.networks).returns
 
 
 def _check_new_clips(

@@ -14,7 +14,7 @@ from tyro.conf import Positional, arg
 from pixelbrax_gym.cli import parse, say
 from pixelbrax_gym.cli._agents import AgentOptions, load
 from pixelbrax_gym.resets import check_seed
-from pixelbrax_jax.validation import check_choice, check_positive_int
+from pixelbrax_jax.validation import check_positive_int
 from pixelbrax_jax.video import write_frames
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ def run(arguments: Sequence[str]) -> int:
     """Run the command."""
     options = parse("record", Options, arguments)
     agent = load(options, options.folder)
-    from pixelbrax_jax.agents.runner.splits import SPLITS, make_split, splits_of
+    from pixelbrax_jax.agents.runner.splits import make_split, splits_of
     from pixelbrax_jax.agents.runner.trained import with_clips
 
     for name in ("grid", "size", "num_frames"):
@@ -55,7 +55,6 @@ def run(arguments: Sequence[str]) -> int:
     check_seed(options.seed)
     has_train = "train" in splits_of(agent.algorithm.config)
     split = options.split or ("train" if has_train else "clean")
-    check_choice("split", split, SPLITS)
     config, shown = with_clips(agent, options.clips)
     env, params = make_split(config, split, shown)
     run = [f"run{options.run_index}"] if options.run_index else []

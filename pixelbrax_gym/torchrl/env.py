@@ -12,7 +12,7 @@ from pixelbrax_jax.extras import needs_extra
 with needs_extra("torchrl", "TorchRL is not installed"):
     import torch
     from tensordict import TensorDict, TensorDictBase
-    from torchrl.data import Unbounded
+    from torchrl.data import Bounded, Unbounded
     from torchrl.envs import EnvBase
 
 from pixelbrax_gym.interop.actions import name_rows
@@ -21,7 +21,7 @@ from pixelbrax_gym.interop.fork import check_not_forked
 from pixelbrax_gym.programs import Stepped
 from pixelbrax_gym.resets import SEEDS, as_mask, spread_seeds
 from pixelbrax_gym.stateful import StatefulEnv
-from pixelbrax_gym.torchrl.specs import action_spec, done_spec, entries, observation_spec
+from pixelbrax_gym.torchrl.specs import done_spec, entries, observation_spec
 
 
 class TorchRLEnv(EnvBase):
@@ -96,7 +96,8 @@ class TorchRLEnv(EnvBase):
 
         env, size = stateful.env, (self._num_envs, self.device)
         self.observation_spec = observation_spec(env.obs_spec, env.images, *size)
-        self.action_spec = action_spec(env.action_size, *size)
+        shape = (self._num_envs, env.action_size)
+        self.action_spec = Bounded(-1.0, 1.0, shape, device=self.device, dtype=torch.float32)
         self.reward_spec = Unbounded((self._num_envs, 1), device=self.device, dtype=torch.float32)
         self.done_spec = done_spec(*size)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from torchrl.data import Bounded, Categorical, Composite, Unbounded
+from torchrl.data import Categorical, Composite, Unbounded
 from torchrl.data.tensor_specs import TensorSpec, UnboundedDiscrete
 
 
@@ -68,11 +68,6 @@ def observation_spec(
         else:
             specs[name] = Unbounded(shape, device=device, dtype=dtype)
     return Composite(specs, shape=(num_envs,), device=device)
-
-
-def action_spec(action_size: int, num_envs: int, device: torch.device) -> Bounded:
-    """Return the spec of an action, (N, A) float32 in [-1, 1]."""
-    return Bounded(-1.0, 1.0, shape=(num_envs, action_size), device=device, dtype=torch.float32)
 
 
 def done_spec(num_envs: int, device: torch.device) -> Composite:

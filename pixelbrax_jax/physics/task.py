@@ -20,16 +20,14 @@ class Task:
         gymnasium_id: its id in Gymnasium.
         summary: the goal, and what ends an episode early.
         success_return: an episode with at least this return is a success; None for no such number.
+        other_names: other libraries' names of the task, for the message about an unknown one.
     """
 
     name: str
     gymnasium_id: str
     summary: str
     success_return: float | None = field(default=None, kw_only=True)
-
-    def other_names(self) -> tuple[str, ...]:
-        """Return other libraries' names of the task, for the message about an unknown one."""
-        return (self.gymnasium_id,)
+    other_names: tuple[str, ...] = field(default=(), kw_only=True)
 
 
 _Task = TypeVar("_Task", bound=Task)

@@ -28,8 +28,6 @@ _HEIGHT, _WIDTH = 24, 40
 _EYES = ((-2.0, -4.25, 2.25), (0.72, -4.25, 1.75))
 """Camera positions of the check, metres. No edge goes through the middle of a pixel."""
 
-Draw = Callable[[Scene, int, int], Frame]
-
 _COLOR = 1.0 / 255.0
 """Largest difference of colors from rounding."""
 
@@ -130,24 +128,21 @@ def kernel_check() -> KernelCheck:
     return check
 
 
-def compare(draw: Draw) -> KernelCheck:
-    """Compare ``draw(scene, height, width)`` with the fused renderer on images of all geoms."""
+def compare(draw: Callable[..., Frame]) -> KernelCheck:
+    """Compare ``draw``, called like ``fused.render``, with that on images of all geoms."""
     # In a separate thread nothing is being traced, and JAX has its default settings.
     with ThreadPoolExecutor(1) as thread:
         return thread.submit(_compare, draw).result()
 
 
-def _compare(draw: Draw) -> KernelCheck:
-    def plain(scene: Scene, height: int, width: int) -> Frame:
-        return fused.render(scene, height, width, 0, height)
-
-    def images(draw: Draw) -> Frame:
-        frames = jax.jit(jax.vmap(lambda scene: draw(scene, _HEIGHT, _WIDTH)))(scenes)
+def _compare(draw: Callable[..., Frame]) -> KernelCheck:
+    def images(draw: Callable[..., Frame]) -> Frame:
+        frames = jax.jit(jax.vmap(lambda scene: draw(scene, _HEIGHT, _WIDTH, 0, _HEIGHT)))(scenes)
         return jax.tree.map(np.asarray, frames)
 
     with default_flags(), jax.default_matmul_precision(PRECISION), jax.disable_jit(False):
         scenes = jax.jit(jax.vmap(_scene))(np.array(_EYES))
-        wanted = images(plain)
+        wanted = images(fused.render)
         try:
             found = images(draw)
         except Exception as error:  # of a compiler or a driver, whatever it is

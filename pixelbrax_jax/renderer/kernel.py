@@ -16,7 +16,7 @@ from pixelbrax_jax.renderer.fused import Near, see, sky_of
 from pixelbrax_jax.renderer.intersect import at_least, at_most
 from pixelbrax_jax.renderer.per_pixel import PerPixel, per_pixel
 from pixelbrax_jax.renderer.shading import from_words, to_words
-from pixelbrax_jax.renderer.view import View, order_of, rays, view_of
+from pixelbrax_jax.renderer.view import View, rays, view_of
 from pixelbrax_jax.types import Frame, GeomKind, Scene
 
 BLOCK = 256
@@ -53,7 +53,7 @@ def draw(
     if "pixels" in images:
         by_pixel = per_pixel(change, Frame(plane, plane, plane, plane, seg, ground))
         if by_pixel is None:
-            frame = render(scene, height, width)
+            frame = render(scene, height, width, 0, height)
             drawn = {"pixels": change(frame), "depth": frame.depth, "segmentation": frame.seg}
             return tuple(drawn[name] for name in images)
         inputs = by_pixel.numbers, by_pixel.images
@@ -69,22 +69,18 @@ def draw(
 
 
 def render(
-    scene: Scene,
-    height: int,
-    width: int,
-    first_row: jax.Array | int = 0,
-    num_rows: int | None = None,
+    scene: Scene, height: int, width: int, first_row: jax.Array | int, num_rows: int
 ) -> Frame:
     """Render a band of rows, without a derivative; see ``fused.render``."""
 
     def planes(_numbers: Any, _images: Any, frame: Frame) -> list[jax.Array]:
         return [frame.r, frame.g, frame.b, frame.depth, frame.seg]
 
-    band = _Band(height, width, first_row, height if num_rows is None else num_rows)
+    band = _Band(height, width, first_row, num_rows)
     dtypes = [*[jnp.float32] * 4, jnp.int32]
     r, g, b, depth, seg = _call(planes, scene, (), (), band, dtypes)
     ground = jnp.zeros(seg.shape, bool)
-    for geom in filter(scene.geoms.is_ground, order_of(scene.geoms)):
+    for geom in filter(scene.geoms.is_ground, range(len(scene.geoms.kind))):
         ground |= seg == geom
     return Frame(r=r, g=g, b=b, depth=depth, seg=seg, ground=ground)
 

@@ -64,7 +64,7 @@ def view_of(
         for lamp in look.lamps
     )
     view = View(
-        order=order_of(geoms),
+        order=tuple(sorted(range(len(geoms.kind)), key=lambda g: geoms.material[g])),
         pos=einsum("gi,ij->gj", scene.pos - scene.camera.pos, to_camera),
         xmat=einsum("ji,gjk->gik", to_camera, scene.xmat),
         geoms=geoms.replace(pos=None, quat=None, strings=()),
@@ -94,11 +94,6 @@ def _mirrored(view: View) -> Mirrored:
         ),
         back=turned(jnp.array([0.0, 0.0, 1.0])),
     )
-
-
-def order_of(geoms: Geoms) -> tuple[int, ...]:
-    """Return the geom of each rank."""
-    return tuple(sorted(range(len(geoms.kind)), key=lambda g: geoms.material[g]))
 
 
 def rays(view: View, height: int, width: int, row: jax.Array, column: jax.Array) -> Vector:

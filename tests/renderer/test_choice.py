@@ -20,10 +20,6 @@ from tests.renderer import scenes
 HEIGHT, WIDTH, NUM_ENVS = 22, 29, 5
 
 
-def plain(scene, height, width):
-    return fused.render(scene, height, width, 0, height)
-
-
 def test_the_kernel_passes_its_check(interpreted):
     check = choice.compare(kernel.render)
     assert check.passed, check.text
@@ -34,8 +30,8 @@ def test_the_kernel_passes_its_check(interpreted):
 def test_the_images_of_the_check_are_far_from_rounding():
     """Everything moved by more than rounding does: the images are the same, in all their parts."""
 
-    def moved(scene, height, width, by):
-        return plain(scene.replace(pos=scene.pos + by), height, width)
+    def moved(scene, *band, by):
+        return fused.render(scene.replace(pos=scene.pos + by), *band)
 
     assert all(choice.compare(partial(moved, by=by)).passed for by in (-5e-5, 5e-5))
     assert not choice.compare(partial(moved, by=0.05)).passed
@@ -44,8 +40,8 @@ def test_the_images_of_the_check_are_far_from_rounding():
 def test_every_kind_of_geom_the_sky_shadows_and_a_reflection_are_in_the_check():
     def drawn(eye, **look):
         scene = choice._scene(eye)
-        look = scene.look.replace(**look)
-        return plain(scene.replace(look=look), choice._HEIGHT, choice._WIDTH)
+        scene = scene.replace(look=scene.look.replace(**look))
+        return fused.render(scene, choice._HEIGHT, choice._WIDTH, 0, choice._HEIGHT)
 
     whole, *others = (
         jax.jit(jax.vmap(partial(drawn, **look)))(np.array(choice._EYES))
@@ -67,8 +63,8 @@ def test_every_kind_of_geom_the_sky_shadows_and_a_reflection_are_in_the_check():
     ],
 )
 def test_one_wrong_pixel_is_refused(plane, value, told):
-    def wrong(scene, height, width):
-        frame = plain(scene, height, width)
+    def wrong(scene, *band):
+        frame = fused.render(scene, *band)
         # Of one of the two images.
         which = scene.camera.pos[0] > 0
         right = getattr(frame, plane)
@@ -126,7 +122,7 @@ def test_the_kernel_is_checked_once_and_then_drawn_with(card, monkeypatch):
 
     def counted(*args):
         calls.append(args)
-        return plain(*args)
+        return fused.render(*args)
 
     monkeypatch.setattr(kernel, "render", counted)
     # Within a trace, too, the check is a program of its own.

@@ -170,7 +170,7 @@ class DrQv2(Algorithm):
 
     def _learn(self, state: OffPolicyState, std: jax.Array) -> tuple[OffPolicyState, Metrics]:
         """Make the updates of an iteration, or none while the replay holds too little."""
-        config, replay = self.config, state.replay
+        config, replay, most = self.config, state.replay, self.config.random_shift
         keys = jax.random.split(stream_key(state, UPDATES), config.num_updates)
         start = (state.networks, state.opt_state, state.target)
         update = one_run_after_the_other(self._update)
@@ -182,7 +182,12 @@ class DrQv2(Algorithm):
             batch = replay.sample(
                 sample_key, config.batch_size, config.env.frame_stack, config.n_step, config.gamma
             )
-            batch = self._augmented(batch, shift_key)
+            shape = (2, config.batch_size, 2)
+            now, later = jax.random.randint(shift_key, shape, -most, most + 1)
+            batch = batch._replace(
+                pixels=shifted(batch.pixels, now, most),
+                next_pixels=shifted(batch.next_pixels, later, most),
+            )
             return update(carry, batch, std, update_key, state.iteration, number)
 
         def learn() -> tuple[Any, Metrics]:
@@ -198,16 +203,6 @@ class DrQv2(Algorithm):
         (networks, opt_state, target), metrics = jax.lax.cond(learns, learn, wait)
         metrics["updates"] = jnp.where(learns, config.num_updates, 0)
         return state.replace(networks=networks, opt_state=opt_state, target=target), metrics
-
-    def _augmented(self, batch: Batch, key: jax.Array) -> Batch:
-        """Shift every observation of a batch."""
-        most = self.config.random_shift
-        shape = (2, len(batch.reward), 2)
-        now, later = jax.random.randint(key, shape, -most, most + 1)
-        return batch._replace(
-            pixels=shifted(batch.pixels, now, most),
-            next_pixels=shifted(batch.next_pixels, later, most),
-        )
 
     def _update(
         self,

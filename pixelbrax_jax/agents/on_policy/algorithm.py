@@ -5,13 +5,12 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from pixelbrax_jax.agents.algorithm import Algorithm
-from pixelbrax_jax.agents.config import TrainConfig
 from pixelbrax_jax.agents.networks.actor_critic import Actor, ActorCritic, Critic
 from pixelbrax_jax.agents.on_policy.config import OnPolicyConfig
 from pixelbrax_jax.agents.on_policy.losses import Batch, RewardScaler, gae, mean, normalized
@@ -64,7 +63,6 @@ class OnPolicy(Algorithm):
     """An algorithm that learns from rollouts of its current policy."""
 
     config: OnPolicyConfig
-    config_class: ClassVar[type[TrainConfig]] = OnPolicyConfig
 
     @property
     @abstractmethod

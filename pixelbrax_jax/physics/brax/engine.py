@@ -39,7 +39,7 @@ from pixelbrax_jax.physics.mujoco.poses import (
     with_unit_rotations,
 )
 from pixelbrax_jax.physics.mujoco.scene import COM_LINK
-from pixelbrax_jax.physics.mujoco.viewpoints import followed_body, read_rigs, unfit_cameras
+from pixelbrax_jax.physics.mujoco.viewpoints import followed_body, read_rigs
 from pixelbrax_jax.physics.task import Color
 from pixelbrax_jax.spatial import quat_normalize
 from pixelbrax_jax.types import CameraRig, PhysicsState
@@ -135,7 +135,7 @@ class BraxPhysics(GuardedPhysics):
             shapes += site_shapes(model, geom_groups)
             self.followed_link = max(followed_body(model) - 1, 0)
             com_link = len(self.link_names)
-            rigs, self.unfit_cameras = read_rigs(model, com_link), unfit_cameras(model)
+            rigs, self.unfit_cameras = read_rigs(model, com_link)
             if any(rig.link == com_link for rig in rigs.values()):
                 self.link_names += (COM_LINK,)
         self.rigs = rigs

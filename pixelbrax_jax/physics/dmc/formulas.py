@@ -128,7 +128,7 @@ def free_of_contact(
     ) -> tuple[jax.Array, Start, jax.Array]:
         number, before, _ = carry
         start = sample(jax.random.fold_in(key, number), before)
-        return number + 1, start, dynamics.touches(start.qpos)
+        return number + 1, start, jnp.any(dynamics.clearances(start.qpos) < 0)
 
     zeros = Start(jnp.zeros(dynamics.model.nq), jnp.zeros(dynamics.model.nv))
     shapes = jax.eval_shape(sample, key, zeros)

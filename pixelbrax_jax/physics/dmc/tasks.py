@@ -19,22 +19,19 @@ class DmcTask(Task):
     domain: str
     task: str
 
-    def other_names(self) -> tuple[str, ...]:
-        """Return DM Control's names of the task, with and without the domain."""
-        return (*super().other_names(), self.name, f"{self.domain}_{self.task}", self.task)
-
 
 def _dmc(domain: str, task: str, summary: str) -> DmcTask:
-    words = f"{domain}_{task}".split("_")
-    camel = "".join(word[:1].upper() + word[1:] for word in words)
+    name = f"{domain}_{task}"
+    camel = "".join(word[:1].upper() + word[1:] for word in name.split("_"))
     # A step's reward is at most 1, and an episode has 1,000 steps.
     return DmcTask(
-        f"dmc_{domain}_{task}",
+        f"dmc_{name}",
         f"PixelBrax/DMC-{camel}-v0",
         summary,
         domain,
         task,
         success_return=500.0,
+        other_names=(f"dmc_{name}", name, task),
     )
 
 

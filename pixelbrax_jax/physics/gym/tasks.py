@@ -28,10 +28,6 @@ class GymTask(Task):
     elevation: float = -45.0
     time_limit: int = 1000
 
-    def other_names(self) -> tuple[str, ...]:
-        """Return Gymnasium's id of the task."""
-        return (*super().other_names(), self.original)
-
 
 def _gym(name: str, original: str, model: str, summary: str, **options: object) -> GymTask:
     return GymTask(
@@ -40,6 +36,7 @@ def _gym(name: str, original: str, model: str, summary: str, **options: object) 
         summary,
         f"{original}-v5",
         model,
+        other_names=(f"{original}-v5",),
         **options,  # type: ignore[arg-type]
     )
 

@@ -171,10 +171,6 @@ class Dynamics:
         """Return (G,) metres at joint positions (Q,): negative for a geom that overlaps another."""
         return self._call("clearances", [qpos], [(self.model.ngeom,)])[0]
 
-    def touches(self, qpos: jax.Array) -> jax.Array:
-        """Return () bool, whether any geoms touch at joint positions (Q,)."""
-        return jnp.any(self.clearances(qpos) < 0)
-
     def _call(
         self, method: str, arrays: list[jax.Array], shapes: list[tuple[int, ...]], *options: int
     ) -> list[jax.Array]:

@@ -27,7 +27,6 @@ from pixelbrax_jax.physics.mujoco.poses import (
     with_unit_rotations,
 )
 from pixelbrax_jax.physics.mujoco.scene import COM_LINK, read_scene
-from pixelbrax_jax.physics.mujoco.viewpoints import unfit_cameras
 from pixelbrax_jax.physics.task import Color
 from pixelbrax_jax.types import CameraRig, Look, PhysicsState
 
@@ -85,10 +84,9 @@ class MujocoPhysics(GuardedPhysics):
             geom_groups=geom_groups,
         )
         self.geoms, self.look = scene.geoms, scene.look
-        self.hull_errors = scene.hull_errors
+        self.hull_errors, self.unfit_cameras = scene.hull_errors, scene.unfit_cameras
         default = scene.rigs.get("default") or scene.rig or next(iter(rigs.values()), None)
         self.rigs = {**scene.rigs, **rigs} | ({"default": default} if default else {})
-        self.unfit_cameras = unfit_cameras(model)
         self.link_names = body_names(model) + scene.links
         self.dynamics = Dynamics(simulated, posed, formulas, engine)
         # Rounded, so that 0.0025 * 10 is 0.025.

@@ -19,7 +19,7 @@ from pixelbrax_jax.physics.mujoco.geometry import VISIBLE_GROUPS
 from pixelbrax_jax.physics.mujoco.lighting import detailed
 from pixelbrax_jax.physics.mujoco.poses import body_names, with_center_of_mass
 from pixelbrax_jax.physics.mujoco.scene import read_scene
-from pixelbrax_jax.physics.mujoco.viewpoints import followed_body, unfit_cameras
+from pixelbrax_jax.physics.mujoco.viewpoints import followed_body
 from pixelbrax_jax.physics.task import Color
 from pixelbrax_jax.types import Look, PhysicsState
 
@@ -60,8 +60,7 @@ class PlaygroundPhysics(GuardedPhysics):
         model = env.mj_model
         scene = read_scene(model, None, colors=colors, geom_groups=geom_groups)
         self.geoms, self.look, self.rigs = scene.geoms, scene.look, scene.rigs
-        self.hull_errors = scene.hull_errors
-        self.unfit_cameras = unfit_cameras(model)
+        self.hull_errors, self.unfit_cameras = scene.hull_errors, scene.unfit_cameras
         self.link_names = body_names(model) + scene.links
         self.followed_link = max(followed_body(model) - 1, 0)
         self.dt = float(f"{float(env.dt):.6g}")

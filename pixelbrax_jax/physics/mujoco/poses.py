@@ -41,10 +41,18 @@ def with_unit_rotations(model: mujoco.MjModel, q: jax.Array) -> jax.Array:
 def center_of_mass(model: mujoco.MjModel, xpos: jax.Array, xquat: jax.Array) -> jax.Array:
     """Return (3,), the center of mass of the subtree of the tracked body, else of the model.
 
-    ``xpos`` (B, 3) and ``xquat`` (B, 4) are the poses of all bodies but the world.
+    ``xpos`` (B, 3) and ``xquat`` (B, 4) are the poses of all bodies but the world. The center of a
+    subtree without mass is that of its root, as in MuJoCo.
     """
-    masses = masses_below(model, max(tracked_body(model), 0))
-    return jnp.dot(masses, xpos + rotate(xquat, f32(model.body_ipos[1:])))
+    root = max(tracked_body(model), 0)
+    below = np.arange(model.nbody) == root
+    for body in range(1, model.nbody):
+        below[body] |= below[model.body_parentid[body]]
+    masses = np.where(below, model.body_mass, 0.0)
+    if masses.sum() < mujoco.mjMINVAL:
+        masses = np.arange(model.nbody) == root
+    shares = f32(masses[1:] / masses.sum())
+    return jnp.dot(shares, xpos + rotate(xquat, f32(model.body_ipos[1:])))
 
 
 def with_center_of_mass(
@@ -58,18 +66,3 @@ def with_center_of_mass(
 def body_names(model: mujoco.MjModel) -> tuple[str, ...]:
     """Return names of all bodies but the world, ``link/<index>`` for one without."""
     return tuple(model.body(i).name or f"link/{i - 1}" for i in range(1, model.nbody))
-
-
-def masses_below(model: mujoco.MjModel, root: int) -> np.ndarray:
-    """Return (bodies - 1,) float32, each body's fraction of the mass of ``root``'s subtree.
-
-    The center of a subtree without mass is that of ``root``, as in MuJoCo.
-    """
-    below = np.zeros(model.nbody, bool)
-    below[root] = True
-    for body in range(1, model.nbody):
-        below[body] |= below[model.body_parentid[body]]
-    masses = np.where(below, model.body_mass, 0.0)
-    if masses.sum() < mujoco.mjMINVAL:
-        masses = np.arange(model.nbody) == root
-    return (masses[1:] / masses.sum()).astype(np.float32)

@@ -54,12 +54,13 @@ class ModelScene(NamedTuple):
     (``tendon/<name>/<piece>``). ``links`` names the links after those of the bodies, if there are
     any: ``camera/com`` at the center of mass of the subtree of ``tracked_body(model)``, and
     ``target`` for what is movable and visible. Neither turns. ``rig`` is the chosen one of
-    ``rigs``; for ``hull_errors`` see ``Physics``.
+    ``rigs``; for ``unfit_cameras`` and ``hull_errors`` see ``Physics``.
     """
 
     geoms: Geoms
     rig: CameraRig | None
     rigs: dict[str, CameraRig]
+    unfit_cameras: dict[str, str]
     look: Look
     links: tuple[str, ...]
     hull_errors: dict[str, float]
@@ -99,10 +100,10 @@ def read_scene(
     geoms = as_geoms([*shapes, *pieces]).replace(
         strings=tuple(strings), mirror=mirrors[0] if mirrors else -1
     )
-    rigs = read_rigs(model, com_link)
+    rigs, unfit = read_rigs(model, com_link)
     look = read_look(model).replace(lamps=tuple(lamps.values()))
     rig = None if camera is None or not model.ncam else rigs[camera_name(model, camera)]
-    return ModelScene(geoms, rig, rigs, look, tuple(links), hull_errors(shapes))
+    return ModelScene(geoms, rig, rigs, unfit, look, tuple(links), hull_errors(shapes))
 
 
 def _textured_geoms(

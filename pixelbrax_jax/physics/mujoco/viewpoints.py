@@ -44,8 +44,8 @@ def followed_body(model: mujoco.MjModel) -> int:
     return (robot or moving or [0])[0]
 
 
-def read_rigs(model: mujoco.MjModel, com_link: int) -> dict[str, CameraRig]:
-    """Return rigs of a model's cameras by name, without ``unfit_cameras``, in the model's order.
+def read_rigs(model: mujoco.MjModel, com_link: int) -> tuple[dict[str, CameraRig], dict[str, str]]:
+    """Return rigs of a model's cameras by name, and the reasons why the others cannot be rigs.
 
     ``com_link`` is the link at the tracked center of mass, -1 for none. A rig's target lies on the
     camera's axis, at the depth of the tracked point or of the model's center of mass: camera
@@ -53,11 +53,11 @@ def read_rigs(model: mujoco.MjModel, com_link: int) -> dict[str, CameraRig]:
     """
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    rigs = {}
-    unfit = unfit_cameras(model)
+    rigs, unfit = {}, {}
     for camera in range(model.ncam):
         name = camera_name(model, camera)
-        if name in unfit:
+        if reason := _why_unfit(model, camera):
+            unfit[name] = reason
             continue
         mode, body = int(model.cam_mode[camera]), int(model.cam_bodyid[camera])
         if mode == _TRACK and body:
@@ -75,29 +75,23 @@ def read_rigs(model: mujoco.MjModel, com_link: int) -> dict[str, CameraRig]:
         # A camera that looks away from the subject also needs a target.
         target = eye + (depth if depth > 1e-3 else 1.0) * forward
         rigs[name] = make_rig(eye, target, fovy, link=link, track=(1.0, 1.0, 1.0), up=up)
-    return rigs
+    return rigs, unfit
 
 
-def unfit_cameras(model: mujoco.MjModel) -> dict[str, str]:
-    """Return the reasons why some cameras cannot be rigs, by name."""
-    reasons = {}
-    for camera in range(model.ncam):
-        mode, body = int(model.cam_mode[camera]), int(model.cam_bodyid[camera])
-        reason = ""
-        if model.cam_projection[camera] != _PERSPECTIVE:
-            reason = "it has no perspective"
-        elif model.cam_sensorsize[camera].any() and model.cam_intrinsic[camera, 2:].any():
-            reason = "its principal point is not the middle of its image"
-        elif mode == _FIXED and model.body_weldid[body] != 0:
-            reason = f"it turns with body {model.body(body).name or body!r}"
-        elif mode == _TRACKCOM and not follows_tracked(model, body):
-            reason = "it follows another center of mass than the first such camera does"
-        elif mode not in (_FIXED, _TRACK, _TRACKCOM):
-            target = int(model.cam_targetbodyid[camera])
-            reason = f"it turns towards body {model.body(target).name or target!r}"
-        if reason:
-            reasons[camera_name(model, camera)] = reason
-    return reasons
+def _why_unfit(model: mujoco.MjModel, camera: int) -> str:
+    mode, body = int(model.cam_mode[camera]), int(model.cam_bodyid[camera])
+    if model.cam_projection[camera] != _PERSPECTIVE:
+        return "it has no perspective"
+    if model.cam_sensorsize[camera].any() and model.cam_intrinsic[camera, 2:].any():
+        return "its principal point is not the middle of its image"
+    if mode == _FIXED and model.body_weldid[body] != 0:
+        return f"it turns with body {model.body(body).name or body!r}"
+    if mode == _TRACKCOM and not follows_tracked(model, body):
+        return "it follows another center of mass than the first such camera does"
+    if mode not in (_FIXED, _TRACK, _TRACKCOM):
+        target = int(model.cam_targetbodyid[camera])
+        return f"it turns towards body {model.body(target).name or target!r}"
+    return ""
 
 
 def camera_name(model: mujoco.MjModel, camera: int) -> str:
