@@ -9,16 +9,20 @@ jaxlib contains) with ctypes.
 
 from __future__ import annotations
 
+import atexit
 import ctypes
 import math
+import os
 import re
 import traceback
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 _TARGET = "pixelbrax_host_call"
@@ -201,3 +205,19 @@ def _handle(pointer: Any) -> Any:
 def _register_target() -> None:
     address = ctypes.cast(_handle, ctypes.c_void_p).value
     jax.ffi.register_ffi_target(_TARGET, jax.ffi.pycapsule(address), platform="cpu")
+    atexit.register(_wait, os.getpid())
+
+
+def _wait(process: int) -> None:
+    """Wait for programs that still run when Python exits: its end in a call would crash it.
+
+    A CPU runs the programs of a thread in the order of their calls, so it is enough to wait for a
+    last one; of other threads, for all results that somebody still has.
+    """
+    if os.getpid() != process:  # XLA does not work in a forked process
+        return
+    for array in jax.live_arrays("cpu"):
+        with suppress(Exception):  # a program that failed
+            array.block_until_ready()
+    for device in jax.local_devices(backend="cpu"):
+        jax.block_until_ready(jax.jit(jnp.negative)(jax.device_put(np.float32(0), device)))

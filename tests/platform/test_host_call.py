@@ -112,3 +112,38 @@ def test_another_process_finds_the_program_in_the_cache(tmp_path):
     assert first["y"] == second["y"] == [0, 2, 4]
     assert first["misses"] == second["hits"] > 0
     assert second["misses"] == 0
+
+
+ENDING = """
+import threading, time
+import jax, jax.numpy as jnp, numpy as np
+from pixelbrax_jax._platform.host_call import host_call, register
+
+def slow(x, y):
+    time.sleep(0.02)
+    y[:] = x + 1
+    print("call", flush=True)
+
+register("test/slow", slow)
+like = [jax.ShapeDtypeStruct((300, 300), np.float32)]
+
+@jax.jit
+def ten(x):  # large enough for JAX not to wait for it
+    return jax.lax.fori_loop(0, 10, lambda _, x: host_call("test/slow", [x @ x], like)[0], x)
+
+x = jnp.zeros((300, 300))
+ten.lower(x).compile()
+kept = []
+"""
+
+
+@pytest.mark.parametrize(
+    "dispatch",
+    ["ten(x)", "t = threading.Thread(target=lambda: kept.append(ten(x))); t.start(); t.join()"],
+    ids=["nobody has the result", "in another thread"],
+)
+def test_python_ends_after_the_calls_of_a_program(dispatch):
+    command = [sys.executable, "-W", "ignore", "-c", ENDING + dispatch]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == 10 * ["call"]
