@@ -20,6 +20,12 @@ def resident_mib() -> float:
     return int(Path("/proc/self/statm").read_text().split()[1]) / PAGES_PER_MIB
 
 
+def test_equal_options_share_programs(make_vector):
+    one, other = make_vector(), make_vector(episode_length=3)
+    assert one._stateful._programs == other._stateful._programs
+    assert one._stateful._programs != make_vector(2)._stateful._programs
+
+
 def run(adapter, num_calls: int) -> tuple[int, float]:
     for _ in range(num_calls):
         adapter.call()

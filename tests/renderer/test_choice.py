@@ -167,6 +167,11 @@ def test_pallas_needs_an_nvidia_gpu():
             make()
 
 
+def test_a_nearly_right_name():
+    with pytest.raises(ValueError, match="Did you mean 'pallas'"):
+        pb.make("ant", renderer="palas")
+
+
 def states_of(env, params):
     keys = jax.random.split(jax.random.key(0), NUM_ENVS)
     reset = jax.vmap(lambda key: env.reset_sim(key, jnp.uint32(0), params))
