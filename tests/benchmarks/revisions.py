@@ -10,6 +10,7 @@ else changes the machine's speed. Both use the packages of this Python. Prints J
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import statistics
@@ -61,23 +62,24 @@ for _ in sys.stdin:
 
 def compare(other: Path, task: str, num_envs: int, rounds: int) -> dict[str, Any]:
     """Steps per second of both checkouts, and the ratio of this one to the other, by round."""
-    workers, digests = [], []
-    for checkout in (HERE, other):
-        command = [sys.executable, "-P", "-c", WORKER, str(checkout), task, str(num_envs)]
-        environ = os.environ | {"PYTHONPATH": str(checkout)}
-        worker = subprocess.Popen(
-            command, env=environ, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE
-        )
-        workers.append(worker)
-        # The next one starts when this one has compiled.
-        digests.append(_answer(worker))
-    speeds: list[list[float]] = []
-    for index in range(rounds):
-        order = workers if index % 2 else workers[::-1]
-        found = {worker.pid: float(_answer(worker, "go\n")) for worker in order}
-        speeds.append([found[worker.pid] for worker in workers])
-    for worker in workers:
-        worker.communicate()
+    with contextlib.ExitStack() as started:
+        workers, digests = [], []
+        for checkout in (HERE, other):
+            command = [sys.executable, "-P", "-c", WORKER, str(checkout), task, str(num_envs)]
+            environ = os.environ | {"PYTHONPATH": str(checkout)}
+            worker = started.enter_context(
+                subprocess.Popen(
+                    command, env=environ, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+                )
+            )
+            workers.append(worker)
+            # The next one starts when this one has compiled.
+            digests.append(_answer(worker))
+        speeds: list[list[float]] = []
+        for index in range(rounds):
+            order = workers if index % 2 else workers[::-1]
+            found = {worker.pid: float(_answer(worker, "go\n")) for worker in order}
+            speeds.append([found[worker.pid] for worker in workers])
     ratios = sorted(here / there for here, there in speeds)
     return {
         "task": task,
