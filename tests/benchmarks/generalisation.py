@@ -39,7 +39,7 @@ TASKS = (
     "halfcheetah",
 )
 TRAININGS = {
-    "clean": ("--random-shift", "0"),
+    "no-shifts": ("--random-shift", "0"),
     "shifts": (),
     "color-easy": ("--distractors", "color-easy"),
     "video-easy": ("--distractors", "video-easy", "--clips", "procedural"),
