@@ -19,7 +19,7 @@ class TorchPolicy:
 
     It compiles once for each number of observations, and has no gradient.
 
-    Example:
+    Examples:
         ``action = TorchPolicy("runs/ppo/policy.jax")(obs)``
     """
 

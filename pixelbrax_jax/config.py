@@ -63,8 +63,8 @@ class ProgramConfig:
     ``pallas`` is a kernel for NVIDIA GPUs (``auto`` takes it there if it passes a check), and
     ``reference`` is the slow renderer that the others are tested against."""
     samples: int = 1
-    """Rays per pixel, whose colors are averaged: 1, 4, 9 or 16. More smooth edges, and take as many
-    times as long to render."""
+    """Rays per pixel, whose colors are averaged: 1, 4, 9 or 16. With more of them edges are
+    smoother, and rendering takes that many times as long."""
     distractors: Distractors = ()
     """Changes of the image: a distractor, the name of a preset, or several of them. A dictionary of
     ``plain.to_plain`` may stand for a distractor. Where only the state is observed, they, their

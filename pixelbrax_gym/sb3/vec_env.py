@@ -53,7 +53,7 @@ class SB3VecEnv(VecEnv):
     ``set_attr`` and ``env_method`` address a ``SubEnv`` for each environment. Methods raise
     ``ClosedEnvironmentError`` after ``close`` and ``RuntimeError`` in a fork that cannot run JAX.
 
-    Example:
+    Examples:
         >>> env = VecMonitor(SB3VecEnv("inverted_pendulum", num_envs=64))
         >>> PPO("CnnPolicy", env).learn(100_000)
     """

@@ -45,7 +45,7 @@ class TorchRLEnv(EnvBase):
             ``episode_return`` (sum of rewards), ``episode_length`` (control steps),
             ``non_finite`` (the physics diverged and ended the episode) and those of distractors.
 
-    Example:
+    Examples:
         >>> env = TorchRLEnv("ant", num_envs=256)
         >>> env.set_seed(0)
         >>> rollout = env.rollout(10, break_when_any_done=False)

@@ -39,7 +39,7 @@ class BraxEnv(Env):
     Brax's ``AutoResetWrapper`` resets every episode to the state of the first one;
     ``wrap_fresh_episodes`` resets to a new one.
 
-    Example:
+    Examples:
         >>> env = BraxEnv(*pixelbrax_jax.make("inverted_pendulum"))
         >>> ppo.train(env, 1_000_000, episode_length=env.episode_length, ...)
 

@@ -39,7 +39,7 @@ class PixelEnv(ProgramConfig):
 
     All randomness of episode e comes from ``fold_in(key, e)``.
 
-    Example:
+    Examples:
         >>> env, params = pixelbrax_jax.make("ant")
         >>> state, timestep = env.reset(jax.random.key(0), params)
         >>> state, timestep = env.step(state, jnp.zeros(env.action_size), params)

@@ -47,7 +47,7 @@ def tasks() -> str:
         page = f"tasks/dmc.md#{domain.replace('_', '-')}"
         names = ", ".join(f"`{row.name}`" for row in rows)
         lines.append([f"[{domain.replace('_', ' ')}]({page})", names])
-    return table(("domain", "in JAX"), lines)
+    return table(("domain", "names"), lines)
 
 
 @cache

@@ -42,12 +42,12 @@ def brax_tasks() -> str:
             f"`{task.gymnasium_id}`",
             f"`{name}`",
             pb.make(name, obs_mode="state")[0].action_size,
-            task.default_backend,
+            ", ".join([task.default_backend, *sorted({*task.backends} - {task.default_backend})]),
             task.summary,
         ]
         for name, task in BRAX_TASKS.items()
     ]
-    return table(("Gymnasium id", "in JAX", "actions", "backend", "goal and end"), lines)
+    return table(("Gymnasium id", "name", "actions", "backends", "goal and end"), lines)
 
 
 def options() -> str:
@@ -96,7 +96,7 @@ PAGES: dict[str, Figures] = {
     "docs/benchmarks/programs.md": performance.COMPILED_PROGRAMS,
     "docs/results.md": results.FIGURES,
     "docs/benchmarks/learning.md": results.RUNS,
-    "docs/measurements.md": results.TRIED,
+    "docs/agents/tried.md": results.TRIED,
     "docs/agents/drqv2.md": results.DRQV2,
     "docs/leaderboard.md": {"board": lambda: leaderboard.page(ROOT / "docs/leaderboard")},
     "docs/dmc.md": dmc_page.FIGURES,
@@ -120,13 +120,14 @@ PAGES: dict[str, Figures] = {
 }
 """Page -> its tables and figures, by name."""
 
-BENCHMARKS = ("cpu-avx512", "cpu-avx2")
-"""Whole results, each with a page of its own."""
+BENCHMARKS = {"cpu-avx512": "AVX-512", "cpu-avx2": "AVX2"}
+"""Whole results, each with a page of its own, and their processors."""
 
 
 def page_of(machine: str) -> str:
     """The page of whole results, with their plot above the first part."""
     text = report.page(performance.read(f"benchmarks/{machine}.json"), GROUPS)
+    text = text.replace("# Measurements", f"# Whole benchmark, {BENCHMARKS[machine]}", 1)
     if not (ROOT / f"docs/benchmarks/{machine}.png").exists():
         return text
     plot = f"![Steps per second over the number of environments]({machine}.png)"

@@ -21,6 +21,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import product
 from pathlib import Path
+from textwrap import indent
 
 from pixelbrax_gym.bench.tables import table
 from pixelbrax_gym.generalisation.scores import RETURNS, SHEET, Row, Scores
@@ -155,10 +156,10 @@ def _tables(
     suite: str,
     rows_of: Callable[[str, dict[str, list[Row]]], tuple[list[str], list[list[str]]]],
 ) -> str:
-    """A table for each task with returns; ``rows_of`` makes its head and its rows."""
+    """A tab for each task with returns; ``rows_of`` makes head and rows of its table."""
     found = {task: columns(task, suite) for task in TASKS}
     return "\n\n".join(
-        f"**`{task}`**\n\n{table(*rows_of(task, scores))}"
+        f'=== "{task}"\n\n{indent(table(*rows_of(task, scores)), "    ")}'
         for task, scores in found.items()
         if scores
     )

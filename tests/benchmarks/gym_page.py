@@ -20,9 +20,8 @@ def tasks() -> str:
     for name, row in GYM_TASKS.items():
         step = kept[name]["control_step"]
         shown = [f"{step[part]:.0e}" for part in ("observation", "reward")]
-        lines.append([f"`{row.gymnasium_id}`", f"`{name}`", row.summary, row.time_limit, *shown])
-    heads = ("Gymnasium id", "in JAX", "goal and end", "time limit", "observation", "reward")
-    return table(heads, lines)
+        lines.append([f"`{name}`", row.summary, row.time_limit, *shown])
+    return table(("name", "goal and end", "time limit", "observation off by", "reward"), lines)
 
 
 def random() -> str:

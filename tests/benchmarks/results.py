@@ -94,7 +94,7 @@ def middle(scores: list[float]) -> str:
     mean = f"{np.mean(scores):,.0f}"
     if len(scores) == 1:
         return mean
-    return f"{mean} ({min(scores):,.0f} to {max(scores):,.0f})".replace(" ", "\u00a0")
+    return f"{mean} ({min(scores):,.0f} to {max(scores):,.0f})"
 
 
 def final(run: dict, split: str = "clean") -> dict:
@@ -108,7 +108,7 @@ def reached(seeds: list[dict]) -> str:
     ends = [final(run) for run in seeds]
     if len(ends) > 1:
         return middle([end["return"] for end in ends])
-    return f"{ends[0]['return']:,.0f}\u00a0±\u00a0{ends[0]['standard_error']:,.0f}"
+    return f"{ends[0]['return']:,.0f} ± {ends[0]['standard_error']:,.0f}"
 
 
 def distance(run: dict, other: dict) -> float:

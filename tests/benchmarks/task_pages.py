@@ -176,13 +176,16 @@ def _keywords(task: Described, count: int) -> str:
     return f" ({', '.join(f'{k} {v:g}' for k, v in task.reward.keywords.items())})"
 
 
+_PAPER_OPTIONS = {"forward_reward_weight": "v counts {:g} times"}
+
+
 def paper(task: Described) -> list[str]:
     """What the reward preset "paper" changes."""
     row, changes = task.row, []
     if row.paper_reward:
         reward = Text.of(_PAPER_REWARDS[row.paper_reward], {})
         changes.append(f"the reward is {reward.sentence()}")
-    changes += [f"{name} {value:g}" for name, value in row.paper_options.items()]
+    changes += [_PAPER_OPTIONS[name].format(value) for name, value in row.paper_options.items()]
     if row.paper_unscaled:
         changes.append("u is the action itself; actuators clip it to their range")
     return [f'* **Paper** (`reward_preset="paper"`): {"; ".join(changes)}.'] if changes else []
@@ -202,7 +205,7 @@ def fact(title: str, tasks: list[Described], text: Callable[[Described], str]) -
 def section(title: str, tasks: list[Described]) -> str:
     """One model's tasks."""
     first = tasks[0]
-    heads = ["Gymnasium id", "in JAX", "goal"]
+    heads = ["Gymnasium id", "name", "goal"]
     lines = [[f"`{t.row.gymnasium_id}`", f"`{t.row.name}`", t.row.summary] for t in tasks]
     if any(task.random for task in tasks):
         heads.append("return of random actions")

@@ -21,9 +21,10 @@ class MujocoOptions:
     ``auto``: in programs for a CPU ``mujoco``, but ``xla`` for a few small models that it steps
     faster; in others ``xla``."""
     num_starts: int = 0
-    """Number of initial states, such as 4096, that a process makes once, in seconds; each episode
-    draws one of them, with all seeds. 0 samples a new state for each episode. On an accelerator
-    every step computes resets, in which DM Control's cheetah settles for 200 physics steps."""
+    """Number of initial states, such as 4096, that a process makes once, in seconds, the same for
+    all seeds; each episode starts from one of them. 0 samples a new state for each episode. On an
+    accelerator every step computes resets, in which DM Control's cheetah settles for 200 physics
+    steps."""
 
     def __post_init__(self) -> None:
         check_choice("engine", self.engine, ENGINES)
