@@ -131,7 +131,7 @@ class Programs:
             state = _where(mask, state, self._state(packed, params))
         rewards = jnp.zeros(self.vector.num_envs)
         see = jax.vmap(self.vector.env.timestep, in_axes=(0, 0, None))
-        return self._stepped(state, see(state, rewards, params))
+        return self._stepped(state, see(state, rewards, params), mask)
 
     @compilation.jit(static_argnums=(0, 3, 4))
     def images(self, packed: Packed, params: EnvParams, height: int, width: int) -> jax.Array:

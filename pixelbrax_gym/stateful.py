@@ -30,6 +30,9 @@ Keep = Callable[[Stepped], Any]
 # Compiled, so that the host sends nothing.
 _new_frames = jax.jit(jnp.zeros, static_argnums=(0, 1))
 
+_LONGEST = 2**31 - 1
+"""Control steps of the longest episode."""
+
 _made: deque[tuple[EnvConfig, PixelEnv, EnvParams]] = deque(maxlen=64)
 """The latest environments, which forks of this process can use without JAX."""
 
@@ -81,7 +84,7 @@ class StatefulEnv:
         self.is_limited = "episode_length" in options
         if max_episode_steps not in (None, -1):
             calls = check_positive_int("max_episode_steps", max_episode_steps)
-            limit = calls * config.action_repeat
+            limit = min(calls * config.action_repeat, _LONGEST)
             # The shorter one, as with Gymnasium's own TimeLimit around an environment.
             limit = min(limit, config.episode_length) if self.is_limited else limit
             config = env_config(config, {"episode_length": limit})
@@ -192,7 +195,7 @@ class StatefulEnv:
 
     def set_time_limit(self, control_steps: int) -> None:
         """Set the time limit, at least 1, of current and later episodes; a shorter task's holds."""
-        control_steps = min(filter(None, (control_steps, self.env.physics.time_limit)))
+        control_steps = min(filter(None, (control_steps, self.env.physics.time_limit, _LONGEST)))
         if control_steps == self.episode_length:
             return
         limit: Any = np.int32(control_steps)

@@ -1,4 +1,4 @@
-"""The cache folder, programs kept in it, paths in the home folder, and complete files."""
+"""The cache folder, and programs kept in it."""
 
 from __future__ import annotations
 
@@ -6,48 +6,22 @@ import hashlib
 import os
 import platform
 import sys
-import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
+
+from pixelbrax_jax.paths import in_home
 
 
 def cache_folder(given: str | Path | None = None) -> Path:
     """Return the given folder, else ``$PIXELBRAX_CACHE``, else ``~/.cache/pixelbrax``."""
     named = given or os.environ.get("PIXELBRAX_CACHE")
     if named:
-        return in_home(Path(named))
+        return in_home(named)
     try:
         return Path.home() / ".cache" / "pixelbrax"
     except RuntimeError as error:  # such as a container's user without an entry in passwd
         raise FileNotFoundError(
             "the user has no home folder; set HOME, or PIXELBRAX_CACHE to a folder"
         ) from error
-
-
-def whole_path(path: str | os.PathLike[str]) -> Path:
-    """Return the absolute path, with ``~`` expanded; raise the same error as ``in_home``."""
-    return in_home(Path(path)).absolute()
-
-
-def in_home(path: Path) -> Path:
-    """Expand ``~``; raise FileNotFoundError with the fix if the home folder is unknown."""
-    try:
-        return path.expanduser()
-    except RuntimeError as error:
-        raise FileNotFoundError(
-            f"{path} is in a home folder that is unknown; set HOME, or give the whole path."
-        ) from error
-
-
-@contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """Yield a path for a file that then replaces ``path``, so that ``path`` is always complete."""
-    # A folder of its own, because several processes may write the file at once.
-    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-        part = Path(folder, path.name)
-        yield part
-        part.replace(path)
 
 
 KEEP_PROGRAMS = "PIXELBRAX_KEEP_PROGRAMS"

@@ -14,6 +14,7 @@ import numpy as np
 
 from pixelbrax_jax.extras import install_extra
 from pixelbrax_jax.ffmpeg import encoder, find_ffmpeg
+from pixelbrax_jax.paths import make_file
 
 SUFFIXES = (".gif", ".mp4")
 
@@ -45,8 +46,7 @@ def write_frames(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> 
             writer = encoder
     except ImportError as error:
         raise ImportError(NO_WRITER) from error
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.open("ab").close()  # whether it can be written, before anything is rendered
+    path = make_file("a video", path)  # before anything is rendered
     try:
         frames = iter(frames)
         first = next(frames, None)

@@ -29,6 +29,7 @@ FOUNDATIONS = {
     "video",
     "ffmpeg",
     "cache",
+    "paths",
     "processor",
 }
 LAYERS = {"physics", "scene", "renderer", "distractors"}
@@ -44,7 +45,12 @@ ALLOWED: dict[str, set[str]] = {
     "pixelbrax_jax.spatial": {"pixelbrax_jax.types"},
     "pixelbrax_jax.observations": {"pixelbrax_jax.validation"},
     "pixelbrax_jax.compilation": {"pixelbrax_jax.flags", "pixelbrax_jax.validation"},
-    "pixelbrax_jax.video": {"pixelbrax_jax.extras", "pixelbrax_jax.ffmpeg"},
+    "pixelbrax_jax.cache": {"pixelbrax_jax.paths"},
+    "pixelbrax_jax.video": {
+        "pixelbrax_jax.extras",
+        "pixelbrax_jax.ffmpeg",
+        "pixelbrax_jax.paths",
+    },
     "pixelbrax_jax.policy": {"pixelbrax_jax.extras", "pixelbrax_jax.validation"},
     **{f"pixelbrax_jax.{name}": _below() for name in LAYERS},
     # The list of tasks, which loads no physics.

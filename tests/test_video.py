@@ -162,7 +162,7 @@ def test_what_cannot_be_opened_is_told_before_a_frame_is_drawn(tmp_path, name):
         yield
 
     (tmp_path / name).mkdir()
-    with pytest.raises(IsADirectoryError):
+    with pytest.raises(ValueError, match=r"must be a file, but .* is a folder"):
         write_frames(tmp_path / name, frames(), 20)
 
 

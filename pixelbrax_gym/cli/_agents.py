@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import arg
@@ -47,3 +49,15 @@ def load(options: AgentOptions, folder: str | None) -> Trained:
     if steps is not None or best or run:
         raise UsageError("--steps, --best and --run need the folder of a run, not --pretrained.")
     return load_pretrained(options.pretrained)
+
+
+def name_of(agent: Trained, folder: str) -> str:
+    """Return a name that tells an agent from another one trained later in the same folder."""
+    import jax
+    import numpy as np
+
+    found = sha256()
+    for leaf in jax.tree.leaves(agent.networks):
+        found.update(np.ascontiguousarray(leaf).data)
+    digest = found.hexdigest()[:8]
+    return f"{Path(folder)}, seed {agent.seed}, {agent.steps} steps, {digest}"

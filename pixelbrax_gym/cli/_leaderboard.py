@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from scipy.stats import trim_mean
 from pixelbrax_gym.bench.tables import table
 from pixelbrax_jax.agents.runner.checkpoint import read_about
 from pixelbrax_jax.agents.runner.metrics import read_metrics
+from pixelbrax_jax.paths import in_home, make_folder
 
 MINUTES = (5, 15, 30)
 FRAMES = (100_000, 500_000, 1_000_000)
@@ -25,6 +27,10 @@ PUBLISHED = "published.json"
 """File beside the entries with returns at frames that others published, by agent and task."""
 
 Entry = dict[str, Any]
+
+_NEEDED = {"task", "agent", "seed", "config", "frames", "seconds", "return"}
+_MAY_DIFFER = {"seed", "clips", "split", "memory_budget_gb"}
+"""Settings in which the seeds of one agent may differ."""
 
 
 def entry(folder: str | Path, agent: str | None = None) -> Entry:
@@ -89,21 +95,51 @@ def _clock(records: Iterable[Mapping[str, float]]) -> tuple[list[float], list[fl
 
 def add(of: Entry, folder: str | Path) -> Path:
     """Write an entry into a folder that has no other of its name; return its file."""
-    agent = "".join(c if c.isalnum() else "-" for c in of["agent"].lower())
-    path = Path(folder) / f"{agent}-{of['task']}-{of['seed']}.json"
+    board = make_folder("--folder", folder)
+    agent, task = re.sub(r"[\W_]", "-", of["agent"].lower()), re.sub(r"\W", "-", of["task"])
+    path = board / f"{agent}-{task}-{of['seed']}.json"
     if path.exists() and json.loads(path.read_text("utf-8")) != of:
         raise FileExistsError(
             f"{path} is another run of this agent, task and seed: delete it, or name the agent "
             "otherwise with --agent."
         )
-    path.parent.mkdir(parents=True, exist_ok=True)
+    for other in read(board):
+        if (other["task"], other["agent"]) == (of["task"], of["agent"]):
+            _check_same_settings(of, other)
     path.write_text(json.dumps(of) + "\n", "utf-8")
     return path
 
 
+def _check_same_settings(of: Entry, other: Entry) -> None:
+    """Raise a ValueError if two entries cannot be seeds of one agent."""
+    here, there = of["config"], other["config"]
+    # Releases differ in what they have settings for.
+    for setting in sorted(here.keys() & there.keys() - _MAY_DIFFER):
+        if here[setting] != there[setting]:
+            raise ValueError(
+                f"runs of one agent differ in seeds alone, but {setting} is {here[setting]!r} with "
+                f"seed {of['seed']} and {there[setting]!r} with seed {other['seed']} of the "
+                "leaderboard: name the agent otherwise with --agent."
+            )
+
+
 def read(folder: str | Path) -> list[Entry]:
-    files = sorted(Path(folder).glob("*.json"))
-    return [json.loads(f.read_text("utf-8")) for f in files if f.name != PUBLISHED]
+    """Read the entries of a folder; a ValueError names what is not a folder, or not an entry."""
+    board = in_home(folder)
+    if not board.is_dir():
+        raise ValueError(f"--folder must be a folder with entries, and {board} is none.")
+    entries = []
+    for file in sorted(board.glob("*.json")):
+        if file.name == PUBLISHED:
+            continue
+        try:
+            found = json.loads(file.read_text("utf-8"))
+        except ValueError:
+            found = None
+        if not (isinstance(found, dict) and found.keys() >= _NEEDED):
+            raise ValueError(f"{file} of --folder is not an entry of a leaderboard; move it away.")
+        entries.append(found)
+    return entries
 
 
 def read_by_agent(folder: str | Path) -> dict[tuple[str, str], list[Entry]]:
@@ -116,7 +152,7 @@ def read_by_agent(folder: str | Path) -> dict[tuple[str, str], list[Entry]]:
 
 def read_published(folder: str | Path) -> dict[str, Any]:
     """Read published returns by agent; none without the file."""
-    file = Path(folder) / PUBLISHED
+    file = in_home(folder) / PUBLISHED
     return json.loads(file.read_text("utf-8"))["agents"] if file.exists() else {}
 
 

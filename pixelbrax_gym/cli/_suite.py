@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pixelbrax_gym.cli import UsageError, say
-from pixelbrax_gym.cli._agents import AgentOptions, load
+from pixelbrax_gym.cli._agents import AgentOptions, load, name_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -85,8 +84,7 @@ def _load(options: AgentOptions, runs: Sequence[str]) -> Mapping[str, Trained]:
         first = load(options, folder)
         for index in range(num_runs(folder)):
             agent = first if index == 0 else load(replace(options, run_index=index), folder)
-            name = f"{Path(folder)}, seed {agent.seed}, {agent.steps} steps, {_digest(agent)}"
-            agents[name] = agent
+            agents[name_of(agent, folder)] = agent
     (first_name, first), *others = agents.items()
     for name, agent in others:
         here, there = (
@@ -101,17 +99,6 @@ def _load(options: AgentOptions, runs: Sequence[str]) -> Mapping[str, Trained]:
                     "evaluate them in separate calls."
                 )
     return agents
-
-
-def _digest(agent: Trained) -> str:
-    """Return a hash of the networks: a run may be trained again in the same folder."""
-    import jax
-    import numpy as np
-
-    found = sha256()
-    for leaf in jax.tree.leaves(agent.networks):
-        found.update(np.ascontiguousarray(leaf).data)
-    return found.hexdigest()[:8]
 
 
 def _check_new_clips(

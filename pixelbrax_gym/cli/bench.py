@@ -6,13 +6,14 @@ import json
 import os
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from pixelbrax_gym.bench.tables import COMPARED, compared, number, table
 from pixelbrax_gym.cli import CommandError, parse
+from pixelbrax_jax.paths import make_file
 from pixelbrax_jax.validation import check_choice, check_positive_int
 
 SECONDS = 15.0
@@ -43,8 +44,7 @@ def run(arguments: Sequence[str]) -> int:
     check_choice("task", options.task, TASKS)
     check_positive_int("num_envs", options.num_envs)
     if options.output is not None:
-        options.output.parent.mkdir(parents=True, exist_ok=True)
-        options.output.touch()
+        options = replace(options, output=make_file("--output", options.output))
     try:
         _measure(options)
     except jax.errors.JaxRuntimeError as error:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tyro.conf import Positional, UseAppendAction, arg
 
 from pixelbrax_gym.cli import UsageError, parse, say
-from pixelbrax_gym.cli._agents import AgentOptions, load
+from pixelbrax_gym.cli._agents import AgentOptions, load, name_of
 from pixelbrax_jax.validation import check_choice
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ def _played(agent: Trained, options: Options) -> tuple[Any, str, dict[str, Any]]
     config, algorithm = agent.algorithm.config.env, agent.algorithm
     check_choice("obs_mode of the agent", config.obs_mode, ("pixels",))
     networks = {name: agent.networks[name] for name in algorithm.acting}
-    name = options.pretrained or f"{options.folder}, seed {agent.seed}, {agent.steps} steps"
+    name = options.pretrained or name_of(agent, str(options.folder))
     left_out = {*LEFT_OUT, "obs_mode"} - {"task"}
     env = {name: getattr(config, name) for name in ENV_OPTIONS if name not in left_out}
     return jax.jit(partial(algorithm.act, networks)), name, env

@@ -15,7 +15,7 @@ from pixelbrax_gym.cli import parse, say
 from pixelbrax_gym.cli._agents import AgentOptions, load
 from pixelbrax_gym.resets import check_seed
 from pixelbrax_jax.validation import check_positive_int
-from pixelbrax_jax.video import write_frames
+from pixelbrax_jax.video import check_suffix, write_frames
 
 if TYPE_CHECKING:
     import numpy as np
@@ -46,12 +46,20 @@ class Options(AgentOptions):
 def run(arguments: Sequence[str]) -> int:
     """Run the command."""
     options = parse("record", Options, arguments)
+    from pixelbrax_jax.memory import check_fits
+
+    for name in ("grid", "size", "num_frames"):
+        check_positive_int(name, getattr(options, name))
+    check_fits(
+        f"a frame with size={options.size}, grid={options.grid}",
+        3 * (options.size * options.grid) ** 2,
+    )
+    if options.output is not None:
+        check_suffix(Path(options.output))
     agent = load(options, options.folder)
     from pixelbrax_jax.agents.runner.splits import make_split, splits_of
     from pixelbrax_jax.agents.runner.trained import with_clips
 
-    for name in ("grid", "size", "num_frames"):
-        check_positive_int(name, getattr(options, name))
     check_seed(options.seed)
     has_train = "train" in splits_of(agent.algorithm.config)
     split = options.split or ("train" if has_train else "clean")

@@ -12,6 +12,7 @@ import numpy as np
 
 from pixelbrax_gym.generalisation.scores import LEFT_OUT, Scores, play
 from pixelbrax_gym.gymnasium.vector_env import GymnasiumVectorEnv
+from pixelbrax_gym.interop.actions import name_rows
 from pixelbrax_jax import EnvParams, VectorPixelEnv
 from pixelbrax_jax.config import ENV_OPTIONS, env_config
 from pixelbrax_jax.flags import default_flags
@@ -67,6 +68,8 @@ def evaluate_suite(
     """
     policies = policy if isinstance(policy, Mapping) else {"policy": policy}
     for name, one in policies.items():
+        if not isinstance(name, str):
+            raise TypeError(f"names of policies must be strings, got {name!r}.")
         if not callable(one):
             raise TypeError(f"policy {name!r} must be a function of observations, got {one!r}.")
     if not policies:
@@ -127,12 +130,15 @@ def _returns(envs: GymnasiumVectorEnv, params: EnvParams, policy: Policy) -> np.
 
 
 def checked(actions: Any, shape: tuple[int, ...]) -> Any:
-    """Return a policy's actions; another shape than (E, A) is a ValueError."""
+    """Return a policy's actions; another shape than (E, A) is a ValueError, and so is NaN."""
     if (got := tuple(np.shape(actions))) != shape:
         raise ValueError(
             f"the policy must return actions of shape {shape}, a row for each of {shape[0]} "
             f"episodes, got {got}."
         )
+    missing = np.isnan(numpy_of(actions)).any(axis=1)
+    if missing.any():
+        raise ValueError(f"the policy's actions of episodes {name_rows(missing)} contain NaN.")
     return actions
 
 

@@ -30,6 +30,7 @@ from pixelbrax_jax.extras import needs_extra
 from pixelbrax_jax.flags import default_flags
 from pixelbrax_jax.generalisation.making import UNDISTURBED, Levels, make_levels
 from pixelbrax_jax.generalisation.suites import EPISODES, SUITES
+from pixelbrax_jax.paths import make_folder
 from pixelbrax_jax.validation import check_choice, check_positive_int
 
 VIEWS = ("clean", "level")
@@ -126,8 +127,9 @@ def record_pairs(
         "sees": sees,
         "policy": "uniform" if policy is None else policy_name,
     }
+    folder = make_folder("output_dir", output_dir)
     # Minari joins a relative folder to itself.
-    storage = _storage(Path(output_dir).absolute(), pairs, settings)
+    storage = _storage(folder.absolute(), pairs, settings)
     first = storage.total_episodes
     size = pairs.bytes_per_episode * (episodes - first) / 1e9
     report(f"{episodes - first} episodes, at most {size:.2f} GB before compression")
@@ -140,7 +142,7 @@ def record_pairs(
         first = storage.total_episodes
         shutil.copyfile(about, about.with_suffix(_KEPT))
         report(f"{first} of {episodes} episodes")
-    return Path(output_dir)
+    return folder
 
 
 class _Pairs:
@@ -254,15 +256,24 @@ def _storage(folder: Path, pairs: _Pairs, settings: dict[str, Any]) -> Any:
                 raise ValueError(f"{about} is damaged ({error}); delete the folder.") from error
             shutil.copyfile(about.with_suffix(_KEPT), about)
             found = MinariStorage.read_raw_metadata(folder).get(_SETTINGS)
+        if found is None and not MinariStorage.read(folder).total_episodes:
+            # A recording was stopped before it had its settings.
+            about.unlink()
+            return _new_storage(folder, pairs, settings)
         if found != settings:
             found = found if isinstance(found, dict) else {}
             names = [n for n in {**settings, **found} if settings.get(n) != found.get(n)]
             differ = "; ".join(f"{n}={found.get(n)!r}, not {settings.get(n)!r}" for n in names)
             raise ValueError(f"{folder} has another recording: {differ}. Take another folder.")
         return MinariStorage.read(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     if any(folder.iterdir()):
         raise ValueError(f"{folder} has files, but no recording; take another folder.")
+    return _new_storage(folder, pairs, settings)
+
+
+def _new_storage(folder: Path, pairs: _Pairs, settings: dict[str, Any]) -> Any:
+    from minari.dataset.minari_storage import MinariStorage
+
     storage = MinariStorage.new(
         folder,
         gym.spaces.Dict(pairs.spaces),

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 
 from pixelbrax_gym.bench.tables import table
-from pixelbrax_jax.cache import replacing
 from pixelbrax_jax.config import ENV_OPTIONS, EnvConfig
 from pixelbrax_jax.generalisation.frames import write_sheet
 from pixelbrax_jax.generalisation.intervals import interquartile_mean
 from pixelbrax_jax.generalisation.making import UNDISTURBED, LevelEnv, Levels
+from pixelbrax_jax.paths import make_folder, replacing
 from pixelbrax_jax.plain import to_plain
 from pixelbrax_jax.tasks import TASKS
 
@@ -168,11 +168,10 @@ def play(
     """
     options = options_of(levels)
     scores = Scores(levels.suite, levels.config.task, options, success_return=success_return)
-    path = None if folder is None else Path(folder)
+    path = None if folder is None else make_folder("output_dir", folder)
     known: Returns = {}
     if path is not None:
         known = read(scores, path)
-        path.mkdir(parents=True, exist_ok=True)
         if not (known and (path / SHEET).exists()):
             write_sheet(levels, path / SHEET)
     for level in levels.levels:
@@ -184,6 +183,9 @@ def play(
                 returns = np.asarray(player(level), np.float64)
                 of_run[name] = returns.tolist()
                 if path is not None:
+                    # Another process may have added runs.
+                    for other, found in read(scores, path).items():
+                        known[other] = found | known.get(other, {})
                     with replacing(path / RETURNS) as part:
                         part.write_text(_json(scores, known), "utf-8")
             mean = float(np.mean(of_run[name]))

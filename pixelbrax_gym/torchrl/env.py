@@ -190,11 +190,14 @@ class TorchRLEnv(EnvBase):
                 **{name: outputs[name] for name in names},
             }
         )
-        self.infos = {name: x.to(self.device) for name, x in exported["infos"].items()}
+        told = {name: x.to(self.device) for name, x in exported["infos"].items()}
         values = {name: exported[name][:, None] for name in names}
         values |= entries(exported["obs"], self._stateful.env.images)
         if where is not None:
-            values = _keep_unstepped(values, tensordict, where.reshape(self._num_envs))
+            rows = where.reshape(self._num_envs)
+            values = _keep_unstepped(values, tensordict, rows)
+            told = _keep_unstepped(told, self.infos, rows)
+        self.infos = told
         return self._tensordict(values)
 
     def _set_seed(self, seed: int | None) -> None:
@@ -232,9 +235,11 @@ class TorchRLEnv(EnvBase):
 
 
 def _keep_unstepped(
-    values: dict[str, torch.Tensor], before: TensorDictBase, where: torch.Tensor
+    values: dict[str, torch.Tensor],
+    before: TensorDictBase | dict[str, torch.Tensor],
+    where: torch.Tensor,
 ) -> dict[str, torch.Tensor]:
-    """Return ``values``, with the previous values and reward 0 in rows that were not stepped."""
+    """Return ``values``, with the previous ones, or 0, and reward 0 in rows without a step."""
 
     def choose(name: str, value: torch.Tensor) -> torch.Tensor:
         old = before.get(name, None) if name != "reward" else None

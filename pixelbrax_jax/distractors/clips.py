@@ -16,9 +16,10 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from pixelbrax_jax.cache import cache_folder, replacing, whole_path
+from pixelbrax_jax.cache import cache_folder
 from pixelbrax_jax.distractors import folders, procedural
 from pixelbrax_jax.distractors.media import AGAIN, read_clip
+from pixelbrax_jax.paths import replacing, whole_path
 from pixelbrax_jax.types import Clips
 from pixelbrax_jax.validation import check_choice, check_positive_int
 

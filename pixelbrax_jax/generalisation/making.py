@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pixelbrax_jax.cache import whole_path
 from pixelbrax_jax.config import EnvConfig
 from pixelbrax_jax.distractors.base import Chain, Distractor
 from pixelbrax_jax.distractors.clips import ClipBank, load_clips
@@ -25,6 +24,7 @@ from pixelbrax_jax.flags import default_flags
 from pixelbrax_jax.generalisation.changes import Change, changes_params_alone
 from pixelbrax_jax.generalisation.suites import EPISODES, SUITES, Level, levels_of
 from pixelbrax_jax.observations import parts_of
+from pixelbrax_jax.paths import whole_path
 from pixelbrax_jax.registry import find_task
 from pixelbrax_jax.scene.cameras import seen_from
 from pixelbrax_jax.types import EnvParams

@@ -126,6 +126,8 @@ def test_errors_name_the_setting_and_the_cure(capsys):
     assert "Did you mean 'ppo'?" in capsys.readouterr().err
     assert main(["train", "ppo", "--task", "antt"]) == 1
     assert "Did you mean 'ant'?" in capsys.readouterr().err
+    assert main(["record", "/nowhere", "--size", "1000000"]) == 1
+    assert "size=1000000, grid=3 would take at least" in capsys.readouterr().err
     assert main(["record", "/nowhere"]) == 1
     assert "no checkpoint in /nowhere/checkpoints, which does not exist" in capsys.readouterr().err
     assert main(["train", "--task", "ant"]) == 2

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pixelbrax_gym.bench.tables import table
-from pixelbrax_jax.cache import replacing
+from pixelbrax_jax.paths import replacing
 from tests.benchmarks.case import Case, Group, Row
 
 _HEADING = (

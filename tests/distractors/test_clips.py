@@ -13,9 +13,9 @@ from PIL import Image
 
 from pixelbrax_gym import cli
 from pixelbrax_jax import distractors, load_clips
-from pixelbrax_jax.cache import replacing
 from pixelbrax_jax.distractors import clips as clips_module
 from pixelbrax_jax.distractors import procedural
+from pixelbrax_jax.paths import replacing
 from pixelbrax_jax.video import write_frames
 
 LENGTHS = {"bear": 3, "boat": 1, "car-turn": 4}

@@ -171,7 +171,9 @@ def test_materials_that_a_model_has_not():
 
 
 def test_make_refuses_materials_that_a_model_has_not():
-    with pytest.raises(ValueError, match=r"materials=\('self', 'grid'\) of Color; it has: MatPlane"):
+    with pytest.raises(
+        ValueError, match=r"materials=\('self', 'grid'\) of Color; it has: MatPlane"
+    ):
         pb.make("gym_halfcheetah", distractors="color-easy")
 
 

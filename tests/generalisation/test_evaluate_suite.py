@@ -13,6 +13,7 @@ from PIL import Image
 
 from pixelbrax_gym import evaluate_suite
 from pixelbrax_gym.cli import _suite, main
+from pixelbrax_gym.cli._agents import name_of
 from pixelbrax_gym.cli.evaluate import Options
 from pixelbrax_jax.agents import PPOConfig
 from pixelbrax_jax.agents.runner.trained import Pretrained, Trained
@@ -159,6 +160,20 @@ def test_a_stopped_command_says_what_it_keeps(keeps, said, runs, capsys, monkeyp
     assert f"stopped; {'the same command ' if keeps else ''}{said}" in capsys.readouterr().err
 
 
+def test_calls_at_once_keep_what_the_others_played(tmp_path):
+    def while_playing(line):
+        if line.startswith("turned"):
+            evaluate({"other": lambda obs: -of_numpy(obs)}, output_dir=tmp_path)
+
+    mine = evaluate({"mine": of_numpy}, output_dir=tmp_path, report=while_playing)
+    assert list(mine.returns) == ["mine"]
+    kept = json.loads((tmp_path / "returns.json").read_text())["returns"]
+    assert {name: list(levels) for name, levels in kept.items()} == dict.fromkeys(
+        ("mine", "other"), LEVELS
+    )
+    assert kept["mine"] == mine.returns["mine"]
+
+
 def test_several_policies_are_seeds():
     found = evaluate({"one": of_numpy, "two": lambda obs: -of_numpy(obs)})
     assert list(found.returns) == ["one", "two"]
@@ -172,6 +187,13 @@ def test_several_policies_are_seeds():
         (lambda obs: [[0.0]], {}, ValueError, r"of shape \(3, 1\), .* got \(1, 1\)"),
         (None, {}, TypeError, "policy 'policy' must be a function of observations, got None"),
         ({}, {}, ValueError, "at least one policy"),
+        ({0: of_numpy}, {}, TypeError, "names of policies must be strings, got 0"),
+        (
+            lambda obs: jnp.array([[0.0], [jnp.nan], [0.0]]),
+            {"output": "jax"},
+            ValueError,
+            "actions of episodes 1 contain NaN",
+        ),
         (of_numpy, {"distractors": "color"}, TypeError, "distractors is decided by the levels"),
         (of_numpy, {"obs_mode": "state"}, ValueError, "obs_mode='state' shows none"),
         (of_numpy, {"heigth": 3}, TypeError, "unexpected keyword argument 'heigth'"),
@@ -216,8 +238,8 @@ def test_a_wrong_command_line(runs, capsys, arguments, message):
 
 def test_a_run_that_was_trained_again_has_another_name():
     first, again = (replace(agent(), networks={"actor": np.full(3, x)}) for x in (0.0, 1.0))
-    assert _suite._digest(first) == _suite._digest(replace(first))
-    assert _suite._digest(first) != _suite._digest(again)
+    assert name_of(first, "runs/a") == name_of(replace(first), "runs/a/")
+    assert name_of(first, "runs/a") != name_of(again, "runs/a")
 
 
 def test_clips_of_training_are_no_test(runs, capsys):

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -109,6 +111,31 @@ def test_a_stopped_recording_continues(policy, relative, tmp_path, monkeypatch):
     assert (tmp_path / "cut" / "0" / "part-0.parquet").stat().st_mtime_ns == before
 
 
+def test_a_recording_that_was_stopped_before_its_first_episode(tmp_path, monkeypatch):
+    with monkeypatch.context() as patched:
+        patched.setattr(
+            "minari.dataset.minari_storage.MinariStorage.update_metadata", _raise_interrupt
+        )
+        with pytest.raises(KeyboardInterrupt):
+            record(tmp_path / "cut")
+    for one, other in zip(record(tmp_path / "cut"), record(tmp_path / "whole"), strict=True):
+        same(one, other)
+
+
+def _raise_interrupt(*_):
+    raise KeyboardInterrupt
+
+
+def test_a_run_that_was_trained_again_is_another_recording(tmp_path, monkeypatch, capsys):
+    line = ["dataset", "run", "--suite", "tiny", "--level", "painted", "--num-envs", "3"]
+    line += ["--output-dir", str(tmp_path / "pairs")]
+    for value, status in ((0.0, 0), (0.0, 0), (1.0, 1)):
+        trained = replace(agent(), networks={"actor": np.full(3, value)})
+        monkeypatch.setattr(dataset, "load", lambda *_, trained=trained: trained)
+        assert main(line) == status
+    assert "another recording: policy='run, seed 0" in capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_the_command_records_agents_and_random_actions(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(dataset, "load", lambda options, folder: agent())
@@ -116,7 +143,7 @@ def test_the_command_records_agents_and_random_actions(tmp_path, monkeypatch, ca
     assert main(["dataset", "run", *where, "--output-dir", str(tmp_path / "run")]) == 0
     assert capsys.readouterr().out.strip() == str(tmp_path / "run")
     found = minari.MinariDataset(tmp_path / "run")
-    assert found.storage.metadata["algorithm_name"] == "run, seed 0, 16 steps"
+    assert found.storage.metadata["algorithm_name"] == "run, seed 0, 16 steps, e3b0c442"
     for one, other in zip(
         found.iterate_episodes(), record(tmp_path / "own", level="painted"), strict=True
     ):
@@ -152,6 +179,11 @@ def test_the_example_reads_the_state_of_clean_images_alone(tmp_path, monkeypatch
         ({"images": "normals"}, ValueError, "unknown images: 'normals'; allowed: depth, seg"),
         ({"obs_mode": "depth"}, TypeError, "obs_mode is decided by the recording; leave it out"),
         ({"policy": 3}, TypeError, "policy must be a function of observations or None, got 3"),
+        (
+            {"policy": lambda obs: jnp.full((2, 1), jnp.nan), "output": "jax"},
+            ValueError,
+            "actions of episodes 0, 1 contain NaN",
+        ),
         ({"num_envs": 0}, ValueError, "num_envs must be a positive integer, got 0"),
         (
             {"policy": lambda obs: np.zeros((2, 3))},

@@ -112,6 +112,31 @@ def test_another_run_is_not_overwritten(tmp_path, capsys):
     assert "name the agent otherwise with --agent" in capsys.readouterr().err
 
 
+def test_runs_of_one_agent_differ_in_seeds_alone(tmp_path, capsys):
+    board = tmp_path / "board"
+    for seed, reward, status in ((0, "brax", 0), (1, "paper", 1), (2, "brax", 0)):
+        run = make_run(tmp_path / str(seed), seed=seed, reward_preset=reward)
+        assert leaderboard(run, "--folder", board) == status
+    told = "reward_preset is 'paper' with seed 1 and 'brax' with seed 0 of the leaderboard"
+    assert told in capsys.readouterr().err
+    assert leaderboard(tmp_path / "1", "--agent", "by paper", "--folder", board) == 0
+
+
+def test_tasks_of_a_folder_have_entries(tmp_path, capsys):
+    assert leaderboard(make_run(tmp_path / "run", task="my/arm"), "--folder", tmp_path) == 0
+    assert "`my/arm`" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"task": "ant"}'])
+def test_other_files_are_no_entries(tmp_path, text, capsys):
+    (tmp_path / "notes.json").write_text(text)
+    assert leaderboard("--folder", tmp_path) == 1
+    assert f"{tmp_path / 'notes.json'} of --folder is not an entry" in capsys.readouterr().err
+    for path in (tmp_path / "notes.json", tmp_path / "none"):
+        assert leaderboard("--folder", path) == 1
+        assert f"--folder must be a folder with entries, and {path}" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("changes", "told"),
     [

@@ -109,6 +109,13 @@ def test_minus_one_keeps_the_time_limit_of_the_environment():
     assert steps_until_truncated(gymnasium.make_vec(ID, num_envs=2, **options)) == 6
 
 
+@pytest.mark.parametrize("make", [gymnasium.make, gymnasium.make_vec])
+def test_a_time_limit_that_no_episode_reaches(make):
+    env = make(ID, obs_mode="state", action_repeat=2, max_episode_steps=10**10)
+    env.reset(seed=0)
+    assert not np.any(env.step(env.action_space.sample())[3])
+
+
 @pytest.mark.parametrize(("calls", "length", "expected"), [(3, 9, 3), (7, 9, 5), (5, 9, 5)])
 def test_of_two_time_limits_the_first_one_holds(calls, length, expected):
     options = {"obs_mode": "state", "action_repeat": 2}

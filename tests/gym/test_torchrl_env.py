@@ -180,6 +180,7 @@ def test_partial_steps_leave_the_rest(make_torchrl):
     td = env.step(act(env.reset(), STAY))["next"]
     td["_step"] = torch.tensor([True, False, True])
     env.step(act(td, STAY))
+    assert env.infos["episode_length"].tolist() == [2, 1, 2]
     # Environment 1 has taken one step less than the others.
     td = env.step(act(td.select("done"), STAY))["next"]
     assert td["observation"][:, 1].tolist() == [3.0, 2.0, 3.0]
@@ -188,6 +189,15 @@ def test_partial_steps_leave_the_rest(make_torchrl):
         expected = whole.step(act(expected, STAY))["next"]
     for row in (0, 2):
         assert torch.equal(td["pixels"][row], expected["pixels"][row])
+
+
+def test_infos_of_environments_without_a_step(make_torchrl):
+    env = make_torchrl()
+    td = act(env.reset())
+    td["_step"] = torch.tensor([True, False, True])
+    env.step(td)
+    assert env.infos["episode_length"].tolist() == [1, 0, 1]
+    assert (env.infos["episode_return"] != 0).tolist() == [True, False, True]
 
 
 def test_unstepped_environments_keep_what_they_had(make_torchrl):

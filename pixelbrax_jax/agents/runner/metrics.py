@@ -19,7 +19,7 @@ from tensorboardX.proto.summary_pb2 import Summary
 from tensorboardX.record_writer import masked_crc32c
 
 from pixelbrax_jax.agents.runner.progress import Report, reason
-from pixelbrax_jax.cache import replacing
+from pixelbrax_jax.paths import replacing
 
 _SUMS = ("episode/return_sum", "episode/length_sum", "episode/count")
 

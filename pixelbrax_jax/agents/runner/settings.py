@@ -21,7 +21,7 @@ from pixelbrax_jax.agents.config import (
     check_annotated,
     describe,
 )
-from pixelbrax_jax.cache import whole_path
+from pixelbrax_jax.paths import in_home, whole_path
 from pixelbrax_jax.processor import name_cpu
 from pixelbrax_jax.types import Clips
 from pixelbrax_jax.validation import check_choice
@@ -70,6 +70,7 @@ class RunConfig:
 
     def __post_init__(self) -> None:
         """Check the settings."""
+        object.__setattr__(self, "output_dir", str(in_home(self.output_dir)))
         check_choice("resume", self.resume, ("never", "latest"))
         check_annotated(self)
         if self.seed + self.seeds > 2**32:

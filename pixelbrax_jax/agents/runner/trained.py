@@ -29,11 +29,11 @@ from pixelbrax_jax.agents.runner.settings import (
 )
 from pixelbrax_jax.agents.runner.splits import plays_clips
 from pixelbrax_jax.agents.train_state import Networks
-from pixelbrax_jax.cache import replacing
 from pixelbrax_jax.distractors.presets import as_tuple
 from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.flags import under_default_flags
 from pixelbrax_jax.generalisation.making import UNDISTURBED
+from pixelbrax_jax.paths import in_home, replacing
 from pixelbrax_jax.policy import Policy, load_policy, read_pretrained
 
 
@@ -84,7 +84,7 @@ def load_trained(
 
     ``run`` is the index of the run, from 0, if several were trained together.
     """
-    checkpoints = Path(folder) / "checkpoints"
+    checkpoints = in_home(folder) / "checkpoints"
     if best and steps is not None:
         raise ValueError(f"give best or steps, not both; got steps={steps}.")
     if best and (steps := best_steps(checkpoints)) is None:
@@ -108,7 +108,7 @@ def load_trained(
 
 def num_runs(folder: str | Path) -> int:
     """Return the number of runs in the latest checkpoint of an output folder."""
-    return read_about(Path(folder) / "checkpoints")["config"].get("seeds", 1)
+    return read_about(in_home(folder) / "checkpoints")["config"].get("seeds", 1)
 
 
 def with_clips(agent: Trained, clips: str | None) -> tuple[TrainConfig, Sequence[str] | None]:
