@@ -71,6 +71,13 @@ def from_plain(value: Any) -> Any:
     parts = {name: part for name, part in value.items() if name != TYPE}
     fields = {field.name: field for field in dataclasses.fields(cls) if field.init}
     check_options(parts, fields)
+    missing = [
+        name
+        for name, field in fields.items()
+        if name not in parts and field.default is field.default_factory is dataclasses.MISSING
+    ]
+    if missing:
+        raise ValueError(f"a dictionary for {value[TYPE]} lacks {', '.join(missing)}.")
     return cls(**{name: _field(part, fields[name]) for name, part in parts.items()})
 
 

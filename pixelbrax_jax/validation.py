@@ -114,3 +114,13 @@ check_not_negative: _Check[float] = partial(
     _check, float, lambda x: x >= 0, "be a number of at least 0"
 )
 check_finite: _Check[float] = partial(_check, float, lambda _: True, "be a finite number")
+
+
+def check_array(what: str, value: Any, *shapes: tuple[int, ...]) -> None:
+    """Raise a ValueError unless ``value`` has one of the shapes and all its numbers are finite."""
+    with suppress(ValueError, TypeError):  # such as rows of several lengths, or words
+        array = np.asarray(value, np.float64)
+        if array.shape in shapes and np.isfinite(array).all():
+            return
+    wanted = " or ".join(map(str, shapes))
+    raise ValueError(f"{what} must have finite numbers of shape {wanted}, got {value!r}.")

@@ -42,7 +42,7 @@ def _below(*names: str) -> set[str]:
 
 ALLOWED: dict[str, set[str]] = {
     **{f"pixelbrax_jax.{name}": set() for name in FOUNDATIONS},
-    "pixelbrax_jax.spatial": {"pixelbrax_jax.types"},
+    "pixelbrax_jax.spatial": {"pixelbrax_jax.types", "pixelbrax_jax.validation"},
     "pixelbrax_jax.observations": {"pixelbrax_jax.validation"},
     "pixelbrax_jax.compilation": {"pixelbrax_jax.flags", "pixelbrax_jax.validation"},
     "pixelbrax_jax.cache": {"pixelbrax_jax.paths"},

@@ -16,7 +16,7 @@ from pixelbrax_jax.spatial import quat_normalize
 from pixelbrax_jax.types import PhysicsState
 
 # MuJoCo's limit for bad numbers (``mju_isBad``). It is small enough for float32 to render a scene.
-_LARGEST = 1e10
+LARGEST = 1e10
 
 
 class Recipe(NamedTuple):
@@ -104,7 +104,7 @@ class GuardedPhysics(Physics):
     def _is_finite(self, state: PhysicsState) -> jax.Array:
         watched = (self._watched(state), state.obs, state.reward)
         # False for NaN too.
-        leaves = [jnp.all(jnp.abs(leaf) < _LARGEST) for leaf in jax.tree.leaves(watched)]
+        leaves = [jnp.all(jnp.abs(leaf) < LARGEST) for leaf in jax.tree.leaves(watched)]
         return jnp.all(jnp.stack(leaves))
 
 

@@ -284,6 +284,9 @@ def _capsule(o: jax.Array, d: jax.Array, size: jax.Array) -> tuple[jax.Array, ja
     for end in (-half, half):
         cap, _ = _sphere(o - jnp.array([0.0, 0.0, 1.0]) * end, d, size)
         t = jnp.minimum(t, cap)
+    # From inside, a ray would enter the sphere of an end.
+    beside = o - jnp.clip(o[..., 2:], -half, half) * jnp.array([0.0, 0.0, 1.0])
+    t = jnp.where(jnp.sum(beside * beside, -1) < size[0] ** 2, jnp.inf, t)
     point = _at(o, d, t)
     on_axis = jnp.clip(point[..., 2], -half, half)
     return t, spatial.unit(point - on_axis[..., None] * jnp.array([0.0, 0.0, 1.0]))

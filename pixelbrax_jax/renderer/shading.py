@@ -33,7 +33,9 @@ def beam(lamp: Lamp, pos: Vector, axis: Vector, points: Vector) -> tuple[Vector,
     away = [p - c for p, c in zip(points, pos, strict=True)]
     square = dot(away, away)
     # A select, because XLA would store a root that has several readers.
-    inv_distance = jnp.where(square > 0.0, jax.lax.rsqrt(square), 1.0)
+    # The inner one keeps derivatives finite.
+    safe = jnp.where(square > 0.0, square, 1.0)
+    inv_distance = jnp.where(square > 0.0, jax.lax.rsqrt(safe), 1.0)
     ray = tuple(component * inv_distance for component in away)
     along = dot(ray, axis)
     strength = jnp.where(along >= lamp.cos_cutoff, at_least(along, 0.0) ** lamp.exponent, 0.0)

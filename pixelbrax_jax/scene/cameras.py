@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pixelbrax_jax.spatial import f32, look_at, make_rig, rotate
+from pixelbrax_jax.spatial import check_rig, f32, look_at, make_rig, rotate
 from pixelbrax_jax.types import Camera, CameraRig, GeomKind, Geoms
 from pixelbrax_jax.validation import check_choice
 
@@ -43,7 +43,7 @@ def choose_rig(
 ) -> CameraRig:
     """Return a rig by name, the given rig, or a rig for a fixed camera."""
     if isinstance(camera, CameraRig):
-        return camera
+        return check_rig(camera)
     if isinstance(camera, Camera):
         pos, xmat = f32(camera.pos), f32(camera.xmat)
         return make_rig(pos, pos - xmat[:, 2], float(camera.fovy), up=xmat[:, 1])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pixelbrax_jax.spatial import f32
 from pixelbrax_jax.types import Look
-from pixelbrax_jax.validation import check_bool, check_choice
+from pixelbrax_jax.validation import check_array, check_bool, check_choice, check_positive_int
 
 LOOKS: dict[str, Look] = {
     # Cool ground and sky, so that the warm colors of the models stand out.
@@ -57,15 +57,34 @@ LOOKS: dict[str, Look] = {
 LOOKS["dmc-plain"] = LOOKS["dmc"]
 
 
+_SHAPES: dict[str, tuple[tuple[int, ...], ...]] = {
+    **dict.fromkeys(("ambient", "diffuse", "specular", "highlight", "ground_pitch"), ((),)),
+    **dict.fromkeys(("headlight", "headlight_highlight", "reflectance", "ground_mark"), ((),)),
+    "light": ((3,),),
+    "sky": ((2, 3), (3, 3)),
+    "ground_rgb": ((2, 3),),
+}
+
+
 def make_look(look: str | Look = "default", *, shadows: bool | None = None) -> Look:
     """Return a look by name, or the given one; ``shadows`` other than None replaces its value.
 
     Raises:
-        ValueError: the name is unknown.
+        ValueError: the name is unknown, or a part of the given look has a wrong value.
         TypeError: ``look`` is neither a string nor a ``Look``, or ``shadows`` is not a bool.
     """
     if isinstance(look, str):
         look = LOOKS[check_choice("look", look, LOOKS)]
     elif not isinstance(look, Look):
         raise TypeError(f"look must be a name or a pixelbrax_jax.Look, got {type(look).__name__}.")
+    else:
+        _check(look)
     return look if shadows is None else look.replace(shadows=check_bool("shadows", shadows))
+
+
+def _check(look: Look) -> None:
+    check_choice("ground of a Look", look.ground, ("checker", "grid"))
+    check_positive_int("shininess of a Look", look.shininess)
+    for name, shapes in _SHAPES.items():
+        if (value := getattr(look, name)) is not None:
+            check_array(f"{name} of a Look", value, *shapes)

@@ -282,6 +282,21 @@ def test_functions_of_other_arguments(change, message):
         build(**change)
 
 
+@pytest.mark.parametrize("groups", [1, "012", (0, 6), (0.5,), ["a"]])
+def test_groups_are_mujocos(groups):
+    with pytest.raises(ValueError, match="geom_groups must be a collection of MuJoCo's groups, 0"):
+        build(geom_groups=groups)
+
+
+@pytest.mark.parametrize(
+    "start", [{"init_q": [0.0, np.nan]}, {"init_q": [0.0, 1e11]}, {"reset_noise": 1e30}]
+)
+def test_episodes_do_not_begin_diverged(start):
+    (name,) = start
+    with pytest.raises(ValueError, match=f"{name} must be .*below 1e\\+10, got"):
+        build(**start)
+
+
 def test_what_is_rendered_opaque_is_named():
     pane = '<geom name="pane" type="box" size=".1 .1 .1" rgba="1 0 0 {}" group="{}"/>'
     fog = '<asset><material name="fog" rgba="1 1 1 .5"/></asset>'

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import mujoco
 import numpy as np
 import pytest
@@ -168,6 +170,89 @@ def test_ground_and_sky_come_from_the_textures(scene):
     assert (above > horizon + 0.1).all()
     assert (above <= [0.4, 0.6, 0.8]).all()
     assert (below < 0.1).all()
+
+
+@pytest.mark.parametrize(
+    ("size", "repeat", "uniform", "pitch"),
+    [
+        ("0 0 1", "2 2", "true", 0.5),
+        ("0 0 1", "2 2", "false", 0.5),
+        ("10 10 1", "2 2", "true", 0.5),
+        ("10 10 1", "2 2", "false", 5.0),
+        ("10 5 1", "4 2", "false", 2.5),
+        ("10 0 1", "4 .4", "false", 2.5),
+    ],
+)
+def test_tiles_of_planes_that_end_or_do_not(size, repeat, uniform, pitch):
+    xml = MODEL.replace('size="2 0 .1"', f'size="{size}"').replace(
+        'texrepeat="2 2" texuniform="true"', f'texrepeat="{repeat}" texuniform="{uniform}"'
+    )
+    assert read_scene(mujoco.MjModel.from_xml_string(xml)).look.ground_pitch == pytest.approx(pitch)
+
+
+def test_tiles_that_are_no_squares_are_told():
+    xml = MODEL.replace('texrepeat="2 2"', 'texrepeat="2 4"')
+    with pytest.warns(UserWarning, match=r"tiles of plane 'ground' are 0\.5 by 0\.25 m"):
+        read_scene(mujoco.MjModel.from_xml_string(xml))
+
+
+@pytest.mark.parametrize(
+    ("changes", "shows"),
+    [
+        ({}, True),
+        ({"rgb1": "1 0 0"}, False),
+        ({"texrepeat": "7 7"}, False),
+    ],
+)
+def test_other_checkered_planes(changes, shows):
+    """Those of other colors or sizes show their mean color."""
+    values = {"rgb1": ".2 .4 .6", "texrepeat": "2 2"} | changes
+    xml = MODEL.replace(
+        "</asset>",
+        f'''<texture name="other" type="2d" builtin="checker" rgb1="{values["rgb1"]}"
+            rgb2=".8 .6 .4" width="40" height="40"/>
+        <material name="other" texture="other" texrepeat="{values["texrepeat"]}"
+            texuniform="true"/></asset>''',
+    ).replace('material="plain"', 'material="other"')
+    geoms = read_scene(mujoco.MjModel.from_xml_string(xml)).geoms
+    wall = row(geoms, "wall")
+    assert geoms.patterned[row(geoms, "ground")]
+    assert geoms.patterned[wall] == shows
+    if changes == {"rgb1": "1 0 0"}:
+        color = geoms.rgb[geoms.material[wall]]
+        np.testing.assert_allclose(color, [0.9, 0.3, 0.2], atol=0.01)
+
+
+def test_what_lights_have_that_is_not_rendered():
+    lights = """
+      <light name="aimed" pos="2 0 3" mode="targetbody" target="arm" cutoff="20"/>
+      <light name="below" directional="true" mode="targetbodycom" target="arm" pos="0 0 -1"/>
+      <light name="far" pos="0 0 3" attenuation="1 0 1"/>
+      <light name="flat" castshadow="false"/>
+      <light name="image" type="image" texture="sky"/>
+    """
+    xml = re.sub(r"<light name=.sun.*", lights, MODEL)
+    model = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    with pytest.warns(UserWarning, match="light") as told:
+        look = read_scene(model).look
+    assert [str(one.message) for one in told] == [
+        "light 'aimed', 'below': it does not turn to its body.",
+        "light 'far': its attenuation is left out.",
+        "light 'flat': it casts shadows, because other lights do.",
+        "light 'image': lights of images are left out.",
+    ]
+    names = [model.light(i).name for i in range(model.nlight) if model.light_type[i] == 0]
+    names.remove("off")
+    assert len(look.lamps) == len(names)
+    aimed = look.lamps[names.index("aimed")]
+    np.testing.assert_allclose(aimed.axis, data.light("aimed").xdir, atol=1e-6)
+    np.testing.assert_allclose(look.light, -data.light("below").xdir, atol=1e-6)
+    assert look.shadows
+    model.light_castshadow[:] = 0
+    with pytest.warns(UserWarning, match="light"):
+        assert not read_scene(model).look.shadows
 
 
 def test_what_cannot_be_drawn_is_named():

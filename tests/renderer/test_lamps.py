@@ -22,6 +22,8 @@ LAMP = Lamp(
     diffuse=jnp.float32(0.7),
     highlight=jnp.float32(0.0),
 )
+TURNED = jnp.array([1.0, -1.0, -1.0])
+"""Of axes that look up instead of down."""
 PLANE = (GeomKind.PLANE, (0.0, 0.0, 1.0), (0, 0, 0))
 
 
@@ -101,6 +103,16 @@ def test_a_sky_of_three_colors(renderer):
     slope = -(np.arange(SIZE) + 0.5 - SIZE / 2) * 2 / SIZE * np.tan(np.deg2rad(30))
     rise = slope / np.hypot(1.0, slope)
     np.testing.assert_allclose(np.asarray(frame.g)[:, 0], 0.5 + 0.5 * rise, atol=1e-5)
+
+
+def test_gradients_where_a_ray_meets_a_lamp_are_finite():
+    """Light on the sky is computed at a metre, and its color then left out."""
+    ahead = LAMP.replace(pos=jnp.array([0.0, 0.0, 1.0]))
+    scene = scene_of(PLANE, look=lit(lamps=(ahead,), opengl=True), camera=from_above(2.0))
+    scene = scene.replace(camera=scene.camera.replace(pos=jnp.zeros(3), xmat=jnp.diag(TURNED)))
+    scene = jax.tree.map(jnp.asarray, scene)
+    gradient = jax.jit(jax.grad(lambda s: jnp.sum(render(s, 3, 3).r)))(scene)
+    assert all(bool(jnp.isfinite(x).all()) for x in jax.tree.leaves(gradient))
 
 
 def test_gradients_of_lamps_are_finite():

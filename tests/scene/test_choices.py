@@ -52,6 +52,38 @@ def test_a_model_has_a_plain_look_and_a_detailed_one():
     assert pixels == [pytest.approx(2.0 / 100)]
 
 
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"ground": "stripes"}, "unknown ground of a Look: 'stripes'; allowed: checker, grid"),
+        ({"shininess": 0}, "shininess of a Look must be a positive integer, got 0"),
+        ({"ambient": np.nan}, r"ambient of a Look must have finite numbers of shape \(\), got nan"),
+        ({"sky": np.ones((4, 3))}, r"sky of a Look .* shape \(2, 3\) or \(3, 3\), got"),
+        ({"ground_rgb": "red"}, r"ground_rgb of a Look .* of shape \(2, 3\), got 'red'"),
+    ],
+)
+def test_a_look_that_cannot_be_rendered(changes, told):
+    with pytest.raises(ValueError, match=told):
+        make_look(make_look("default").replace(**changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"eye": (0.0, np.nan, 1.0)}, r"eye of a CameraRig .* finite numbers of shape \(3,\)"),
+        ({"target": (0.0, 1.0)}, r"target of a CameraRig .* of shape \(3,\), got \(0.0, 1.0\)"),
+        ({"fovy": np.nan}, "fovy of a CameraRig must have finite numbers"),
+        ({"fovy": 200.0}, "fovy must lie between 0 and 180 degrees, got 200"),
+        ({"link": -7}, r"link of a CameraRig must be at least -1 \(none\), got -7"),
+        ({"eye": OWN["default"].target}, "cannot look at"),
+        ({"up": OWN["default"].target - OWN["default"].eye}, "'up' must not be parallel"),
+    ],
+)
+def test_a_camera_that_sees_nothing(changes, told):
+    with pytest.raises(ValueError, match=told):
+        choose_rig("ball", OWN["default"].replace(**changes), OWN)
+
+
 def test_dmcs_look_is_the_suites():
     """Colors and headlight of common/materials.xml, skybox.xml and visual.xml."""
     look = make_look("dmc")

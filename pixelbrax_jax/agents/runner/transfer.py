@@ -16,6 +16,7 @@ from pixelbrax_jax.agents.train_state import Networks
 from pixelbrax_jax.compilation import jit
 from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.envs.vector import VectorPixelEnv
+from pixelbrax_jax.flags import default_flags
 from pixelbrax_jax.generalisation.suites import EPISODES
 from pixelbrax_jax.types import EnvParams
 
@@ -42,7 +43,8 @@ def play_in(
     """
     acting = {name: networks[name] for name in player.acting}
     bare = replace(env, obs_mode="state")
-    keys = VectorPixelEnv.env_keys(jax.random.key(EPISODES), num_episodes)
+    with default_flags():
+        keys = VectorPixelEnv.env_keys(jax.random.key(EPISODES), num_episodes)
     returns, lengths = np.zeros(num_episodes), np.zeros(num_episodes, int)
 
     def look(frames: deque[np.ndarray], key: jax.Array) -> np.ndarray:

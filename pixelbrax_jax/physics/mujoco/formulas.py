@@ -16,6 +16,12 @@ from pixelbrax_jax.physics.mujoco.needs import Needs
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
 from pixelbrax_jax.spatial import f32, quat_multiply, quat_to_mat, rotate
 
+_JOINT = mujoco.mjtJoint
+_POSITIONS = {int(_JOINT.mjJNT_FREE): 7, int(_JOINT.mjJNT_BALL): 4}
+_POSITIONS |= dict.fromkeys(map(int, (_JOINT.mjJNT_HINGE, _JOINT.mjJNT_SLIDE)), 1)
+_VELOCITIES = _POSITIONS | {int(_JOINT.mjJNT_FREE): 6, int(_JOINT.mjJNT_BALL): 3}
+"""Numbers of a joint by its type."""
+
 
 class Start(struct.PyTreeNode):
     """An initial state with fields of ``State``; None means at rest or without a target."""
@@ -54,12 +60,17 @@ class Snapshot:
         return self.state.qvel
 
     def joint_pos(self, *names: str) -> jax.Array:
-        """Return the positions of hinges and slides."""
-        return self.state.qpos[np.array([self.model.joint(name).qposadr[0] for name in names])]
+        """Return the positions of joints, concatenated; of a free joint 7 numbers, of a ball 4."""
+        return self.state.qpos[self._rows(names, _POSITIONS, "qposadr")]
 
     def joint_vel(self, *names: str) -> jax.Array:
-        """Return the velocities of hinges and slides."""
-        return self.state.qvel[np.array([self.model.joint(name).dofadr[0] for name in names])]
+        """Return the velocities of joints, concatenated; of a free joint 6 numbers, of a ball 3."""
+        return self.state.qvel[self._rows(names, _VELOCITIES, "dofadr")]
+
+    def _rows(self, names: Iterable[str], sizes: Mapping[int, int], first: str) -> np.ndarray:
+        joints = [self.model.joint(name) for name in names]
+        starts = [(int(getattr(joint, first)[0]), sizes[int(joint.type[0])]) for joint in joints]
+        return np.array([row for start, size in starts for row in range(start, start + size)], int)
 
     def sensor(self, *names: str) -> jax.Array:
         """Return the readings of sensors, concatenated."""

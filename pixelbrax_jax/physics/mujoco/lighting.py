@@ -20,6 +20,11 @@ from pixelbrax_jax.types import Lamp, Look
 
 _DIRECTIONAL = int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
 _POINT = int(mujoco.mjtLightType.mjLIGHT_POINT)
+_IMAGE = int(mujoco.mjtLightType.mjLIGHT_IMAGE)
+_AIMED = (
+    int(mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODY),
+    int(mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODYCOM),
+)
 _TRACKCOM = int(mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM)
 _PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
 _RGB = int(mujoco.mjtTextureRole.mjTEXROLE_RGB)
@@ -48,14 +53,16 @@ def read_look(model: mujoco.MjModel) -> Look:
             f"{model.light(suns[0]).name or suns[0]!r}, is rendered.",
             stacklevel=2,
         )
+    _warn_of_lights(model)
     sun = suns[0] if suns else None
+    toward = None if sun is None else -_axis(model, sun)
     headlight = model.vis.headlight
     pitch, colors = _ground(model)
     return Look(
         ground="checker",
-        shadows=True,
+        shadows=_cast_shadows(model),
         shininess=_SHININESS,
-        light=None if sun is None else f32(-model.light_dir[sun]),
+        light=None if toward is None else f32(toward),
         ambient=f32(_ambient(model)),
         diffuse=f32(0.0 if sun is None else model.light_diffuse[sun].mean()),
         specular=f32(0.0),
@@ -102,12 +109,13 @@ def read_lamps(model: mujoco.MjModel, com_link: int) -> dict[str, Lamp]:
     for light in _active(model):
         mode, body = int(model.light_mode[light]), int(model.light_bodyid[light])
         is_unfit = mode == _TRACKCOM and not follows_tracked(model, body)
-        if model.light_type[light] == _DIRECTIONAL or is_unfit:
+        if model.light_type[light] in (_DIRECTIONAL, _IMAGE) or is_unfit:
             continue
-        link, pos, axis = body - 1, model.light_pos0[light], model.light_dir0[light]
+        link, pos = body - 1, model.light_pos0[light]
         if body == 0:
-            # These are up to date even if the model was edited after it was compiled.
-            pos, axis = model.light_pos[light], model.light_dir[light]
+            # It is up to date even if the model was edited after it was compiled.
+            pos = model.light_pos[light]
+        axis = _axis(model, light)
         if mode == _TRACKCOM:
             link, pos = com_link, model.light_poscom0[light]
         cutoff, exponent = float(model.light_cutoff[light]), float(model.light_exponent[light])
@@ -123,6 +131,43 @@ def read_lamps(model: mujoco.MjModel, com_link: int) -> dict[str, Lamp]:
             highlight=f32(_SPECULAR * model.light_specular[light].mean()),
         )
     return lamps
+
+
+def _axis(model: mujoco.MjModel, light: int) -> np.ndarray:
+    """Return the direction of a light; of one that turns to a body, in the first pose."""
+    if int(model.light_mode[light]) in _AIMED:
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_camlight(model, data)
+        axis: np.ndarray = data.light_xdir[light]
+        return axis
+    is_fixed = model.light_bodyid[light] == 0
+    # These are up to date even if the model was edited after it was compiled.
+    return model.light_dir[light] if is_fixed else model.light_dir0[light]
+
+
+def _cast_shadows(model: mujoco.MjModel) -> bool:
+    """Return whether lights cast shadows."""
+    active = model.light_active.astype(bool)
+    return not active.any() or bool(model.light_castshadow[active].any())
+
+
+def _warn_of_lights(model: mujoco.MjModel) -> None:
+    """Warn of what a model's lights have that is not rendered."""
+    active = model.light_active.astype(bool)
+    near = active & (model.light_type != _DIRECTIONAL) & (model.light_type != _IMAGE)
+    shadows = model.light_castshadow.astype(bool)
+    unlike = {
+        "it does not turn to its body": active & np.isin(model.light_mode, _AIMED),
+        "its attenuation is left out": near & (model.light_attenuation != (1, 0, 0)).any(axis=1),
+        "it casts shadows, because other lights do": active & ~shadows & shadows[active].any(),
+        "lights of images are left out": active & (model.light_type == _IMAGE),
+    }
+    for what, where in unlike.items():
+        names = [repr(model.light(i).name or f"light/{i}") for i in np.flatnonzero(where)]
+        if names:
+            warnings.warn(f"light {', '.join(names)}: {what}.", stacklevel=4)
 
 
 def _active(model: mujoco.MjModel) -> list[int]:
@@ -176,14 +221,37 @@ def texture_of(model: mujoco.MjModel, geom: int) -> int:
 
 
 def _ground(model: mujoco.MjModel) -> tuple[Any, Any]:
-    """Return pitch and colors of the first checkered plane; a texture has two tiles per edge."""
+    """Return pitch and colors of the first checkered plane."""
     if (geom := _checkered(model)) is None:
         return f32(1.0), f32([[0.1, 0.2, 0.3], [0.2, 0.3, 0.4]])
-    material = int(model.geom_matid[geom])
-    repeat = float(model.mat_texrepeat[material, 0])
-    if not model.mat_texuniform[material]:
-        repeat /= max(float(model.geom_size[geom, 0]), 1e-6)
-    return f32(1.0 / repeat), f32(checker(model, geom))
+    pitch, other = _pitch(model, geom)
+    if not np.isclose(pitch, other):
+        warnings.warn(
+            f"the tiles of plane {model.geom(geom).name or geom!r} are {pitch:.3g} by {other:.3g} "
+            "m; squares of the first are rendered.",
+            stacklevel=3,
+        )
+    return f32(pitch), f32(checker(model, geom))
+
+
+def _pitch(model: mujoco.MjModel, plane: int) -> np.ndarray:
+    """Return the (2,) edges of a checkered plane's tiles in metres, two for each texture."""
+    material = int(model.geom_matid[plane])
+    size = model.geom_size[plane, :2]
+    # Along an axis without end the texture repeats by the metre, whatever `texuniform` says.
+    spread = (size > 0) & ~bool(model.mat_texuniform[material])
+    repeat = model.mat_texrepeat[material] / np.where(spread, size, 1.0)
+    edges: np.ndarray = 1.0 / repeat
+    return edges
+
+
+def shows_ground(model: mujoco.MjModel, plane: int) -> bool:
+    """Return whether a plane has the checkers of the look's ground."""
+    own, first = checker(model, plane), _checkered(model)
+    if own is None or first is None:
+        return False
+    same = plane == first or bool(np.allclose(_pitch(model, plane), _pitch(model, first)))
+    return same and bool((own == checker(model, first)).all())
 
 
 def _ground_mark(model: mujoco.MjModel) -> Any:

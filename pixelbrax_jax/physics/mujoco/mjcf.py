@@ -16,6 +16,7 @@ import numpy as np
 
 from pixelbrax_jax.flags import default_flags
 from pixelbrax_jax.physics.base import ResetFn
+from pixelbrax_jax.physics.divergence import LARGEST
 from pixelbrax_jax.physics.mujoco.compatibility import loading_silenced
 from pixelbrax_jax.physics.mujoco.dynamics import Dynamics
 from pixelbrax_jax.physics.mujoco.formulas import Formulas, Snapshot, Start, never, observe_joints
@@ -114,6 +115,9 @@ def mjcf_physics(
             "noise in reset."
         )
     noise = 0.01 if reset_noise is None else check_not_negative("reset_noise", reset_noise)
+    if not noise < LARGEST:
+        raise ValueError(f"reset_noise must be below {LARGEST:g}, got {reset_noise!r}.")
+    _check_groups(geom_groups)
     substeps = check_positive_int("n_frames", n_frames)
     spec, model = _load(source)
     if model.nv == 0:
@@ -180,6 +184,8 @@ def _start(
     initial = np.asarray(init_q, np.float32)
     if initial.shape != (model.nq,):
         raise ValueError(f"init_q must have shape ({model.nq},), got {initial.shape}")
+    if not (np.abs(initial) < LARGEST).all():
+        raise ValueError(f"init_q must be finite and below {LARGEST:g}, got {init_q}.")
 
     def around(key: jax.Array) -> tuple[jax.Array, jax.Array]:
         q_key, qd_key = jax.random.split(key)
@@ -200,6 +206,14 @@ def _start(
         return Start(with_unit_rotations(model, qpos), qvel)
 
     return start
+
+
+def _check_groups(groups: object) -> None:
+    if not isinstance(groups, Collection) or not set(groups) <= {*range(mujoco.mjNGROUP)}:
+        raise ValueError(
+            f"geom_groups must be a collection of MuJoCo's groups, 0 to {mujoco.mjNGROUP - 1}, got "
+            f"{groups!r}."
+        )
 
 
 def _check_takes(name: str, function: Callable[..., Any], *arguments: str) -> None:

@@ -18,6 +18,7 @@ from pixelbrax_jax.physics.mujoco.compatibility import loading_silenced
 from pixelbrax_jax.physics.mujoco.multipliers import MultipliedModels
 from pixelbrax_jax.physics.mujoco.needs import Needs
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
+from pixelbrax_jax.physics.mujoco.sensors import read_actuators, read_constraints
 from pixelbrax_jax.processor import num_cores
 
 from mujoco.rollout import Rollout  # isort: skip  # MuJoCo is imported without OpenGL above
@@ -47,10 +48,13 @@ class Native:
         unread = disabled if needs.reads_forces else disabled | _OFF.mjDSBL_SENSOR
         self._moving = _without(model, unread)
         self._resting = _without(posed, disabled | _OFF.mjDSBL_ACTUATION)
-        self._still = _without(
-            posed,
-            disabled | _OFF.mjDSBL_ACTUATION | _OFF.mjDSBL_CONSTRAINT | _OFF.mjDSBL_CONTACT,
-        )
+        self._reads_actuators = read_actuators(model)
+        still = disabled
+        if not self._reads_actuators:
+            still |= _OFF.mjDSBL_ACTUATION
+        if not read_constraints(model):
+            still |= _OFF.mjDSBL_CONSTRAINT | _OFF.mjDSBL_CONTACT
+        self._still = _without(posed, still)
         self._still.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
         if mujoco.mj_stateSize(model, _STATE) != 1 + model.nq + model.nv + model.na:
             raise ValueError("MuJoCo's plugins and delays are not simulated: remove them.")
@@ -159,6 +163,12 @@ class Native:
         with self._models(self._resting, multipliers) as models:
             _, found = self._roll(self._resting, models, first, 1)
         self._read(found[:, 0], xpos, xquat, sensordata)
+        if self._reads_actuators and self._senses:
+            # With actuators off they have no velocities.
+            with self._models(self._still, multipliers) as models:
+                _, found = self._roll(self._still, models, first, 1)
+            own = found[:, 0, : sensordata.shape[1]]
+            sensordata[:, ~self._is_force] = own[:, ~self._is_force]
         if fields:
             with self._models(self._moving, multipliers) as models:
                 self._fill(fields, first, partial(self._look, models))

@@ -21,11 +21,11 @@ from pixelbrax_jax.physics.mujoco.geometry import (
     site_shapes,
 )
 from pixelbrax_jax.physics.mujoco.lighting import (
-    checker,
     mean_color,
     mirror_of,
     read_lamps,
     read_look,
+    shows_ground,
     texture_of,
 )
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
@@ -115,7 +115,7 @@ def _textured_geoms(
         yield shape._replace(
             rgb=shape.rgb if is_own else mean_color(model, shape.row, shape.rgb),
             bounded=bool(is_plane and (shape.size[:2] > 0).any()),
-            patterned=is_plane and not is_own and checker(model, shape.row) is not None,
+            patterned=is_plane and not is_own and shows_ground(model, shape.row),
             textured=not is_own and texture_of(model, shape.row) >= 0,
         )
 

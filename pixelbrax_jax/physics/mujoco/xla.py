@@ -16,6 +16,7 @@ from pixelbrax_jax.physics.mujoco.multipliers import multiplied
 from pixelbrax_jax.physics.mujoco.needs import Needs
 from pixelbrax_jax.physics.mujoco.omissions import check_simulated
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
+from pixelbrax_jax.physics.mujoco.sensors import read_more_than_bodies
 
 with import_silenced():
     from mujoco import mjx
@@ -125,9 +126,13 @@ class Xla:
 
     def _readings(self, model: Any, data: Any) -> Arrays:
         """Return ``xpos, xquat, sensordata``; sensors of forces are those of ``data``."""
-        data = mjx.kinematics(model, data)
-        data = mjx.com_pos(model, data)
-        data = mjx.com_vel(model, data)
+        if read_more_than_bodies(self._model):
+            data = mjx.fwd_position(model, data)
+            data = mjx.fwd_velocity(model, data)
+        else:
+            data = mjx.kinematics(model, data)
+            data = mjx.com_pos(model, data)
+            data = mjx.com_vel(model, data)
         if self._model.nsensor:
             data = mjx.sensor_pos(model, data)
             data = mjx.sensor_vel(model, data)
