@@ -14,6 +14,7 @@ from pixelbrax_jax.tasks import TASKS
 if TYPE_CHECKING:
     from pixelbrax_gym.generalisation.evaluation import evaluate_suite as evaluate_suite
     from pixelbrax_gym.generalisation.pairs import record_pairs as record_pairs
+    from pixelbrax_gym.generalisation.scores import Scores as Scores
     from pixelbrax_gym.gymnasium.check import check_vector_env as check_vector_env
     from pixelbrax_gym.gymnasium.env import GymnasiumEnv as GymnasiumEnv
     from pixelbrax_gym.gymnasium.vector_env import GymnasiumVectorEnv as GymnasiumVectorEnv
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 __all__ = [
     "GymnasiumEnv",
     "GymnasiumVectorEnv",
+    "Scores",
     "check_vector_env",
     "evaluate_suite",
     "record_pairs",
@@ -34,6 +36,7 @@ __all__ = [
 _LAZY = {
     "GymnasiumEnv": "pixelbrax_gym.gymnasium.env",
     "GymnasiumVectorEnv": "pixelbrax_gym.gymnasium.vector_env",
+    "Scores": "pixelbrax_gym.generalisation.scores",
     "SB3VecEnv": "pixelbrax_gym.sb3.vec_env",
     "TorchPolicy": "pixelbrax_gym.policy",
     "TorchRLEnv": "pixelbrax_gym.torchrl.env",

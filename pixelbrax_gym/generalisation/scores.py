@@ -76,7 +76,11 @@ class Scores:
     success_return: float | None = None
 
     def rows(self) -> list[Row]:
-        """Return a row for each level that all runs have, and one for all but the first level."""
+        """Return a row for each level that all runs have, and one for all but the first level.
+
+        It has ``level``, ``runs``, ``episodes``, ``mean``, ``low``, ``high``, ``standard_error``,
+        ``ratio`` (to clean), ``success`` and ``success_return``; what does not apply is NaN.
+        """
         runs = list(self.returns.values())
         names = [name for name in runs[0] if all(name in run for run in runs)] if runs else []
         arrays = {name: np.array([run[name] for run in runs], np.float64) for name in names}

@@ -210,6 +210,11 @@ def pictures() -> str:
     return table(["mean difference of a color, of 255", "image", "bodies"], lines)
 
 
+def picture(area: str = "all", pair: str = "ours, theirs") -> str:
+    """The median of models of how far their pictures are from dm_control's."""
+    return f"{median(of_pictures(pair, area)):.1f}"
+
+
 PARTS = {
     "whole": "nothing",
     "sky": "the sky's texture",
@@ -252,10 +257,13 @@ def parts() -> str:
 
 
 WHOLE = partial(whole, "peers.dm_control_envs")
+PICTURE = {"picture": picture, "picture-bodies": partial(picture, "else")}
 FIGURES = {
+    **PICTURE,
+    "picture-plain": partial(picture, "all", "ours, single"),
+    "picture-bodies-plain": partial(picture, "else", "ours, single"),
     "whole": WHOLE,
     "whole-share": partial(whole, "dmc.with_look", look="dmc-plain"),
-    "pictures": pictures,
     "tasks": tasks,
     "least": lambda: named(next(iter(ratios()))),
     "most": lambda: named(next(reversed(ratios()))),
@@ -267,7 +275,7 @@ FIGURES = {
     "part": part,
 }
 TRANSFER = {"transfer": transfer}
-ALL = {"speed": speed, "looks": looks, "parts": parts, "physics": physics}
+ALL = {"speed": speed, "looks": looks, "pictures": pictures, "parts": parts, "physics": physics}
 
 
 LEADERBOARD = FOLDER.parent / "leaderboard"
@@ -324,14 +332,8 @@ def training_minutes() -> str:
     return f"{span(taken)} minutes on each of {len(tasks)} tasks of DM Control"
 
 
-def picture(area: str = "all") -> str:
-    """The median of models of how far their pictures are from dm_control's."""
-    return f"{median(of_pictures('ours, theirs', area)):.1f}"
-
-
 README = {
-    "picture": picture,
-    "picture-bodies": partial(picture, "else"),
+    **PICTURE,
     "whole": WHOLE,
     "cheetah": lambda: number(speeds("dmc_cheetah_run")[0]),
     "cheetah-ratio": lambda: f"{ratios()['dmc_cheetah_run']:.0f}",
