@@ -96,6 +96,7 @@ def _clock(records: Iterable[Mapping[str, float]]) -> tuple[list[float], list[fl
 def add(of: Entry, folder: str | Path) -> Path:
     """Write an entry into a folder that has no other of its name; return its file."""
     board = make_folder("--folder", folder)
+    entries = read(board)
     agent, task = re.sub(r"[\W_]", "-", of["agent"].lower()), re.sub(r"\W", "-", of["task"])
     path = board / f"{agent}-{task}-{of['seed']}.json"
     if path.exists() and json.loads(path.read_text("utf-8")) != of:
@@ -103,7 +104,7 @@ def add(of: Entry, folder: str | Path) -> Path:
             f"{path} is another run of this agent, task and seed: delete it, or name the agent "
             "otherwise with --agent."
         )
-    for other in read(board):
+    for other in entries:
         if (other["task"], other["agent"]) == (of["task"], of["agent"]):
             _check_same_settings(of, other)
     path.write_text(json.dumps(of) + "\n", "utf-8")
@@ -112,7 +113,7 @@ def add(of: Entry, folder: str | Path) -> Path:
 
 def _check_same_settings(of: Entry, other: Entry) -> None:
     """Raise a ValueError if two entries cannot be seeds of one agent."""
-    here, there = of["config"], other["config"]
+    here, there = ({"algorithm": one.get("algorithm"), **one["config"]} for one in (of, other))
     # Releases differ in what they have settings for.
     for setting in sorted(here.keys() & there.keys() - _MAY_DIFFER):
         if here[setting] != there[setting]:

@@ -12,7 +12,6 @@ import numpy as np
 
 from pixelbrax_gym.generalisation.scores import LEFT_OUT, Scores, play
 from pixelbrax_gym.gymnasium.vector_env import GymnasiumVectorEnv
-from pixelbrax_gym.interop.actions import name_rows
 from pixelbrax_jax import EnvParams, VectorPixelEnv
 from pixelbrax_jax.config import ENV_OPTIONS, env_config
 from pixelbrax_jax.flags import default_flags
@@ -61,9 +60,11 @@ def evaluate_suite(
 
     Raises:
         ValueError: the suite is unknown or has no levels for the task, the policy returns another
-            shape, the folder has returns of other options, or ``success_return`` is not finite.
+            shape or NaN, the folder is a file or has returns of other options, or
+            ``success_return`` is not finite.
         FileNotFoundError: clips are missing; the message says where to get them.
-        TypeError: an option is unknown or the suite's own, or a policy cannot be called.
+        TypeError: an option is unknown or the suite's own, or a policy cannot be called or has a
+            name that is no string.
         ImportError: ``output_dir`` is given and Pillow is missing.
     """
     policies = policy if isinstance(policy, Mapping) else {"policy": policy}
@@ -129,8 +130,11 @@ def _returns(envs: GymnasiumVectorEnv, params: EnvParams, policy: Policy) -> np.
     return returns
 
 
-def checked(actions: Any, shape: tuple[int, ...]) -> Any:
-    """Return a policy's actions; another shape than (E, A) is a ValueError, and so is NaN."""
+def checked(actions: Any, shape: tuple[int, ...], episodes: np.ndarray | None = None) -> Any:
+    """Return a policy's actions; another shape than (E, A) is a ValueError, and so is NaN.
+
+    ``episodes`` are the numbers of the rows' episodes, by default 0 to E - 1.
+    """
     if (got := tuple(np.shape(actions))) != shape:
         raise ValueError(
             f"the policy must return actions of shape {shape}, a row for each of {shape[0]} "
@@ -138,7 +142,9 @@ def checked(actions: Any, shape: tuple[int, ...]) -> Any:
         )
     missing = np.isnan(numpy_of(actions)).any(axis=1)
     if missing.any():
-        raise ValueError(f"the policy's actions of episodes {name_rows(missing)} contain NaN.")
+        numbers = np.arange(len(missing)) if episodes is None else episodes
+        names = ", ".join(map(str, sorted({*numbers[missing].tolist()})))
+        raise ValueError(f"the policy's actions of episodes {names} contain NaN.")
     return actions
 
 

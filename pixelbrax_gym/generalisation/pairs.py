@@ -95,8 +95,8 @@ def record_pairs(
         The folder.
 
     Raises:
-        ValueError: a name or number is not allowed, the policy returns another shape, or the
-            folder has something else.
+        ValueError: a name or number is not allowed, the policy returns another shape or NaN, or
+            the folder has something else or is a file.
         FileNotFoundError: clips are missing; the message says where to get them.
         TypeError: an option is unknown, the suite's own or ``obs_mode``.
         ImportError: Minari is missing; the message says how to install it.
@@ -182,8 +182,8 @@ class _Pairs:
                 drawn = [one.uniform(-1.0, 1.0, shape[1:]) for one in random]
                 actions: Any = np.resize(np.array(drawn, np.float32), shape)
             else:
-                seen = obs[sees]
-                actions = checked(policy(seen["pixels"] if sees == "clean" else seen), shape)
+                seen = obs[sees]["pixels"] if sees == "clean" else obs[sees]
+                actions = checked(policy(seen), shape, np.resize(index, shape[0]))
             length += ~over
             stepped = {name: envs.step(actions) for name, envs in self._envs.items()}
             obs = {name: result[0] for name, result in stepped.items()}
@@ -249,15 +249,16 @@ def _storage(folder: Path, pairs: _Pairs, settings: dict[str, Any]) -> Any:
     about = folder / _ABOUT
     if about.exists():
         try:
-            found = MinariStorage.read_raw_metadata(folder).get(_SETTINGS)
+            raw = MinariStorage.read_raw_metadata(folder)
         except json.JSONDecodeError as error:
             # It was being written when a recording was stopped.
             if not about.with_suffix(_KEPT).exists():
                 raise ValueError(f"{about} is damaged ({error}); delete the folder.") from error
             shutil.copyfile(about.with_suffix(_KEPT), about)
-            found = MinariStorage.read_raw_metadata(folder).get(_SETTINGS)
-        if found is None and not MinariStorage.read(folder).total_episodes:
-            # A recording was stopped before it had its settings.
+            raw = MinariStorage.read_raw_metadata(folder)
+        found = raw.get(_SETTINGS)
+        if "dataset_id" not in raw and raw.get("total_episodes") == 0:
+            # So Minari begins: a recording was stopped before it had its settings.
             about.unlink()
             return _new_storage(folder, pairs, settings)
         if found != settings:

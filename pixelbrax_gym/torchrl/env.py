@@ -44,6 +44,7 @@ class TorchRLEnv(EnvBase):
         infos: tensors with leading axis N about the episodes of the last step:
             ``episode_return`` (sum of rewards), ``episode_length`` (control steps),
             ``non_finite`` (the physics diverged and ended the episode) and those of distractors.
+            Rows that a partial step leaves out keep theirs, 0 before their first step.
 
     Examples:
         >>> env = TorchRLEnv("ant", num_envs=256)

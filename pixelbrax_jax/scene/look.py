@@ -64,6 +64,9 @@ _SHAPES: dict[str, tuple[tuple[int, ...], ...]] = {
     "sky": ((2, 3), (3, 3)),
     "ground_rgb": ((2, 3),),
 }
+_LAMP_SHAPES = {"pos": (3,), "axis": (3,), "cos_cutoff": (), "diffuse": (), "highlight": ()}
+_MAY_LACK = ("light", "headlight", "headlight_highlight", "reflectance", "ground_mark")
+"""What a look may have None for."""
 
 
 def make_look(look: str | Look = "default", *, shadows: bool | None = None) -> Look:
@@ -71,7 +74,7 @@ def make_look(look: str | Look = "default", *, shadows: bool | None = None) -> L
 
     Raises:
         ValueError: the name is unknown, or a part of the given look has a wrong value.
-        TypeError: ``look`` is neither a string nor a ``Look``, or ``shadows`` is not a bool.
+        TypeError: ``look`` is neither a string nor a ``Look``, or its ``shadows`` are not a bool.
     """
     if isinstance(look, str):
         look = LOOKS[check_choice("look", look, LOOKS)]
@@ -85,6 +88,10 @@ def make_look(look: str | Look = "default", *, shadows: bool | None = None) -> L
 def _check(look: Look) -> None:
     check_choice("ground of a Look", look.ground, ("checker", "grid"))
     check_positive_int("shininess of a Look", look.shininess)
+    check_bool("shadows of a Look", look.shadows)
     for name, shapes in _SHAPES.items():
-        if (value := getattr(look, name)) is not None:
+        if (value := getattr(look, name)) is not None or name not in _MAY_LACK:
             check_array(f"{name} of a Look", value, *shapes)
+    for lamp in look.lamps:
+        for name, shape in _LAMP_SHAPES.items():
+            check_array(f"{name} of a Lamp", getattr(lamp, name), shape)

@@ -197,6 +197,17 @@ def test_errors_say_what_is_allowed(options, error, message, tmp_path):
         record(tmp_path, **options)
 
 
+def test_episodes_with_nan_are_named(tmp_path):
+    # An episode has five steps, and the second batch has episode 2 alone.
+    with pytest.raises(ValueError, match="actions of episodes 2 contain NaN"):
+        record(tmp_path, _nan_in_call(6), output="jax")
+
+
+def _nan_in_call(number):
+    calls = iter(range(number + 1))
+    return lambda obs: jnp.full((2, 1), jnp.nan if next(calls) == number - 1 else 0.0)
+
+
 def test_clips_are_only_for_levels_with_video(tmp_path):
     options = {"suite": "paper", "output_dir": tmp_path, **TINY}
     with pytest.raises(FileNotFoundError, match="level 'video' of suite 'paper' shows videos"):
@@ -209,6 +220,11 @@ def test_a_folder_holds_one_recording(tmp_path):
     record(tmp_path / "one", of_jax, output="jax", episodes=1)
     with pytest.raises(ValueError, match=r"another recording: sees='clean', not 'level'\. Take"):
         record(tmp_path / "one", of_jax, output="jax", episodes=1, sees="level")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "metadata.json").write_text('{"name": "my package"}')
+    with pytest.raises(ValueError, match="other has another recording"):
+        record(tmp_path / "other")
+    assert (tmp_path / "other" / "metadata.json").read_text() == '{"name": "my package"}'
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "notes.txt").write_text("mine")
     with pytest.raises(ValueError, match="full has files, but no recording"):

@@ -122,6 +122,16 @@ def test_runs_of_one_agent_differ_in_seeds_alone(tmp_path, capsys):
     assert leaderboard(tmp_path / "1", "--agent", "by paper", "--folder", board) == 0
 
 
+def test_runs_of_one_agent_have_one_algorithm(tmp_path, capsys):
+    board = tmp_path / "board"
+    assert leaderboard(make_run(tmp_path / "0"), "--agent", "mine", "--folder", board) == 0
+    (path,) = board.iterdir()
+    path.write_text(path.read_text().replace('"algorithm": "ppo"', '"algorithm": "dcpg"'))
+    run = make_run(tmp_path / "1", seed=1)
+    assert leaderboard(run, "--agent", "mine", "--folder", board) == 1
+    assert "algorithm is 'ppo' with seed 1 and 'dcpg' with seed 0" in capsys.readouterr().err
+
+
 def test_tasks_of_a_folder_have_entries(tmp_path, capsys):
     assert leaderboard(make_run(tmp_path / "run", task="my/arm"), "--folder", tmp_path) == 0
     assert "`my/arm`" in capsys.readouterr().out

@@ -282,7 +282,7 @@ def test_functions_of_other_arguments(change, message):
         build(**change)
 
 
-@pytest.mark.parametrize("groups", [1, "012", (0, 6), (0.5,), ["a"]])
+@pytest.mark.parametrize("groups", [1, "012", (0, 6), (0.5,), ["a"], [[0]]])
 def test_groups_are_mujocos(groups):
     with pytest.raises(ValueError, match="geom_groups must be a collection of MuJoCo's groups, 0"):
         build(geom_groups=groups)

@@ -232,6 +232,7 @@ def test_what_lights_have_that_is_not_rendered():
       <light name="image" type="image" texture="sky"/>
     """
     xml = re.sub(r"<light name=.sun.*", lights, MODEL)
+    xml = xml.replace('<light name="lamp"', '<light name="held"/><light name="lamp"')
     model = mujoco.MjModel.from_xml_string(xml)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -239,6 +240,7 @@ def test_what_lights_have_that_is_not_rendered():
         look = read_scene(model).look
     assert [str(one.message) for one in told] == [
         "light 'aimed', 'below': it does not turn to its body.",
+        "light 'held': it does not turn with its body.",
         "light 'far': its attenuation is left out.",
         "light 'flat': it casts shadows, because other lights do.",
         "light 'image': lights of images are left out.",
@@ -251,6 +253,10 @@ def test_what_lights_have_that_is_not_rendered():
     np.testing.assert_allclose(look.light, -data.light("below").xdir, atol=1e-6)
     assert look.shadows
     model.light_castshadow[:] = 0
+    with pytest.warns(UserWarning, match="light"):
+        assert not read_scene(model).look.shadows
+    # Nor does a light that is not rendered.
+    model.light_castshadow[model.light("image").id] = 1
     with pytest.warns(UserWarning, match="light"):
         assert not read_scene(model).look.shadows
 

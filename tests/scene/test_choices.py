@@ -8,6 +8,7 @@ import pytest
 from pixelbrax_jax import EnvConfig, list_envs, make_look, make_rig, register
 from pixelbrax_jax.envs import making
 from pixelbrax_jax.scene.cameras import choose_rig, with_sides
+from pixelbrax_jax.types import Lamp
 from tests.envs.toy import Ball
 
 OWN = {
@@ -15,6 +16,9 @@ OWN = {
     "side": make_rig((0, -2, 1), (0, 0, 1), 30.0),
     "back": make_rig((-2, 0, 1), (0, 0, 1), 60.0),
 }
+
+
+DARK = Lamp(-1, 0, np.full(3, np.nan), np.array([0, 0, -1]), *np.zeros(3, np.float32))
 
 
 def test_a_models_own_look_is_the_default_one():
@@ -59,6 +63,8 @@ def test_a_model_has_a_plain_look_and_a_detailed_one():
         ({"shininess": 0}, "shininess of a Look must be a positive integer, got 0"),
         ({"ambient": np.nan}, r"ambient of a Look must have finite numbers of shape \(\), got nan"),
         ({"sky": np.ones((4, 3))}, r"sky of a Look .* shape \(2, 3\) or \(3, 3\), got"),
+        ({"ambient": None}, "ambient of a Look must have finite numbers"),
+        ({"lamps": (DARK,)}, r"pos of a Lamp must have finite numbers of shape \(3,\), got"),
         ({"ground_rgb": "red"}, r"ground_rgb of a Look .* of shape \(2, 3\), got 'red'"),
     ],
 )

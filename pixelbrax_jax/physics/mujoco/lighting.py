@@ -21,6 +21,7 @@ from pixelbrax_jax.types import Lamp, Look
 _DIRECTIONAL = int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
 _POINT = int(mujoco.mjtLightType.mjLIGHT_POINT)
 _IMAGE = int(mujoco.mjtLightType.mjLIGHT_IMAGE)
+_FIXED = int(mujoco.mjtCamLight.mjCAMLIGHT_FIXED)
 _AIMED = (
     int(mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODY),
     int(mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODYCOM),
@@ -103,7 +104,8 @@ def read_lamps(model: mujoco.MjModel, com_link: int) -> dict[str, Lamp]:
     """Return the model's lamps by name.
 
     A lamp on a body follows but does not turn. Lamps that follow another center of mass than the
-    camera are left out. ``com_link`` is the link at the tracked center of mass, -1 for none.
+    camera, and lights of images, are left out. ``com_link`` is the link at the tracked center of
+    mass, -1 for none.
     """
     lamps = {}
     for light in _active(model):
@@ -148,21 +150,29 @@ def _axis(model: mujoco.MjModel, light: int) -> np.ndarray:
 
 
 def _cast_shadows(model: mujoco.MjModel) -> bool:
-    """Return whether lights cast shadows."""
-    active = model.light_active.astype(bool)
-    return not active.any() or bool(model.light_castshadow[active].any())
+    """Return whether lights cast shadows, if there are any."""
+    rendered = _rendered(model)
+    return not rendered.any() or bool(model.light_castshadow[rendered].any())
+
+
+def _rendered(model: mujoco.MjModel) -> np.ndarray:
+    """Return, for each light, whether it is rendered: no image, and of suns the first."""
+    rendered = model.light_active.astype(bool) & (model.light_type != _IMAGE)
+    rendered[np.flatnonzero(rendered & (model.light_type == _DIRECTIONAL))[1:]] = False
+    return rendered
 
 
 def _warn_of_lights(model: mujoco.MjModel) -> None:
     """Warn of what a model's lights have that is not rendered."""
-    active = model.light_active.astype(bool)
-    near = active & (model.light_type != _DIRECTIONAL) & (model.light_type != _IMAGE)
+    rendered, modes, kinds = _rendered(model), model.light_mode, model.light_type
+    fades = (model.light_attenuation != (1, 0, 0)).any(axis=1) & (kinds != _DIRECTIONAL)
     shadows = model.light_castshadow.astype(bool)
     unlike = {
-        "it does not turn to its body": active & np.isin(model.light_mode, _AIMED),
-        "its attenuation is left out": near & (model.light_attenuation != (1, 0, 0)).any(axis=1),
-        "it casts shadows, because other lights do": active & ~shadows & shadows[active].any(),
-        "lights of images are left out": active & (model.light_type == _IMAGE),
+        "it does not turn to its body": rendered & np.isin(modes, _AIMED),
+        "it does not turn with its body": rendered & (modes == _FIXED) & (model.light_bodyid > 0),
+        "its attenuation is left out": rendered & fades,
+        "it casts shadows, because other lights do": rendered & ~shadows & shadows[rendered].any(),
+        "lights of images are left out": model.light_active.astype(bool) & (kinds == _IMAGE),
     }
     for what, where in unlike.items():
         names = [repr(model.light(i).name or f"light/{i}") for i in np.flatnonzero(where)]

@@ -209,7 +209,8 @@ def _start(
 
 
 def _check_groups(groups: object) -> None:
-    if not isinstance(groups, Collection) or not set(groups) <= {*range(mujoco.mjNGROUP)}:
+    known = range(mujoco.mjNGROUP)
+    if not isinstance(groups, Collection) or not all(group in known for group in groups):
         raise ValueError(
             f"geom_groups must be a collection of MuJoCo's groups, 0 to {mujoco.mjNGROUP - 1}, got "
             f"{groups!r}."
