@@ -135,7 +135,12 @@ class MovingCamera(Distractor):
         rig = params.rig
         radius, azimuth, polar = _spherical(rig.eye - rig.target)
         away = _cartesian(state.radius * radius, state.azimuth + azimuth, state.polar + polar)
-        up = _turn(jnp.asarray(rig.up), spatial.unit(away), state.roll)
+        # The horizon stays level, unless the camera looks straight down.
+        turn = jnp.where(polar < _POLE, 0.0, state.azimuth)
+        x, y, z = jnp.asarray(rig.up)
+        cos, sin = jnp.cos(turn), jnp.sin(turn)
+        level = jnp.stack([x * cos - y * sin, x * sin + y * cos, z])
+        up = _turn(level, spatial.unit(away), state.roll)
         return params.replace(rig=rig.replace(eye=rig.target + away, up=up))
 
     def info(self, state: CameraState) -> dict[str, jax.Array]:

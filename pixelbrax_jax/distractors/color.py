@@ -7,6 +7,7 @@ from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from pixelbrax_jax.distractors.base import Distractor
 from pixelbrax_jax.types import EnvParams, Frame
@@ -53,12 +54,13 @@ class Color(Distractor):
         sky: whether the sky shifts too; only with ``mode="geom"``.
         materials: the model's names of the materials that shift, only with ``mode="geom"``; None
             for all. If materials have no names, all shift.
-        ground: whether the ground, planes with the look's checkers, shifts; False only with
-            ``mode="geom"`` and without ``materials``.
+        ground: whether the ground, planes with the look's checkers, shifts; ``"texture"`` darkens
+            it by factors 1 + x with x in [-scale, 0], as a change of the white material of a
+            texture does. Other than True only with ``mode="geom"`` and without ``materials``.
 
     Raises:
         ValueError: an option is unknown or out of range; the message says what is allowed.
-        TypeError: ``sky`` or ``ground`` is no bool.
+        TypeError: ``sky`` is no bool, or ``ground`` neither that nor ``"texture"``.
     """
 
     mode: str = "frame"
@@ -67,7 +69,7 @@ class Color(Distractor):
     distribution: str = "normal"
     sky: bool = False
     materials: tuple[str, ...] | None = None
-    ground: bool = True
+    ground: bool | str = True
 
     kind: ClassVar[str] = "color"
     stream: ClassVar[int] = 1
@@ -78,10 +80,15 @@ class Color(Distractor):
         check_choice("distribution of Color", self.distribution, DISTRIBUTIONS)
         check_fraction("scale of Color", self.scale)
         check_bool("sky of Color", self.sky)
-        check_bool("ground of Color", self.ground)
-        if self.mode == "frame" and (self.sky or self.materials is not None or not self.ground):
+        textured = self.ground == "texture"
+        if not (textured or isinstance(self.ground, (bool, np.bool_))):
+            raise TypeError(
+                f"ground of Color must be True, False or 'texture', got {self.ground!r}."
+            )
+        is_usual = bool(self.ground) and not textured
+        if self.mode == "frame" and (self.sky or self.materials is not None or not is_usual):
             raise ValueError("sky, materials and ground of Color are only for mode='geom'.")
-        if self.materials is not None and not self.ground:
+        if self.materials is not None and not is_usual:
             raise ValueError("materials of Color name all that shifts: leave out ground.")
         if self.materials is not None and not _are_names(self.materials):
             raise ValueError(
@@ -118,7 +125,9 @@ class Color(Distractor):
             look = look.replace(sky=jnp.clip(moved, 0.0, 1.0))
         plane = _plane_material(params)
         if plane is not None:
-            look = look.replace(ground_rgb=look.ground_rgb + state[plane])
+            ground, shift = look.ground_rgb, state[plane]
+            moved = ground * (1.0 + shift) if self.ground == "texture" else ground + shift
+            look = look.replace(ground_rgb=moved)
         # A plane may share its material with other geoms that have tighter bounds.
         rgb = jnp.clip(geoms.rgb + state, 0.0, 1.0)
         return params.replace(geoms=geoms.replace(rgb=rgb), look=look)
@@ -160,6 +169,8 @@ class Color(Distractor):
             # Planes show the ground's colors instead of their own.
             ground = jnp.asarray(params.look.ground_rgb)
             down, up = (-ground.min(0), 1 - ground.max(0)) if self.ground else (0.0, 0.0)
+            if self.ground == "texture":
+                down, up = -1.0, 0.0
             low, high = low.at[plane].set(down), high.at[plane].set(up)
         names = params.geoms.material_name
         if self.materials is not None and names:

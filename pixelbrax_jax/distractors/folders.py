@@ -130,6 +130,14 @@ def _plain(folder: Path, split: str) -> tuple[list[Source], str]:
             f"{folder} has clips next to the folders {', '.join(parts)}, which also have clips; "
             "move them into a separate folder."
         )
+    flat = {clip.name.lower(): clip.name for clip in clips if clip.is_dir()}
+    # `train` alone may be a clip, as it is one of DAVIS.
+    if "train" in flat and not _FOR_TESTS.isdisjoint(flat):
+        names = [flat[name] for name in ("train", *sorted(_FOR_TESTS)) if name in flat]
+        raise ValueError(
+            f"{folder} has images directly in {', '.join(names)}, and a folder of images is one "
+            f"clip: put each clip into a folder of its own, such as {names[0]}/clip/00000.jpg."
+        )
     if not parts and not clips:
         kinds = ", ".join(sorted(VIDEOS))
         own = "; it has images itself, so give the folder above it" if _pictures(folder) else ""

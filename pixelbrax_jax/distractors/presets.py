@@ -100,8 +100,14 @@ def preset(name: str, task: str) -> tuple[Distractor, ...]:
             dynamics="walk" if dynamic else "static",
             scale=scale,
             distribution="uniform",
+            ground=dcs_ground(task),
         ),
     )
+
+
+def dcs_ground(task: str) -> bool | str:
+    """Return how DCS changes the ground: in DM Control its material is white, with a texture."""
+    return "texture" if task.startswith("dmc_") else True
 
 
 def _ground_alpha(task: str) -> float:

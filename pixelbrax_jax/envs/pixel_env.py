@@ -221,7 +221,8 @@ class PixelEnv(ProgramConfig):
             params: the parameters.
 
         Returns:
-            The state and the first timestep, never terminated; the next step may be.
+            The state and the first timestep, terminated only if the pose is not finite; the next
+            step may be.
 
         Raises:
             ValueError: ``qpos`` or ``qvel`` has another shape.

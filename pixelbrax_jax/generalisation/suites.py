@@ -9,7 +9,7 @@ from pixelbrax_jax.distractors.base import Distractor
 from pixelbrax_jax.distractors.camera import MovingCamera
 from pixelbrax_jax.distractors.color import Color
 from pixelbrax_jax.distractors.image_filter import ImageFilter
-from pixelbrax_jax.distractors.presets import NUM_CLIPS, preset
+from pixelbrax_jax.distractors.presets import NUM_CLIPS, dcs_ground, preset
 from pixelbrax_jax.distractors.video import Video
 from pixelbrax_jax.generalisation.changes import (
     BodyColor,
@@ -120,7 +120,7 @@ def _dmcgb(task: str) -> tuple[Level, ...]:
 def _distracting(task: str, scale: float) -> tuple[Distractor, ...]:
     """Return the Distracting Control Suite's dynamic distractors at another scale."""
     videos = [link for link in preset("dcs-easy", task) if isinstance(link, Video)]
-    color = Color("geom", "walk", scale, "uniform")
+    color = Color("geom", "walk", scale, "uniform", ground=dcs_ground(task))
     return MovingCamera(scale), *_of_all_clips(videos), color
 
 

@@ -121,7 +121,7 @@ class Physics(abc.ABC):
             key: PRNG key for what else the task samples, such as a target.
 
         Returns:
-            A state for ``step``, never terminated; the next step may be.
+            A state for ``step``, terminated only if the pose is not finite; the next step may be.
 
         Raises:
             ValueError: a shape is wrong.

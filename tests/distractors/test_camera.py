@@ -196,6 +196,24 @@ def test_the_agent_stays_in_view_at_the_easy_level(task):
     assert inside.mean() > 0.8
 
 
+@pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.0, 0.5, 0.866)])
+def test_the_horizon_tilts_by_the_roll_alone(up):
+    """Also with cameras whose own up direction is tilted, as those of DM Control that look down."""
+    params = PARAMS.replace(rig=make_rig((0.0, -3.0, 1.0), (0.0, 0.0, 0.0), 50.0, up=up))
+    camera = distractors.MovingCamera(scale=0.3)
+    keys = jax.random.split(jax.random.key(0), 100)
+
+    def tilt(key):
+        state = camera.reset(key, params)
+        xmat = aim(camera.change_params(state, params).rig, jnp.zeros((1, 3))).xmat
+        # The world's vertical in the image.
+        return jnp.arctan2(xmat[2, 0], xmat[2, 1]), state.roll, state.azimuth
+
+    tilts, rolls, azimuths = jax.jit(jax.vmap(tilt))(keys)
+    assert np.abs(azimuths).max() > 0.4
+    np.testing.assert_allclose(np.abs(tilts), np.abs(rolls), atol=1e-5)
+
+
 def test_roll_turns_the_picture():
     params = PARAMS.replace(rig=RIG)
     camera = distractors.MovingCamera(scale=0.3, dynamic=False)

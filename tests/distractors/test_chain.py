@@ -17,6 +17,7 @@ from pixelbrax_jax.distractors import Color, MovingCamera, Video
 from pixelbrax_jax.distractors.base import Chain
 from pixelbrax_jax.distractors.presets import resolve
 from pixelbrax_jax.envs.pixel_env import PixelEnv
+from pixelbrax_jax.generalisation.suites import levels_of
 from tests.distractors.conftest import SIZE, make_bank, make_clips
 from tests.envs.toy import PARAMS, Ball
 
@@ -234,6 +235,16 @@ def test_ground_under_videos_of_dm_controls_tasks():
         assert video.ground_alpha == alpha, task
 
 
+def test_color_on_the_ground_of_dm_controls_tasks():
+    """The Distracting Control Suite changes the white material of its texture."""
+    for task, ground in (("dmc_walker_run", "texture"), ("walker2d", True)):
+        for name in ("dcs-hard", "dcs-easy-static"):
+            assert distractors.preset(name, task)[-1].ground == ground
+    for task, ground in (("dmc_walker_run", "texture"), ("ant", True)):
+        color = levels_of("dmcgb", task)[-1].changes[-1]
+        assert (color.kind, color.ground) == ("color", ground)
+
+
 def test_names_and_objects_may_be_mixed():
     assert resolve("color", "ant") == (Color(),)
     assert resolve(("video", Color(scale=0.1)), "ant") == (
@@ -334,7 +345,11 @@ def test_options_are_checked(distractor, options, message):
     ("distractor", "options", "message"),
     [
         (Color, {"mode": "geom", "sky": "no"}, "sky of Color must be True or False, got 'no'"),
-        (Color, {"mode": "geom", "ground": 1}, "ground of Color must be True or False, got 1"),
+        (
+            Color,
+            {"mode": "geom", "ground": 1},
+            "ground of Color must be True, False or 'texture', got 1",
+        ),
         (MovingCamera, {"dynamic": "false"}, "dynamic of MovingCamera must be True or False"),
         (Video, {"random_start": "no"}, "random_start of Video must be True or False"),
     ],

@@ -436,3 +436,15 @@ def test_command(davis, tmp_path, capsys):
     nowhere = str(tmp_path / "nowhere" / "sheet.png")
     assert cli.main(["clips", str(davis), "--size", "8", "--sheet", nowhere]) == 1
     assert "nowhere" in capsys.readouterr().err
+
+
+def test_splits_of_single_images_are_no_clips(tmp_path):
+    for name in ("train", "Test"):
+        (tmp_path / name).mkdir()
+        Image.new("RGB", (8, 8)).save(tmp_path / name / "0.png")
+    with pytest.raises(ValueError, match=r"images directly in train, Test, .* train/clip/00000"):
+        load_clips(tmp_path, "train", height=8, width=8)
+    # DAVIS has a clip of that name.
+    (tmp_path / "Test").rename(tmp_path / "bear")
+    with pytest.warns(UserWarning, match="split"):
+        assert load_clips(tmp_path, "train", height=8, width=8).names == ("bear", "train")

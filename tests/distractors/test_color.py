@@ -161,6 +161,23 @@ def test_the_ground_can_stay():
     np.testing.assert_array_equal(changed.look.ground_rgb, PARAMS.look.ground_rgb)
 
 
+@pytest.mark.parametrize("dynamics", ["static", "walk"])
+def test_a_textured_ground_darkens(dynamics):
+    """A channel of the Distracting Control Suite's white material is uniform in [1 - b, 1]."""
+    color = distractors.Color("geom", dynamics, 0.3, "uniform", ground="texture")
+    shifts = starts(color)[:, PARAMS.geoms.material[0]]
+    assert shifts.min() >= -0.3
+    assert shifts.max() <= 0.0
+    np.testing.assert_allclose(shifts.mean(0), -0.15, atol=0.003)
+    np.testing.assert_allclose(shifts.std(0), 0.3 / np.sqrt(12), rtol=0.02)
+    states = walk(color, PARAMS, steps=20, num=20)[-1]
+    for state in states:
+        changed = color.change_params(state, PARAMS).look.ground_rgb
+        factor = 1 + state[PARAMS.geoms.material[0]]
+        np.testing.assert_allclose(changed, PARAMS.look.ground_rgb * factor, rtol=1e-6)
+        assert ((factor >= 0.7 - 1e-6) & (factor <= 1)).all()
+
+
 def test_materials_that_a_model_has_not():
     color = distractors.Color("geom", "static", 0.3, "uniform", materials=("gird",))
     params = PARAMS.replace(geoms=PARAMS.geoms.replace(material_name=("floor", "skin")))
