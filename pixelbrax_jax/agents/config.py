@@ -123,6 +123,11 @@ class TrainConfig:
         """Bytes of the frames that an iteration stores besides the state."""
         return 0
 
+    @property
+    def steps_to_fill(self) -> int:
+        """Steps of the agent in which an empty replay is filled before learning begins."""
+        return 0
+
     def to_fit(self, excess: float) -> str:
         """Say how a run that takes ``excess`` bytes too much is made to fit."""
         del excess

@@ -31,7 +31,7 @@ _PROCGEN = {
     "learning_rate": 5e-4,
     "ent_coef": 0.01,
 }
-_PAPER = {"num_policy_phases": 32, "aux_minibatches": 32, "aux_epochs": 6}
+_PAPER = {"num_policy_phases": 32, "aux_minibatches": 512, "aux_epochs": 6}
 _FAST = {
     "frame_stack": 2,
     "num_steps": 32,
@@ -80,7 +80,7 @@ _SMALL_DRQV2 = {
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     # The defaults of each class.
     "default": {name: {} for name in ALGORITHMS},
-    # Lyu et al.'s scripts for Brax (the code of arXiv 2502.00021).
+    # Garcin et al.'s scripts for Brax (deac-rep, the code behind arXiv 2502.00021).
     "deacrep": {
         "ppo": _DEACREP | {"update_epochs": 1},
         "ppg": _DEACREP | {"aux_epochs": 1, "vf_coef": 0.5},
@@ -88,7 +88,7 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     },
     # Moon et al. for Procgen (arXiv 2210.09960), and Cobbe et al. for PPG (arXiv 2009.04416).
     "procgen": {
-        "ppo": _PROCGEN | {"clip_value": True},
+        "ppo": _PROCGEN | {"layout": "shared", "clip_value": True},
         "ppg": _PROCGEN | _PAPER | {"adam_eps": 1e-8, "max_grad_norm": 0.0},
         "dcpg": _PROCGEN | _PAPER,
     },

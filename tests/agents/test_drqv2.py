@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 from pixelbrax_jax.agents.off_policy.drqv2 import DrQv2
+from pixelbrax_jax.agents.runner import train
 from pixelbrax_jax.agents.runner.devices import check_memory
 from pixelbrax_jax.agents.runner.settings import RunConfig
 from pixelbrax_jax.agents.runner.train import run
@@ -117,6 +119,15 @@ def test_a_resumed_run_goes_on_with_or_without_its_replay(tmp_path, stored):
         assert int(resumed.state.replay.count) == 16
         assert int(resumed.state.opt_state["critic"].count) == (3 - 1) + 1
         assert same(resumed.state.env_state.sim.episode, whole.env_state.sim.episode)
+
+
+@pytest.mark.parametrize(("iterations", "learns"), [(3, True), (4, False)])
+def test_a_resumed_run_says_whether_it_learns_on(iterations, learns):
+    config = LATE.config.replace(total_steps=32 * 5)
+    state = SimpleNamespace(iteration=np.int32(iterations))
+    told = train._filled_anew(["replay"], state, config)
+    assert told.endswith("filled anew before learning goes on") == learns
+    assert ("first 64 of the agent's steps, and only 32 are left" in told) != learns
 
 
 def test_a_replay_that_does_not_fit_beside_the_state_is_told_with_the_largest(tmp_path):

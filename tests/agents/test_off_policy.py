@@ -172,7 +172,7 @@ CONFIG = DrQv2Config(env=SMALL["env"], encoder="small", num_envs=4, num_steps=8,
         (
             {"buffer_size": 100_000, "memory_budget_gb": 0.001},
             "the replay needs 97,200,000 bytes, but memory_budget_gb=0.001 allows 1,000,000; "
-            "the largest that fits is buffer_size=1024.",
+            "for frames alone the largest that fits is buffer_size=1024.",
         ),
     ],
 )

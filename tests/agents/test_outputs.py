@@ -127,6 +127,9 @@ def test_weights_and_biases_may_fail(tmp_path, monkeypatch):
     logged = []
 
     class Run:
+        def define_metric(self, names, step_metric):
+            assert (names, step_metric) == ("*", "steps")
+
         def log(self, record):
             logged.append(record["steps"])
             if len(logged) == 2:
@@ -149,6 +152,39 @@ def test_weights_and_biases_may_fail(tmp_path, monkeypatch):
     (missing,) = writer.missing()
     assert "Weights & Biases may lack records after 1 steps" in missing
     assert len(read_metrics(tmp_path / "metrics.jsonl")) == 3
+
+
+def test_weights_and_biases_may_not_start(tmp_path, monkeypatch):
+    class CommError(Exception):
+        pass
+
+    def init(**_):
+        raise CommError("api_key not configured (no-tty)")
+
+    monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(init=init))
+    told = []
+    writer = open_metrics(tmp_path, {}, told.append, wandb_project="p")
+    writer.write(1, {"x": 0.0})
+    writer.close()
+    assert len(read_metrics(tmp_path / "metrics.jsonl")) == 1
+    (line,), (missing,) = told, writer.missing()
+    assert "cannot log to Weights & Biases: api_key not configured (no-tty)" in line
+    assert "api_key not configured" in missing
+
+
+def test_a_resumed_run_is_one_run_of_weights_and_biases(tmp_path, monkeypatch):
+    given = []
+
+    def init(**options):
+        given.append(options)
+        return SimpleNamespace(define_metric=lambda *_, **__: None, finish=lambda: None)
+
+    monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(init=init))
+    for folder in ("a", "a", "b"):
+        open_metrics(tmp_path / folder, {}, print, wandb_project="p").close()
+    one, again, other = (options["id"] for options in given)
+    assert one == again != other
+    assert {options["resume"] for options in given} == {"allow"}
 
 
 class BrokenPipe:

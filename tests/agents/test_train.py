@@ -226,6 +226,25 @@ def test_the_best_and_the_latest_are_kept(tmp_path):
     again.close()
 
 
+def test_training_episodes_score_where_there_are_no_evaluations(tmp_path):
+    """All that ended since the last checkpoint, in iterations with a record or without."""
+    each = options(tmp_path, checkpoint_every=4 * PER_ITERATION)
+    run(ppg(), PARAMS, replace(each, keep_checkpoints=9))
+    records = read_metrics(tmp_path / "metrics.jsonl")
+    for first, steps in ((0, 4 * PER_ITERATION), (4 * PER_ITERATION, 8 * PER_ITERATION)):
+        part = [r for r in records if first < r["steps"] <= steps and r["episode/count"]]
+        count = sum(r["episode/count"] for r in part)
+        mean = sum(r["episode/return"] * r["episode/count"] for r in part) / count
+        score = read_about(tmp_path / "checkpoints", steps)["score"]
+        assert score == pytest.approx(mean)
+        assert len(part) > 1
+
+
+def test_splits_need_one_without_distractors(tmp_path):
+    with pytest.raises(ValueError, match="splits must have 'clean', got test"):
+        run(ppg(), PARAMS, options(tmp_path, num_evals=1), splits={"test": SPLITS["clean"]})
+
+
 @pytest.mark.slow
 def test_only_evaluations_score_where_there_are_any(tmp_path):
     each = options(tmp_path, num_evals=2, eval_episodes=1, checkpoint_every=PER_ITERATION)

@@ -35,8 +35,9 @@ class Actor(nn.Module):
     * ``"gaussian"``: the mean is linear in the features. Each action has one log standard
       deviation, clipped to [-5, 2], which is that of ``initial_std`` at first.
     * ``"tanh_gaussian"``: the same, but the action is the ``tanh`` of the sample.
-    * ``"deacrep"`` (Lyu et al.'s code for arXiv 2502.00021): the mean is ``tanh`` of a linear
-      layer, the standard deviation ``softplus`` of another one, clipped to [-10, 2], plus 0.001.
+    * ``"deacrep"`` (Garcin et al.'s code, behind arXiv 2502.00021): the mean is ``tanh`` of a
+      linear layer, the standard deviation ``softplus`` of another one, clipped to [-10, 2], plus
+      0.001.
     """
 
     encoder: str

@@ -108,7 +108,7 @@ class DrQv2Config(TrainConfig):
             raise ValueError(
                 f"the replay needs {self.replay_bytes:,} bytes, but memory_budget_gb="
                 f"{self.memory_budget_gb} allows {int(self.memory_budget_gb * 1e9):,}; "
-                f"{self.largest_that_fits(self.memory_budget_gb * 1e9)}"
+                f"for frames alone {self.largest_that_fits(self.memory_budget_gb * 1e9)}"
             )
 
     def _check_updates(self) -> None:
@@ -162,6 +162,11 @@ class DrQv2Config(TrainConfig):
     def steps_per_iteration(self) -> int:
         """Control steps of one iteration over all environments."""
         return self.num_envs * self.num_steps * self.env.action_repeat
+
+    @property
+    def steps_to_fill(self) -> int:
+        """See ``TrainConfig.steps_to_fill``."""
+        return self.learning_starts
 
     @property
     def num_updates(self) -> int:

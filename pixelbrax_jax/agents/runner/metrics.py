@@ -7,6 +7,7 @@ import os
 import socket
 import struct
 import time
+import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -22,6 +23,8 @@ from pixelbrax_jax.agents.runner.progress import Report, reason
 from pixelbrax_jax.paths import replacing
 
 _SUMS = ("episode/return_sum", "episode/length_sum", "episode/count")
+
+_SERVICE = "Weights & Biases"
 
 _MAX_WAITING = 64 * 2**20
 """Maximum number of bytes in memory for a file that cannot be written."""
@@ -131,20 +134,33 @@ def _tensorboard(folder: Path, first_step: int) -> _Output:
     return _Output(str(folder), write, file.close, first_step)
 
 
-def _wandb(project: str, config: dict[str, Any], folder: Path, first_step: int) -> _Output:
+def _wandb(
+    project: str, config: dict[str, Any], folder: Path, first_step: int, report: Report
+) -> _Output:
     try:
         import wandb
     except ImportError as error:
         raise ImportError(
             "wandb_project needs wandb, which is not installed: pip install wandb"
         ) from error
-    run = wandb.init(project=project, config=config, dir=str(folder))
+    try:
+        # A resumed run goes on in the same run of the service.
+        known = folder / "wandb_id"
+        if not known.exists():
+            known.write_text(uuid.uuid4().hex[:8] + "\n", "utf-8")
+        name = known.read_text("utf-8").strip()
+        run = wandb.init(project=project, config=config, dir=str(folder), id=name, resume="allow")
+        run.define_metric("*", step_metric="steps")
+    except Exception as error:  # The package has errors of many kinds.
+        report(f"cannot log to {_SERVICE}: {reason(error)}; training continues without it")
+        nothing: Any = lambda *_: None  # noqa: E731
+        return _Output(_SERVICE, nothing, nothing, first_step, retries=False, failure=reason(error))
 
     def write(steps: int, seconds: float, record: Mapping[str, float]) -> None:
         del seconds
         run.log(dict(record) | {"steps": steps})
 
-    return _Output("Weights & Biases", write, run.finish, first_step, retries=False)
+    return _Output(_SERVICE, write, run.finish, first_step, retries=False)
 
 
 class MetricsWriter:
@@ -219,7 +235,7 @@ def open_metrics(
     seconds = _keep_until(path, first_step)
     outputs = [_lines(path, first_step), _tensorboard(folder / "tensorboard", first_step)]
     if wandb_project is not None:
-        outputs.append(_wandb(wandb_project, config, folder, first_step))
+        outputs.append(_wandb(wandb_project, config, folder, first_step, report))
     return MetricsWriter(report, outputs, seconds)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -101,8 +102,11 @@ def run(
     Raises:
         CheckpointError: checkpoints cannot be written, or the folder has another or a longer run.
         FileExistsError: the folder has a run, and ``options.resume`` is not ``"latest"``.
+        ValueError: ``splits`` are given without ``"clean"``.
         TrainingDivergedError: a metric is not finite.
     """
+    if splits and "clean" not in splits:
+        raise ValueError(f"splits must have 'clean', got {', '.join(splits)}.")
     messages = Messages(report)
     with stop_requests(report) as stop:
         runs, mesh = Runs(algorithm, options.seeds), mesh_of(algorithm)
@@ -125,10 +129,7 @@ def run(
             if _goes_on(checkpoints, options, messages):
                 state = _restored(checkpoints, template, algorithm, messages)
                 if left_out := parts_not_kept(state):
-                    messages(
-                        f"not in the checkpoint: {', '.join(left_out)}; filled anew before "
-                        "learning goes on"
-                    )
+                    messages(_filled_anew(left_out, state, algorithm.config))
                     fresh = runs.init(seed, env_params)
                     state = state.replace(**{name: getattr(fresh, name) for name in left_out})
             else:
@@ -143,6 +144,19 @@ def run(
             }
             one = _Run(runs, env_params, options, checkpoints, messages, stop, evaluators)
             return one.train(state)
+
+
+def _filled_anew(parts: Sequence[str], state: TrainState, config: TrainConfig) -> str:
+    """Say when learning goes on without these parts of the state."""
+    iterations, needed = config.num_iterations - _iterations(state), config.steps_to_fill
+    steps = iterations * config.steps_per_iteration // config.env.action_repeat
+    then = "filled anew before learning goes on"
+    if 0 < steps < needed:
+        then = (
+            f"filling it takes the first {needed} of the agent's steps, and only {steps} are left, "
+            "so nothing more is learned; raise total_steps"
+        )
+    return f"not in the checkpoint: {', '.join(parts)}; {then}"
 
 
 def _goes_on(checkpoints: Checkpoints, options: RunConfig, report: Report) -> bool:
@@ -199,6 +213,8 @@ class _Run:
     warned: bool = False
     since: tuple[float, int] = (0.0, 0)
     """Time and steps at the last record."""
+    ended: tuple[float, float] = (0.0, 0.0)
+    """Sum of the returns, and number, of training episodes since the last checkpoint."""
 
     def __post_init__(self) -> None:
         self.algorithm = self.runs.algorithm
@@ -275,12 +291,13 @@ class _Run:
             logs = saves or number % self.options.log_every == 0
             if logs:
                 self.log(steps)
-            score = None if self.options.num_evals else self.record.get("episode/return")
+            score = None if self.options.num_evals else self.mean_return()
             if evaluates and not stopped_by:
                 self.evaluate(state, steps)
                 score = self.results["clean"].mean
             if saves:
                 self.checkpoints.save(kept(state), steps, score, last=last)
+                self.ended = 0.0, 0.0
             else:
                 self.checkpoints.look_after()
             if stopped_by:
@@ -314,6 +331,8 @@ class _Run:
         for record in records:
             self.check_finite(record, steps)
         self.record = summarize(records)
+        mean, count = (self.record.get(f"episode/{name}", 0.0) for name in ("return", "count"))
+        self.ended = self.ended[0] + mean * count, self.ended[1] + count
         if not self.warned:
             for line in self.algorithm.warnings(self.record):
                 self.report(line)
@@ -325,6 +344,11 @@ class _Run:
             self.writer.write(steps, self.record)
         if "episode/return" in self.record:
             self.bar.set_postfix(episode_return=f"{self.record['episode/return']:.1f}")
+
+    def mean_return(self) -> float | None:
+        """Return the mean return of training episodes since the last checkpoint, if any ended."""
+        total, count = self.ended
+        return total / count if count else None
 
     def check_finite(self, record: dict[str, Any], steps: int) -> None:
         wrong = {name: ~np.isfinite(value) for name, value in record.items()}
