@@ -103,6 +103,16 @@ def test_frames_are_stacked_and_actions_repeated_up_to_the_time_limit():
     assert told[1].startswith("episode 2 of 2: return ")
 
 
+def test_an_environment_that_also_shows_the_state_gives_equal_returns():
+    def returns(obs_mode):
+        env = PixelEnv(Ball(), height=8, width=8, frame_stack=2, obs_mode=obs_mode)
+        agent = player(lambda pixels: pixels.astype(jnp.float32).mean((1, 2, 3))[:, None] / 255)
+        return Evaluator(agent, env, limited(5), num_episodes=2)({}).returns
+
+    np.testing.assert_array_equal(returns("both"), returns("pixels"))
+    assert returns("pixels").any()
+
+
 def test_it_shows_the_states_of_our_physics():
     env = PixelEnv(Ball(), height=8, width=8, frame_stack=2, action_repeat=2)
     track, agent = Track(), player(lambda pixels: jnp.full((len(pixels), 1), 0.5))

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pixelbrax_jax.agents.rollout import split_obs
 from pixelbrax_jax.agents.runner.trained import Player
 from pixelbrax_jax.agents.train_state import Networks
 from pixelbrax_jax.compilation import jit
@@ -75,7 +76,9 @@ def _play(
 
     def step(carry: tuple[EnvState, jax.Array, Any]) -> tuple[EnvState, jax.Array, Any]:
         state, number, (over, returns, lengths) = carry
-        action = algorithm.act(networks, envs.obs(state))
+        # The environment of a training may also show the state, to a critic.
+        pixels, _ = split_obs(envs.obs(state))
+        action = algorithm.act(networks, pixels)
         state, timestep = envs.step(state, action, params)
         # Results after the end of an episode are ignored.
         returns = jnp.where(over, returns, timestep.info["episode_return"])
