@@ -107,7 +107,7 @@ docs-serve: $(VENV)/.installed-docs ## read the documentation in a browser while
 	NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs serve
 
 clean: ## remove the environment, builds and caches; keeps runs/
-	rm -rf $(VENV) .venv-ci .venv-clients .venv-newest .venv-oldest .venv-peers build dist site .jax_cache .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) .venv-ci .venv-clients .venv-newest .venv-oldest .venv-peers build dist site MUJOCO_LOG.TXT .jax_cache .mypy_cache .pytest_cache .ruff_cache
 	find pixelbrax_jax pixelbrax_gym tests examples -name __pycache__ -prune -exec rm -rf {} +
 
 # One environment for all; each set of extras is installed when it is first needed, and again
@@ -115,6 +115,9 @@ clean: ## remove the environment, builds and caches; keeps runs/
 $(VENV)/.installed-%: $(VENV)/.created pyproject.toml constraints.txt
 	@echo "Installing PixelBrax with its $* extras into $(VENV); the first time takes minutes ..."
 	@$(PIP) -e ".[$*]"
+	@# Tests read its models alone; what else it requires has no wheels for newer Pythons.
+	@if test "$*" = dev && ! $(RUN) -c "import sys; sys.exit(sys.version_info >= (3, 13))"; then \
+		$(PIP) --no-deps dm_control; fi
 	@touch $@
 
 # With no constraints pip takes the newest releases. Of dm_control only models are read; what else it

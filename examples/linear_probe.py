@@ -1,5 +1,6 @@
 """How much of the state a linear map reads off the pixels, clean and under a level.
 
+    pip install -c constraints.txt ".[train,dataset,dmc]"   # in a clone
     pixelbrax dataset --pretrained dmc_walker_walk --suite dmcgb2 --level color-hard \
         --episodes 20 --output-dir pairs/walker
     python examples/linear_probe.py pairs/walker
@@ -45,10 +46,16 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
     parser.add_argument("--cells", type=int, default=16, help="rows and columns of averaged pixels")
     parser.add_argument("--ridge", type=float, default=1.0, help="weight of the penalty")
     options = parser.parse_args(arguments)
-    episodes = list(minari.MinariDataset(options.dataset).iterate_episodes())
+    try:
+        episodes = list(minari.MinariDataset(options.dataset).iterate_episodes())
+    except ValueError as error:
+        parser.error(str(error))
     episodes = [one for one in episodes if len(one.rewards) >= FRAMES - 1]
     if len(episodes) < 5:
         parser.error(f"{options.dataset} has {len(episodes)} episodes; record at least 5.")
+    size = min(episodes[0].observations["pixels"].shape[1:3])
+    if not 1 <= options.cells <= size:
+        parser.error(f"--cells must lie in 1 to {size}, the size of images, got {options.cells}.")
 
     def stacked(part: list[Any], view: str) -> np.ndarray:
         return np.concatenate([features(one.observations[view], options.cells) for one in part])

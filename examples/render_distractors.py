@@ -139,20 +139,24 @@ def motion(frames: dict[str, np.ndarray], path: Path) -> None:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Writes both images."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--output-dir", type=Path, default=Path("docs/images/distractors"))
+    default = "default: docs/images/distractors, or runs/images/distractors for a part of them"
+    parser.add_argument("--output-dir", type=Path, help=default)
     parser.add_argument("--num-frames", type=int, default=18)
     parser.add_argument("--tasks", nargs="+", default=TASKS, choices=pixelbrax_jax.list_envs())
     parser.add_argument("--presets", nargs="+", default=list(ROWS), choices=list(ROWS))
     options = parser.parse_args(arguments)
-    options.output_dir.mkdir(parents=True, exist_ok=True)
+    whole = options == parser.parse_args([])
+    images = Path("docs/images" if whole else "runs/images")
+    folder = options.output_dir or images / "distractors"
+    folder.mkdir(parents=True, exist_ok=True)
     states = {task: simulate(task, options.num_frames) for task in options.tasks}
     frames = {
         name: np.concatenate([play(task, ROWS[name], states[task]) for task in states], axis=1)
         for name in options.presets
     }
-    levels(frames, options.output_dir / "levels.png")
+    levels(frames, folder / "levels.png")
     moving = {name: video for name, video in frames.items() if name in MOVING}
-    motion(moving or frames, options.output_dir / "motion.webp")
+    motion(moving or frames, folder / "motion.webp")
 
 
 if __name__ == "__main__":

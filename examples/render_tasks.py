@@ -133,12 +133,15 @@ def save(frames: np.ndarray, path: Path) -> None:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Writes ``wall.webp``, ``tasks/<task>.webp`` and ``views.png``, or ``dmc/wall.webp``."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--output-dir", type=Path, default=Path("docs/images"))
+    default = "default: docs/images, or runs/images for a part of them"
+    parser.add_argument("--output-dir", type=Path, help=default)
     parser.add_argument("--num-frames", type=int, default=60)
     tasks = pb.list_envs(suite="brax")
     parser.add_argument("--suite", choices=("brax", "dmc"), default="brax")
     parser.add_argument("--only", nargs="+", default=tasks, choices=tasks, help="tasks of Brax")
     options = parser.parse_args(arguments)
+    whole = options == parser.parse_args(["--suite", options.suite])
+    folder = options.output_dir or Path("docs/images" if whole else "runs/images")
 
     def played(names: Sequence[str]) -> dict[str, Any]:
         return {task: episode(task, options.num_frames) for task in names}
@@ -149,22 +152,22 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if options.suite == "dmc":
         if options.only is not tasks:
             parser.error("--only is for --suite brax")
-        (options.output_dir / "dmc").mkdir(parents=True, exist_ok=True)
+        (folder / "dmc").mkdir(parents=True, exist_ok=True)
         tiles = animated(played([f"dmc_{task}" for task in DMC_TILES]))
-        save(wall(list(tiles.values()), 5), options.output_dir / "dmc" / "wall.webp")
+        save(wall(list(tiles.values()), 5), folder / "dmc" / "wall.webp")
         return
-    (options.output_dir / "tasks").mkdir(parents=True, exist_ok=True)
+    (folder / "tasks").mkdir(parents=True, exist_ok=True)
     states = played(options.only)
     animations = animated(states)
     for task, frames in animations.items():
-        save(frames, options.output_dir / "tasks" / f"{task}.webp")
+        save(frames, folder / "tasks" / f"{task}.webp")
     if options.only is tasks:
         animations |= animated(played([task for task in TRAINED if task not in tasks]))
     if tiles := [animations[task] for task in TRAINED if task in animations]:
-        save(wall(tiles, 4), options.output_dir / "wall.webp")
+        save(wall(tiles, 4), folder / "wall.webp")
     shown = "ant" if "ant" in animations else options.only[0]
     images = views(shown, states[shown])
-    Image.fromarray(images).save(options.output_dir / "views.png")
+    Image.fromarray(images).save(folder / "views.png")
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from packaging.requirements import Requirement
 
-WITHOUT_TORCH = ("train", "dmc", "clips", "human", "video", "test")
+WITHOUT_TORCH = ("train", "dmc", "clips", "dataset", "human", "video", "test")
 """Extras of which the tests that need no torch make use."""
 
 

@@ -19,6 +19,7 @@ from pixelbrax_jax.agents.runner.train import run
 from pixelbrax_jax.agents.runner.trained import save_policy
 from pixelbrax_jax.policy import load_policy
 from tests.agents.small import DRQV2, PARAMS, ball_envs, same, small_agent
+from tests.agents.test_pretrained import SOURCES
 
 # One update in each iteration, from the second one on.
 LATE = small_agent(
@@ -154,6 +155,7 @@ def test_returns_outside_the_range_of_c51_are_told_once(tmp_path):
 def test_a_policy_in_a_file_acts_as_the_agent(tmp_path):
     networks = DRQV2.init().networks
     path = save_policy(DRQV2.algorithm, networks, tmp_path / "policy.jax")
+    assert not SOURCES.search(path.read_bytes())
     pixels = np.random.default_rng(0).integers(0, 256, (5, 18, 18, 6), np.uint8)
     expected = DRQV2.algorithm.act(networks, jnp.asarray(pixels))
     np.testing.assert_allclose(load_policy(path)(pixels), expected, rtol=1e-5, atol=1e-6)

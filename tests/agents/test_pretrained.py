@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,12 +14,16 @@ from pixelbrax_jax import list_pretrained, load_policy, make, policy
 from pixelbrax_jax.agents.registry import ALGORITHMS
 from pixelbrax_jax.agents.runner.trained import load_pretrained
 
+SOURCES = re.compile(rb"[\w./-]+\.py\b")
+"""Paths of source files, which tell of the machine."""
+
 
 @pytest.mark.parametrize("name", list_pretrained())
 def test_a_pretrained_policy_is_small_and_fits_its_environment(name):
     about = policy.read_pretrained(name)
     file = policy.FOLDER / f"{name}.jax"
     assert file.stat().st_size <= 2_000_000
+    assert not SOURCES.search(file.read_bytes())
     acts = load_policy(name)
     env, _ = make(**acts.env_options)
     assert env.obs_spec.shape == acts.shape

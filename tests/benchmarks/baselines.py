@@ -7,6 +7,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 from functools import partial
 
@@ -61,6 +62,7 @@ def play_baselines(configs: dict[str, dict], episodes: int = 256) -> None:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__).parse_args()
     play_baselines(
         {
             task: {"task": task, "action_repeat": 1, "episode_length": 1000}

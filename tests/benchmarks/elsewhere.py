@@ -5,6 +5,7 @@ python -m tests.benchmarks.elsewhere        a minute
 
 from __future__ import annotations
 
+import argparse
 import json
 
 from pixelbrax_jax.agents.runner.evaluate import Evaluator
@@ -46,6 +47,7 @@ def play(task: str, split: str, changes: dict) -> dict:
 
 def main() -> None:
     """Play where it is not known of the policy of today."""
+    argparse.ArgumentParser(description=__doc__).parse_args()
     known = json.loads(KEPT.read_text()) if KEPT.exists() else {}
     for name, (task, split, changes) in CASES.items():
         if known.get(name, {}).get("policy") != identity(task):

@@ -6,12 +6,12 @@ python -m tests.benchmarks.figures --plots    plots, too
 
 from __future__ import annotations
 
+import argparse
 import ast
 import importlib
 import inspect
 import itertools
 import json
-import sys
 from dataclasses import fields
 from pathlib import Path
 
@@ -136,12 +136,15 @@ def page_of(machine: str) -> str:
 
 def main() -> None:
     """Write all pages."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--plots", action="store_true", help="make plots, too")
+    options = parser.parse_args()
     for name, figures in PAGES.items():
         page = ROOT / name
         page.write_text(filled(page.read_text("utf-8"), figures), "utf-8")
     for machine in BENCHMARKS:
         (ROOT / f"docs/benchmarks/{machine}.md").write_text(page_of(machine), "utf-8")
-    if "--plots" in sys.argv[1:]:
+    if options.plots:
         from tests.benchmarks import plots
 
         results.plot()

@@ -5,6 +5,7 @@ MUJOCO_GL=egl python -m tests.benchmarks.generalisation_minutes    six minutes, 
 
 from __future__ import annotations
 
+import argparse
 import json
 import subprocess
 import sys
@@ -63,6 +64,7 @@ def in_dm_control() -> float:
 
 def main() -> None:
     """Time both, one after the other."""
+    argparse.ArgumentParser(description=__doc__).parse_args()
     episodes, seconds = here()
     kept = {
         "policy": POLICY,

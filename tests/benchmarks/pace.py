@@ -8,6 +8,7 @@ Each preset is measured twice, in turns, and the faster time is kept.
 
 from __future__ import annotations
 
+import argparse
 import json
 import subprocess
 import sys
@@ -49,6 +50,7 @@ def measure(algorithm: str, task: str) -> dict[str, float]:
 
 def main() -> None:
     """Measure all of them."""
+    argparse.ArgumentParser(description=__doc__).parse_args()
     presets: dict[str, dict[str, float]] = {}
     for task in ROUNDS * TASKS:
         for algorithm in ALGORITHMS:

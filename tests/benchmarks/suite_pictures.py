@@ -203,7 +203,8 @@ def main() -> None:
         (DOCS / "images" / "dmc").mkdir(parents=True, exist_ok=True)
         sheet(pairs).save(DOCS / "images" / "dmc" / "beside.png", optimize=True)
     else:
-        sheet(pairs).save("beside.png")
+        Path("runs").mkdir(exist_ok=True)
+        sheet(pairs).save("runs/beside.png")
 
 
 if __name__ == "__main__":

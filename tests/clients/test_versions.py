@@ -28,8 +28,8 @@ def test_the_table_names_what_is_installed(row):
 
 def test_every_file_of_tests_has_a_row():
     files = {path.stem.removeprefix("test_") for path in Path(__file__).parent.glob("test_*.py")}
-    # Playground makes tasks; it is no client.
-    files -= {"versions", "playground"}
+    # Playground makes tasks, and Warp simulates; they are no clients.
+    files -= {"versions", "playground", "warp"}
     names = {"gymnasium_wrappers": "gymnasium", "gymnasium_vector_wrappers": "gymnasium"}
     names |= {"sb3": "stable-baselines3", "cleanrl": "torch"}
     assert {names.get(name, name) for name in files} | {"sb3-contrib"} == {r[1] for r in TABLE}

@@ -6,18 +6,17 @@ import gc
 import hashlib
 import subprocess
 import sys
-from pathlib import Path
 
 import jax
 import pytest
 
+from tests.conftest import memory_of_this_process
 from tests.gym.adapters import ADAPTERS
-
-PAGES_PER_MIB = 256
 
 
 def resident_mib() -> float:
-    return int(Path("/proc/self/statm").read_text().split()[1]) / PAGES_PER_MIB
+    """0 where the system does not tell."""
+    return memory_of_this_process()[1] / 2**20
 
 
 def test_equal_options_share_programs(make_vector):

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -146,6 +146,18 @@ def load_config(about: Mapping[str, Any]) -> TrainConfig:
     return kind().replace(**{name: stored[name] for name in former if name not in OF_RUNS})
 
 
+@contextmanager
+def _without_locations() -> Iterator[None]:
+    """Leave paths of source files out of programs, which others may get."""
+    name = "jax_traceback_in_locations_limit"
+    limit = jax.config.values[name]
+    jax.config.update(name, 0)
+    try:
+        yield
+    finally:
+        jax.config.update(name, limit)
+
+
 def save_policy(algorithm: Algorithm, networks: Networks, path: str | Path) -> Path:
     """Export the mean actions of a policy to a file, and return its path.
 
@@ -155,9 +167,11 @@ def save_policy(algorithm: Algorithm, networks: Networks, path: str | Path) -> P
     spec, _ = split_obs(algorithm.envs.env.obs_spec)
     acting = {name: networks[name] for name in algorithm.acting}
     (batch,) = jax.export.symbolic_shape("batch")
-    exported = jax.export.export(
+    act = jax.export.export(
         jax.jit(lambda pixels: algorithm.act(acting, pixels)), platforms=("cpu", "cuda", "tpu")
-    )(jax.ShapeDtypeStruct((batch, *spec.shape), spec.dtype))
+    )
+    with _without_locations():
+        exported = act(jax.ShapeDtypeStruct((batch, *spec.shape), spec.dtype))
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as part:

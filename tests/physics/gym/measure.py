@@ -5,6 +5,7 @@ Write the figures into ``docs/gym/physics.json``: ``python -m tests.physics.gym.
 
 from __future__ import annotations
 
+import argparse
 import json
 from functools import cache
 from importlib import metadata
@@ -123,6 +124,7 @@ def _largest(ours: Any, theirs: np.ndarray) -> float:
 
 def main() -> None:
     """Measure all tasks."""
+    argparse.ArgumentParser(description=__doc__).parse_args()
     versions = {name: metadata.version(name) for name in ("gymnasium", "mujoco", "jax")}
     found = {}
     for task in TASKS:
