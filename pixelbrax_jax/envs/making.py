@@ -70,10 +70,7 @@ def make(task: str | EnvConfig, **options: Any) -> tuple[PixelEnv, EnvParams]:
         dynamics=_dynamics(config, physics),
     )
     # Here, because a transfer in a program may be forbidden (`jax.transfer_guard`).
-    params = jax.device_put(params).replace(clips=_clips(config, env))
-    # A distractor that does not fit the task says so now, not in the first reset.
-    jax.eval_shape(lambda: env.chain.reset(jax.random.key(0), params))
-    return env, params
+    return env, jax.device_put(params).replace(clips=_clips(config, env))
 
 
 # For help() and editors.

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import pixelbrax_jax as pb
 from pixelbrax_jax import distractors
 from tests.distractors.conftest import episode, walk
 from tests.envs.toy import PARAMS
@@ -185,13 +184,6 @@ def test_materials_that_a_model_has_not():
         ValueError, match=r"none of materials=\('gird',\) of Color; it has: floor, skin"
     ):
         color.reset(jax.random.key(0), params)
-
-
-def test_make_refuses_materials_that_a_model_has_not():
-    with pytest.raises(
-        ValueError, match=r"materials=\('self', 'grid'\) of Color; it has: MatPlane"
-    ):
-        pb.make("gym_halfcheetah", distractors="color-easy")
 
 
 def test_plain_planes_are_no_ground():

@@ -240,7 +240,6 @@ def test_what_lights_have_that_is_not_rendered():
         look = read_scene(model).look
     assert [str(one.message) for one in told] == [
         "light 'aimed', 'below': it does not turn to its body.",
-        "light 'held': it does not turn with its body.",
         "light 'far': its attenuation is left out.",
         "light 'flat': it casts shadows, because other lights do.",
         "light 'image': lights of images are left out.",

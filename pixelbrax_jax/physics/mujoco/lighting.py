@@ -21,7 +21,6 @@ from pixelbrax_jax.types import Lamp, Look
 _DIRECTIONAL = int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
 _POINT = int(mujoco.mjtLightType.mjLIGHT_POINT)
 _IMAGE = int(mujoco.mjtLightType.mjLIGHT_IMAGE)
-_FIXED = int(mujoco.mjtCamLight.mjCAMLIGHT_FIXED)
 _AIMED = (
     int(mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODY),
     int(mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODYCOM),
@@ -169,7 +168,6 @@ def _warn_of_lights(model: mujoco.MjModel) -> None:
     shadows = model.light_castshadow.astype(bool)
     unlike = {
         "it does not turn to its body": rendered & np.isin(modes, _AIMED),
-        "it does not turn with its body": rendered & (modes == _FIXED) & (model.light_bodyid > 0),
         "its attenuation is left out": rendered & fades,
         "it casts shadows, because other lights do": rendered & ~shadows & shadows[rendered].any(),
         "lights of images are left out": model.light_active.astype(bool) & (kinds == _IMAGE),
