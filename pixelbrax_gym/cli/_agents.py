@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     from pixelbrax_jax.agents.runner.trained import Trained
 
 
+MAY_DIFFER = ("clips", "memory_budget_gb", "split")
+"""Settings besides the seed in which the seeds of one agent may differ."""
+
+
 @dataclass(frozen=True)
 class AgentOptions:
     """Options that select a trained agent."""

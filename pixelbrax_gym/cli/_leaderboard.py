@@ -17,6 +17,7 @@ import numpy as np
 from scipy.stats import trim_mean
 
 from pixelbrax_gym.bench.tables import table
+from pixelbrax_gym.cli._agents import MAY_DIFFER
 from pixelbrax_jax.agents.runner.checkpoint import read_about
 from pixelbrax_jax.agents.runner.metrics import read_metrics
 from pixelbrax_jax.paths import in_home, make_folder
@@ -29,8 +30,6 @@ PUBLISHED = "published.json"
 Entry = dict[str, Any]
 
 _NEEDED = {"task", "agent", "seed", "config", "frames", "seconds", "return"}
-_MAY_DIFFER = {"seed", "clips", "split", "memory_budget_gb"}
-"""Settings in which the seeds of one agent may differ."""
 
 
 def entry(folder: str | Path, agent: str | None = None) -> Entry:
@@ -115,7 +114,7 @@ def _check_same_settings(of: Entry, other: Entry) -> None:
     """Raise a ValueError if two entries cannot be seeds of one agent."""
     here, there = ({"algorithm": one.get("algorithm"), **one["config"]} for one in (of, other))
     # Releases differ in what they have settings for.
-    for setting in sorted(here.keys() & there.keys() - _MAY_DIFFER):
+    for setting in sorted(here.keys() & there.keys() - {"seed", *MAY_DIFFER}):
         if here[setting] != there[setting]:
             raise ValueError(
                 f"runs of one agent differ in seeds alone, but {setting} is {here[setting]!r} with "

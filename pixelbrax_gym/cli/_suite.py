@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pixelbrax_gym.cli import UsageError, say
-from pixelbrax_gym.cli._agents import AgentOptions, load, name_of
+from pixelbrax_gym.cli._agents import MAY_DIFFER, AgentOptions, load, name_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -17,9 +17,6 @@ if TYPE_CHECKING:
 
     from pixelbrax_jax.agents.runner.trained import Trained
     from pixelbrax_jax.generalisation.making import LevelEnv, Levels
-
-_MAY_DIFFER = ("clips", "memory_budget_gb", "split")
-"""Settings in which the seeds of one agent may differ."""
 
 
 def evaluate(
@@ -92,7 +89,7 @@ def _load(options: AgentOptions, runs: Sequence[str]) -> Mapping[str, Trained]:
             for one in (first, agent)
         )
         for setting in [*here, *there]:
-            if setting not in _MAY_DIFFER and here.get(setting) != there.get(setting):
+            if setting not in MAY_DIFFER and here.get(setting) != there.get(setting):
                 raise ValueError(
                     f"runs of one call are seeds of one agent, but {setting} is "
                     f"{here.get(setting)!r} in {first_name} and {there.get(setting)!r} in {name}; "

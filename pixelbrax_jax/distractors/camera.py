@@ -137,9 +137,7 @@ class MovingCamera(Distractor):
         away = _cartesian(state.radius * radius, state.azimuth + azimuth, state.polar + polar)
         # The horizon stays level, unless the camera looks straight down.
         turn = jnp.where(polar < _POLE, 0.0, state.azimuth)
-        x, y, z = jnp.asarray(rig.up)
-        cos, sin = jnp.cos(turn), jnp.sin(turn)
-        level = jnp.stack([x * cos - y * sin, x * sin + y * cos, z])
+        level = _turn(jnp.asarray(rig.up), jnp.array([0.0, 0.0, 1.0]), turn)
         up = _turn(level, spatial.unit(away), state.roll)
         return params.replace(rig=rig.replace(eye=rig.target + away, up=up))
 
