@@ -33,8 +33,9 @@ def make_folder(option: str, path: str | os.PathLike[str]) -> Path:
     """
     folder = in_home(path)
     for one in (folder, *folder.parents):
-        if one.exists() and not one.is_dir():
-            raise ValueError(f"{option} needs the folder {folder}, but {one} is a file.")
+        if (one.exists() or one.is_symlink()) and not one.is_dir():
+            what = "a file" if one.exists() else "a link to what does not exist"
+            raise ValueError(f"{option} needs the folder {folder}, but {one} is {what}.")
     folder.mkdir(parents=True, exist_ok=True)
     return folder
 
@@ -50,7 +51,9 @@ def make_file(option: str, path: str | os.PathLike[str]) -> Path:
     if file.is_dir():
         raise ValueError(f"{option} must be a file, but {file} is a folder.")
     make_folder(option, file.parent)
-    file.open("ab").close()
+    # A pipe would wait for its reader.
+    if not file.exists() or file.is_file():
+        file.open("ab").close()
     return file
 
 

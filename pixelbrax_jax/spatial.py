@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pixelbrax_jax.types import CameraRig
-from pixelbrax_jax.validation import check_array
+from pixelbrax_jax.validation import check_array, check_link
 
 
 def f32(values: Any) -> Any:
@@ -101,31 +101,27 @@ def make_rig(
         ValueError: a number is not finite or missing, eye and target coincide, ``up`` is parallel
             to the view, or ``fovy`` is wrong.
     """
-    return check_rig(
-        CameraRig(
-            link=link,
-            track=f32(track if link >= 0 else (0.0, 0.0, 0.0)),
-            eye=f32(eye),
-            target=f32(target),
-            up=f32(up),
-            fovy=f32(fovy),
-        )
-    )
+    if check_link("link", link) < 0:
+        track = (0.0, 0.0, 0.0)
+    parts: dict[str, Any] = {"eye": eye, "target": target, "up": up, "fovy": fovy, "track": track}
+    return check_rig(CameraRig(link=link, **parts))
 
 
 def check_rig(rig: CameraRig) -> CameraRig:
-    """Return the rig; raise a ValueError if nothing can be seen with it."""
-    for name, shape in {"track": (3,), "eye": (3,), "target": (3,), "up": (3,), "fovy": ()}.items():
-        check_array(f"{name} of a CameraRig", getattr(rig, name), shape)
-    if not 0.0 < rig.fovy < 180.0:
+    """Return the rig with float32 arrays; raise a ValueError if nothing can be seen with it."""
+    shapes = {"track": (3,), "eye": (3,), "target": (3,), "up": (3,), "fovy": ()}
+    parts = {
+        name: check_array(f"{name} of a CameraRig", getattr(rig, name), shape)
+        for name, shape in shapes.items()
+    }
+    if not 0.0 < parts["fovy"] < 180.0:
         raise ValueError(f"fovy must lie between 0 and 180 degrees, got {rig.fovy}.")
-    if rig.link < -1:
-        raise ValueError(f"link of a CameraRig must be at least -1 (none), got {rig.link}.")
-    eye, target, up = (np.asarray(part) for part in (rig.eye, rig.target, rig.up))
+    check_link("link of a CameraRig", rig.link)
+    eye, target, up = (parts[name] for name in ("eye", "target", "up"))
     view = target - eye
     if np.linalg.norm(np.cross(view, up)) < 1e-6 * max(float(np.linalg.norm(view)), 1e-6):
         raise ValueError(
             f"a camera at {eye} cannot look at {target} with up={up}: the two points must "
             "differ and 'up' must not be parallel to the view."
         )
-    return rig
+    return rig.replace(**parts)

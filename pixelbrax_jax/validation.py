@@ -114,13 +114,20 @@ check_not_negative: _Check[float] = partial(
     _check, float, lambda x: x >= 0, "be a number of at least 0"
 )
 check_finite: _Check[float] = partial(_check, float, lambda _: True, "be a finite number")
+check_link: _Check[int] = partial(
+    _check, int, lambda x: x >= -1, "be a whole number of at least -1 (none)"
+)
 
 
-def check_array(what: str, value: Any, *shapes: tuple[int, ...]) -> None:
-    """Raise a ValueError unless ``value`` has one of the shapes and all its numbers are finite."""
-    with suppress(ValueError, TypeError):  # such as rows of several lengths, or words
-        array = np.asarray(value, np.float64)
-        if array.shape in shapes and np.isfinite(array).all():
-            return
+def check_array(what: str, value: Any, *shapes: tuple[int, ...]) -> np.ndarray:
+    """Return ``value`` in float32; raise ValueError for another shape, NaN, inf and words."""
+    with suppress(ValueError, TypeError):  # such as rows of several lengths
+        array = np.asarray(value)
+        # No words, objects, dates and complex numbers; JAX's bfloat16 has a kind of its own.
+        if array.shape in shapes and array.dtype.kind not in "USOMmc":
+            with np.errstate(over="ignore"):
+                array = array.astype(np.float32)
+            if np.isfinite(array).all():
+                return array
     wanted = " or ".join(map(str, shapes))
     raise ValueError(f"{what} must have finite numbers of shape {wanted}, got {value!r}.")

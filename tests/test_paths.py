@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -61,6 +62,18 @@ def test_a_file_in_place_of_a_folder(notes, below):
             width=18,
         )
     assert notes.read_text() == "mine"
+
+
+def test_a_link_to_nothing_is_named(tmp_path):
+    (tmp_path / "gone").symlink_to(tmp_path / "none")
+    with pytest.raises(ValueError, match=r"output_dir needs the folder .*gone is a link to what"):
+        make_folder("output_dir", tmp_path / "gone")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no named pipes")
+def test_a_pipe_without_a_reader_does_not_block(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    assert make_file("--output", tmp_path / "pipe") == tmp_path / "pipe"
 
 
 def test_the_benchmark_refuses_a_folder_before_it_measures(tmp_path, capsys):

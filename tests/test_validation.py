@@ -11,6 +11,7 @@ from pixelbrax_jax.validation import (
     check_count,
     check_finite,
     check_fraction,
+    check_link,
     check_not_negative,
     check_options,
     check_positive,
@@ -88,6 +89,7 @@ NUMBERS = {
     r"lie in \[0, 1\]": (check_fraction, (0, 1, np.float32(0.5)), (-0.1, 1.1, np.nan, True, "0")),
     "positive number": (check_positive, (3, 1e-9), (0, -1, np.inf, np.nan, HUGE, True, None)),
     "number of at least 0": (check_not_negative, (0, 0.0, 7), (-1e-9, np.inf, np.nan, (1,))),
+    r"whole number of at least -1 \(none\)": (check_link, (-1, np.int32(2)), (-2, 0.0, True, None)),
     "finite number": (check_finite, (-3, np.float32(0)), (np.inf, -np.inf, np.nan, HUGE, "x")),
 }
 

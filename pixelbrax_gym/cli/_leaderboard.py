@@ -98,7 +98,13 @@ def add(of: Entry, folder: str | Path) -> Path:
     entries = read(board)
     agent, task = re.sub(r"[\W_]", "-", of["agent"].lower()), re.sub(r"\W", "-", of["task"])
     path = board / f"{agent}-{task}-{of['seed']}.json"
-    if path.exists() and json.loads(path.read_text("utf-8")) != of:
+    there = _read_json(path) if path.exists() else of
+    if any(there.get(name) != of[name] for name in ("task", "agent", "seed")):
+        raise FileExistsError(
+            f"{path} belongs to agent {there.get('agent')!r} on task {there.get('task')!r}: name "
+            "the agent otherwise with --agent."
+        )
+    if there != of:
         raise FileExistsError(
             f"{path} is another run of this agent, task and seed: delete it, or name the agent "
             "otherwise with --agent."
@@ -132,14 +138,20 @@ def read(folder: str | Path) -> list[Entry]:
     for file in sorted(board.glob("*.json")):
         if file.name == PUBLISHED:
             continue
-        try:
-            found = json.loads(file.read_text("utf-8"))
-        except ValueError:
-            found = None
-        if not (isinstance(found, dict) and found.keys() >= _NEEDED):
+        found = _read_json(file)
+        if not (found.keys() >= _NEEDED and isinstance(found["config"], dict) and found["frames"]):
             raise ValueError(f"{file} of --folder is not an entry of a leaderboard; move it away.")
         entries.append(found)
     return entries
+
+
+def _read_json(file: Path) -> dict[str, Any]:
+    """Read a file; return nothing if it is not JSON of an object."""
+    try:
+        found = json.loads(file.read_text("utf-8"))
+    except (ValueError, IsADirectoryError):
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 def read_by_agent(folder: str | Path) -> dict[tuple[str, str], list[Entry]]:
@@ -153,7 +165,12 @@ def read_by_agent(folder: str | Path) -> dict[tuple[str, str], list[Entry]]:
 def read_published(folder: str | Path) -> dict[str, Any]:
     """Read published returns by agent; none without the file."""
     file = in_home(folder) / PUBLISHED
-    return json.loads(file.read_text("utf-8"))["agents"] if file.exists() else {}
+    if not file.exists():
+        return {}
+    agents = _read_json(file).get("agents")
+    if not isinstance(agents, dict):
+        raise ValueError(f"{file} of --folder has no 'agents' of published returns; move it away.")
+    return agents
 
 
 def return_at(of: Entry, clock: str, when: float) -> float:

@@ -50,6 +50,7 @@ def run(arguments: Sequence[str]) -> int:
 
     for name in ("grid", "size", "num_frames"):
         check_positive_int(name, getattr(options, name))
+    check_seed(options.seed)
     check_fits(
         f"a frame with size={options.size}, grid={options.grid}",
         3 * (options.size * options.grid) ** 2,
@@ -60,7 +61,6 @@ def run(arguments: Sequence[str]) -> int:
     from pixelbrax_jax.agents.runner.splits import make_split, splits_of
     from pixelbrax_jax.agents.runner.trained import with_clips
 
-    check_seed(options.seed)
     has_train = "train" in splits_of(agent.algorithm.config)
     split = options.split or ("train" if has_train else "clean")
     config, shown = with_clips(agent, options.clips)

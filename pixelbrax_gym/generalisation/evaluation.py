@@ -8,6 +8,7 @@ from os import PathLike
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from pixelbrax_gym.generalisation.scores import LEFT_OUT, Scores, play
@@ -140,8 +141,12 @@ def checked(actions: Any, shape: tuple[int, ...], episodes: np.ndarray | None = 
             f"the policy must return actions of shape {shape}, a row for each of {shape[0]} "
             f"episodes, got {got}."
         )
-    missing = np.isnan(numpy_of(actions)).any(axis=1)
-    if missing.any():
+    values = numpy_of(actions)
+    # The environment refuses other dtypes.
+    if (
+        jnp.issubdtype(values.dtype, jnp.floating)
+        and (missing := np.isnan(values).any(axis=1)).any()
+    ):
         numbers = np.arange(len(missing)) if episodes is None else episodes
         names = ", ".join(map(str, sorted({*numbers[missing].tolist()})))
         raise ValueError(f"the policy's actions of episodes {names} contain NaN.")

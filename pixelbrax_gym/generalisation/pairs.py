@@ -256,8 +256,11 @@ def _storage(folder: Path, pairs: _Pairs, settings: dict[str, Any]) -> Any:
                 raise ValueError(f"{about} is damaged ({error}); delete the folder.") from error
             shutil.copyfile(about.with_suffix(_KEPT), about)
             raw = MinariStorage.read_raw_metadata(folder)
+        if not isinstance(raw, dict):
+            raise ValueError(f"{about} is not of a recording; take another folder.")
         found = raw.get(_SETTINGS)
-        if "dataset_id" not in raw and raw.get("total_episodes") == 0:
+        is_begun = "dataset_id" not in raw and {"total_episodes", "action_space"} <= raw.keys()
+        if is_begun and raw["total_episodes"] == 0 and list(folder.iterdir()) == [about]:
             # So Minari begins: a recording was stopped before it had its settings.
             about.unlink()
             return _new_storage(folder, pairs, settings)

@@ -191,14 +191,14 @@ class TorchRLEnv(EnvBase):
                 **{name: outputs[name] for name in names},
             }
         )
-        told = {name: x.to(self.device) for name, x in exported["infos"].items()}
+        new_infos = {name: x.to(self.device) for name, x in exported["infos"].items()}
         values = {name: exported[name][:, None] for name in names}
         values |= entries(exported["obs"], self._stateful.env.images)
         if where is not None:
             rows = where.reshape(self._num_envs)
             values = _keep_unstepped(values, tensordict, rows)
-            told = _keep_unstepped(told, self.infos, rows)
-        self.infos = told
+            new_infos = _keep_unstepped(new_infos, self.infos, rows)
+        self.infos = new_infos
         return self._tensordict(values)
 
     def _set_seed(self, seed: int | None) -> None:

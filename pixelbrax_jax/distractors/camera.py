@@ -135,8 +135,8 @@ class MovingCamera(Distractor):
         rig = params.rig
         radius, azimuth, polar = _spherical(rig.eye - rig.target)
         away = _cartesian(state.radius * radius, state.azimuth + azimuth, state.polar + polar)
-        # The horizon stays level, unless the camera looks straight down.
-        turn = jnp.where(polar < _POLE, 0.0, state.azimuth)
+        # The horizon stays level, unless the camera looks straight down or up.
+        turn = jnp.where(jnp.minimum(polar, jnp.pi - polar) < _POLE, 0.0, state.azimuth)
         level = _turn(jnp.asarray(rig.up), jnp.array([0.0, 0.0, 1.0]), turn)
         up = _turn(level, spatial.unit(away), state.roll)
         return params.replace(rig=rig.replace(eye=rig.target + away, up=up))

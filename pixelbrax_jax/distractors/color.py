@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -55,7 +55,7 @@ class Color(Distractor):
         materials: the model's names of the materials that shift, only with ``mode="geom"``; None
             for all. If materials have no names, all shift.
         ground: whether the ground, planes with the look's checkers, shifts; ``"texture"`` darkens
-            it by factors 1 + x with x in [-scale, 0], as a change of the white material of a
+            it by factors 1 + x, with x clipped to [-1, 0], as a change of the white material of a
             texture does. Other than True only with ``mode="geom"`` and without ``materials``.
 
     Raises:
@@ -80,7 +80,7 @@ class Color(Distractor):
         check_choice("distribution of Color", self.distribution, DISTRIBUTIONS)
         check_fraction("scale of Color", self.scale)
         check_bool("sky of Color", self.sky)
-        textured = self.ground == "texture"
+        textured = isinstance(self.ground, str) and self.ground == "texture"
         if not (textured or isinstance(self.ground, (bool, np.bool_))):
             raise TypeError(
                 f"ground of Color must be True, False or 'texture', got {self.ground!r}."
@@ -168,9 +168,12 @@ class Color(Distractor):
         if plane is not None:
             # Planes show the ground's colors instead of their own.
             ground = jnp.asarray(params.look.ground_rgb)
-            down, up = (-ground.min(0), 1 - ground.max(0)) if self.ground else (0.0, 0.0)
-            if self.ground == "texture":
+            down: Any = -ground.min(0)
+            up: Any = 1 - ground.max(0)
+            if isinstance(self.ground, str):
                 down, up = -1.0, 0.0
+            elif not self.ground:
+                down, up = 0.0, 0.0
             low, high = low.at[plane].set(down), high.at[plane].set(up)
         names = params.geoms.material_name
         if self.materials is not None and names:

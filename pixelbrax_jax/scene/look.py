@@ -2,9 +2,21 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
+
 from pixelbrax_jax.spatial import f32
-from pixelbrax_jax.types import Look
-from pixelbrax_jax.validation import check_array, check_bool, check_choice, check_positive_int
+from pixelbrax_jax.types import Lamp, Look
+from pixelbrax_jax.validation import (
+    check_array,
+    check_bool,
+    check_choice,
+    check_count,
+    check_link,
+    check_positive,
+    check_positive_int,
+)
 
 LOOKS: dict[str, Look] = {
     # Cool ground and sky, so that the warm colors of the models stand out.
@@ -81,17 +93,40 @@ def make_look(look: str | Look = "default", *, shadows: bool | None = None) -> L
     elif not isinstance(look, Look):
         raise TypeError(f"look must be a name or a pixelbrax_jax.Look, got {type(look).__name__}.")
     else:
-        _check(look)
+        look = _checked(look)
     return look if shadows is None else look.replace(shadows=check_bool("shadows", shadows))
 
 
-def _check(look: Look) -> None:
+def _checked(look: Look) -> Look:
+    """Return a look of arrays; raise a ValueError or TypeError that names what is wrong."""
     check_choice("ground of a Look", look.ground, ("checker", "grid"))
     check_positive_int("shininess of a Look", look.shininess)
     check_bool("shadows of a Look", look.shadows)
-    for name, shapes in _SHAPES.items():
-        if (value := getattr(look, name)) is not None or name not in _MAY_LACK:
-            check_array(f"{name} of a Look", value, *shapes)
-    for lamp in look.lamps:
-        for name, shape in _LAMP_SHAPES.items():
-            check_array(f"{name} of a Lamp", getattr(lamp, name), shape)
+    check_bool("opengl of a Look", look.opengl)
+    shapes = dict(_SHAPES)
+    if look.sky_texture is not None:
+        edge = (*np.shape(look.sky_texture), 0, 0)[1]
+        shapes["sky_texture"] = ((6, edge, edge, 3),)
+    parts: dict[str, Any] = {
+        name: check_array(f"{name} of a Look", value, *shapes[name])
+        for name in shapes
+        if (value := getattr(look, name)) is not None or name not in _MAY_LACK
+    }
+    check_positive("ground_pitch of a Look", parts["ground_pitch"].item())
+    if "light" in parts and not parts["light"].any():
+        raise ValueError("light of a Look must not have length 0; None is for no such light.")
+    if not isinstance(look.lamps, tuple | list):
+        raise TypeError(f"lamps of a Look must be a tuple of Lamp, got {look.lamps!r}.")
+    return look.replace(**parts, lamps=tuple(map(_checked_lamp, look.lamps)))
+
+
+def _checked_lamp(lamp: Lamp) -> Lamp:
+    if not isinstance(lamp, Lamp):
+        raise TypeError(f"lamps of a Look must be a tuple of Lamp, got {lamp!r} in it.")
+    check_count("exponent of a Lamp", lamp.exponent)
+    check_link("link of a Lamp", lamp.link)
+    parts = {
+        name: check_array(f"{name} of a Lamp", getattr(lamp, name), shape)
+        for name, shape in _LAMP_SHAPES.items()
+    }
+    return lamp.replace(**parts)

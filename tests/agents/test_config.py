@@ -220,6 +220,8 @@ def test_environments_come_with_their_parameters():
         ({"seed": 2**32 - 1, "seeds": 2}, "seeds must be below 2**32"),
         ({"resume": "last"}, "Did you mean 'latest'"),
         ({"progress": "no"}, "progress must be True or False, got 'no'"),
+        ({"output_dir": None}, "output_dir must be a folder's path, got None"),
+        ({"output_dir": ""}, "output_dir must be a folder's path, got ''"),
     ],
 )
 def test_options_of_a_run_out_of_range_are_told(settings, message):

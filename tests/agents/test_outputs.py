@@ -172,6 +172,20 @@ def test_weights_and_biases_may_not_start(tmp_path, monkeypatch):
     assert "api_key not configured" in missing
 
 
+def test_a_run_of_weights_and_biases_that_fails_early_is_finished(tmp_path, monkeypatch):
+    finished = []
+
+    def define_metric(*_, **__):
+        raise RuntimeError("no metric")
+
+    run = SimpleNamespace(define_metric=define_metric, finish=lambda: finished.append(True))
+    monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(init=lambda **_: run))
+    told = []
+    open_metrics(tmp_path, {}, told.append, wandb_project="p").close()
+    assert finished == [True]
+    assert "cannot log to Weights & Biases: no metric" in told[0]
+
+
 def test_a_resumed_run_is_one_run_of_weights_and_biases(tmp_path, monkeypatch):
     given = []
 

@@ -211,7 +211,20 @@ def test_the_horizon_tilts_by_the_roll_alone(up):
 
     tilts, rolls, azimuths = jax.jit(jax.vmap(tilt))(keys)
     assert np.abs(azimuths).max() > 0.4
-    np.testing.assert_allclose(np.abs(tilts), np.abs(rolls), atol=1e-5)
+    np.testing.assert_allclose(tilts, rolls, atol=1e-5)
+
+
+@pytest.mark.parametrize("height", [3.0, -3.0])
+def test_a_camera_straight_above_or_below_keeps_its_up_direction(height):
+    """There a change of azimuth moves it along one meridian or another, and turns no picture."""
+    rig = make_rig((0.0, 0.0, height), (0.0, 0.0, 0.0), 50.0, up=(0.0, 1.0, 0.0))
+    params = PARAMS.replace(rig=rig)
+    camera = distractors.MovingCamera(scale=0.3, dynamic=False)
+    state = camera.reset(jax.random.key(0), params).replace(
+        radius=jnp.float32(1), azimuth=jnp.float32(0.5), polar=jnp.float32(0), roll=jnp.float32(0)
+    )
+    moved = aim(camera.change_params(state, params).rig, jnp.zeros((1, 3))).xmat
+    np.testing.assert_allclose(moved, aim(rig, jnp.zeros((1, 3))).xmat, atol=1e-5)
 
 
 def test_roll_turns_the_picture():

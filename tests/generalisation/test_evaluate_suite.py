@@ -194,6 +194,12 @@ def test_several_policies_are_seeds():
             ValueError,
             "actions of episodes 1 contain NaN",
         ),
+        (
+            lambda obs: np.full((3, 1), "left"),
+            {"output": "numpy"},
+            TypeError,
+            r"action must be floating point in \[-1, 1\], got <U4",
+        ),
         (of_numpy, {"distractors": "color"}, TypeError, "distractors is decided by the levels"),
         (of_numpy, {"obs_mode": "state"}, ValueError, "obs_mode='state' shows none"),
         (of_numpy, {"heigth": 3}, TypeError, "unexpected keyword argument 'heigth'"),

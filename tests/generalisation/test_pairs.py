@@ -225,6 +225,14 @@ def test_a_folder_holds_one_recording(tmp_path):
     with pytest.raises(ValueError, match="other has another recording"):
         record(tmp_path / "other")
     assert (tmp_path / "other" / "metadata.json").read_text() == '{"name": "my package"}'
+    for mine, told in (
+        ('{"total_episodes": 0}', "another recording"),
+        ("[]", "not of a recording"),
+    ):
+        (tmp_path / "other" / "metadata.json").write_text(mine)
+        with pytest.raises(ValueError, match=told):
+            record(tmp_path / "other")
+        assert (tmp_path / "other" / "metadata.json").read_text() == mine
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "notes.txt").write_text("mine")
     with pytest.raises(ValueError, match="full has files, but no recording"):

@@ -137,6 +137,24 @@ def test_tasks_of_a_folder_have_entries(tmp_path, capsys):
     assert "`my/arm`" in capsys.readouterr().out
 
 
+def test_tasks_whose_names_differ_in_signs_need_other_agents(tmp_path, capsys):
+    board = tmp_path / "board"
+    first, second = (
+        make_run(tmp_path / str(i), task=t) for i, t in enumerate(("my/arm", "my-arm"))
+    )
+    assert leaderboard(first, "--folder", board) == 0
+    assert leaderboard(second, "--folder", board) == 1
+    assert "belongs to agent 'ppo' on task 'my/arm': name" in capsys.readouterr().err
+    assert leaderboard(second, "--agent", "other", "--folder", board) == 0
+
+
+@pytest.mark.parametrize("text", ["{", "{}", '{"agents": []}'])
+def test_published_returns_that_are_none(tmp_path, text, capsys):
+    (tmp_path / "published.json").write_text(text)
+    assert leaderboard("--folder", tmp_path) == 1
+    assert f"{tmp_path / 'published.json'} of --folder has no 'agents'" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("text", ["{", "[]", '{"task": "ant"}'])
 def test_other_files_are_no_entries(tmp_path, text, capsys):
     (tmp_path / "notes.json").write_text(text)

@@ -246,7 +246,9 @@ def test_models_that_are_no_task(xml, message):
         ({"terminated": lambda a: a.qpos > 0}, r"terminated must return a scalar bool, .* \(2,\)"),
         ({"observe": lambda a: a.data.xpos}, "observe must return a flat float array"),
         ({"observe": lambda a: a.qpos[:0]}, "observe must return a flat float array"),
-        ({"init_q": np.zeros(3)}, r"init_q must have shape \(2,\), got \(3,\)"),
+        ({"init_q": np.zeros(3)}, r"init_q must have finite numbers of shape \(2,\), got array"),
+        ({"init_q": ["a", "b"]}, r"init_q must have finite numbers of shape \(2,\), got \['a'"),
+        ({"init_q": [0.0, -1e12]}, r"init_q must lie between -1e\+10 and 1e\+10, got \[0.0, -1"),
         ({"n_frames": 0}, "n_frames must be a positive integer, got 0"),
         ({"n_frames": 1.5}, "n_frames must be a positive integer, got 1.5"),
         ({"reset_noise": -1.0}, "reset_noise must be a number of at least 0, got -1.0"),
@@ -282,7 +284,9 @@ def test_functions_of_other_arguments(change, message):
         build(**change)
 
 
-@pytest.mark.parametrize("groups", [1, "012", (0, 6), (0.5,), ["a"], [[0]]])
+@pytest.mark.parametrize(
+    "groups", [1, "012", (0, 6), (0.5,), ["a"], [[0]], (True,), np.array([[0, 1]])]
+)
 def test_groups_are_mujocos(groups):
     with pytest.raises(ValueError, match="geom_groups must be a collection of MuJoCo's groups, 0"):
         build(geom_groups=groups)
@@ -293,8 +297,14 @@ def test_groups_are_mujocos(groups):
 )
 def test_episodes_do_not_begin_diverged(start):
     (name,) = start
-    with pytest.raises(ValueError, match=f"{name} must be .*below 1e\\+10, got"):
+    with pytest.raises(ValueError, match=f"{name} must .*(finite|1e\\+10).*, got"):
         build(**start)
+
+
+def test_a_keyframe_far_away_is_named():
+    key = '<keyframe><key qpos="1e12 0"/></keyframe></mujoco>'
+    with pytest.raises(ValueError, match="qpos of the model's first keyframe must lie between"):
+        build(CART.replace("</mujoco>", key))
 
 
 def test_what_is_rendered_opaque_is_named():

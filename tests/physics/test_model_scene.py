@@ -233,19 +233,23 @@ def test_what_lights_have_that_is_not_rendered():
     """
     xml = re.sub(r"<light name=.sun.*", lights, MODEL)
     xml = xml.replace('<light name="lamp"', '<light name="held"/><light name="lamp"')
+    other = '<body pos="3 0 1"><geom size=".1"/><light name="com" mode="trackcom"/></body>'
+    xml = xml.replace("</worldbody>", f"{other}</worldbody>")
     model = mujoco.MjModel.from_xml_string(xml)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     with pytest.warns(UserWarning, match="light") as told:
         look = read_scene(model).look
     assert [str(one.message) for one in told] == [
-        "light 'aimed', 'below': it does not turn to its body.",
-        "light 'far': its attenuation is left out.",
-        "light 'flat': it casts shadows, because other lights do.",
+        "light 'aimed', 'below': lights do not turn to bodies.",
+        "light 'far': attenuation is left out.",
+        "light 'flat': casts shadows, because other lights do.",
         "light 'image': lights of images are left out.",
+        "light 'com': left out, because it follows another center of mass than the camera.",
     ]
     names = [model.light(i).name for i in range(model.nlight) if model.light_type[i] == 0]
     names.remove("off")
+    names.remove("com")
     assert len(look.lamps) == len(names)
     aimed = look.lamps[names.index("aimed")]
     np.testing.assert_allclose(aimed.axis, data.light("aimed").xdir, atol=1e-6)
@@ -255,9 +259,10 @@ def test_what_lights_have_that_is_not_rendered():
     with pytest.warns(UserWarning, match="light"):
         assert not read_scene(model).look.shadows
     # Nor does a light that is not rendered.
-    model.light_castshadow[model.light("image").id] = 1
-    with pytest.warns(UserWarning, match="light"):
-        assert not read_scene(model).look.shadows
+    for name in ("image", "com"):
+        model.light_castshadow[model.light(name).id] = 1
+        with pytest.warns(UserWarning, match="light"):
+            assert not read_scene(model).look.shadows
 
 
 def test_what_cannot_be_drawn_is_named():

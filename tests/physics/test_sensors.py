@@ -1,4 +1,4 @@
-"""Sensors of positions and velocities of every kind read what MuJoCo's own read."""
+"""Sensors of positions and velocities, and of the kinetic energy, read what MuJoCo's own read."""
 
 from __future__ import annotations
 
@@ -85,9 +85,34 @@ def test_sensors_are_mujocos(engine, limits):
     for _ in range(2):
         mujoco.mj_forward(model, data)
         assert (np.abs(data.sensordata) > 1e-9).sum() > data.sensordata.size - 4, "few are 0"
+        # float32 positions, of a ball in the floor, move the contact a little.
         np.testing.assert_allclose(state.obs, data.sensordata, atol=1e-3, rtol=1e-3)
         state, data.ctrl[:] = step(state, action), action
         mujoco.mj_step(model, data, 3)
+
+
+def test_kinetic_energy_is_that_of_the_row():
+    """Half of v M v; MuJoCo's sensor keeps an earlier one if the model's flag is on."""
+    flag = '<option timestep="0.002"><flag energy="enable"/></option>'
+    xml = MODEL.format(limits="<e_kinetic/>").replace('<option timestep="0.002"/>', flag)
+    physics = mjcf_physics(
+        xml,
+        reward=lambda before, after, action: 0.0,
+        observe=lambda seen: seen.data.sensordata[-1:],
+        reset_noise=0.0,
+    )
+    model = mujoco.MjModel.from_xml_string(xml)
+    data, qpos = mujoco.MjData(model), jnp.tile(jnp.array(model.qpos0), (2, 1))
+    for speeds in ((0.5, 5.0), (5.0, 0.5)):
+        qvel = jnp.outer(jnp.array(speeds), jnp.ones(model.nv))
+        found = jax.jit(jax.vmap(physics.from_qpos))(qpos, qvel).obs[:, 0]
+        expected = []
+        for speed in speeds:
+            data.qvel[:] = speed
+            mujoco.mj_forward(model, data)
+            mujoco.mj_energyVel(model, data)
+            expected.append(data.energy[1])
+        np.testing.assert_allclose(found, expected, rtol=1e-5)
 
 
 def test_joints_have_all_their_numbers():

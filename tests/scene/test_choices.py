@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import numpy as np
 import pytest
 
@@ -31,7 +32,8 @@ def test_a_models_own_look_is_the_default_one():
         config = EnvConfig("ball", look=look, **options)
         return making._look(config, Lit(), 45.0)
 
-    assert chosen("default") is chosen("dmc") is chosen("dmc-plain") is own
+    for look in ("default", "dmc", "dmc-plain"):
+        jax.tree.map(np.testing.assert_array_equal, chosen(look), own)
     assert chosen("original") is make_look("original")
     assert chosen("dmc", shadows=False).ambient == np.float32(0.7)
     assert making._look(EnvConfig("ball"), Ball(), 45.0) is make_look("default")
@@ -66,11 +68,30 @@ def test_a_model_has_a_plain_look_and_a_detailed_one():
         ({"ambient": None}, "ambient of a Look must have finite numbers"),
         ({"lamps": (DARK,)}, r"pos of a Lamp must have finite numbers of shape \(3,\), got"),
         ({"ground_rgb": "red"}, r"ground_rgb of a Look .* of shape \(2, 3\), got 'red'"),
+        ({"ambient": "0.5"}, r"ambient of a Look .* finite numbers of shape \(\), got '0.5'"),
+        ({"ambient": 1e39}, "ambient of a Look must have finite numbers"),
+        ({"ground_pitch": 0.0}, "ground_pitch of a Look must be a positive number, got 0"),
+        ({"light": np.zeros(3)}, "light of a Look must not have length 0; None is for no such"),
+        ({"sky_texture": np.full((2, 2), np.nan)}, r"sky_texture of a Look .* \(6, 2, 2, 3\)"),
+        ({"opengl": "no"}, "opengl of a Look must be True or False, got 'no'"),
+        ({"lamps": None}, "lamps of a Look must be a tuple of Lamp, got None"),
+        ({"lamps": (None,)}, "lamps of a Look must be a tuple of Lamp, got None in it"),
+        ({"lamps": (DARK.replace(exponent="x"),)}, "exponent of a Lamp must be a whole number"),
+        ({"lamps": (DARK.replace(link=-2),)}, r"link of a Lamp .* at least -1 \(none\), got -2"),
     ],
 )
 def test_a_look_that_cannot_be_rendered(changes, told):
-    with pytest.raises(ValueError, match=told):
+    with pytest.raises((ValueError, TypeError), match=told):
         make_look(make_look("default").replace(**changes))
+
+
+def test_plain_numbers_become_arrays():
+    sky = [[1.0, 1.0, 1.0], [0.0, 0.0, 0.0]]
+    look = make_look(make_look("default").replace(sky=sky, ambient=1))
+    assert look.sky.shape == (2, 3)
+    assert (look.sky.dtype, look.ambient.dtype) == (np.float32, np.float32)
+    rig = choose_rig("ball", OWN["default"].replace(eye=(0.0, -3.0, 1.0)), OWN)
+    np.testing.assert_array_equal(rig.eye, np.float32([0, -3, 1]))
 
 
 @pytest.mark.parametrize(
@@ -80,7 +101,9 @@ def test_a_look_that_cannot_be_rendered(changes, told):
         ({"target": (0.0, 1.0)}, r"target of a CameraRig .* of shape \(3,\), got \(0.0, 1.0\)"),
         ({"fovy": np.nan}, "fovy of a CameraRig must have finite numbers"),
         ({"fovy": 200.0}, "fovy must lie between 0 and 180 degrees, got 200"),
-        ({"link": -7}, r"link of a CameraRig must be at least -1 \(none\), got -7"),
+        ({"link": -7}, r"link of a CameraRig .* of at least -1 \(none\), got -7"),
+        ({"link": 1.5}, r"link of a CameraRig must be a whole number .*, got 1.5"),
+        ({"link": None}, r"link of a CameraRig must be a whole number .*, got None"),
         ({"eye": OWN["default"].target}, "cannot look at"),
         ({"up": OWN["default"].target - OWN["default"].eye}, "'up' must not be parallel"),
     ],

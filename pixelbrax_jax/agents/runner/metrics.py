@@ -9,7 +9,7 @@ import struct
 import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -147,10 +147,14 @@ def _wandb(
         # A resumed run goes on in the same run of the service.
         known = folder / "wandb_id"
         if not known.exists():
-            known.write_text(uuid.uuid4().hex[:8] + "\n", "utf-8")
+            with replacing(known) as part:
+                part.write_text(uuid.uuid4().hex[:8] + "\n", "utf-8")
         name = known.read_text("utf-8").strip()
         run = wandb.init(project=project, config=config, dir=str(folder), id=name, resume="allow")
-        run.define_metric("*", step_metric="steps")
+        with ExitStack() as undo:
+            undo.callback(run.finish)
+            run.define_metric("*", step_metric="steps")
+            undo.pop_all()
     except Exception as error:  # The package has errors of many kinds.
         report(f"cannot log to {_SERVICE}: {reason(error)}; training continues without it")
         nothing: Any = lambda *_: None  # noqa: E731

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -70,6 +71,8 @@ class RunConfig:
 
     def __post_init__(self) -> None:
         """Check the settings."""
+        if not isinstance(self.output_dir, str | os.PathLike) or not str(self.output_dir):
+            raise ValueError(f"output_dir must be a folder's path, got {self.output_dir!r}.")
         object.__setattr__(self, "output_dir", str(in_home(self.output_dir)))
         check_choice("resume", self.resume, ("never", "latest"))
         check_annotated(self)

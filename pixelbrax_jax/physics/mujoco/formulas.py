@@ -16,12 +16,6 @@ from pixelbrax_jax.physics.mujoco.needs import Needs
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
 from pixelbrax_jax.spatial import f32, quat_multiply, quat_to_mat, rotate
 
-_JOINT = mujoco.mjtJoint
-_POSITIONS = {int(_JOINT.mjJNT_FREE): 7, int(_JOINT.mjJNT_BALL): 4}
-_POSITIONS |= dict.fromkeys(map(int, (_JOINT.mjJNT_HINGE, _JOINT.mjJNT_SLIDE)), 1)
-_VELOCITIES = _POSITIONS | {int(_JOINT.mjJNT_FREE): 6, int(_JOINT.mjJNT_BALL): 3}
-"""Numbers of a joint by its type."""
-
 
 class Start(struct.PyTreeNode):
     """An initial state with fields of ``State``; None means at rest or without a target."""
@@ -61,16 +55,14 @@ class Snapshot:
 
     def joint_pos(self, *names: str) -> jax.Array:
         """Return the positions of joints, concatenated; of a free joint 7 numbers, of a ball 4."""
-        return self.state.qpos[self._rows(names, _POSITIONS, "qposadr")]
+        joints = map(self.model.joint, names)
+        return self.state.qpos[_rows((j.qposadr[0], len(j.qpos0)) for j in joints)]
 
     def joint_vel(self, *names: str) -> jax.Array:
         """Return the velocities of joints, concatenated; of a free joint 6 numbers, of a ball 3."""
-        return self.state.qvel[self._rows(names, _VELOCITIES, "dofadr")]
-
-    def _rows(self, names: Iterable[str], sizes: Mapping[int, int], first: str) -> np.ndarray:
-        joints = [self.model.joint(name) for name in names]
-        starts = [(int(getattr(joint, first)[0]), sizes[int(joint.type[0])]) for joint in joints]
-        return np.array([row for start, size in starts for row in range(start, start + size)], int)
+        joints = map(self.model.joint, names)
+        # Damping has a number for each velocity.
+        return self.state.qvel[_rows((j.dofadr[0], len(j.damping)) for j in joints)]
 
     def sensor(self, *names: str) -> jax.Array:
         """Return the readings of sensors, concatenated."""
@@ -85,8 +77,7 @@ class Snapshot:
 
     def _sensors(self, indices: Iterable[int]) -> jax.Array:
         adr, dim = self.model.sensor_adr, self.model.sensor_dim
-        rows = [row for i in indices for row in range(adr[i], adr[i] + dim[i])]
-        return self.data.sensordata[np.array(rows, int)]
+        return self.data.sensordata[_rows((adr[i], dim[i]) for i in indices)]
 
     def xpos(self, body: str) -> jax.Array:
         """Return (3,), the origin of a body."""
@@ -129,6 +120,11 @@ class Snapshot:
 
     def _rotation(self, body: int, quat: np.ndarray) -> jax.Array:
         return quat_to_mat(quat_multiply(self.data.xquat[body], f32(quat)))
+
+
+def _rows(parts: Iterable[tuple[int, int]]) -> np.ndarray:
+    """Return the indices of parts of an array, each given by its start and length."""
+    return np.array([row for start, size in parts for row in range(start, start + size)], int)
 
 
 def joined(*parts: jax.Array | float) -> jax.Array:

@@ -102,16 +102,12 @@ def mirror_of(model: mujoco.MjModel) -> int:
 def read_lamps(model: mujoco.MjModel, com_link: int) -> dict[str, Lamp]:
     """Return the model's lamps by name.
 
-    A lamp on a body follows but does not turn. Lamps that follow another center of mass than the
-    camera, and lights of images, are left out. ``com_link`` is the link at the tracked center of
+    A lamp on a body follows but does not turn. ``com_link`` is the link at the tracked center of
     mass, -1 for none.
     """
     lamps = {}
-    for light in _active(model):
+    for light in map(int, np.flatnonzero(_rendered(model) & (model.light_type != _DIRECTIONAL))):
         mode, body = int(model.light_mode[light]), int(model.light_bodyid[light])
-        is_unfit = mode == _TRACKCOM and not follows_tracked(model, body)
-        if model.light_type[light] in (_DIRECTIONAL, _IMAGE) or is_unfit:
-            continue
         link, pos = body - 1, model.light_pos0[light]
         if body == 0:
             # It is up to date even if the model was edited after it was compiled.
@@ -149,28 +145,39 @@ def _axis(model: mujoco.MjModel, light: int) -> np.ndarray:
 
 
 def _cast_shadows(model: mujoco.MjModel) -> bool:
-    """Return whether lights cast shadows, if there are any."""
+    """Return whether any light casts shadows; true if there is no light."""
     rendered = _rendered(model)
     return not rendered.any() or bool(model.light_castshadow[rendered].any())
 
 
 def _rendered(model: mujoco.MjModel) -> np.ndarray:
-    """Return, for each light, whether it is rendered: no image, and of suns the first."""
+    """Return, for each light, whether it is rendered.
+
+    Those are the first directional light, and lamps; but no images, and no lamp that follows
+    another center of mass than the camera.
+    """
     rendered = model.light_active.astype(bool) & (model.light_type != _IMAGE)
-    rendered[np.flatnonzero(rendered & (model.light_type == _DIRECTIONAL))[1:]] = False
+    suns = model.light_type == _DIRECTIONAL
+    rendered[np.flatnonzero(rendered & suns)[1:]] = False
+    for lamp in np.flatnonzero(rendered & ~suns & (model.light_mode == _TRACKCOM)):
+        rendered[lamp] = follows_tracked(model, int(model.light_bodyid[lamp]))
     return rendered
 
 
 def _warn_of_lights(model: mujoco.MjModel) -> None:
     """Warn of what a model's lights have that is not rendered."""
     rendered, modes, kinds = _rendered(model), model.light_mode, model.light_type
+    active, lacks = model.light_active.astype(bool), ~rendered & (modes == _TRACKCOM)
     fades = (model.light_attenuation != (1, 0, 0)).any(axis=1) & (kinds != _DIRECTIONAL)
     shadows = model.light_castshadow.astype(bool)
     unlike = {
-        "it does not turn to its body": rendered & np.isin(modes, _AIMED),
-        "its attenuation is left out": rendered & fades,
-        "it casts shadows, because other lights do": rendered & ~shadows & shadows[rendered].any(),
-        "lights of images are left out": model.light_active.astype(bool) & (kinds == _IMAGE),
+        "lights do not turn to bodies": rendered & np.isin(modes, _AIMED),
+        "attenuation is left out": rendered & fades,
+        "casts shadows, because other lights do": rendered & ~shadows & shadows[rendered].any(),
+        "lights of images are left out": active & (kinds == _IMAGE),
+        "left out, because it follows another center of mass than the camera": active
+        & lacks
+        & ~np.isin(kinds, (_DIRECTIONAL, _IMAGE)),
     }
     for what, where in unlike.items():
         names = [repr(model.light(i).name or f"light/{i}") for i in np.flatnonzero(where)]
@@ -248,6 +255,11 @@ def _pitch(model: mujoco.MjModel, plane: int) -> np.ndarray:
     size = model.geom_size[plane, :2]
     # Along an axis without end the texture repeats by the metre, whatever `texuniform` says.
     spread = (size > 0) & ~bool(model.mat_texuniform[material])
+    if not model.mat_texrepeat[material].all():
+        raise ValueError(
+            f"material {model.mat(material).name or material!r} of a plane has texrepeat 0, so its "
+            "tiles have no size; give another."
+        )
     repeat = model.mat_texrepeat[material] / np.where(spread, size, 1.0)
     edges: np.ndarray = 1.0 / repeat
     return edges
@@ -258,8 +270,8 @@ def shows_ground(model: mujoco.MjModel, plane: int) -> bool:
     own, first = checker(model, plane), _checkered(model)
     if own is None or first is None:
         return False
-    same = plane == first or bool(np.allclose(_pitch(model, plane), _pitch(model, first)))
-    return same and bool((own == checker(model, first)).all())
+    same = np.allclose(_pitch(model, plane), _pitch(model, first))
+    return bool(same and (own == checker(model, first)).all())
 
 
 def _ground_mark(model: mujoco.MjModel) -> Any:

@@ -6,6 +6,7 @@ import inspect
 import os
 import warnings
 from collections.abc import Callable, Collection, Mapping
+from numbers import Integral
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,7 @@ from pixelbrax_jax.physics.mujoco.poses import with_unit_rotations
 from pixelbrax_jax.physics.mujoco.viewpoints import followed_body
 from pixelbrax_jax.physics.task import Color
 from pixelbrax_jax.types import PhysicsState
-from pixelbrax_jax.validation import check_not_negative, check_positive_int
+from pixelbrax_jax.validation import check_array, check_not_negative, check_positive_int
 
 RewardFn = Callable[[Snapshot, Snapshot, jax.Array], jax.Array]
 
@@ -179,13 +180,13 @@ def _load(source: str | Path) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
 def _start(
     model: mujoco.MjModel, reset: ResetFn | None, init_q: np.typing.ArrayLike | None, noise: float
 ) -> Callable[[Dynamics, jax.Array], Start]:
+    what = "init_q"
     if init_q is None:
+        what = "qpos of the model's first keyframe" if model.nkey else "qpos0 of the model"
         init_q = model.key_qpos[0] if model.nkey else model.qpos0
-    initial = np.asarray(init_q, np.float32)
-    if initial.shape != (model.nq,):
-        raise ValueError(f"init_q must have shape ({model.nq},), got {initial.shape}")
+    initial = check_array(what, init_q, (model.nq,))
     if not (np.abs(initial) < LARGEST).all():
-        raise ValueError(f"init_q must be finite and below {LARGEST:g}, got {init_q}.")
+        raise ValueError(f"{what} must lie between -{LARGEST:g} and {LARGEST:g}, got {init_q}.")
 
     def around(key: jax.Array) -> tuple[jax.Array, jax.Array]:
         q_key, qd_key = jax.random.split(key)
@@ -210,7 +211,11 @@ def _start(
 
 def _check_groups(groups: object) -> None:
     known = range(mujoco.mjNGROUP)
-    if not isinstance(groups, Collection) or not all(group in known for group in groups):
+
+    def is_one(group: object) -> bool:
+        return isinstance(group, Integral) and not isinstance(group, bool) and group in known
+
+    if not isinstance(groups, Collection) or not all(map(is_one, groups)):
         raise ValueError(
             f"geom_groups must be a collection of MuJoCo's groups, 0 to {mujoco.mjNGROUP - 1}, got "
             f"{groups!r}."

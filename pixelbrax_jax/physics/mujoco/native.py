@@ -309,6 +309,8 @@ def with_poses(spec: mujoco.MjSpec) -> mujoco.MjModel:
 def _without(model: mujoco.MjModel, features: int) -> mujoco.MjModel:
     model = copy.copy(model)
     model.opt.disableflags |= int(features)
+    # With it, a sensor of the kinetic energy keeps what a row had that used the data before.
+    model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_ENERGY)
     return model
 
 
