@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from pixelbrax_gym.cli import UsageError, say
 from pixelbrax_gym.cli._agents import MAY_DIFFER, AgentOptions, load, name_of
+from pixelbrax_jax.validation import check_choice
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -17,6 +18,16 @@ if TYPE_CHECKING:
 
     from pixelbrax_jax.agents.runner.trained import Trained
     from pixelbrax_jax.generalisation.making import LevelEnv, Levels
+
+
+def check_suite(name: str) -> None:
+    """Raise a UsageError with the names of all suites if there is none of this name."""
+    from pixelbrax_jax.generalisation.suites import SUITES
+
+    try:
+        check_choice("suite", name, SUITES)
+    except ValueError as error:
+        raise UsageError(str(error)) from error
 
 
 def evaluate(

@@ -12,6 +12,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from pixelbrax_gym.cli import UsageError, parse, say
 from pixelbrax_gym.cli._agents import AgentOptions, load, name_of
+from pixelbrax_gym.cli._suite import check_suite
 from pixelbrax_jax.validation import check_choice
 
 if TYPE_CHECKING:
@@ -54,6 +55,7 @@ class Options(AgentOptions):
 def run(arguments: Sequence[str]) -> int:
     """Run the command."""
     options = parse("dataset", Options, arguments)
+    check_suite(options.suite)
     from pixelbrax_gym.generalisation.pairs import record_pairs
 
     size = {name: getattr(options, name) for name in ("height", "width")}

@@ -15,7 +15,7 @@ from tyro.conf import Positional, arg
 
 from pixelbrax_gym.cli import CommandError, UsageError, parse, say
 from pixelbrax_gym.cli._agents import AgentOptions, load
-from pixelbrax_gym.cli._suite import evaluate
+from pixelbrax_gym.cli._suite import check_suite, evaluate
 from pixelbrax_jax.tasks import SUITES
 from pixelbrax_jax.validation import check_positive_int
 
@@ -35,8 +35,9 @@ class Options(AgentOptions):
     """Output folder of the training run; with --suite one or several."""
     episodes: int | None = None
     """Number of episodes of each split or level; default: 32, or the suite's number."""
-    suite: Literal["axes", "dcs", "dmcgb", "dmcgb2", "paper", "subtle"] | None = None
-    """Plays the levels of a suite instead of splits, and writes a table in Markdown."""
+    suite: Annotated[str | None, arg(metavar="NAME")] = None
+    """Plays the levels of a suite instead of splits, and writes a table in Markdown: dmcgb, dmcgb2,
+    dcs, paper, subtle or axes."""
     output_dir: str | None = None
     """Folder for the suite's returns.json, table.csv and levels.png. Levels whose returns it has
     are not played again."""
@@ -57,6 +58,7 @@ def run(arguments: Sequence[str]) -> int:
     """Run the command."""
     options = parse("evaluate", Options, arguments)
     if options.suite is not None:
+        check_suite(options.suite)
         for name, value in (("split", options.split), ("in", options.where)):
             if value:
                 raise UsageError(f"--suite plays its own levels; leave out --{name}.")

@@ -92,6 +92,7 @@ class Algorithm(ABC):
         """Return (N, A) float32 actions for (N, H, W, 3 K) uint8 pixels, or float32 depths.
 
         Needs only the networks in ``acting``. A key samples the actions; None returns the best.
+        The exported policy has any N: there ``pixels.shape[0]`` is a symbol, and no number.
         """
 
     def warnings(self, record: Mapping[str, float]) -> list[str]:

@@ -21,10 +21,15 @@ class Distractor:
     Attributes:
         kind: name of the distractor; an environment has at most one of each kind.
         stream: unique number of its random stream, folded into an episode's key.
+        only_colors: whether it changes nothing but colors; then an environment without them
+            refuses it.
+        one_camera: whether it is for environments of one camera alone.
     """
 
     kind: ClassVar[str]
     stream: ClassVar[int]
+    only_colors: ClassVar[bool] = False
+    one_camera: ClassVar[bool] = False
 
     @property
     def whole_image(self) -> bool:

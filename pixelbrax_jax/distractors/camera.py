@@ -73,6 +73,7 @@ class MovingCamera(Distractor):
 
     kind: ClassVar[str] = "camera"
     stream: ClassVar[int] = 3
+    one_camera: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         check_fraction("scale of MovingCamera", self.scale)

@@ -73,6 +73,7 @@ class Color(Distractor):
 
     kind: ClassVar[str] = "color"
     stream: ClassVar[int] = 1
+    only_colors: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         check_choice("mode of Color", self.mode, MODES)

@@ -40,6 +40,7 @@ class ImageFilter(Distractor):
 
     kind: ClassVar[str] = "filter"
     stream: ClassVar[int] = 4
+    only_colors: ClassVar[bool] = True
 
     @property
     def whole_image(self) -> bool:

@@ -58,6 +58,7 @@ class Light(Distractor):
 
     kind: ClassVar[str] = "light"
     stream: ClassVar[int] = 5
+    only_colors: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         if not 0.0 <= check_finite("direction of Light", self.direction) <= 180.0:

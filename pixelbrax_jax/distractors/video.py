@@ -77,6 +77,7 @@ class Video(Distractor):
 
     kind: ClassVar[str] = "video"
     stream: ClassVar[int] = 2
+    only_colors: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         check_choice("mode of Video", self.mode, MODES)

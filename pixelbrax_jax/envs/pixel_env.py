@@ -81,15 +81,16 @@ class PixelEnv(ProgramConfig):
             why_no_kernel()  # on a GPU, checks the kernel before a program is traced
 
     def _check_distractors(self) -> None:
-        for kind in (link.kind for link in self.chain.links):
-            if kind in ("color", "video", "light", "filter") and "pixels" not in self.images:
+        for link in self.chain.links:
+            if link.only_colors and "pixels" not in self.images:
                 raise ValueError(
-                    f"distractor {kind!r} changes only colors, which obs_mode={self.obs_mode!r} "
-                    "does not show: leave it out, or add 'pixels' to obs_mode."
+                    f"distractor {link.kind!r} changes only colors, which "
+                    f"obs_mode={self.obs_mode!r} does not show: leave it out, or add 'pixels' to "
+                    "obs_mode."
                 )
-            if kind == "camera" and self.num_cameras > 1:
+            if link.one_camera and self.num_cameras > 1:
                 raise ValueError(
-                    f"distractor 'camera' moves one camera, but there are {self.num_cameras}: "
+                    f"distractor {link.kind!r} moves one camera, but there are {self.num_cameras}: "
                     "leave it out, or give one camera."
                 )
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from pixelbrax_jax.agents.config import TrainConfig, describe, make_env
-from pixelbrax_jax.agents.off_policy.config import DrQv2Config
 from pixelbrax_jax.agents.on_policy.config import OnPolicyConfig
 from pixelbrax_jax.agents.on_policy.dcpg import DCPGConfig
 from pixelbrax_jax.agents.on_policy.ppg import PPGConfig
@@ -22,7 +21,7 @@ from pixelbrax_jax.envs.vector import VectorPixelEnv
 from pixelbrax_jax.types import Camera
 from tests.agents.small import SMALL, ball_envs, settings_of
 
-CONFIGS = (PPOConfig, PPGConfig, DCPGConfig, DrQv2Config)
+CONFIGS = tuple(kind.config_class for kind in ALGORITHMS.values())
 
 COUNTS = (
     "height", "width", "frame_stack", "action_repeat", "episode_length", "total_steps", "num_envs",

@@ -12,7 +12,7 @@ import pytest
 
 import pixelbrax_jax as pb
 from pixelbrax_jax import PixelEnv, VectorPixelEnv, check_env, make_rig
-from pixelbrax_jax.distractors import Color, MovingCamera, Video
+from pixelbrax_jax.distractors import Color, Distractor, MovingCamera, Video
 from pixelbrax_jax.observations import MAX_DEPTH
 from pixelbrax_jax.scene.cameras import aim
 from tests.envs.toy import PARAMS, Ball
@@ -194,6 +194,13 @@ def test_the_order_of_parts_does_not_matter():
     assert pb.EnvConfig(camera=["front"]) == pb.EnvConfig(camera="front")
 
 
+class Dimmer(Distractor):
+    """A user's."""
+
+    kind, stream = "dimmer", 99
+    only_colors = one_camera = True
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -207,6 +214,11 @@ def test_the_order_of_parts_does_not_matter():
         ({"camera": ("front", "sid")}, "unknown camera of task 'inverted_pendulum': 'sid'"),
         ({"obs_mode": "depth", "distractors": Color()}, "'color' changes only colors, which"),
         ({"obs_mode": "depth+state", "distractors": Video()}, "'video' changes only colors"),
+        ({"obs_mode": "depth", "distractors": Dimmer()}, "'dimmer' changes only colors"),
+        (
+            {"camera": ("front", "top"), "distractors": Dimmer()},
+            "'dimmer' moves one camera, but there are 2",
+        ),
         ({"camera_sizes": {"top": (36, 36)}}, "several cameras, got only 'top': use height and"),
         ({"camera_sizes": {"front": 36, "top": 36}}, "a height and a width by the name of each"),
         ({"camera_sizes": (("a", 36, 36), ("a", 24, 24))}, "different names, got a, a"),

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
-from typing import get_args, get_type_hints
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,7 +14,6 @@ from PIL import Image
 from pixelbrax_gym import evaluate_suite
 from pixelbrax_gym.cli import _suite, main
 from pixelbrax_gym.cli._agents import name_of
-from pixelbrax_gym.cli.evaluate import Options
 from pixelbrax_jax.agents import PPOConfig
 from pixelbrax_jax.agents.runner.trained import Pretrained, Trained
 from pixelbrax_jax.generalisation.suites import SUITES
@@ -266,10 +265,16 @@ def test_options_of_a_suite_need_one(capsys):
     ):
         assert main(["evaluate", *arguments]) == 2
         assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["evaluate", "dataset"])
+def test_suites_have_names(command, capsys):
     with pytest.raises(SystemExit):
-        main(["evaluate", "a", "--suite", "dmcgb3"])
-
-
-def test_the_command_has_all_suites():
-    literal, _ = get_args(get_type_hints(Options)["suite"])
-    assert {*get_args(literal), "tiny"} == set(SUITES)
+        main([command, "--help"])
+    told = capsys.readouterr().out
+    assert all(re.search(rf"\b{name}\b", told) for name in SUITES if name != "tiny")
+    more = [] if command == "evaluate" else ["--level", "x", "--output-dir", "y"]
+    assert main([command, "a", "--suite", "dmcgb3", *more]) == 2
+    told = capsys.readouterr().err
+    assert "unknown suite: 'dmcgb3'. Did you mean 'dmcgb" in told
+    assert all(name in told for name in SUITES)

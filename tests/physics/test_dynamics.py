@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 
 import pixelbrax_jax as pb
-from pixelbrax_jax.physics.mujoco import native
+from pixelbrax_jax.physics.mujoco import native, xla
+from pixelbrax_jax.physics.mujoco.options import ENGINES, Engine
+from pixelbrax_jax.physics.mujoco.xla import Mjx
 from pixelbrax_jax.registry import make_physics
 from pixelbrax_jax.tasks import DMC_TASKS
 
@@ -138,6 +140,19 @@ def test_small_models_are_stepped_by_mujoco_xla():
     assert "pixelbrax_host_call" not in step.as_text()
     reset = jax.jit(small.reset).lower(jax.random.key(0))
     assert "pixelbrax_host_call" in reset.as_text()
+
+
+def test_an_engine_is_a_row(monkeypatch):
+    class Mine(Mjx):
+        pass
+
+    monkeypatch.setattr(xla, "Mine", Mine, raising=False)
+    monkeypatch.setitem(ENGINES, "mine", Engine("xla:Mine"))
+    physics = make_physics("dmc_pendulum_swingup", engine="mine")
+    assert isinstance(physics.dynamics.xla, Mine)
+    state = jax.eval_shape(physics.reset, jax.random.key(0))
+    # It computes on every device, so nothing is chosen.
+    assert "by_platform" not in str(jax.make_jaxpr(physics.step)(state, jnp.zeros(1)))
 
 
 def test_engines_are_options_of_the_suite():

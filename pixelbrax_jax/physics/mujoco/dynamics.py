@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Sequence
 from copy import copy
 from functools import cached_property, partial
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -21,6 +22,7 @@ from pixelbrax_jax.physics.mujoco.multipliers import check_varies
 from pixelbrax_jax.physics.mujoco.native import Native
 from pixelbrax_jax.physics.mujoco.needs import Needs
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
+from pixelbrax_jax.physics.mujoco.options import ENGINES
 from pixelbrax_jax.spatial import quat_normalize
 
 if TYPE_CHECKING:
@@ -73,8 +75,7 @@ class Dynamics:
     """A model's dynamics, for one environment, by an engine of ``options.ENGINES``.
 
     With ``"auto"`` MuJoCo computes programs lowered for a CPU, in float64, and MuJoCo XLA all
-    others, in float32; with ``needs.prefers_xla`` MuJoCo XLA takes the steps on a CPU, too. With
-    ``"warp"`` MuJoCo Warp takes the steps on every device.
+    others, in float32; with ``needs.prefers_xla`` MuJoCo XLA takes the steps on a CPU, too.
     """
 
     def __init__(
@@ -96,7 +97,7 @@ class Dynamics:
         data = mujoco.MjData(model)
         fields = [getattr(data, name).shape for name in needs.reads]
         self._shapes = [(model.nbody, 3), (model.nbody, 4), (model.nsensordata,), *fields]
-        if engine == "warp":
+        if not ENGINES[engine].by_mujoco:
             # It says now what it lacks or cannot compute.
             _ = self.xla
 
@@ -109,15 +110,18 @@ class Dynamics:
     @cached_property
     def xla(self) -> Xla:
         """The engine for accelerators, loaded at the first use."""
+        made_by = ENGINES[self.engine].made_by
+        if made_by is None:
+            raise NotImplementedError(
+                f"engine={self.engine!r} computes on a CPU alone; for programs of other devices "
+                "choose engine='xla', or engine='auto'."
+            )
         # The first use may be within a program that is being traced.
         with jax.ensure_compile_time_eval():
-            if self.engine == "warp":
-                from pixelbrax_jax.physics.mujoco.warp import Warp
-
-                return Warp(self.model, self._needs)
-            from pixelbrax_jax.physics.mujoco.xla import Xla
-
-            return Xla(self.model, self._needs, plain=self.engine == "mjx")
+            module, kind = made_by.split(":")
+            loaded = import_module(f"pixelbrax_jax.physics.mujoco.{module}")
+            engine: Xla = getattr(loaded, kind)(self.model, self._needs)
+            return engine
 
     def state(
         self,
@@ -184,22 +188,17 @@ class Dynamics:
             return host_call(name, row, like)
 
         def by_xla(*row: jax.Array) -> list[jax.Array]:
-            if self.engine == "mujoco":
-                raise NotImplementedError(
-                    "engine='mujoco' computes on a CPU alone; for programs of other devices choose "
-                    "engine='xla', or engine='auto'."
-                )
             return list(getattr(self.xla, method)(*options, *row))
 
-        if self.engine in ("xla", "mjx") or (method == "step" and self._steps_by_xla):
+        _, by_mujoco, has_derivatives = ENGINES[self.engine]
+        if (has_derivatives and not by_mujoco) or (method == "step" and self._steps_by_xla):
             return by_xla(*arrays)
-        is_warp = self.engine == "warp"
-        who = "MuJoCo Warp" if is_warp else "MuJoCo itself"
+        who = "MuJoCo itself" if by_mujoco else f"engine={self.engine!r}"
         results: list[jax.Array] = by_platform(
             tuple(arrays),
             like,
-            cpu=None if is_warp else by_native,
-            default=by_xla if is_warp else fold(by_xla),
+            cpu=by_native if by_mujoco else None,
+            default=fold(by_xla) if by_mujoco else by_xla,
             no_derivative=f"{who} has no derivatives: choose engine='xla', MuJoCo XLA, "
             "which has them.",
         )

@@ -3,11 +3,33 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from pixelbrax_jax.validation import check_choice, check_count
 
-ENGINES = ("auto", "mujoco", "xla", "mjx", "warp")
-"""Names of the engines."""
+
+class Engine(NamedTuple):
+    """How an engine computes.
+
+    Attributes:
+        made_by: module in ``physics/mujoco`` and class, with the methods of ``xla.Xla``; None if
+            MuJoCo itself computes, on a CPU alone.
+        by_mujoco: whether MuJoCo itself computes programs for a CPU.
+        has_derivatives: whether what the class computes has derivatives.
+    """
+
+    made_by: str | None
+    by_mujoco: bool = False
+    has_derivatives: bool = True
+
+
+ENGINES = {
+    "auto": Engine("xla:Xla", by_mujoco=True),
+    "mujoco": Engine(None, by_mujoco=True),
+    "xla": Engine("xla:Xla"),
+    "mjx": Engine("xla:Mjx"),
+    "warp": Engine("warp:Warp", has_derivatives=False),
+}
 
 
 @dataclass(frozen=True, kw_only=True)

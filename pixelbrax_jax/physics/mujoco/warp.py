@@ -12,7 +12,7 @@ import numpy as np
 from pixelbrax_jax.extras import needs_extra
 from pixelbrax_jax.physics.mujoco.needs import Needs
 from pixelbrax_jax.physics.mujoco.opengl import mujoco
-from pixelbrax_jax.physics.mujoco.xla import Arrays, Xla, changed
+from pixelbrax_jax.physics.mujoco.xla import Arrays, Mjx, changed
 
 with needs_extra("warp"):
     import warp
@@ -27,12 +27,12 @@ _TAKEN = ("qpos", "qvel", "act", "qacc_warmstart", "ctrl")
 """Fields of ``MjData`` that a step takes."""
 
 
-class Warp(Xla):
+class Warp(Mjx):
     """The same as ``Xla``, with steps by MuJoCo Warp; all else is computed by MuJoCo XLA."""
 
     def __init__(self, model: mujoco.MjModel, needs: Needs):
         """Put a model on the device; see ``Xla``."""
-        super().__init__(model, needs, plain=True)
+        super().__init__(model, needs)
         if "cfrc_ext" in self._fields:
             raise ValueError(
                 "engine='warp' does not compute cfrc_ext, which this task's formulas need. Choose "

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Iterable
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -29,14 +29,11 @@ Arrays = tuple[jax.Array, ...]
 class Xla:
     """Steps of a model, as ``Native`` makes them, for one environment and as pure functions."""
 
-    def __init__(
-        self,
-        model: mujoco.MjModel,
-        needs: Needs,
-        *,
-        plain: bool = False,
-    ):
-        """Put a model on the device; ``plain`` takes MuJoCo XLA's own step."""
+    has_own_stages: ClassVar[bool] = True
+    """Whether stages of ours take the place of MuJoCo XLA's where they can."""
+
+    def __init__(self, model: mujoco.MjModel, needs: Needs):
+        """Put a model on the device."""
         load_onto_own_device(mjx_io)
         check_simulated(model)
         self._model = model
@@ -45,7 +42,7 @@ class Xla:
         self._fields = needs.reads
         # What a step leaves, by its names of `MjData`.
         self._left = ("qpos", "qvel", "act", "qacc_warmstart", "sensordata", *needs.reads)
-        self._stages: Any = mjx if plain or not stages.is_supported(model) else stages
+        self._stages: Any = stages if self.has_own_stages and stages.is_supported(model) else mjx
         self.simulated = _simulated(model, needs.out_of_reach)
         try:
             self._mx = mjx.put_model(self.simulated, impl="jax")
@@ -141,6 +138,12 @@ class Xla:
     def _data(self, qpos: jax.Array, qvel: jax.Array, **fields: jax.Array) -> Any:
         data = mjx.make_data(self.simulated, impl="jax")
         return data.replace(qpos=qpos, qvel=qvel, **fields)
+
+
+class Mjx(Xla):
+    """The same with MuJoCo XLA's own steps."""
+
+    has_own_stages = False
 
 
 def changed(model: Any, multipliers: jax.Array) -> Any:

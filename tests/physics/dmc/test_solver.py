@@ -13,7 +13,7 @@ from pixelbrax_jax._platform.interpreter import batch_last
 from pixelbrax_jax.physics.mujoco import elimination, stages
 from pixelbrax_jax.physics.mujoco.needs import Needs
 from pixelbrax_jax.physics.mujoco.stages import is_supported
-from pixelbrax_jax.physics.mujoco.xla import Xla
+from pixelbrax_jax.physics.mujoco.xla import Mjx, Xla
 
 # Two arms with dry friction, damping, limits, a brake and a joint that follows another; a ball that
 # slides and rolls.
@@ -59,9 +59,9 @@ def last(function):
     return batch_last(function, (0, 0))
 
 
-def after_a_step(model, qpos, qvel, batch=jax.vmap, **options):
+def after_a_step(model, qpos, qvel, batch=jax.vmap, kind=Xla):
     """Our ``qpos, qvel, act, qacc`` after a step."""
-    engine = Xla(model, Needs(), **options)
+    engine = kind(model, Needs())
     rest = [jnp.zeros(size) for size in (model.na, model.nv, model.nu, 0)]
     move = batch(lambda q, v: engine.step(1, q, v, *rest)[:4])
     return jax.jit(move)(jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32))
@@ -219,7 +219,7 @@ def test_each_stage_of_our_own_is_used_and_agrees_with_mujoco_xlas(integrator, m
     qpos, qvel = states(model)
     ours = after_a_step(model, qpos, qvel)
     assert set(used) == {*STAGES}
-    theirs = after_a_step(model, qpos, qvel, plain=True)
+    theirs = after_a_step(model, qpos, qvel, kind=Mjx)
     for one, other in zip(ours[:2], theirs[:2], strict=True):
         scale = np.maximum(1.0, np.abs(other).max(axis=1, keepdims=True))
         far = (np.abs(one - other) / scale).max(axis=1)
