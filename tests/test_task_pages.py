@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -17,6 +20,16 @@ DESCRIBED = {"brax": task_pages.brax, "dmc": task_pages.dmc, "gymnasium": task_p
 def test_every_suite_has_a_page():
     assert {name for suite in SUITES.values() for name in suite} == set(TASKS)
     assert set(task_pages.FIGURES) == set(SUITES)
+
+
+def test_pages_count_dm_controls_tasks():
+    texts = [
+        Path(__file__).parents[1].joinpath(n).read_text() for n in ("README.md", "docs/dmc.md")
+    ]
+    counts = [
+        int(n) for text in texts for n in re.findall(r"(\d+) tasks of the \[?DM Control", text)
+    ]
+    assert counts == [len(DMC_TASKS)] * 3
 
 
 @pytest.mark.parametrize("suite", SUITES)

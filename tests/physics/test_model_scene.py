@@ -190,6 +190,12 @@ def test_tiles_of_planes_that_end_or_do_not(size, repeat, uniform, pitch):
     assert read_scene(mujoco.MjModel.from_xml_string(xml)).look.ground_pitch == pytest.approx(pitch)
 
 
+def test_tiles_have_a_size():
+    model = mujoco.MjModel.from_xml_string(MODEL.replace('texrepeat="2 2"', 'texrepeat="0 2"'))
+    with pytest.raises(ValueError, match="material 'floor' of a plane has texrepeat 0"):
+        read_scene(model)
+
+
 def test_tiles_that_are_no_squares_are_told():
     xml = MODEL.replace('texrepeat="2 2"', 'texrepeat="2 4"')
     with pytest.warns(UserWarning, match=r"tiles of plane 'ground' are 0\.5 by 0\.25 m"):
