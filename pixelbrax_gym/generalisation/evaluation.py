@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping
 from functools import partial
 from os import PathLike
@@ -52,8 +53,8 @@ def evaluate_suite(
         clips: folder of the videos, or ``"procedural"``, for suites that show any.
         output: type of the observations, ``"numpy"``, ``"torch"`` or ``"jax"``.
         output_dir: folder for ``returns.json``, with the return of every episode, ``table.csv`` and
-            ``levels.png``. Levels that the file has are not played again; it knows policies by
-            name alone.
+            ``levels.png``. Levels that the file has are not played again, with a UserWarning; it
+            knows policies by name alone.
         report: takes a line after each level.
         success_return: an episode with at least this return is a success; None for the task's, with
             which ``episode_length`` and ``reward_preset`` must be the usual ones.
@@ -85,14 +86,24 @@ def evaluate_suite(
     levels = make_levels(config, suite, episodes, clips, report)
     # Levels with one program share their environments.
     made: dict[Any, GymnasiumVectorEnv] = {}
+    num_played = 0
 
     def play_level(level: LevelEnv, policy: Policy) -> np.ndarray:
+        nonlocal num_played
+        num_played += 1
         if level.env not in made:
             made[level.env] = make_level_envs(levels, level, levels.episodes, output)
         return _returns(made[level.env], level.params, policy)
 
     players = {name: partial(play_level, policy=one) for name, one in policies.items()}
-    return play(levels, players, output_dir, report, success_return)
+    scores = play(levels, players, output_dir, report, success_return)
+    if num_kept := len(levels.levels) * len(players) - num_played:
+        warnings.warn(
+            f"{num_kept} levels of {', '.join(players)} were not played, because {output_dir} has "
+            "returns of policies with these names: give another policy another name or folder.",
+            stacklevel=2,
+        )
+    return scores
 
 
 def make_level_envs(
@@ -136,6 +147,11 @@ def checked(actions: Any, shape: tuple[int, ...], episodes: np.ndarray | None = 
 
     ``episodes`` are the numbers of the rows' episodes, by default 0 to E - 1.
     """
+    if isinstance(actions, tuple):
+        raise ValueError(
+            "the policy must return an array of actions, got a tuple; of what predict of "
+            "Stable-Baselines3 returns, take the first."
+        )
     if (got := tuple(np.shape(actions))) != shape:
         raise ValueError(
             f"the policy must return actions of shape {shape}, a row for each of {shape[0]} "

@@ -10,6 +10,9 @@ import jax.numpy as jnp
 
 from pixelbrax_jax.types import EnvParams, Frame
 
+_OF_EPISODES = ("episode_return", "episode_length", "non_finite")
+"""Names in ``Timestep.info`` that are not a distractor's."""
+
 
 class Distractor:
     """A change of an environment's image, written for ONE environment.
@@ -145,7 +148,13 @@ class Chain:
         """Return what all of them add to ``Timestep.info``."""
         info: dict[str, jax.Array] = {}
         for link, state in zip(self.links, states, strict=True):
-            info |= link.info(state)
+            added = link.info(state)
+            if taken := sorted(added.keys() & {*info, *_OF_EPISODES}):
+                raise ValueError(
+                    f"info of distractor {link.kind!r} has {taken[0]!r}, which is taken: give it "
+                    "another name."
+                )
+            info |= added
         return info
 
     @staticmethod

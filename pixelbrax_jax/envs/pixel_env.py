@@ -84,9 +84,8 @@ class PixelEnv(ProgramConfig):
         for link in self.chain.links:
             if link.only_colors and "pixels" not in self.images:
                 raise ValueError(
-                    f"distractor {link.kind!r} changes only colors, which "
-                    f"obs_mode={self.obs_mode!r} does not show: leave it out, or add 'pixels' to "
-                    "obs_mode."
+                    f"distractor {link.kind!r} changes only colors, which obs_mode="
+                    f"{self.obs_mode!r} does not show: leave it out, or add 'pixels' to obs_mode."
                 )
             if link.one_camera and self.num_cameras > 1:
                 raise ValueError(

@@ -14,7 +14,7 @@ from PIL import Image
 import pixelbrax_jax as pb
 from pixelbrax_jax import distractors
 from pixelbrax_jax.distractors import Color, MovingCamera, Video
-from pixelbrax_jax.distractors.base import Chain
+from pixelbrax_jax.distractors.base import Chain, Distractor
 from pixelbrax_jax.distractors.presets import resolve
 from pixelbrax_jax.envs.pixel_env import PixelEnv
 from pixelbrax_jax.generalisation.suites import levels_of
@@ -53,6 +53,19 @@ def test_state_reward_and_flags_are_the_same_bits(runs):
     for name in ("episode_return", "episode_length", "non_finite"):
         np.testing.assert_array_equal(changed.info[name], clean.info[name])
     assert (changed.obs["pixels"] != clean.obs["pixels"]).mean() > 0.8
+
+
+@pytest.mark.parametrize("name", ["episode_return", "color"])
+def test_an_entry_of_info_has_one_owner(name):
+    class Meddler(Distractor):
+        kind, stream = "meddler", 99
+
+        def info(self, state):
+            return {name: state}
+
+    chain = Chain((Color(), Meddler()))
+    with pytest.raises(ValueError, match=f"info of distractor 'meddler' has '{name}', which is ta"):
+        chain.info((jnp.zeros(3), jnp.zeros(())))
 
 
 def test_info_tells_of_every_distractor(runs):

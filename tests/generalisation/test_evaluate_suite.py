@@ -126,13 +126,16 @@ def test_a_stopped_call_continues_with_equal_returns(tmp_path):
     ]
     first = len(calls)
     lines = []
-    assert evaluate(policy, output_dir=tmp_path, report=lines.append).returns == whole.returns
+    with pytest.warns(UserWarning, match="2 levels of policy were not played, because"):
+        rest = evaluate(policy, output_dir=tmp_path, report=lines.append)
+    assert rest.returns == whole.returns
     assert len(calls) == first * 3 // 2
     assert [line.endswith("from the file") for line in lines] == [True, True, False]
     assert (tmp_path / "table.csv").read_text() == whole.csv()
     # What counts as a success changes no return.
     lowest = min(min(returns) for returns in whole.returns["policy"].values())
-    again = evaluate(policy, output_dir=tmp_path, success_return=lowest)
+    with pytest.warns(UserWarning, match="3 levels of policy were not played"):
+        again = evaluate(policy, output_dir=tmp_path, success_return=lowest)
     assert [row.success for row in again.rows()] == [1.0] * 4
     assert (tmp_path / "table.csv").read_text() == again.csv() != whole.csv()
     assert "success" not in (tmp_path / "returns.json").read_text()
@@ -183,6 +186,7 @@ def test_several_policies_are_seeds():
     ("policy", "more", "error", "message"),
     [
         (lambda obs: np.zeros(3, np.float32), {}, ValueError, r"of shape \(3, 1\), .* got \(3,\)"),
+        (lambda obs: (of_numpy(obs), None), {}, ValueError, "got a tuple; of what predict of Stab"),
         (lambda obs: [[0.0]], {}, ValueError, r"of shape \(3, 1\), .* got \(1, 1\)"),
         (None, {}, TypeError, "policy 'policy' must be a function of observations, got None"),
         ({}, {}, ValueError, "at least one policy"),
