@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pixelbrax_jax.types import CameraRig
-from pixelbrax_jax.validation import check_array, check_link
+from pixelbrax_jax.validation import check_arrays, check_link
 
 
 def f32(values: Any) -> Any:
@@ -110,10 +110,7 @@ def make_rig(
 def check_rig(rig: CameraRig) -> CameraRig:
     """Return the rig with float32 arrays; raise a ValueError if nothing can be seen with it."""
     shapes = {"track": (3,), "eye": (3,), "target": (3,), "up": (3,), "fovy": ()}
-    parts = {
-        name: check_array(f"{name} of a CameraRig", getattr(rig, name), shape)
-        for name, shape in shapes.items()
-    }
+    parts = check_arrays("a CameraRig", rig, shapes)
     if not 0.0 < parts["fovy"] < 180.0:
         raise ValueError(f"fovy must lie between 0 and 180 degrees, got {rig.fovy}.")
     check_link("link of a CameraRig", rig.link)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from functools import partial
 from numbers import Integral, Real
@@ -131,3 +131,13 @@ def check_array(what: str, value: Any, *shapes: tuple[int, ...]) -> np.ndarray:
                 return array
     wanted = " or ".join(map(str, shapes))
     raise ValueError(f"{what} must have finite numbers of shape {wanted}, got {value!r}.")
+
+
+def check_arrays(
+    what: str, value: object, shapes: Mapping[str, tuple[int, ...]]
+) -> dict[str, np.ndarray]:
+    """Return attributes as ``check_array`` does, by their names; ``what`` is that of the object."""
+    return {
+        name: check_array(f"{name} of {what}", getattr(value, name), shape)
+        for name, shape in shapes.items()
+    }

@@ -24,7 +24,8 @@ def test_every_suite_has_a_page():
 
 def test_pages_count_dm_controls_tasks():
     texts = [
-        Path(__file__).parents[1].joinpath(n).read_text() for n in ("README.md", "docs/dmc.md")
+        Path(__file__).parents[1].joinpath(n).read_text("utf-8")
+        for n in ("README.md", "docs/dmc.md")
     ]
     counts = [
         int(n) for text in texts for n in re.findall(r"(\d+) tasks of the \[?DM Control", text)

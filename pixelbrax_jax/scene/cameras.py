@@ -10,7 +10,7 @@ import numpy as np
 
 from pixelbrax_jax.spatial import check_rig, f32, look_at, make_rig, rotate
 from pixelbrax_jax.types import Camera, CameraRig, GeomKind, Geoms
-from pixelbrax_jax.validation import check_array, check_choice
+from pixelbrax_jax.validation import check_arrays, check_choice
 
 _DISTANT = 1000
 """Radii of a sphere or capsule beyond which float32 moves its edge by hundredths of a radius."""
@@ -45,10 +45,9 @@ def choose_rig(
     if isinstance(camera, CameraRig):
         return check_rig(camera)
     if isinstance(camera, Camera):
-        pos = check_array("pos of a Camera", camera.pos, (3,))
-        xmat = check_array("xmat of a Camera", camera.xmat, (3, 3))
-        fovy = check_array("fovy of a Camera", camera.fovy, ())
-        return make_rig(pos, pos - xmat[:, 2], fovy.item(), up=xmat[:, 1])
+        parts = check_arrays("a Camera", camera, {"pos": (3,), "xmat": (3, 3), "fovy": ()})
+        pos, xmat = parts["pos"], parts["xmat"]
+        return make_rig(pos, pos - xmat[:, 2], parts["fovy"].item(), up=xmat[:, 1])
     if not isinstance(camera, str):
         raise TypeError(
             "camera must be a name, a pixelbrax_jax.CameraRig or a pixelbrax_jax.Camera, "

@@ -10,6 +10,7 @@ from pixelbrax_jax.spatial import f32
 from pixelbrax_jax.types import Lamp, Look
 from pixelbrax_jax.validation import (
     check_array,
+    check_arrays,
     check_bool,
     check_choice,
     check_count,
@@ -125,8 +126,4 @@ def _checked_lamp(lamp: Lamp) -> Lamp:
         raise TypeError(f"lamps of a Look must be a tuple of Lamp, got {lamp!r} in it.")
     check_count("exponent of a Lamp", lamp.exponent)
     check_link("link of a Lamp", lamp.link)
-    parts = {
-        name: check_array(f"{name} of a Lamp", getattr(lamp, name), shape)
-        for name, shape in _LAMP_SHAPES.items()
-    }
-    return lamp.replace(**parts)
+    return lamp.replace(**check_arrays("a Lamp", lamp, _LAMP_SHAPES))

@@ -167,16 +167,15 @@ def _rendered(model: mujoco.MjModel) -> np.ndarray:
 def _warn_of_lights(model: mujoco.MjModel) -> None:
     """Warn of what a model's lights have that is not rendered."""
     rendered, modes, kinds = _rendered(model), model.light_mode, model.light_type
-    active, lacks = model.light_active.astype(bool), ~rendered & (modes == _TRACKCOM)
+    left_out = model.light_active.astype(bool) & ~rendered
     fades = (model.light_attenuation != (1, 0, 0)).any(axis=1) & (kinds != _DIRECTIONAL)
     shadows = model.light_castshadow.astype(bool)
     unlike = {
         "lights do not turn to bodies": rendered & np.isin(modes, _AIMED),
         "attenuation is left out": rendered & fades,
         "casts shadows, because other lights do": rendered & ~shadows & shadows[rendered].any(),
-        "lights of images are left out": active & (kinds == _IMAGE),
-        "left out, because it follows another center of mass than the camera": active
-        & lacks
+        "lights of images are left out": left_out & (kinds == _IMAGE),
+        "left out, because it follows another center of mass than the camera": left_out
         & ~np.isin(kinds, (_DIRECTIONAL, _IMAGE)),
     }
     for what, where in unlike.items():
