@@ -85,8 +85,8 @@ class Machine:
     jax_platform: str | None  # cpu, gpu, tpu, ...
     jax_error: str | None  # why JAX has no device
     has_nvidia: bool  # whether the system has an NVIDIA GPU
-    # Whether torch can use CUDA, a tensor shares the memory of its array, and an array that of its
-    # tensor; or the error; None without torch.
+    # Whether torch can use CUDA, and whether arrays become tensors, and tensors arrays, without a
+    # copy; or the error; None without torch.
     torch_cuda: bool | str | None
     to_torch: bool | str | None
     to_jax: bool | str | None
@@ -275,7 +275,7 @@ def broken_variables() -> dict[str, str]:
             continue
         without = {key: value for key, value in os.environ.items() if key != name}
         why = _why_it_fails(variable.code, dict(os.environ))
-        # The same error without the variable has another cause.
+        # An error that also occurs without the variable has another cause.
         if why and why != _why_it_fails(variable.code, without):
             broken[name] = why
     return broken

@@ -15,7 +15,7 @@ from pixelbrax_jax.flags import is_key, with_keys, without_keys
 from pixelbrax_jax.types import EnvParams, EnvState, Timestep
 
 _FEW = 32
-"""Up to this number of environments, joining the parts of a state is faster than passing them."""
+"""Largest number of environments for which joining a state's parts is faster than passing them."""
 
 _MANY_PROGRAMS = 64
 """Number of sets of options whose programs stay in memory."""
@@ -58,8 +58,7 @@ class Programs:
     leaves the state before or after a step. New frames reuse the memory of ``spare``, frames
     that are not read again. With ``single``, actions and outputs lack the leading axis.
 
-    ``programs_of`` makes one object per set of options, compared by identity, because JAX compares
-    it in every call.
+    ``programs_of`` makes one object per set of options: JAX compares it in every call, by identity.
     """
 
     def __init__(self, vector: VectorPixelEnv, single: bool) -> None:

@@ -194,7 +194,7 @@ class StatefulEnv:
         return self._replace(self._programs.start(state, self.params, packed, mask))
 
     def set_time_limit(self, control_steps: int) -> None:
-        """Set the time limit, at least 1, of current and later episodes; a shorter task's holds."""
+        """Set the time limit of current and later episodes, at least 1, at most the task's own."""
         control_steps = min(filter(None, (control_steps, self.env.physics.time_limit, _LONGEST)))
         if control_steps == self.episode_length:
             return
@@ -320,7 +320,7 @@ def _make(config: EnvConfig) -> tuple[PixelEnv, EnvParams]:
             check_not_forked()
         return known[0][1:]
     env, params = make(config)
-    # This list would keep the 100 MB of clips in memory.
+    # The list would keep 100 MB of clips in memory.
     if params.clips is None and not known:
         _made.append((config, env, params))
     return env, params
@@ -329,5 +329,5 @@ def _make(config: EnvConfig) -> tuple[PixelEnv, EnvParams]:
 def _is_equal(one: EnvConfig, other: EnvConfig) -> bool:
     try:
         return one == other
-    except ValueError:  # Arrays of a camera or look, which have no truth value.
+    except ValueError:  # Arrays of a camera or look have no truth value.
         return False

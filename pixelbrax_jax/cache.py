@@ -25,8 +25,7 @@ def cache_folder(given: str | Path | None = None) -> Path:
 
 
 KEEP_PROGRAMS = "PIXELBRAX_KEEP_PROGRAMS"
-"""Environment variable: with ``1`` importing PixelBrax keeps compiled programs, with ``0`` nothing
-does."""
+"""Environment variable: ``1`` keeps compiled programs on import, ``0`` never keeps them."""
 
 _FOLDER, _SHORTEST = "JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"
 
@@ -34,15 +33,15 @@ _FOLDER, _SHORTEST = "JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMP
 def keep_programs() -> Path | None:
     """Keep compiled programs in the cache folder, for later processes; imports no JAX.
 
-    Returns the folder for this kind of CPU, because a program may use instructions that another
-    lacks; None if JAX was told of another or the environment forbids it. Nothing is ever deleted.
+    Returns the folder for this kind of CPU, because programs may use instructions that other CPUs
+    lack; None if JAX has another folder or the environment forbids it. Nothing is ever deleted.
     """
     jax = sys.modules.get("jax")
     told = jax.config.jax_compilation_cache_dir if jax else os.environ.get(_FOLDER)
     if told or os.environ.get(KEEP_PROGRAMS) == "0":
         return None
     folder = cache_folder() / "programs" / _kind_of_cpu()
-    # For processes that this one starts, too.
+    # Also for child processes.
     os.environ[_FOLDER] = str(folder)
     os.environ.setdefault(_SHORTEST, "0.3")
     if jax:

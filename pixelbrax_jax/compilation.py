@@ -70,9 +70,9 @@ def compiler_options(env: Any = None, platform: str | None = None) -> dict[str, 
 def jit(**options: Any) -> Callable[[Callable[_P, _T]], Callable[_P, _T]]:
     """Decorate like ``jax.jit``, with ``compiler_options``; the first argument is static.
 
-    They are those of that argument, an environment or what has one as ``env``; of anything else,
-    such as an agent, those of no environment. They are computed at the first call, because
-    importing a package must not start a device.
+    The options are those of this argument, an environment or an object whose ``env`` is one; for
+    anything else, such as an agent, those without an environment. They are computed at the first
+    call, because importing a package must not start a device.
     """
 
     def decorate(function: Callable[_P, _T]) -> Callable[_P, _T]:
@@ -87,7 +87,7 @@ def jit(**options: Any) -> Callable[[Callable[_P, _T]], Callable[_P, _T]]:
             if is_guarded("host_to_device"):
                 args, kwargs = jax.tree.map(_put, (args, kwargs))
             # JAX gives loop counters 64 bits if jax_enable_x64 is set while it lowers, after
-            # `under_default_flags` has ended. XLA then rounds otherwise in loops of convolutions.
+            # `under_default_flags` has ended. XLA then rounds loops of convolutions differently.
             with jax.enable_x64(False):
                 return program(_physics(args[0]), _default_platform())(*args, **kwargs)
 

@@ -51,8 +51,7 @@ def encoder(path: Path, fps: float) -> Iterator[Callable[[np.ndarray], None]]:
 
     An odd side gets its last row or column twice. OSError has the reason of a failure.
     """
-    # Each PPM has its own size. The codec is explicit: an FFmpeg without it would choose one that
-    # few players support.
+    # Each PPM has its own size. Without libx264 FFmpeg would choose a codec few players support.
     frames = ["-f", "image2pipe", "-c:v", "ppm", "-framerate", str(fps), "-i", "-"]
     h264 = ["-f", "mp4", "-c:v", "libx264", "-pix_fmt", "yuv420p", str(path.absolute())]
     command = [find_ffmpeg(), "-y", "-v", "error", *frames, *h264]
@@ -78,7 +77,7 @@ def encoder(path: Path, fps: float) -> Iterator[Callable[[np.ndarray], None]]:
                 why = reason(_read(log)) or f"FFmpeg's exit status is {status}"
                 if status < 0:
                     why = f"FFmpeg was ended by {signal.Signals(-status).name}"
-                path.unlink(missing_ok=True)  # a part of a file that no player plays
+                path.unlink(missing_ok=True)  # incomplete; no player plays it
                 raise OSError(f"{path} was not written: {why}.")
 
 
@@ -113,9 +112,9 @@ def complaint(log: str) -> str:
 
 
 def declared_frames(path: Path, log: str) -> tuple[int, bool]:
-    """Return about how many frames a video file declares, 0 if none, given the log of ``decode``.
+    """Return the approximate number of frames a video declares, 0 if none, by ``decode``'s log.
 
-    The second result is whether that is the length of the file, whose sound may be longer.
+    The second result is whether it follows from the length of a file whose sound may be longer.
     """
     source, count = _source(log), _frames_of_avi(path)
     duration = re.search(r"Duration: (\d+):(\d+):([\d.]+)", source)

@@ -14,8 +14,8 @@ _P = ParamSpec("_P")
 _T = TypeVar("_T")
 
 PRNG = "threefry2x32"
-"""Implementation of all random numbers. Of JAX's implementations it is the one in which the numbers
-of a key do not depend on the other keys of a batch."""
+"""Implementation of all random numbers: JAX's only one in which the numbers of a key do not depend
+on the other keys of a batch."""
 
 PRECISION = "highest"
 """Precision of matrix products in environments."""
@@ -32,8 +32,7 @@ _FLAGS = (
 )
 """Flags that change a program's result or what JAX accepts, at their defaults. The last three
 checks must be off: jaxopt, used by Brax, leaks tracers, joint limits are infinite, and models
-contain Python numbers. Inputs and outputs of a compiled program are checked as the process has set
-it."""
+contain Python numbers. A program's inputs and outputs are checked as the process has set it."""
 
 
 @contextmanager

@@ -9,7 +9,7 @@ import jax
 
 
 def check_fits(what: str, num_bytes: float) -> None:
-    """Raise MemoryError if ``what``, options and values, exceeds main memory, to find typos."""
+    """Raise MemoryError if the bytes exceed main memory; ``what`` names options and values."""
     limit = _main_memory()
     if num_bytes > limit:
         raise MemoryError(

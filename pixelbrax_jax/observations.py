@@ -9,7 +9,7 @@ from pixelbrax_jax.validation import check_choice, check_positive_int
 
 
 class Image(NamedTuple):
-    """An image: channels per camera, dtype, and dtype as drawn, all channels in one number."""
+    """An image: channels per camera, dtype, and dtype when drawn, all channels in one number."""
 
     channels: int
     dtype: str

@@ -42,9 +42,8 @@ def register(
         name: new name of the task.
         make_physics: builds the physics, e.g. ``lambda: BraxPhysics(MyEnv())``. The first ``make``
             calls it once.
-        camera: default viewpoint. None takes the rig ``default`` of the physics; without one the
-            camera shows all geoms but the ground from a corner and follows
-            ``Physics.followed_link``.
+        camera: default viewpoint. None takes the rig ``default`` of the physics; without one a view
+            from a corner shows all geoms but the ground and follows ``Physics.followed_link``.
 
     Raises:
         ValueError: the name is taken or empty.

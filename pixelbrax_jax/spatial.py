@@ -14,7 +14,7 @@ from pixelbrax_jax.validation import check_arrays, check_link
 
 
 def f32(values: Any) -> Any:
-    """Return a float32 array of NumPy: importing the package must not start a device."""
+    """Return a float32 NumPy array, because importing the package must not start a device."""
     return np.asarray(values, np.float32)
 
 

@@ -14,8 +14,7 @@ _ALWAYS = ("SIGINT", "SIGTERM")
 _UNLESS_IN_USE = ("SIGHUP", "SIGUSR1", "SIGUSR2", "SIGXCPU")
 """A closed terminal; warnings of Slurm (``--signal``), LSF (``-wa``; SIGUSR2 at a run limit) and
 Grid Engine (``-notify``, soft limits); and limits of processor time. SIGQUIT is missing because it
-ends a hanging process and no scheduler sends it; SIGTSTP because a process may continue after
-it."""
+ends a hanging process and no scheduler sends it; SIGTSTP because a process may continue."""
 
 _APART = 1.0
 """Seconds between two intended SIGINTs; a wrapper may pass one key press on twice."""

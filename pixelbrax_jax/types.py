@@ -318,7 +318,7 @@ class Scene(struct.PyTreeNode):
 
 
 class Frame(struct.PyTreeNode):
-    """One image. Its color channels are separate arrays: it is slow on a CPU to stack them early.
+    """One image. Color channels are separate arrays, because stacking them early is slow on a CPU.
 
     Attributes:
         r, g, b: (H, W) in [0, 1].

@@ -136,7 +136,7 @@ def check_array(what: str, value: Any, *shapes: tuple[int, ...]) -> np.ndarray:
 def check_arrays(
     what: str, value: object, shapes: Mapping[str, tuple[int, ...]]
 ) -> dict[str, np.ndarray]:
-    """Return attributes as ``check_array`` does, by their names; ``what`` is that of the object."""
+    """Return attributes by name, checked by ``check_array``; ``what`` is the object's name."""
     return {
         name: check_array(f"{name} of {what}", getattr(value, name), shape)
         for name, shape in shapes.items()

@@ -124,7 +124,7 @@ def _save_gif(path: Path, images: list[Any], times: list[int]) -> None:
     try:
         first.save(path, format="GIF", append_images=others, **moving)
     except BaseException as error:
-        path.unlink(missing_ok=True)  # a part of a file that nothing shows
+        path.unlink(missing_ok=True)  # incomplete; nothing shows it
         # A side or a time exceeds 16 bits.
         if isinstance(error, (OSError, struct.error)):
             raise OSError(f"{path} was not written: {error}.") from error

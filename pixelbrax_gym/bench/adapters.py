@@ -30,7 +30,7 @@ def compare_speeds(
 ) -> dict[Name, dict[str, Any]]:
     """Compare runs of ``steps`` steps in 5 to 300 rounds, about ``seconds`` in total.
 
-    Each round makes all in random order, so a slower machine affects all alike. Results by name are
+    Each round runs all in random order, so a slower machine affects all alike. Results by name are
     ``steps_per_second``; ``ratio``, the median over rounds of its speed to that of the name's
     ``standard``; ``interval``, its 95 % bootstrap interval; and ``runs``, the number of rounds.
     """
@@ -78,7 +78,7 @@ def compare(task: str, num_envs: int, seconds: float = SECONDS) -> list[dict[str
 
 
 def adapter_runs(task: str, num_envs: int) -> tuple[dict[tuple[str, str], Run], int]:
-    """Return runs by adapter and autoreset mode, compiled at their first call, and their steps."""
+    """Return runs by adapter and autoreset mode, and the steps of each; first calls compile."""
     env, params = pb.make(task)
     actions = random_actions(max(8, min(100, 512 // num_envs)), num_envs, env.action_size)
     runs: dict[tuple[str, str], Run] = {

@@ -127,7 +127,7 @@ def scan(task: str, num_envs: int, obs_mode: str = "pixels") -> dict[str, Any]:
         )
         return total
 
-    # Memory allocation for a call takes a tenth of the time of four steps of 1000 environments.
+    # Allocating a call's memory takes 10 % of the time of four steps of 1000 environments.
     speed = rate(run, least_calls=16)
     return {
         "steps_per_second": num_envs * speed["median"],

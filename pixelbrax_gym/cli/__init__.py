@@ -71,10 +71,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 @contextmanager
 def _programs_kept() -> Iterator[None]:
-    """Keep compiled programs; say so after the first ones."""
+    """Cache compiled programs; say so when the folder is new."""
     try:
         folder = keep_programs()
-    except FileNotFoundError:  # without a home folder none are kept
+    except FileNotFoundError:  # no home folder
         folder = None
     new = folder if folder and not folder.exists() else None
     yield
@@ -119,8 +119,8 @@ def _help() -> str:
 
 
 def _find_modules_here() -> None:
-    """Search the current folder for the user's modules, last so that no file hides a library."""
-    with suppress(OSError):  # the folder is deleted
+    """Append the current folder to ``sys.path``, last so that no file hides a library."""
+    with suppress(OSError):  # the folder was deleted
         if not {"", (here := str(Path.cwd()))}.intersection(sys.path):
             sys.path.append(here)
 

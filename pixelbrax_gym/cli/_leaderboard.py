@@ -35,8 +35,8 @@ _NEEDED = {"task", "agent", "seed", "config", "frames", "seconds", "return"}
 def entry(folder: str | Path, agent: str | None = None) -> Entry:
     """Read the entry of a run from its output folder; ``agent`` names it, default its algorithm.
 
-    Seconds are those of training: without evaluations, and without the compilation at the start,
-    which is the excess of the first iteration over the second. What a resumed run compiles counts.
+    Seconds exclude evaluations and the compilation at the start, which is the first iteration's
+    time minus the second's. They include the compilation of a resumed run.
     """
     folder = Path(folder)
     about = read_about(folder / "checkpoints")
@@ -79,7 +79,7 @@ def entry(folder: str | Path, agent: str | None = None) -> Entry:
 
 
 def _clock(records: Iterable[Mapping[str, float]]) -> tuple[list[float], list[float], float]:
-    """Return steps, the seconds of training up to each, and those of compilation."""
+    """Return steps, seconds of training up to each, and seconds of compilation."""
     training = [record for record in records if "speed/steps_per_second" in record]
     if len(training) < 2:
         raise ValueError("the run has too few records; train with --log-training-metrics.")
@@ -93,7 +93,7 @@ def _clock(records: Iterable[Mapping[str, float]]) -> tuple[list[float], list[fl
 
 
 def add(of: Entry, folder: str | Path) -> Path:
-    """Write an entry into a folder that has no other of its name; return its file."""
+    """Write an entry into a folder without another entry of its name; return the file."""
     board = make_folder("--folder", folder)
     entries = read(board)
     agent, task = re.sub(r"[\W_]", "-", of["agent"].lower()), re.sub(r"\W", "-", of["task"])
@@ -119,7 +119,7 @@ def add(of: Entry, folder: str | Path) -> Path:
 def _check_same_settings(of: Entry, other: Entry) -> None:
     """Raise a ValueError if two entries cannot be seeds of one agent."""
     here, there = ({"algorithm": one.get("algorithm"), **one["config"]} for one in (of, other))
-    # Releases differ in what they have settings for.
+    # Releases have different settings.
     for setting in sorted(here.keys() & there.keys() - {"seed", *MAY_DIFFER}):
         if here[setting] != there[setting]:
             raise ValueError(
@@ -176,11 +176,11 @@ def read_published(folder: str | Path) -> dict[str, Any]:
 def return_at(of: Entry, clock: str, when: float) -> float:
     """Return an entry's return at a number of ``"frames"`` or ``"seconds"``, or NaN.
 
-    It is interpolated between evaluations, and unknown before the first one. After its end a run
-    has no return at more frames, but at later times its last one.
+    Returns are interpolated between evaluations, and NaN before the first one. After the end of
+    the run they are NaN for more frames, and the last return for later times.
     """
     times = of[clock]
-    # Iterations end near a round number.
+    # Iterations end near round numbers of frames.
     if when < 0.98 * times[0] or (clock == "frames" and when > 1.02 * times[-1]):
         return math.nan
     return float(np.interp(when, times, of["return"]))
@@ -207,7 +207,7 @@ def page(folder: str | Path) -> str:
 
 
 def _end(runs: list[Entry]) -> str:
-    """Return the last returns, and after how many frames."""
+    """Format the last returns and the number of frames."""
     ends = [run["frames"][-1] / 1e6 for run in runs]
     frames = dict.fromkeys(f"{end:.1f}" for end in (min(ends), max(ends)))
     return f"{middle([run['return'][-1] for run in runs])} at {' to '.join(frames)}M"
@@ -215,12 +215,12 @@ def _end(runs: list[Entry]) -> str:
 
 def _shown(runs: list[Entry], clock: str, when: float) -> str:
     found = [return_at(run, clock, when) for run in runs]
-    # Of some runs alone it would not compare with the other columns.
+    # A mean of only some runs is not comparable with the other columns.
     return "" if any(map(math.isnan, found)) else middle(found)
 
 
 def middle(scores: list[float]) -> str:
-    """Return the interquartile mean, and of several scores their range."""
+    """Format the interquartile mean, and the range of several scores."""
     # As in rliable (arXiv 2108.13264).
     mean = f"{trim_mean(scores, 0.25):.0f}"
     if len(scores) == 1:

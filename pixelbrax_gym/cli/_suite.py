@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def check_suite(name: str) -> None:
-    """Raise a UsageError with the names of all suites if there is none of this name."""
+    """Raise a UsageError that lists all suites if the name is unknown."""
     from pixelbrax_jax.generalisation.suites import SUITES
 
     try:

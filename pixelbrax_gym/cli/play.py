@@ -82,7 +82,7 @@ def run(arguments: Sequence[str]) -> int:
     except TypeError as error:
         raise CommandError(str(error)) from error
     lacking = "" if options.gif else _why_no_window()
-    # Of a task module:name, not all systems have files so called.
+    # Not all systems allow the colon of a task module:name in file names.
     name = options.task.rpartition(":")[2]
     written = options.gif or (f"{name}.gif" if lacking else None)
     if written and None in map(find_spec, ("imageio_ffmpeg", "PIL")):

@@ -136,7 +136,7 @@ def record_pairs(
     about = storage.data_path / _ABOUT
     while first < episodes:
         for number in range(first, min(first + num_envs, episodes)):
-            # Of an episode that was being written when a recording was stopped.
+            # The episode is incomplete if a recording was stopped while writing it.
             (storage.data_path / str(number) / _ABOUT).unlink(missing_ok=True)
         storage.update_episodes(pairs.play(first, policy, sees))
         first = storage.total_episodes
@@ -251,7 +251,7 @@ def _storage(folder: Path, pairs: _Pairs, settings: dict[str, Any]) -> Any:
         try:
             raw = MinariStorage.read_raw_metadata(folder)
         except json.JSONDecodeError as error:
-            # It was being written when a recording was stopped.
+            # A recording was stopped while writing it.
             if not about.with_suffix(_KEPT).exists():
                 raise ValueError(f"{about} is damaged ({error}); delete the folder.") from error
             shutil.copyfile(about.with_suffix(_KEPT), about)
@@ -261,7 +261,7 @@ def _storage(folder: Path, pairs: _Pairs, settings: dict[str, Any]) -> Any:
         found = raw.get(_SETTINGS)
         is_begun = "dataset_id" not in raw and {"total_episodes", "action_space"} <= raw.keys()
         if is_begun and raw["total_episodes"] == 0 and list(folder.iterdir()) == [about]:
-            # So Minari begins: a recording was stopped before it had its settings.
+            # Minari's initial file: the recording stopped before it stored its settings.
             about.unlink()
             return _new_storage(folder, pairs, settings)
         if found != settings:

@@ -27,7 +27,7 @@ RETURNS, ROWS, SHEET = "returns.json", "table.csv", "levels.png"
 """Files in the output folder."""
 
 LEFT_OUT = ("task", *UNDISTURBED)
-"""Options that a suite decides."""
+"""Options that a suite sets."""
 
 ALL = "all but clean"
 """Name of the last row, of all levels but the first."""
@@ -40,12 +40,12 @@ Returns = dict[str, dict[str, list[float]]]
 class Row:
     """A line of the table: of a level, or the last one of all levels but clean.
 
-    ``runs`` R are seeds, of E ``episodes`` for each level. ``mean`` is the mean return; of several
-    runs the interquartile mean over their mean returns, in the last row over those of all levels.
-    ``low`` and ``high`` are the ends of its 95 % stratified bootstrap interval, NaN for one run.
-    ``standard_error`` is that of a run's mean over its episodes, averaged over runs; NaN for one
-    episode and for the last row. ``ratio`` is ``mean`` over that of the level clean; NaN if that is
-    not positive. ``success`` is the share of all episodes with at least the return
+    ``runs`` is the number R of seeds, with E ``episodes`` per level. ``mean`` is the mean
+    return; for several runs the interquartile mean of their mean returns, in the last row over all
+    levels. ``low`` and ``high`` are the ends of its 95 % stratified bootstrap interval, NaN for one
+    run. ``standard_error`` is that of a run's mean over its episodes, averaged over runs; NaN for
+    one episode and for the last row. ``ratio`` is ``mean`` divided by that of level clean; NaN if
+    that is not positive. ``success`` is the share of all episodes with a return of at least
     ``success_return``; both are NaN without one.
     """
 
@@ -63,7 +63,7 @@ class Row:
 
 @dataclass
 class Scores:
-    """The (E,) ``returns`` of a suite's episodes by run and level, and all that decides them.
+    """The (E,) ``returns`` of a suite's episodes by run and level, and what determines them.
 
     An episode with at least ``success_return`` is a success. None takes the task's, if it has one
     and ``options`` have the usual rewards and length of episodes.
@@ -78,8 +78,8 @@ class Scores:
     def rows(self) -> list[Row]:
         """Return a row for each level that all runs have, and one for all but the first level.
 
-        It has ``level``, ``runs``, ``episodes``, ``mean``, ``low``, ``high``, ``standard_error``,
-        ``ratio`` (to clean), ``success`` and ``success_return``; what does not apply is NaN.
+        Rows have ``level``, ``runs``, ``episodes``, ``mean``, ``low``, ``high``,
+        ``standard_error``, ``ratio`` (to clean), ``success`` and ``success_return``, or NaN.
         """
         runs = list(self.returns.values())
         names = [name for name in runs[0] if all(name in run for run in runs)] if runs else []
@@ -150,7 +150,7 @@ def _text(value: float, digits: int) -> str:
 
 
 def options_of(levels: Levels) -> dict[str, Any]:
-    """Return all that decides the returns of a policy but suite and task, as JSON values."""
+    """Return what determines a policy's returns besides suite and task, as JSON values."""
     names = [name for name in ENV_OPTIONS if name not in LEFT_OUT]
     options = {name: to_plain(getattr(levels.config, name)) for name in names}
     bank = levels.bank

@@ -228,7 +228,7 @@ class GymnasiumVectorEnv(StatefulAdapter, gymnasium.vector.VectorEnv):
     def _infos(self, outputs: Mapping[str, Any]) -> dict[str, Any]:
         info, is_numpy = dict(outputs["info"]), self._output == "numpy"
         final_obs, final_info = info.pop("final_obs", None), info.pop("final_info", None)
-        # Copies take less time than views of a few numbers.
+        # Copying a few numbers is faster than making views.
         numbers = partial(jax.tree.map, np.array) if is_numpy else self._export
         infos = _with_masks(numbers(info), numbers(outputs["reported"]))
         if final_obs is None:
@@ -256,7 +256,7 @@ def _with_masks(infos: dict[str, Any], mask: Any) -> dict[str, Any]:
 
 
 def as_autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:
-    """Convert the name of an autoreset mode, or the value of a member, to Gymnasium's member."""
+    """Convert the name or value of an autoreset mode to Gymnasium's member."""
     for known in AutoresetMode:
         if mode in (known, known.value):
             return known

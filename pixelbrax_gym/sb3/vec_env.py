@@ -24,7 +24,7 @@ from pixelbrax_jax.validation import check_bool, check_choice
 
 
 def check_channels(env: PixelEnv, channels_first: bool) -> None:
-    """Reject images whose shortest axis, which Stable-Baselines3 reads as channels, is another."""
+    """Reject images for which Stable-Baselines3 would take rows or columns for channels."""
     if "pixels" not in env.images:
         return
     cameras = 1 if env.camera_sizes else env.num_cameras

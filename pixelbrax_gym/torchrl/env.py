@@ -227,7 +227,6 @@ class TorchRLEnv(EnvBase):
         return as_mask(what, given.reshape(self._num_envs), (self._num_envs,))
 
     def __repr__(self) -> str:
-        """Name the task, the number of environments and the device."""
         name = type(self).__name__
         return f"{name}({self._task!r}, num_envs={self._num_envs}, device={self.device})"
 
@@ -240,7 +239,7 @@ def _keep_unstepped(
     before: TensorDictBase | dict[str, torch.Tensor],
     where: torch.Tensor,
 ) -> dict[str, torch.Tensor]:
-    """Return ``values``, with the previous ones, or 0, and reward 0 in rows without a step."""
+    """Return ``values``; rows without a step keep the previous ones, or 0, with reward 0."""
 
     def choose(name: str, value: torch.Tensor) -> torch.Tensor:
         old = before.get(name, None) if name != "reward" else None

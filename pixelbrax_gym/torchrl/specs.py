@@ -51,7 +51,7 @@ class PixelSpec(UnboundedDiscrete, metaclass=_Itself):
 
 
 def entries(obs: Any, images: tuple[str, ...]) -> dict[str, Any]:
-    """Return the parts of an observation by TorchRL's names; a lone part is image or state."""
+    """Return the parts of an observation by TorchRL's names."""
     parts = obs if isinstance(obs, dict) else {(*images, "state")[0]: obs}
     return {"observation" if name == "state" else name: part for name, part in parts.items()}
 
@@ -59,7 +59,7 @@ def entries(obs: Any, images: tuple[str, ...]) -> dict[str, Any]:
 def observation_spec(
     spec: Any, images: tuple[str, ...], num_envs: int, device: torch.device
 ) -> Composite:
-    """Return the spec of an observation, with entries of the names of ``entries``."""
+    """Return the spec of an observation; names are those of ``entries``."""
     specs: dict[str, TensorSpec] = {}
     for name, part in entries(spec, images).items():
         shape, dtype = (num_envs, *part.shape), getattr(torch, part.dtype.name)

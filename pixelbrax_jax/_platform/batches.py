@@ -16,7 +16,7 @@ _CHUNK = 128
 """Largest number of rows that a CPU computes together, to keep results in its caches."""
 
 _RAYS = 2**18
-"""Number of rays, about, that a CPU computes together. More than 32 MB of intermediate results
+"""Approximate number of rays that a CPU computes together. More than 32 MB of intermediate results
 would be mapped into memory anew in every call."""
 
 Step = Callable[..., tuple[Any, jax.Array]]
@@ -25,8 +25,8 @@ Step = Callable[..., tuple[Any, jax.Array]]
 def step_rows(step: Step, state: Any, rows: Any, shared: Any) -> tuple[Any, jax.Array]:
     """Step every row of a batch, as ``jax.vmap(step, (0, 0, None))(state, rows, shared)``.
 
-    A CPU steps the rows in chunks, which are the last axis of intermediate results, see
-    ``batch_last``; results differ from those of ``jax.vmap`` by rounding. ``step`` returns a row's
+    A CPU steps chunks of rows, with the rows as last axis of intermediate results (see
+    ``batch_last``); results differ from those of ``jax.vmap`` by rounding. ``step`` returns a row's
     next state, with the same tree, and a () float32.
     """
     together = jax.vmap(step, in_axes=(0, 0, None))
@@ -41,7 +41,7 @@ def step_rows(step: Step, state: Any, rows: Any, shared: Any) -> tuple[Any, jax.
 def draw_rows(draw: Callable[..., Any], arguments: tuple[Any, ...], rays: int) -> Any:
     """Return ``jax.vmap(draw)(*arguments)``, the images of every row of a batch.
 
-    A CPU draws few together, some twice, so that intermediate images of ``rays`` stay small.
+    A CPU draws a few rows, of ``rays`` each, at a time to limit intermediate results; some twice.
     """
     num_rows = len(jax.tree.leaves(arguments)[0])
     size = -(-num_rows // -(-num_rows * rays // _RAYS))
@@ -55,7 +55,7 @@ def draw_rows(draw: Callable[..., Any], arguments: tuple[Any, ...], rays: int) -
 
     def in_turns(consts: list[Any], *arguments: Any) -> Any:
         def put(i: jax.Array, images: Any) -> Any:
-            first = i * size  # moved back where the last turn would go past the end
+            first = i * size  # JAX moves it back if the last turn would exceed the end
             rows = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, first, size), arguments)
             return jax.tree.map(
                 lambda x, drawn: jax.lax.dynamic_update_slice_in_dim(x, drawn, first, 0),
@@ -81,7 +81,7 @@ def map_runs(function: Callable[[Any], Any], runs: Any) -> Any:
 
 
 def one_run_after_the_other(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return ``function``, the ``jax.vmap`` of which is ``map_runs``; it has no gradient."""
+    """Return ``function`` with ``map_runs`` in place of ``jax.vmap``; it has no gradient."""
     mapped = jax.custom_batching.custom_vmap(function)
 
     @mapped.def_vmap

@@ -1,4 +1,4 @@
-"""Functions with a form for each platform, of which only the one that is lowered is traced."""
+"""Functions with a form for each platform; only the lowered form is traced."""
 
 from __future__ import annotations
 
@@ -28,17 +28,16 @@ def by_platform(
     tpu: _Form | None = None,
     no_derivative: str = "",
 ) -> Any:
-    """Return what the form for a platform makes of the arguments, as ``platform_dependent`` does.
+    """Call the platform's form with the arguments, like ``jax.lax.platform_dependent``.
 
-    ``jax.lax.platform_dependent`` traces all forms, and ``jax.vmap`` of it all of them again. Here
-    the form of the platform is traced when the program is lowered, and all of them only for a
-    derivative. So a form may not close over values of the program: they are arguments (``traced``
-    makes them such). ``like`` has the shapes and dtypes of the results; ``no_derivative`` is the
-    message of the error if there is no derivative.
+    That function traces all forms, and ``jax.vmap`` traces them again. Here only the platform's
+    form is traced, when the program is lowered; a derivative traces all. So a form may not close
+    over values of the program; ``traced`` turns these into arguments. ``like`` has the shapes and
+    dtypes of the results; ``no_derivative`` is the error message if there is no derivative.
     """
     leaves, tree = jax.tree.flatten(arguments)
     shapes, result_tree = jax.tree.flatten(like)
-    # The context of this call has ended when the program is lowered.
+    # The program is lowered after the context of this call has ended.
     precision = getattr(jax.config, "jax_default_matmul_precision", None)
 
     def flat(form: _Form) -> _Form:
@@ -53,7 +52,7 @@ def by_platform(
     arrays = [jnp.asarray(x) for x in leaves]
     all_forms = _Forms(flat(default), named, no_derivative)
     if getattr(jax.config, "jax_debug_key_reuse", False) and any(is_key(x.dtype) for x in arrays):
-        # The check takes a key as used by a primitive that it does not know.
+        # The check counts an unknown primitive as a use of its keys.
         results = _by_jax(*arrays, forms=all_forms)
     else:
         results = _primitive.bind(
@@ -65,7 +64,7 @@ def by_platform(
 def computed_once(
     compute: Callable[..., _Result], arguments: tuple[Any, ...], like: Any
 ) -> _Result:
-    """Return ``compute(*arguments)``, which XLA would else compute again for each reader.
+    """Return ``compute(*arguments)``; XLA would otherwise recompute it for each reader.
 
     ``compute`` and ``like`` are as in ``by_platform``.
     """
@@ -78,11 +77,10 @@ def computed_once(
 
 
 def in_a_conditional(compute: Callable[[jax.Array], _Result], like: Any) -> _Result:
-    """Return ``compute(zero)``, which XLA for CPUs does not fuse into what reads it.
+    """Return ``compute(zero)`` so that XLA for CPUs does not fuse it into its readers.
 
-    It fuses across barriers but not across conditionals. ``zero`` is () int32 behind a barrier,
-    which hides from the compiler that the conditional is always taken; otherwise the compiler would
-    remove it. ``like`` has the shapes and dtypes of the result.
+    XLA fuses across barriers but not conditionals. ``zero`` is () int32 behind a barrier, so that
+    XLA keeps the conditional. ``like`` has the shapes and dtypes of the result.
     """
     zero = jax.lax.optimization_barrier(jnp.int32(0))
     blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
@@ -93,8 +91,7 @@ def in_a_conditional(compute: Callable[[jax.Array], _Result], like: Any) -> _Res
 class Traced(NamedTuple):
     """A function that has been traced; ``like`` has its results' shapes and dtypes.
 
-    ``compute`` takes the constants of ``program``, which may be values of another one that is being
-    traced, and the function's arguments.
+    ``compute`` takes ``program``'s constants, which may be tracers, then the function's arguments.
     """
 
     program: core.ClosedJaxpr
@@ -115,7 +112,7 @@ def traced(function: Callable[..., Any], *like: Any) -> Traced:
 
 
 def traced_row(function: Callable[..., Any], *batches: Any) -> Traced:
-    """Trace a function for one row of some batches; ``like`` is that of the results of all rows."""
+    """Trace a function for one row of each batch; ``like`` describes the results of all rows."""
     num_rows = len(jax.tree.leaves(batches)[0])
     row = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), batches)
     program, compute, like = traced(function, *row)

@@ -1,6 +1,6 @@
-"""Compute what is known while a program is traced, and index by constants with slices.
+"""Fold constants while a program is traced, and replace constant indices by slices.
 
-XLA for GPUs leaves both in a program, one kernel each.
+XLA for GPUs does neither, and runs a kernel for each.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class _Found(NamedTuple):
 
 
 class _Inner(NamedTuple):
-    """The plan of the program within an equation: of a call, or of a loop's body."""
+    """The plan of an equation's inner program: a call or a loop's body."""
 
     plan: _Plan
 
@@ -47,10 +47,9 @@ _Plan = list[_Found | _Inner | None]
 def fold(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return a function with the same results, up to rounding and weak types.
 
-    It takes positional arguments alone. Bodies of ``while`` loops and branches stay as they are.
-    The function itself is computed under ``jax.disable_jit``, for arguments on a mesh with explicit
-    axes or that ``jax.shard_map`` tracks, and, with a RuntimeWarning, where an unknown release of
-    JAX has other programs.
+    It takes only positional arguments. Bodies of ``while`` loops and branches are not folded. The
+    function itself runs under ``jax.disable_jit``, for arguments on a mesh with explicit axes or
+    tracked by ``jax.shard_map``, and, with a RuntimeWarning, if JAX has unknown programs.
     """
 
     def folded(*args: Any) -> Any:
@@ -60,10 +59,9 @@ def fold(function: Callable[..., Any]) -> Callable[..., Any]:
         closed, shapes = jax.make_jaxpr(function, return_shape=True)(*args)
         if any(map(_is_sharded, (*leaves, *closed.consts))):
             return function(*args)
-        # Whatever this meets in an unknown release must not stop a user: `function`, and so the
-        # user's mistakes, went through `make_jaxpr` above.
+        # An unknown release of JAX must not fail; `make_jaxpr` above raised the user's own errors.
         try:
-            # In one program: one for each result would take seconds to compile.
+            # One program, because one for each result would take seconds to compile.
             plan = jax.jit(lambda: _plan(closed, [*map(_known, leaves)])[0]).lower().compile()()
             results = _evaluate(closed, leaves, plan)
         except Exception as error:
@@ -72,7 +70,7 @@ def fold(function: Callable[..., Any]) -> Callable[..., Any]:
                 f"({type(error).__name__}: {error}). Results are as good, and a GPU launches more "
                 "kernels.",
                 RuntimeWarning,
-                stacklevel=1,  # one line, which Python warns of once
+                stacklevel=1,  # one line, so that Python warns once
             )
             return function(*args)
         return jax.tree.unflatten(jax.tree.structure(shapes), results)
@@ -167,7 +165,7 @@ def _is_sharded(x: Any) -> bool:
 
 
 def _gather(numbers: Any, slice_sizes: tuple[int, ...], x: Any, indices: Any) -> Any:
-    """Return ``x`` at constant indices of one axis, by slices; None if it indexes otherwise."""
+    """Return ``x`` at constant indices of one axis, by slices; None for other indices."""
     axes = numbers.start_index_map
     rows = _rows(indices, axes, numbers.operand_batching_dims, x.shape)
     whole = tuple(1 if axis in axes else size for axis, size in enumerate(x.shape))
@@ -181,7 +179,7 @@ def _gather(numbers: Any, slice_sizes: tuple[int, ...], x: Any, indices: Any) ->
 
 
 def _scatter(numbers: Any, x: Any, indices: Any, updates: Any, *, adds: bool) -> Any:
-    """Return ``x`` with rows at constant indices replaced or increased; None as ``_gather``."""
+    """Return ``x`` with rows at constant indices replaced or increased; None for others."""
     axes = numbers.scatter_dims_to_operand_dims
     rows = _rows(indices, axes, numbers.operand_batching_dims, x.shape)
     window = numbers.update_window_dims

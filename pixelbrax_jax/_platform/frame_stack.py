@@ -15,17 +15,17 @@ def unpack(packed: jax.Array) -> jax.Array:
 
 
 def push(frames: jax.Array, newest: jax.Array, is_first: jax.Array) -> jax.Array:
-    """Return the frame stack (H, W, c K) after one more frame, as an image is drawn.
+    """Push the newest frame onto the frame stack, (H, W, c K).
 
-    That is (H, W), or (C, H, W) with C cameras: uint32 packed pixels for a stack of uint8, where c
-    is 3 C; otherwise numbers of the stack's dtype, where c is C. With ``is_first``, () bool, the
-    stack becomes K copies of the frame.
+    The newest frame is (H, W), or (C, H, W) with C cameras: uint32 packed pixels for a uint8 stack,
+    with c = 3 C, else numbers of the stack's dtype, with c = C. With ``is_first``, () bool, the
+    stack becomes K copies of it.
     """
     return by_platform((frames, newest, is_first), frames, cpu=_concatenate, default=_shift)
 
 
 def _concatenate(frames: jax.Array, newest: jax.Array, is_first: jax.Array) -> jax.Array:
-    """Push by a concatenation of frames, which is fastest on a CPU."""
+    """Push by concatenation, which is fastest on a CPU."""
     image = unpack(newest) if frames.dtype == jnp.uint8 else newest[..., None]
     if image.ndim > 3:
         image = jnp.concatenate(list(image), axis=-1)

@@ -1,10 +1,9 @@
 """Calls of Python functions by programs compiled for a CPU.
 
-``jax.pure_callback`` starts other work of JAX's in every call, which may wait for the very thread
-that makes the call, and JAX does not cache programs with it. A call here reads and writes the
-program's memory, takes some 20 microseconds, and is cached, because the program contains only a
-name. It implements the C interface of XLA's foreign functions (``xla/ffi/api/c_api.h``, which
-jaxlib contains) with ctypes.
+``jax.pure_callback`` starts other JAX operations in every call, which may wait for the calling
+thread, and JAX does not cache programs with it. A call here reads and writes the program's memory
+and takes some 20 microseconds; its program contains only a name, so JAX can cache it. This module
+implements the C interface of XLA's foreign functions (``xla/ffi/api/c_api.h`` in jaxlib) by ctypes.
 """
 
 from __future__ import annotations
@@ -43,7 +42,7 @@ def register(name: str, function: Callable[..., None]) -> None:
 def host_call(
     name: str, operands: Sequence[jax.Array], results: Sequence[jax.ShapeDtypeStruct]
 ) -> list[jax.Array]:
-    """Return what the function registered as ``name`` makes of float32 or bool arrays.
+    """Return the results of the function registered as ``name`` for float32 or bool arrays.
 
     Only a CPU's programs may contain it. Under ``jax.vmap`` the function gets all rows at once,
     arrays with more axes in front. An exception of the function ends the program with an
@@ -209,10 +208,10 @@ def _register_target() -> None:
 
 
 def _wait(process: int) -> None:
-    """Wait for programs that still run when Python exits: its end in a call would crash it.
+    """Wait for running programs when Python exits, because exiting during a call would crash.
 
-    A CPU runs the programs of a thread in the order of their calls, so it is enough to wait for a
-    last one; of other threads, for all results that somebody still has.
+    A CPU runs the programs of a thread in order, so waiting for a last program is enough for this
+    thread. For other threads, wait for all live results.
     """
     if os.getpid() != process:  # XLA does not work in a forked process
         return

@@ -53,8 +53,7 @@ def batch_last(fn: Callable[..., Any], in_axes: Sequence[int | None]) -> Callabl
         ]
         try:
             results = _evaluate(closed, operands, padded)
-        # Whatever this meets in an unknown release must not stop a user: `fn` itself, and so the
-        # user's mistakes, went through `make_jaxpr` above.
+        # An unknown release of JAX must not fail; `make_jaxpr` above raised the user's own errors.
         except Exception as error:
             warnings.warn(
                 f"jax {jax.__version__} has programs that PixelBrax cannot compute with the "
@@ -62,7 +61,7 @@ def batch_last(fn: Callable[..., Any], in_axes: Sequence[int | None]) -> Callabl
                 "by jax.vmap: the results are as good, and on a CPU physics take up to three times "
                 "as long.",
                 RuntimeWarning,
-                stacklevel=1,  # one line, which Python warns of once
+                stacklevel=1,  # one line, so that Python warns once
             )
             return jax.vmap(fn, in_axes=tuple(in_axes))(*args)
         outputs, tree = jax.tree.flatten(shapes)
@@ -113,11 +112,11 @@ def _by_vmap(eqn: core.JaxprEqn, inputs: list[Operand]) -> list[Any]:
 
 
 _CALLS = {"jit": "jaxpr", "closed_call": "call_jaxpr"}
-"""Primitives that contain a program, and its parameter."""
+"""Primitives that contain a program, and the name of its parameter."""
 
 
 def _program(eqn: core.JaxprEqn) -> core.ClosedJaxpr | None:
-    """Return an equation's program, to be inlined; of ``platform_dependent`` that for CPUs."""
+    """Return an equation's program to inline; for ``platform_dependent`` the CPU's."""
     if eqn.primitive.name in _CALLS:
         return eqn.params[_CALLS[eqn.primitive.name]]
     for platforms, branch in zip(

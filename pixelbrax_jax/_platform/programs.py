@@ -19,8 +19,7 @@ def interpret(
 ) -> list[_T]:
     """Return the results of a program; ``apply(eqn, inputs)`` returns those of an equation.
 
-    ``of_constant`` returns what ``apply`` gets in place of the program's constants, and of its
-    literals, which are NumPy scalars.
+    ``of_constant`` maps constants, and literals (NumPy scalars), to inputs of ``apply``.
     """
     jaxpr = closed.jaxpr
     known = dict(zip(jaxpr.constvars, map(of_constant, closed.consts), strict=True))
@@ -53,7 +52,7 @@ def bind(eqn: core.JaxprEqn, *values: Any, **changed: Any) -> list[Any]:
 def split_scan(
     params: Mapping[str, Any], operands: list[_T]
 ) -> tuple[list[_T], list[_T], list[_T]]:
-    """Return a scan's constants, its carry, and what it takes slices of, from its parameters."""
+    """Split a scan's operands into constants, carry and sliced arrays."""
     if "num_carry" in params:
         start, num_carry = params["num_consts"], params["num_carry"]
     else:  # from jax 0.12 on

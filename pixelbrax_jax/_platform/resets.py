@@ -39,15 +39,15 @@ def reset_rows(
 def replace_rows(
     fn: Callable[..., Any], arguments: tuple[Any, ...], mask: jax.Array, rows: Any
 ) -> Any:
-    """Return ``rows`` with ``fn`` of the arguments' rows where ``mask`` (N,) bool is set.
+    """Return ``rows``, replaced by ``fn`` of the arguments' rows where ``mask``, (N,) bool, is set.
 
     The work is done in blocks and grows with the number of masked rows, not with N: most steps end
-    no episode. The loop carries the remaining rows. With a counter instead, XLA would move what
-    blocks have in common, such as physics at the initial pose, out of the loop and into every step.
+    no episode. The loop carries the remaining rows. With a counter instead, XLA would move work
+    that all blocks share, such as physics at the initial pose, out of the loop into every step.
     """
     num_rows = mask.shape[0]
     if num_rows == 1:
-        # In a loop, everything would be common to all blocks.
+        # XLA would move everything out of a loop.
         return jax.lax.cond(mask[0], lambda: jax.vmap(fn)(*arguments), lambda: rows)
     block = min(_BLOCK, num_rows)
 

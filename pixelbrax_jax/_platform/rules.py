@@ -15,8 +15,7 @@ from jax.extend import core
 from pixelbrax_jax._platform.programs import bind, row_aval
 
 FEW = 4
-"""Number of rows up to which there is no padding and no inlining of matrix products: short loops
-gain nothing."""
+"""Largest number of rows without padding and inlined matrix products: short loops gain nothing."""
 
 _LONGEST_SUM = 16
 """Longest axis of matrix products that are written as sums; longer ones call a library."""

@@ -24,7 +24,7 @@ class Algorithm(ABC):
 
     Equal settings in equal environments share compiled programs. ``acting`` names the networks that
     ``act`` needs. With several runs in one program, a CPU computes ``iterate`` for one run after
-    the other, which copies their states; with ``vmaps_runs`` it computes ``jax.vmap`` of it.
+    the other, which copies their states, or for all by ``jax.vmap`` with ``vmaps_runs``.
 
     Raises:
         ValueError: the environments contradict the settings.
@@ -39,7 +39,6 @@ class Algorithm(ABC):
     vmaps_runs: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        """Check the environments."""
         config, envs = self.config, self.envs
         try:
             hash(envs)
@@ -92,11 +91,11 @@ class Algorithm(ABC):
         """Return (N, A) float32 actions for (N, H, W, 3 K) uint8 pixels, or float32 depths.
 
         Needs only the networks in ``acting``. A key samples the actions; None returns the best.
-        The exported policy has any N: there ``pixels.shape[0]`` is a symbol, and no number.
+        In the exported policy N is symbolic: ``pixels.shape[0]`` is no number.
         """
 
     def warnings(self, record: Mapping[str, float]) -> list[str]:
-        """Return what a user should know about a record of the metrics; told once in a run."""
+        """Return warnings about a record of the metrics; each is reported once per run."""
         del record
         return []
 

@@ -84,7 +84,6 @@ class TrainConfig:
     """Memory limit of stored frames and state in GB (10^9 bytes); None uses the device's memory."""
 
     def __post_init__(self) -> None:
-        """Check the settings."""
         _check_env(self.env)
         check_annotated(self)
         object.__setattr__(self, "test_dynamics", check_ranges("test_dynamics", self.test_dynamics))
@@ -125,11 +124,11 @@ class TrainConfig:
 
     @property
     def steps_to_fill(self) -> int:
-        """Steps of the agent in which an empty replay is filled before learning begins."""
+        """Steps of the agent that fill an empty replay before learning begins."""
         return 0
 
     def to_fit(self, excess: float) -> str:
-        """Say how a run that takes ``excess`` bytes too much is made to fit."""
+        """Suggest how to reduce a run's memory by ``excess`` bytes."""
         del excess
         return (
             f"Lower {', '.join(self.memory_settings)} or the image size, or raise memory_budget_gb."

@@ -144,8 +144,7 @@ _CPU_TASKS: dict[str, dict[str, Any]] = {
     "halfcheetah": {"action_repeat": 2, "gamma": 0.97, "total_steps": 3_100_000},
     # With Brax's reward the walker stands and hardly walks; see docs/results.md.
     "walker2d": {"reward_preset": "paper", "action_repeat": 4, "total_steps": 6_800_000},
-    # Brax's reward subtracts half of each squared action, so noise of 0.5 costs Ant its reward for
-    # staying up.
+    # Brax subtracts half of each squared action: noise of 0.5 costs Ant its reward for staying up.
     "ant": {"initial_std": 0.25, "action_repeat": 2, "gamma": 0.97, "total_steps": 3_400_000},
     "humanoid": {"action_repeat": 3, "gamma": 0.98, "total_steps": 3_500_000},
 }
@@ -158,7 +157,7 @@ _CPU_MUJOCO_TASKS: dict[str, dict[str, Any]] = {
         "update_epochs": 3,
         "total_steps": 6_000_000,
     },
-    # With less noise at first, one of two seeds reaches half of the targets alone.
+    # With less initial noise, one of two seeds reaches only half of the targets.
     "dmc_reacher_easy": {
         "action_repeat": 4,
         "gamma": 0.97,

@@ -37,7 +37,7 @@ def without_envs(*, kept: bool = True) -> Any:
 
 
 def as_declared(leading_axes: int = 0, *, kept: bool = True) -> Any:
-    """Declare a field whose class declares its fields; its arrays have more ``leading_axes``."""
+    """Declare a field whose class declares its own fields, behind ``leading_axes`` more axes."""
 
     def axes(value: Any) -> Any:
         own = None if value is None else env_axes(value)

@@ -24,9 +24,8 @@ class Distractor:
     Attributes:
         kind: name of the distractor; an environment has at most one of each kind.
         stream: unique number of its random stream, folded into an episode's key.
-        only_colors: whether it changes nothing but colors; then an environment without them
-            refuses it.
-        one_camera: whether it is for environments of one camera alone.
+        only_colors: whether it changes only colors; environments without colors reject it.
+        one_camera: whether it supports only environments with one camera.
     """
 
     kind: ClassVar[str]
@@ -68,8 +67,7 @@ class Distractor:
     def change_frame(self, state: Any, frame: Frame, backdrop: jax.Array | None) -> Frame:
         """Return some or all rows of the image with other colors in [0, 1].
 
-        ``backdrop`` has the same rows of the backdrop, if there is one; noise per pixel belongs
-        there.
+        ``backdrop`` has the same rows of the backdrop, if any; noise per pixel belongs there.
         """
         return frame
 
@@ -145,7 +143,7 @@ class Chain:
         return frame
 
     def info(self, states: tuple[Any, ...]) -> dict[str, jax.Array]:
-        """Return what all of them add to ``Timestep.info``."""
+        """Return the entries that all distractors add to ``Timestep.info``."""
         info: dict[str, jax.Array] = {}
         for link, state in zip(self.links, states, strict=True):
             added = link.info(state)

@@ -186,7 +186,7 @@ def load_clips(
 @lru_cache(maxsize=8)
 def _procedural(names: tuple[str, ...], split: str, height: int, width: int) -> ClipBank:
     frames = np.concatenate([procedural.clip(name, height, width) for name in names])
-    frames.flags.writeable = False  # shared by all who ask
+    frames.flags.writeable = False  # shared by all callers
     length = np.full(len(names), procedural.FRAMES, np.int32)
     return ClipBank(frames, length, names, "procedural", split)
 
@@ -202,7 +202,7 @@ def warn_procedural() -> None:
 
 
 def _warn(message: str, category: type[Warning] = UserWarning) -> None:
-    """Warn of the line in the user's code."""
+    """Warn with the line of the user's code."""
     level, frame = 1, sys._getframe()
     while frame.f_back and frame.f_globals["__name__"].partition(".")[0] in _NOT_THE_USER:
         level, frame = level + 1, frame.f_back
@@ -246,7 +246,7 @@ def _digest(sources: list[folders.Source], height: int, width: int) -> str:
     digest = hashlib.sha256(json.dumps([_CACHE_VERSION, height, width]).encode())
     for source in sources:
         digest.update(json.dumps([source.name, len(source.files)]).encode())
-        # Sequential: threads would wait for Python's lock longer than for a hash.
+        # Sequential, because threads would wait longer for Python's lock than for a hash.
         for file in source.files:
             with file.open("rb") as opened:  # a video need not fit into memory
                 digest.update(hashlib.file_digest(opened, "sha256").digest())
@@ -254,7 +254,7 @@ def _digest(sources: list[folders.Source], height: int, width: int) -> str:
 
 
 def _read_cache(cache_dir: str | Path | None, name: Path) -> _Decoded | None:
-    # A file that is damaged, or cannot be read now, is the same as none.
+    # A damaged or unreadable file counts as missing.
     try:
         file = cache_folder(cache_dir) / name
         with file.open("rb") as opened, np.load(opened) as cached:

@@ -131,7 +131,7 @@ def _plain(folder: Path, split: str) -> tuple[list[Source], str]:
             "move them into a separate folder."
         )
     flat = {clip.name.lower(): clip.name for clip in clips if clip.is_dir()}
-    # `train` alone may be a clip, as it is one of DAVIS.
+    # `train` alone may be a clip: DAVIS has one of this name.
     if "train" in flat and not _FOR_TESTS.isdisjoint(flat):
         names = [flat[name] for name in ("train", *sorted(_FOR_TESTS)) if name in flat]
         raise ValueError(

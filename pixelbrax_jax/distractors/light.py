@@ -22,7 +22,7 @@ class LightState(struct.PyTreeNode):
     """Light of an episode, relative to the undisturbed light.
 
     Attributes:
-        azimuth: () float32, radians about the world's z axis, of the horizontal axis of the turn.
+        azimuth: () float32, radians about the world's z axis, of the horizontal turn axis.
         angle: () float32, radians of the turn.
         intensity: () float32, factor.
         color: (3,) float32, factors of red, green and blue.
@@ -92,8 +92,7 @@ class Light(Distractor):
 def turn_lights(params: EnvParams, azimuth: jax.Array, angle: jax.Array) -> EnvParams:
     """Turn all lights by radians about the horizontal axis of this azimuth, () each.
 
-    Spot lights turn about the origin of the link that they follow, or else about the target of the
-    first camera.
+    Spot lights turn about the origin of the link they follow, or else the first camera's target.
     """
     axis = jnp.stack([jnp.cos(azimuth), jnp.sin(azimuth), 0.0])
     quat = spatial.axis_angle(axis, angle)

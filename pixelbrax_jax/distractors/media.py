@@ -18,7 +18,7 @@ AGAIN = "get it again, or remove it"
 
 
 _TOLERANCE = 2
-"""Frames that an intact video may have less than its container declares."""
+"""Number of declared frames that an intact video may lack."""
 
 
 class _UnfitError(ValueError):
@@ -81,7 +81,7 @@ def _read_gif(file: Path, keep: Callable[[Any], None]) -> str:
         ended = file.read_bytes().rstrip(b"\0").endswith(b";")
     except MemoryError:
         raise
-    except Exception as error:  # Pillow's of damaged files are of every kind
+    except Exception as error:  # Pillow raises errors of all kinds for damaged files
         if not found:
             raise ValueError(f"{file} cannot be read as a video: {_say(file, error)}.") from error
         ended = False
@@ -103,7 +103,7 @@ def _picture(file: Path, height: int, width: int) -> np.ndarray:
             return _fit(ImageOps.exif_transpose(image), height, width)
     except MemoryError:
         raise
-    except Exception as error:  # Pillow's of damaged files are of every kind
+    except Exception as error:  # Pillow raises errors of all kinds for damaged files
         raise ValueError(f"{file} cannot be read as an image: {_say(file, error)}.") from error
 
 

@@ -22,7 +22,7 @@ PIXELS = "pixels/view_0"
 """Name of the image in an observation; Brax treats entries named ``pixels/...`` as images."""
 
 _LEVEL = np.float32(1 / 255)
-"""Pixels are multiplied with it, because XLA may round a division by a constant differently."""
+"""Factor of pixels, because XLA may round a division by a constant differently."""
 
 _NO_LIMIT = 2**31 - 1
 """More control steps than any episode has."""
@@ -77,8 +77,7 @@ class BraxEnv(Env):
     def reset(self, rng: jax.Array) -> State:
         """Reset to episode 0 of the environment with the key ``rng``, typed or uint32 like Brax's.
 
-        The state's ``pipeline_state`` is the pixel environment's ``EnvState``. Raises TypeError if
-        ``rng`` is not one key.
+        ``State.pipeline_state`` is an ``EnvState``. Raises TypeError if ``rng`` is not one key.
         """
         if isinstance(rng, jax.Array | np.ndarray) and not is_key(rng.dtype):
             rng = jax.random.wrap_key_data(rng)
@@ -177,8 +176,7 @@ class _FreshEpisodes(Wrapper):
     """Resets to the next episode in the step that ends one, as ``AutoResetWrapper`` does."""
 
     def step(self, state: State, action: jax.Array) -> State:
-        # Brax reads flag and step count after the step that ends an episode; the next step may
-        # clear them.
+        # Brax reads flag and step count after an episode's last step; the next may clear them.
         steps = jnp.where(state.done, 0.0, state.info["steps"])
         info = {**state.info, "steps": steps}
         state = self.env.step(state.replace(done=jnp.zeros_like(state.done), info=info), action)

@@ -53,7 +53,7 @@ class ParamRows:
         return jax.tree.unflatten(self.tree, leaves)
 
     def of_row(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        """Return ``function`` with an environment's rows as last argument, its parameters."""
+        """Return ``function`` with rows in place of the parameters as last argument."""
 
         def of_row(*args: Any) -> Any:
             *others, own = args
@@ -62,7 +62,7 @@ class ParamRows:
         return of_row
 
     def mark(self, own: Any, shared: Any) -> Any:
-        """Return a tree like the parameters, with one value for rows, another for shared arrays."""
+        """Return a tree like the parameters, with ``own`` for arrays with rows, else ``shared``."""
         marks = [own if is_own else shared for is_own in self.is_own]
         return jax.tree.unflatten(self.tree, marks)
 

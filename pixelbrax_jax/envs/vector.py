@@ -100,8 +100,7 @@ class VectorPixelEnv:
         Without a ``key`` they start their next episode, with a key or (N,) keys episode 0.
 
         Returns:
-            The states and timesteps, with reward 0; other environments repeat their current
-            observation and flags.
+            The states and timesteps, with reward 0; others repeat their observation and flags.
 
         Raises:
             TypeError: ``key`` has another type.
@@ -194,7 +193,6 @@ class VectorPixelEnv:
     def _reset_rows(
         self, state: EnvState, mask: jax.Array, episode: jax.Array, params: ParamRows
     ) -> SimState:
-        """Return the simulation states, reset where ``mask`` is set."""
         reset, rows = params.of_row(self.env.reset_sim), (state.key, episode, params.own)
         return reset_rows(reset, rows, mask, state.sim)
 

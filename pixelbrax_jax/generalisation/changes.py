@@ -19,8 +19,8 @@ NUM_VIEWS = 100
 """Number of directions of the camera in DMC-GB2; episode i and episode i + 100 have the same."""
 
 _ROTATION_STRIDE, _SHIFT_STRIDE = 61, 47
-"""Episode i takes direction (stride i) mod 100. Both visit all, the first few are spread evenly,
-and so are the pairs of both."""
+"""Episode i takes direction (stride i) mod 100. Both strides visit all directions; the first few
+are spread evenly, as are pairs of both."""
 
 
 class Change:
@@ -140,7 +140,7 @@ class Radius(Change):
 
 
 def changes_params_alone(distractor: Distractor) -> bool:
-    """Return whether a distractor changes an episode's parameters, and nothing after its start."""
+    """Return whether a distractor only changes parameters, and only at an episode's start."""
     match distractor:
         case Color(mode="geom", dynamics="static") | MovingCamera(dynamic=False) | Light():
             return True
@@ -148,7 +148,7 @@ def changes_params_alone(distractor: Distractor) -> bool:
 
 
 def _turn_cameras(params: EnvParams, axis: jax.Array, angle: jax.Array) -> EnvParams:
-    """Turn cameras at their places about a unit axis (3,) in their own frames, by radians."""
+    """Turn cameras in place about a unit axis (3,) in their own frames, by radians."""
     quat = spatial.axis_angle(axis, angle)
 
     def turn(rig: CameraRig) -> CameraRig:

@@ -49,8 +49,7 @@ _WHERE = (
 class LevelEnv:
     """One level, ready to be played.
 
-    ``env`` has the distractors that act within an episode; some arrays of ``params`` have a row for
-    each episode.
+    ``env`` has the distractors that act within episodes; ``params`` may have rows for each episode.
     """
 
     level: Level
@@ -99,12 +98,12 @@ def make_levels(
     report: Callable[[str], object] = lambda _: None,
     only: str | None = None,
 ) -> Levels:
-    """Make the levels of a suite for a task with these options, or ``only`` one as it is among all.
+    """Make the levels of a suite for a task with these options, or ``only`` the one of this name.
 
-    Distractors, clips, split and dynamics of ``config`` are left out. Episode i of every level
-    starts from the same state, that of the key ``fold_in(key(EPISODES), i)``. Parameters that a
-    level draws for it have a key that no training has. ``clips`` is a folder or ``procedural``;
-    ``report`` takes lines about replaced clips.
+    Distractors, clips, split and dynamics of ``config`` are ignored. Episode i of every level
+    starts from the same state, that of the key ``fold_in(key(EPISODES), i)``. A level draws its
+    parameters with a key that no training uses. ``clips`` is a folder or ``procedural``;
+    ``report`` takes lines about replaced clips. ``only`` does not change the level.
     """
     if "pixels" not in parts_of(config.obs_mode):
         raise ValueError(
@@ -182,7 +181,7 @@ def _draw(changes: Sequence[Change | Distractor], base: EnvParams, keys: jax.Arr
 def _share(
     bases: Sequence[EnvParams], drawn: Sequence[EnvParams], episodes: int
 ) -> list[EnvParams]:
-    """Give the same arrays rows in all levels: those that some level changes."""
+    """Give an array a row per episode in all levels if any level changes it."""
     before = [jax.tree.leaves(base) for base in bases]
     after = [jax.tree.leaves(rows) for rows in drawn]
     changed = [
@@ -255,7 +254,7 @@ def _bank(
 def _first_split(
     clips: str | PathLike[str], names: Sequence[str], config: EnvConfig
 ) -> tuple[str, ClipBank]:
-    """Return the first of some splits that is there, and its clips."""
+    """Return the first split of ``names`` that exists, and its clips."""
     read = partial(load_clips, height=config.height, width=config.width)
     if str(clips) == "procedural":
         split = next(name for name in names if name in SPLITS)

@@ -34,7 +34,7 @@ class Level:
     Attributes:
         name: unique in its suite.
         changes: distractors and changes of parameters, in this order.
-        clips: splits of the clips, of which the first that is there is used; empty without video.
+        clips: splits of the clips; the first existing one is used; empty without video.
         num_clips: number of clips, from the first; None for all.
         in_order: whether episode i shows clip i modulo their number; else clips are sampled.
     """
@@ -125,7 +125,7 @@ def _distracting(task: str, scale: float) -> tuple[Distractor, ...]:
 
 
 def _of_all_clips(links: Iterable[Distractor]) -> tuple[Distractor, ...]:
-    """Return distractors whose videos show any clip; a level has the number of clips."""
+    """Return distractors whose videos may show all clips; the level sets their number."""
     return tuple(
         replace(link, num_clips=None) if isinstance(link, Video) else link for link in links
     )
@@ -148,7 +148,7 @@ def _dmcgb2(task: str) -> tuple[Level, ...]:
         levels += [
             Level(f"color-{name}", palette),
             _video(f"video-{name}", hard, ground=not hard),
-            # Here the ground stays at both levels, in its code too.
+            # The ground stays at both levels, as in the benchmark's code.
             _video(f"color-video-{name}", hard, True, *palette),
             Level(f"rotate-{name}", (rotation,)),
             Level(f"shift-{name}", (shift,)),

@@ -66,8 +66,7 @@ def render(
     Colors and depth may be differentiated by all arrays of the scene: poses, sizes, colors, camera
     and light. The derivative is finite everywhere, and is that of the surface at the pixel's
     center. It ignores the motion of silhouettes, shadow edges and borders between geoms, and the
-    highlight that begins or ends where a surface turns to the light. ``seg`` and ``ground`` have
-    none.
+    highlight's start or end where a surface turns to the light. ``seg`` and ``ground`` have none.
 
     Args:
         scene: the scene, in the world frame.
@@ -99,7 +98,7 @@ def _render(
     renderer: str,
     times: int = 1,
 ) -> Frame:
-    """``render`` with ``times`` by ``times`` samples, for whatever device it is compiled."""
+    """``render`` with ``times`` by ``times`` samples, compiled for any device."""
     if times > 1:
         frame = _render(scene, first_row, height, width, num_rows, renderer)
         size, first, rows = (height * times, width * times), first_row * times, num_rows * times
@@ -245,7 +244,7 @@ class _Drawing:
         size = self.height, self.width
 
         def flat(first_row: jax.Array) -> tuple[jax.Array, ...]:
-            # As the renderer computes it.
+            # Flat, as the renderer computes it.
             return tuple(image.ravel() for image in self._draw_rows(first_row, self.height))
 
         like = tuple(

@@ -59,8 +59,7 @@ def why_no_kernel() -> str | None:
     """Return why ``"auto"`` does not use the kernel on CUDA; None if it does.
 
     Starts a device. On an NVIDIA GPU the first call in a process checks the kernel, with programs
-    of its own, and warns if it fails. Programs compiled for CUDA without a GPU use the kernel
-    unchecked.
+    of its own, and warns if it fails. Programs compiled for CUDA without a GPU use it unchecked.
     """
     why = why_unsupported()
     if why is None and jax.default_backend() == "gpu":

@@ -54,7 +54,7 @@ def sky_of(
         return shading.sky_texture(texture, *ways.T)
 
     # XLA would else look texels up in the loop over pixels, slowly, and for each image of a batch.
-    # The position is 0, because those of a batch may differ where its directions do not.
+    # The position is 0, because positions in a batch may differ when directions do not.
     camera = scene.camera.replace(pos=jnp.zeros(3), xmat=xmat)
     given = scene.look.sky_texture, camera, jnp.asarray(first_row)
     like = jax.ShapeDtypeStruct((num_rows * width, 3), jnp.float32)
@@ -65,10 +65,10 @@ def sky_of(
 def ground_light_of(
     scene: Scene, height: int, width: int, first_row: jax.Array | int, num_rows: int
 ) -> dict[int, list[jax.Array]]:
-    """Return what lights multiply each bounded ground's colors by with OpenGL's formulas.
+    """Return the factors of each bounded ground's colors from light, by OpenGL's formulas.
 
-    That is for pixels of a band, (num_rows * width,) each, as if each saw that ground. It depends
-    on the poses of camera, lamps and ground alone: a batch in which none moves computes it once.
+    They are (num_rows * width,) each, for a band's pixels as if all saw that ground, and depend
+    only on the poses of camera, lamps and ground: a batch in which none moves computes them once.
     """
     geoms, look = scene.geoms, scene.look
     grounds = [g for g in range(len(geoms.kind)) if geoms.is_ground(g) and geoms.is_bounded(g)]
@@ -86,7 +86,7 @@ def ground_light_of(
 
 
 def _on_ground(view: View, ray: Vector, plane: Solid) -> list[Any]:
-    """Return what lights multiply the colors of one ground by, where rays see it."""
+    """Return the factors of one ground's colors from light, where rays see it."""
     lights = opengl.lights_of(view.look, (0.0, 0.0, 1.0))
     place = _place(plane, ray, plane.hit(ray, plane.center).t)
     return opengl.on_plane(lights, (0.0, 0.0, 0.0), plane.center, plane.axes, plane.size, place)

@@ -20,8 +20,7 @@ from pixelbrax_jax.renderer.view import View, rays, view_of
 from pixelbrax_jax.types import Frame, GeomKind, Scene
 
 BLOCK = 256
-"""Pixels of a block, some rows of a small image. In smaller blocks fewer pixels share work; larger
-ones see more geoms."""
+"""Pixels of a block, some rows of an image: smaller ones share less work, larger see more geoms."""
 
 _WARPS = 4
 

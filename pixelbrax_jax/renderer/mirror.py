@@ -21,8 +21,7 @@ _INF_BITS = np.uint32(0x7F800000)
 def reflection(view: View, ray: Vector, t: jax.Array, in_kernel: bool) -> list[jax.Array]:
     """Return the color that each pixel would get if it saw the mirror at distance ``t``.
 
-    The pixel's ray, straight on behind the mirror, meets the mirrored geoms. Ground other than the
-    mirror is not reflected.
+    Behind the mirror the pixel's ray meets the mirrored geoms. Other ground is not reflected.
     """
     mirrored, geoms = view.mirrored, view.geoms
     assert mirrored is not None

@@ -43,11 +43,10 @@ def beam(lamp: Lamp, pos: Vector, axis: Vector, points: Vector) -> tuple[Vector,
 
 
 def computed_apart(compute: Callable[[], list[jax.Array]]) -> list[jax.Array]:
-    """Return values in [0, 1], rounded to 10 bits, that XLA computes in other loops than the rest.
+    """Return values in [0, 1], rounded to 10 bits, that XLA computes in a separate loop.
 
-    A loop over pixels that is too long compiles slowly, and XLA then computes values in it again;
-    so it does for each of several results. Hence three values share a word. There is no
-    derivative.
+    Too long a loop over pixels compiles slowly, and XLA then recomputes values in it, as it does
+    for each of several results. So three values share a word. There is no derivative.
     """
     program, compute_values, values = traced(compute)
     like = [jax.ShapeDtypeStruct(value.shape, jnp.uint32) for value in values[::3]]
@@ -156,8 +155,7 @@ def second_color_fraction(
 
     The pattern is ``"checker"`` or ``"grid"``, a product of two one-dimensional patterns. In units
     of its pitch, (x, y) is the ground at the pixel's center, and the widths are the positive
-    extents of the ground that the pixel sees. The mean over this rectangle is exact, so nothing
-    flickers.
+    extents of the ground that the pixel sees. The mean over the area is exact, so nothing flickers.
     """
     pattern = look.ground
     if pattern == "checker" and look.ground_mark is not None:

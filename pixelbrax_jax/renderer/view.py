@@ -155,8 +155,8 @@ def _planes(geoms: Geoms, g: int, in_kernel: bool) -> Fold:
         return jax.lax.fori_loop(np.int32(first), np.int32(end), one, value)
 
     def in_a_row(prepare: Callable, update: Callable, value: Any) -> Any:
-        # A loop would keep images of all values. The barrier keeps what differs by plane alone out
-        # of the loop over pixels.
+        # A loop would keep images of all values. The barrier keeps work per plane out of the loop
+        # over pixels.
         columns = prepare(tuple(planes[first:end, k] for k in range(4)))
         columns = jax.lax.optimization_barrier(columns)
         for row in range(end - first):

@@ -79,7 +79,7 @@ _SHAPES: dict[str, tuple[tuple[int, ...], ...]] = {
 }
 _LAMP_SHAPES = {"pos": (3,), "axis": (3,), "cos_cutoff": (), "diffuse": (), "highlight": ()}
 _MAY_LACK = ("light", "headlight", "headlight_highlight", "reflectance", "ground_mark")
-"""What a look may have None for."""
+"""Parts of a look that may be None."""
 
 
 def make_look(look: str | Look = "default", *, shadows: bool | None = None) -> Look:

@@ -61,7 +61,7 @@ def place(geoms: Geoms, rig: CameraRig, look: Look, xpos: jax.Array, xquat: jax.
 def impedance(string: String, length: jax.Array) -> jax.Array:
     """Return () the impedance of a string's limit at a length () in metres, 0 within its limits.
 
-    MuJoCo computes it of how far the length exceeds the limit ("Solver parameters" in its
+    MuJoCo computes it from the excess of the length over the limit ("Solver parameters" in its
     documentation): it grows from the first number of ``solimp`` to the second over the width, by
     two powers that meet at the midpoint.
     """

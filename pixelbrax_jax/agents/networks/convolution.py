@@ -1,4 +1,4 @@
-"""Convolutions that are fast on a CPU too, also in loops and in gradients."""
+"""Convolutions that are fast on a CPU too, also in loops and gradients."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Pads = tuple[tuple[int, int], tuple[int, int]]
 """Rows above and below, columns to the left and to the right."""
 
 Before = Callable[[jax.Array], jax.Array]
-"""Changes each number of an array by itself."""
+"""An elementwise function."""
 
 
 def unchanged(x: jax.Array) -> jax.Array:
@@ -21,14 +21,14 @@ def unchanged(x: jax.Array) -> jax.Array:
     return x
 
 
-# Compiled once where it is called outside a program, too.
+# Outside a program it is also compiled once.
 @partial(jax.jit, static_argnums=(2, 3, 4), inline=True)
 def convolve(
     x: jax.Array, kernel: jax.Array, stride: int, pads: Pads, before: Before = unchanged
 ) -> jax.Array:
     """Cross-correlate ``before(x)``, (B, H, W, C), with (h, w, C, D).
 
-    On a CPU there are derivatives in reverse mode (``jax.grad``, also of ``jax.grad``) alone.
+    On a CPU only derivatives in reverse mode exist (``jax.grad``, also nested).
     """
 
     def native(x: jax.Array, kernel: jax.Array) -> jax.Array:
@@ -95,10 +95,10 @@ _by_image.defvjp(_by_image_forward, _by_image_backward)
 
 
 def _on_each_device(loop: Callable[..., Any], *batches: jax.Array) -> Any:
-    """Return the results of a loop over each part of a batch, (parts, ...), a part a device.
+    """Run a loop over each device's part of a batch; return the results, (parts, ...).
 
-    XLA does not divide a loop over an axis that is sharded: every device would get all images. So
-    it is with a batch that is no multiple of JAX's devices, or is spread over some of them alone.
+    XLA does not divide a loop over a sharded axis: every device would compute all images. It still
+    does so if JAX's devices do not divide the batch, or only some of them hold it.
     """
     devices, size = jax.device_count(), batches[0].shape[0]
     # Policies are exported for batches of any size.
@@ -110,7 +110,7 @@ def _on_each_device(loop: Callable[..., Any], *batches: jax.Array) -> Any:
 def _patches(
     image: jax.Array, kernel: jax.Array, stride: int, pads: Pads, before: Before
 ) -> jax.Array:
-    """Return the numbers under the kernel at each of its places, (H', W', h * w * C)."""
+    """Return the patch under the kernel at each position, (H', W', h * w * C)."""
     image = jnp.pad(before(image).astype(kernel.dtype), (*pads, (0, 0)))
     height, width = kernel.shape[:2]
     rows, columns = (

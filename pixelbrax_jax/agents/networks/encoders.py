@@ -102,7 +102,7 @@ class Impala(nn.Module):
 
 
 class Stack(nn.Module):
-    """Unpadded convolutions of ``before(pixels)``, and a dense layer that ``relu`` follows.
+    """Unpadded convolutions of ``before(pixels)``, and a dense layer followed by ``relu``.
 
     ``bounded`` features are normalised and pass ``tanh`` instead.
     """
@@ -158,7 +158,7 @@ SMALLEST = {"impala": 1, "nature": 36, "drq": 15, "small": 18, "patch": 24, "pat
 
 
 def _convolved(x: jax.Array, layers: Layers, before: Before, **options: Any) -> jax.Array:
-    """Return the features of convolutions in the module that calls; ``before`` acts on ``x``."""
+    """Apply convolutions as submodules of the calling module; ``before`` acts on ``x``."""
     for channels, size, stride in layers:
         x = nn.relu(Conv(channels, size, stride, before=before, **options)(x))
         before = unchanged

@@ -10,7 +10,7 @@ from pixelbrax_jax.agents.networks.encoders import dense
 
 
 class Trunk(nn.Module):
-    """A dense layer, LayerNorm and ``tanh``, which bound what the layers behind see."""
+    """A dense layer, LayerNorm and ``tanh``, which bound the inputs of later layers."""
 
     size: int
 
@@ -21,7 +21,7 @@ class Trunk(nn.Module):
 
 
 class Head(nn.Module):
-    """Two hidden layers, with LayerNorm on request, and a linear layer."""
+    """Two hidden layers, optionally with LayerNorm, and a linear layer."""
 
     hidden_dim: int
     outputs: int

@@ -22,8 +22,7 @@ from pixelbrax_jax.validation import check_choice
 class DrQv2Config(TrainConfig):
     """Settings of DrQ-v2.
 
-    The defaults are those of its code, but for ``num_envs``, ``buffer_size`` and
-    ``saturation_coef``.
+    Defaults are those of its code, except ``num_envs``, ``buffer_size`` and ``saturation_coef``.
     """
 
     memory_settings: ClassVar[tuple[str, ...]] = ("buffer_size",)
@@ -91,7 +90,6 @@ class DrQv2Config(TrainConfig):
     """Bound of the noise in updates; while playing it has none."""
 
     def __post_init__(self) -> None:
-        """Check the settings."""
         super().__post_init__()
         check_choice("encoder", self.encoder, LAYERS)
         check_choice("critic", self.critic, ("clipped", "c51"))
@@ -189,7 +187,7 @@ class DrQv2Config(TrainConfig):
         return f"{super().to_fit(excess)} Of the replay, {largest}"
 
     def largest_that_fits(self, num_bytes: float) -> str:
-        """Tell the largest ``buffer_size`` whose frames take at most so many bytes."""
+        """Name the largest ``buffer_size`` whose frames fit into ``num_bytes``."""
         per_iteration = self.num_envs * self.num_steps
         largest = int(num_bytes // (self.frame_bytes * per_iteration)) * per_iteration
         if largest < max(self.learning_starts, 1):

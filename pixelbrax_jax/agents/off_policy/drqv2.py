@@ -1,4 +1,4 @@
-"""DrQ-v2 (Yarats et al., arXiv 2107.09645) in many environments, with C51 on request."""
+"""DrQ-v2 (Yarats et al., arXiv 2107.09645) in many environments, optionally with C51."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ class DrQv2(Algorithm):
     def iterate(self, state: OffPolicyState, env_params: EnvParams) -> tuple[TrainState, Metrics]:
         """Collect steps into the replay and, once it holds enough, learn from it."""
         config = self.config
-        # Steps of all environments so far, up to where nothing depends on them, within 32 bits.
+        # Steps of all environments, capped at the end of all schedules to fit into 32 bits.
         per_iteration = config.num_envs * config.num_steps
         enough = -(-max(config.std_steps, config.learning_starts) // per_iteration)
         steps = jnp.minimum(state.iteration, jnp.uint32(enough)) * jnp.uint32(per_iteration)
@@ -158,7 +158,7 @@ class DrQv2(Algorithm):
         ]
 
     def _apply(self, name: str, networks: Networks, *inputs: jax.Array) -> jax.Array:
-        """Apply a network, in bfloat16 on request; the result is float32."""
+        """Apply a network, in bfloat16 if configured; the result is float32."""
         params = networks[name]
         if self.config.bfloat16:
             params = jax.tree.map(lambda x: x.astype(jnp.bfloat16), params)
@@ -175,7 +175,7 @@ class DrQv2(Algorithm):
         start = (state.networks, state.opt_state, state.target)
         update = one_run_after_the_other(self._update)
 
-        # The loop reads the replay and does not carry it: XLA would copy it in every turn.
+        # The loop does not carry the replay, because XLA would copy it in every iteration.
         def step(carry: Any, inputs: tuple[jax.Array, jax.Array]) -> tuple[Any, Metrics]:
             number, key = inputs
             sample_key, shift_key, update_key = jax.random.split(key, 3)
@@ -213,7 +213,7 @@ class DrQv2(Algorithm):
         iteration: jax.Array,
         number: jax.Array,
     ) -> tuple[Any, Metrics]:
-        """Update encoder and critic, the actor in every ``policy_delay``-th turn, the target."""
+        """Update encoder and critic, the actor every ``policy_delay``-th time, and the target."""
         networks, opt_state, target = carry
         config, optimizer = self.config, Optimizer(self.config)
         target_key, actor_key = jax.random.split(key)
@@ -243,7 +243,7 @@ class DrQv2(Algorithm):
                 networks,
                 opt_state,
             )
-            # Means over all updates are those over the actor's.
+            # Turns means over all updates into means over those of the actor.
             loss, norm = loss * config.policy_delay, norm * config.policy_delay
         norms["actor"] = norm
         metrics |= {"loss/actor": loss}
@@ -292,8 +292,7 @@ class DrQv2(Algorithm):
         output = self._apply("actor", {"actor": actor}, features)
         action = noisy(jnp.tanh(output), std, key, self.config.std_clip)
         values = self.values(self._apply("critic", networks, features, action))
-        # The gradient of `min` compares values with the result, and is NaN if XLA rounds a copy of
-        # them otherwise.
+        # The gradient of `min` is NaN if XLA rounds copies of values and result differently.
         least = jnp.where(values[0] < values[1], values[0], values[1])
         value = least if self.config.critic == "clipped" else values.mean(0)
         loss = -batch.mean(value)
@@ -340,8 +339,8 @@ def noisy(action: jax.Array, std: Any, key: jax.Array, clip: float | None = None
 def projected(probabilities: jax.Array, values: jax.Array, support: jax.Array) -> jax.Array:
     """Project (..., M) probabilities onto (M,) atoms (C51; Bellemare et al., arXiv 1707.06887).
 
-    Each of (..., M) values, clipped to the atoms' range, gives its probability to the two equally
-    spaced atoms beside it, so that the mean stays.
+    The atoms are equally spaced. Each of (..., M) values, clipped to their range, splits its
+    probability between the two nearest atoms so that the mean stays.
     """
     spacing = support[1] - support[0]
     values = jnp.clip(values, support[0], support[-1])

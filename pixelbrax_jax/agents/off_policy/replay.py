@@ -103,10 +103,9 @@ class Replay(struct.PyTreeNode):
     def sample(
         self, key: jax.Array, batch_size: int, stack: int, n_step: int, gamma: float
     ) -> Batch:
-        """Sample uniformly, with replacement, transitions that K - 1 steps precede and n follow.
+        """Sample transitions with K - 1 steps before and n after, uniformly and with replacement.
 
-        The environments form gcd(N, B) groups, each of which gives equally many transitions, so
-        that devices share a batch equally.
+        Each of gcd(N, B) groups of environments gives B / gcd(N, B): devices share a batch equally.
         """
         num_envs = self.reward.shape[0]
         groups = math.gcd(num_envs, batch_size)

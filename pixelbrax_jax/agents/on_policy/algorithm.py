@@ -166,8 +166,7 @@ class OnPolicy(Algorithm):
         """Take an optimiser step for each minibatch of a rollout, ``num_epochs`` times.
 
         Only ``learners`` learn; None means all networks with an optimiser state. The update stops
-        above the approximate KL divergence ``target_kl``. Metrics are means over the minibatches
-        used.
+        above the approximate KL divergence ``target_kl``. Metrics are means over used minibatches.
         """
         config, optimizer = self.config, Optimizer(self.config)
 

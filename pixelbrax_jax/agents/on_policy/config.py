@@ -48,7 +48,6 @@ class OnPolicyConfig(TrainConfig):
     """Divides rewards by the standard deviation of discounted returns."""
 
     def __post_init__(self) -> None:
-        """Check the settings."""
         super().__post_init__()
         check_divides("num_steps", self.num_steps, "num_minibatches", self.num_minibatches)
         check_choice("policy", self.policy, POLICIES)

@@ -39,7 +39,6 @@ class DCPGConfig(PhasicConfig):
     """Rate tau of the averaged actor that provides the old values in the decoupled variant."""
 
     def __post_init__(self) -> None:
-        """Check the settings."""
         super().__post_init__()
         # Values learn only in the delayed phase.
         check_positive_int("aux_epochs", self.aux_epochs)

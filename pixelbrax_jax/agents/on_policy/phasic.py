@@ -51,7 +51,6 @@ class PhasicConfig(OnPolicyConfig):
     """Weight of KL(old policy || policy) in the auxiliary phase."""
 
     def __post_init__(self) -> None:
-        """Check the settings."""
         super().__post_init__()
         phases, minibatches = self.num_policy_phases, self.aux_minibatches
         if self.aux_epochs and self.num_iterations < phases:

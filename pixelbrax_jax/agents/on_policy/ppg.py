@@ -35,7 +35,6 @@ class PPGConfig(PhasicConfig):
     """Weight of the separate critic's loss in the auxiliary phase."""
 
     def __post_init__(self) -> None:
-        """Check the settings."""
         super().__post_init__()
         check_choice("layout", self.layout, ("dual", "detach", "shared"))
         if self.layout != "dual" and self.policy_epochs != self.value_epochs:

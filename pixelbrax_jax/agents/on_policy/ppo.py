@@ -38,7 +38,6 @@ class PPOConfig(OnPolicyConfig):
     """Stops an update early above this approximate KL divergence."""
 
     def __post_init__(self) -> None:
-        """Check the settings."""
         super().__post_init__()
         check_choice("layout", self.layout, ("separate", "shared"))
         if self.state_critic and self.layout == "shared":

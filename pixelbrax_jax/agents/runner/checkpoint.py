@@ -283,7 +283,7 @@ class Checkpoints:
 
 
 def _read(folder: Path, steps: int, template: Tree, *, whole: bool, advice: str = "") -> Tree:
-    """Read the arrays of a tree, which are the ``whole`` checkpoint or some of it."""
+    """Read the arrays of a tree: the ``whole`` checkpoint or a part of it."""
     leaves = _leaves(template)
     wanted = {name: jax.eval_shape(without_keys, leaf) for name, leaf in leaves.items()}
     shapes = {name: leaf.shape for name, leaf in wanted.items()}
@@ -307,7 +307,7 @@ def _read(folder: Path, steps: int, template: Tree, *, whole: bool, advice: str 
 
     def leaf(path: Any, like: Any) -> Any:
         value = restored[_name(path)] if like.size else np.zeros(like.shape, like.dtype)
-        # Without a sharding it may go to any device, as in a new run: its program is the same.
+        # Without a sharding JAX chooses the device, as in a new run, so the program is the same.
         return with_keys(jax.device_put(value, like.sharding), like)
 
     return jax.tree_util.tree_map_with_path(leaf, template)

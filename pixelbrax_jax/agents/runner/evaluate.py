@@ -51,7 +51,7 @@ class Evaluator:
     def __init__(
         self, algorithm: Player, env: PixelEnv, env_params: EnvParams, *, num_episodes: int = 32
     ) -> None:
-        """Prepare the evaluation of ``algorithm.act`` in ``env``, which shows pixels."""
+        """Prepare the evaluation of ``algorithm.act`` in ``env``, which must show pixels."""
         self._algorithm, self._params = algorithm, env_params
         self._envs = VectorPixelEnv(env, num_episodes, "disabled")
 
@@ -76,7 +76,7 @@ def _play(
 
     def step(carry: tuple[EnvState, jax.Array, Any]) -> tuple[EnvState, jax.Array, Any]:
         state, number, (over, returns, lengths) = carry
-        # The environment of a training may also show the state, to a critic.
+        # Training environments may also show the state, for a critic.
         pixels, _ = split_obs(envs.obs(state))
         action = algorithm.act(networks, pixels)
         state, timestep = envs.step(state, action, params)

@@ -57,7 +57,6 @@ class AppendedFile:
     """An append-only file without gaps, which keeps bytes in memory while the disk is full."""
 
     def __init__(self, path: Path) -> None:
-        """Open or create the file."""
         self._file = path.open("ab", buffering=0)
         self._waiting = bytearray()
         self._ended = False
@@ -144,7 +143,7 @@ def _wandb(
             "wandb_project needs wandb, which is not installed: pip install wandb"
         ) from error
     try:
-        # A resumed run goes on in the same run of the service.
+        # A resumed run continues the same run of the service.
         known = folder / "wandb_id"
         if not known.exists():
             with replacing(known) as part:

@@ -42,7 +42,6 @@ class Bar(tqdm):
     """An optional progress bar, gone after an error; ``failure`` is the error, or empty."""
 
     def __init__(self, shown: bool, total: int, report: Report) -> None:
-        """Show a bar of ``total`` iterations."""
         self.failure, self._report = "", report
         with self._watched():
             super().__init__(total=total, unit="iteration", disable=not shown)

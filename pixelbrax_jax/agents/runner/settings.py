@@ -70,7 +70,6 @@ class RunConfig:
     """Shows a progress bar; default: only if stderr is a terminal."""
 
     def __post_init__(self) -> None:
-        """Check the settings."""
         if not isinstance(self.output_dir, str | os.PathLike) or not str(self.output_dir):
             raise ValueError(f"output_dir must be a folder's path, got {self.output_dir!r}.")
         object.__setattr__(self, "output_dir", str(in_home(self.output_dir)))
@@ -98,7 +97,7 @@ def describe_run(
 
 
 def former_settings(kind: type[TrainConfig]) -> dict[str, Any]:
-    """Return the values, by name, that settings of class ``kind`` have if a run lacks them."""
+    """Return values by name for settings of class ``kind`` that a stored run lacks."""
     return describe(kind()) | {name: getattr(RunConfig(), name) for name in OF_RUNS}
 
 

@@ -49,8 +49,8 @@ def make_splits(
     """Yield name, environment and parameters of each split.
 
     ``clean`` has neither distractors nor varied dynamics. ``train`` has those of the training.
-    ``test`` has the same distractors with other clips: split ``test``, or ``paper-test`` if
-    training uses ``paper-train``; and ``test_dynamics``. It needs one of them.
+    ``test`` has the same distractors with other clips (split ``test``, or ``paper-test`` if
+    training uses ``paper-train``) and ``test_dynamics``; it needs at least one of these.
 
     Without ``names`` it yields all available splits and reports the missing ones. ``shown`` are
     ``clip_digests`` of the training's clips; None uses the clips of ``config``.
@@ -72,8 +72,7 @@ def make_split(
     """Make one of the environments of `make_splits`.
 
     Raises:
-        NoSplitError: ``train`` has other clips than the training, or ``test`` shares some or has
-            none.
+        NoSplitError: ``train`` has other clips than training, or ``test`` has none or shared ones.
     """
     check_choice("split", name, SPLITS)
     names = splits_of(config)

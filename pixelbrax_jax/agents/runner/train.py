@@ -147,7 +147,7 @@ def run(
 
 
 def _filled_anew(parts: Sequence[str], state: TrainState, config: TrainConfig) -> str:
-    """Say when learning goes on without these parts of the state."""
+    """Say which parts of the state are refilled, and whether enough steps are left for it."""
     iterations, needed = config.num_iterations - _iterations(state), config.steps_to_fill
     steps = iterations * config.steps_per_iteration // config.env.action_repeat
     then = "filled anew before learning goes on"

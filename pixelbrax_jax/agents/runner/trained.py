@@ -53,7 +53,7 @@ class Pretrained:
 
 
 Player = Algorithm | Pretrained
-"""What chooses actions: an ``Algorithm`` with its networks, or a policy."""
+"""Chooses actions: an ``Algorithm`` with its networks, or a policy of the package."""
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ def load_config(about: Mapping[str, Any]) -> TrainConfig:
 
 @contextmanager
 def _without_locations() -> Iterator[None]:
-    """Leave paths of source files out of programs, which others may get."""
+    """Omit paths of source files from programs, which may be shared."""
     name = "jax_traceback_in_locations_limit"
     limit = jax.config.values[name]
     jax.config.update(name, 0)

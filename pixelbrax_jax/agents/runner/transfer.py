@@ -90,6 +90,6 @@ _reset, _step = (jit(static_argnums=0)(method) for method in (PixelEnv.reset, Pi
 
 @jit(static_argnums=0)
 def _draw(env: PixelEnv, qpos: Any, qvel: Any, key: jax.Array, params: EnvParams) -> jax.Array:
-    """Draw our picture of a pose, with the target of the episode that ``key`` begins."""
+    """Draw our picture of a pose, with the target of the episode of ``key``."""
     state, _ = replace(env, obs_mode="state").from_qpos(qpos, qvel, key, params)
     return env.image(state, params)

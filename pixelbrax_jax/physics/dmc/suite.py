@@ -25,9 +25,9 @@ _DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
 class SuiteEnv:
     """An environment of ``dm_control.suite`` that starts where one of ours does.
 
-    ``size`` is height and width of pictures; None is for no pictures, which needs no OpenGL. They
-    are drawn larger by the root of ``samples``, a square number, and averaged, as the option
-    ``samples`` of ours has it; OpenGL, which ``MUJOCO_GL`` chooses, smooths edges besides.
+    ``size`` is height and width of pictures; None makes none and needs no OpenGL. Pictures are
+    drawn larger by the root of ``samples``, a square number, and averaged, like option ``samples``
+    of ``make``. The OpenGL that ``MUJOCO_GL`` selects also smooths edges.
     """
 
     def __init__(

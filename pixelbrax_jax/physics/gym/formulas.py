@@ -73,7 +73,7 @@ def _start_pusher(dynamics: Dynamics, key: jax.Array) -> Start:
 
 
 def _left(seen: Snapshot, body: str) -> jax.Array:
-    """Return (3,) metres, where MuJoCo's last step left a body."""
+    """Return (3,) metres, a body's position as MuJoCo's last step left it."""
     return seen.data.fields["xpos"][seen.model.body(body).id]
 
 
@@ -172,18 +172,18 @@ def _within(x: jax.Array, low: float, high: float) -> jax.Array:
 
 
 def _lagging_speed(seen: Snapshot, place: Callable[[Snapshot], jax.Array]) -> jax.Array:
-    """Return the velocity along x of what lags behind the root's joint by one physics step of 5."""
+    """Return the velocity along x of a place one physics step (of 5) behind the root's joint."""
     lag = place(seen) - seen.state.remembered
     return (seen.data.moved[0] + lag[0]) / (seen.model.opt.timestep * 5)
 
 
 def _torso(seen: Snapshot) -> jax.Array:
-    """Return (2,) metres, the first body, from the root's joint."""
+    """Return (2,) metres, the first body relative to the root's joint."""
     return seen.data.fields["xpos"][1, :2] - seen.state.qpos[:2]
 
 
 def _center_of_mass(seen: Snapshot) -> jax.Array:
-    """Return (2,) metres, the center of mass, from the root's joint."""
+    """Return (2,) metres, the center of mass relative to the root's joint."""
     masses = f32(seen.model.body_mass / seen.model.body_mass.sum())
     # The world has no mass. Differences from the root keep their digits far away.
     root = joined(seen.state.qpos[:2], 0.0)

@@ -1,4 +1,4 @@
-"""What MuJoCo, MuJoCo XLA and Brax print, warn of and need of JAX, without loading the last two."""
+"""Known output of MuJoCo, MuJoCo XLA and Brax, and what they need of JAX; loads MuJoCo alone."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def accept_device_put_replicated(module: ModuleType) -> None:
 
 
 def _replace_in(module: ModuleType, name: str, imported: ModuleType, **functions: Any) -> None:
-    """Replace functions of an ``imported`` module, which only ``module`` sees, as its ``name``."""
+    """Replace functions of an ``imported`` module, ``name`` in ``module``, only for ``module``."""
     if vars(module)[name] is imported:
         changed = ModuleType(imported.__name__)
         vars(changed).update(functions, __getattr__=partial(getattr, imported))

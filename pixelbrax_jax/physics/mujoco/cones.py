@@ -46,7 +46,7 @@ class Cones(NamedTuple):
         return self.stiffness[:, 0] / jnp.maximum(square * (1 + square), mujoco.mjMINVAL)
 
     def _by_zone(self, residual: jax.Array, sticking: jax.Array, slipping: jax.Array) -> jax.Array:
-        """Return 0 for free contacts, else what is for those that stick or slip: (C, ...)."""
+        """Return 0 for free contacts, else ``sticking`` or ``slipping``, (C, ...)."""
         normal, length, _ = self._parts(residual)
         axes = range(1, sticking.ndim)
         is_free = jnp.expand_dims(normal >= self._mu * length, axes)

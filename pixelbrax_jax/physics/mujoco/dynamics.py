@@ -85,7 +85,7 @@ class Dynamics:
         needs: Needs,
         engine: str,
     ):
-        """Take a model and the same ``with_poses``."""
+        """Take a model, and the same model compiled ``with_poses``."""
         self.model = model
         self.engine = engine
         self._needs = needs
@@ -98,7 +98,7 @@ class Dynamics:
         fields = [getattr(data, name).shape for name in needs.reads]
         self._shapes = [(model.nbody, 3), (model.nbody, 4), (model.nsensordata,), *fields]
         if not ENGINES[engine].by_mujoco:
-            # It says now what it lacks or cannot compute.
+            # Raises errors about missing packages and unsupported models now.
             _ = self.xla
 
     def by_mujoco(self) -> Dynamics:
@@ -157,7 +157,7 @@ class Dynamics:
     def first(self, state: State, *, is_sampled: bool = True) -> Readings:
         """Return the readings of a first state; actuators are off, as in DM Control's resets.
 
-        ``is_sampled``: whether the task has sampled it; ``Needs.starts_with_forces`` is of such.
+        ``is_sampled``: whether the task sampled it; ``Needs.starts_with_forces`` is about those.
         """
         arrays = [state.qpos, state.qvel, state.multipliers]
         results = self._call("first", arrays, self._shapes, int(is_sampled))
@@ -208,9 +208,9 @@ class Dynamics:
 def _of_rows(
     function: Callable[..., None], result_axes: Sequence[int], *arrays: np.ndarray
 ) -> None:
-    """Call ``function`` of (N, ...) rows, where there are any axes in place of N.
+    """Call ``function``, which takes (N, ...) rows, with any number of leading axes.
 
-    A row of an operand is a vector, that of a result has ``result_axes``.
+    A row of an operand is a vector; a row of a result has as many axes as ``result_axes`` says.
     """
     num_operands = len(arrays) - len(result_axes)
     axes = [1] * num_operands + list(result_axes)

@@ -1,4 +1,4 @@
-"""Small linear systems, in operations that a device does for a whole batch."""
+"""Small linear systems, solved by operations on a whole batch."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 LARGEST = 17
-"""Largest number of unknowns that a CPU eliminates, where LAPACK is slower, one matrix after the
+"""Largest number of unknowns that a CPU eliminates, because LAPACK takes one matrix after the
 other, and that a GPU eliminates without a loop."""
 
 IN_ONE_KERNEL = 9

@@ -22,9 +22,9 @@ DEFAULT_RGBA = np.array([0.5, 0.5, 0.5, 1.0], np.float32)
 class Shape(NamedTuple):
     """One visible shape; fields as in ``Geoms``, with its color and its material's name.
 
-    ``row`` is its place among the model's geoms or sites. ``planes`` are the (K, 4) half-spaces of
-    a mesh, as in ``Geoms``, and ``error`` how far they leave its convex hull, in metres. Shapes
-    with different ``owner`` share no color.
+    ``row`` is its index among the model's geoms or sites. ``planes`` are the (K, 4) half-spaces of
+    a mesh, as in ``Geoms``, and ``error`` is their largest distance from its convex hull in metres.
+    Shapes with different ``owner`` share no color.
     """
 
     kind: GeomKind
@@ -78,7 +78,7 @@ def as_geoms(shapes: Sequence[Shape]) -> Geoms:
 
 
 def hull_errors(shapes: Sequence[Shape]) -> dict[str, float]:
-    """Return by name how far what is drawn of each mesh leaves its convex hull, in metres."""
+    """Return ``Shape.error`` of each mesh by name, in metres."""
     return {shape.name: shape.error for shape in shapes if shape.kind == GeomKind.MESH}
 
 
@@ -196,7 +196,7 @@ def _kind_name(number: int) -> str:
 
 
 def _check_kinds(model: mujoco.MjModel, groups: Collection[int]) -> None:
-    """Raise a ValueError that names everything visible that has no formula."""
+    """Raise a ValueError that names all visible elements without a formula."""
     found = []
     objects = (
         ("geom", mujoco.mjtObj.mjOBJ_GEOM),

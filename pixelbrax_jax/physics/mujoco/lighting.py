@@ -102,7 +102,7 @@ def mirror_of(model: mujoco.MjModel) -> int:
 def read_lamps(model: mujoco.MjModel, com_link: int) -> dict[str, Lamp]:
     """Return the model's lamps by name.
 
-    A lamp on a body follows but does not turn. ``com_link`` is the link at the tracked center of
+    A lamp follows its body but does not turn. ``com_link`` is the link at the tracked center of
     mass, -1 for none.
     """
     lamps = {}
@@ -131,7 +131,7 @@ def read_lamps(model: mujoco.MjModel, com_link: int) -> dict[str, Lamp]:
 
 
 def _axis(model: mujoco.MjModel, light: int) -> np.ndarray:
-    """Return the direction of a light; of one that turns to a body, in the first pose."""
+    """Return a light's direction; for one that turns to a body, that in the first pose."""
     if int(model.light_mode[light]) in _AIMED:
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
@@ -153,8 +153,8 @@ def _cast_shadows(model: mujoco.MjModel) -> bool:
 def _rendered(model: mujoco.MjModel) -> np.ndarray:
     """Return, for each light, whether it is rendered.
 
-    Those are the first directional light, and lamps; but no images, and no lamp that follows
-    another center of mass than the camera.
+    The first directional light and all lamps are, but no images, and no lamps that follow another
+    center of mass than the camera.
     """
     rendered = model.light_active.astype(bool) & (model.light_type != _IMAGE)
     suns = model.light_type == _DIRECTIONAL
@@ -165,7 +165,7 @@ def _rendered(model: mujoco.MjModel) -> np.ndarray:
 
 
 def _warn_of_lights(model: mujoco.MjModel) -> None:
-    """Warn of what a model's lights have that is not rendered."""
+    """Warn about features of a model's lights that are not rendered."""
     rendered, modes, kinds = _rendered(model), model.light_mode, model.light_type
     left_out = model.light_active.astype(bool) & ~rendered
     fades = (model.light_attenuation != (1, 0, 0)).any(axis=1) & (kinds != _DIRECTIONAL)

@@ -40,7 +40,7 @@ class MjcfPhysics(MujocoPhysics):
     """A user's task of a MuJoCo model, made by ``mjcf_physics``."""
 
     def __init__(self, reward: RewardFn, formulas: Formulas, spec: mujoco.MjSpec, **options: Any):
-        """See ``MujocoPhysics``; ``reward`` stands in for that of the formulas."""
+        """See ``MujocoPhysics``; ``reward`` replaces that of the formulas."""
         self._reward = reward
         super().__init__(formulas, spec, identity=None, **options)
         self.followed_link = max(followed_body(self._model) - 1, 0)
@@ -227,7 +227,7 @@ def _check_takes(name: str, function: Callable[..., Any], *arguments: str) -> No
     try:
         signature = inspect.signature(function)
     except ValueError:
-        # Some functions written in C do not tell.
+        # Some functions written in C have no signature.
         return
     except TypeError as error:
         raise TypeError(f"{name} must be a function, got {function!r}.") from error

@@ -35,9 +35,9 @@ def multiplied(model: Any, multipliers: Any) -> dict[str, Any]:
         "body_mass": model.body_mass * mass,
         "body_inertia": model.body_inertia * mass,
         "body_subtreemass": model.body_subtreemass * mass,
-        # Inertia of bodies for which MuJoCo does not compute it anew.
+        # MuJoCo reads the inertia of simple bodies from here.
         "dof_M0": (model.dof_M0 - model.dof_armature) * mass + model.dof_armature,
-        # MuJoCo XLA's models have some.
+        # MuJoCo XLA's models have only some of these fields.
         **{name: getattr(model, name) * damping for name in _DAMPING if hasattr(model, name)},
         "actuator_gainprm": model.actuator_gainprm * gains,
         "actuator_biasprm": model.actuator_biasprm * gains,
@@ -67,7 +67,7 @@ class MultipliedModels:
         self._multipliers = np.empty((0, 0))
 
     def of_rows(self, multipliers: np.ndarray) -> list[mujoco.MjModel]:
-        """Return models for (N, 5) multipliers; a row that is as in the last call costs nothing."""
+        """Return models for (N, 5) multipliers; a row as in the last call costs nothing."""
         before, self._multipliers = self._multipliers, np.empty((0, 0))
         for i, row in enumerate(multipliers):
             if i == len(self._copies):

@@ -41,7 +41,7 @@ class Native:
     """
 
     def __init__(self, model: mujoco.MjModel, posed: mujoco.MjModel, needs: Needs):
-        """Take a model and the same ``with_poses``."""
+        """Take a model, and the same model compiled ``with_poses``."""
         self._fields = needs.reads
         # A state that diverges stays as it is.
         disabled = _OFF.mjDSBL_AUTORESET
@@ -89,7 +89,7 @@ class Native:
                 last, qacc, sensors = self._step_each(models, num_steps, *begin, fields)
             else:
                 last, qacc, sensors = self._step_all(models, num_steps, *begin)
-        # MuJoCo may end a row's steps where it warns.
+        # MuJoCo may end a row's steps early at a warning.
         is_bad |= np.abs(last[:, 0] - num_steps * model.opt.timestep) > model.opt.timestep / 2
         is_bad |= ~(np.abs(qacc) < mujoco.mjMAXVAL).all(axis=1)
         last[is_bad] = self._rest
@@ -154,7 +154,7 @@ class Native:
     ) -> None:
         """Fill readings of ``qpos`` and ``qvel`` with actuators off, as DM Control's resets do.
 
-        The forces of any state are computed, whether the task has sampled it or not.
+        Forces are computed for all states; ``is_sampled`` is ignored.
         """
         del is_sampled
         xpos, xquat, sensordata, *fields = results
@@ -164,7 +164,7 @@ class Native:
             _, found = self._roll(self._resting, models, first, 1)
         self._read(found[:, 0], xpos, xquat, sensordata)
         if self._reads_actuators and self._senses:
-            # With actuators off they have no velocities.
+            # Actuators that are off have no velocities.
             with self._models(self._still, multipliers) as models:
                 _, found = self._roll(self._still, models, first, 1)
             own = found[:, 0, : sensordata.shape[1]]
@@ -201,7 +201,7 @@ class Native:
         try:
             block(*edges[:2])
         finally:
-            # They write to the same arrays, which live no longer than this call.
+            # The threads write to arrays that live no longer than this call.
             wait(others)
         for other in others:
             other.result()
@@ -216,7 +216,7 @@ class Native:
         xpos[:, 1:], xquat[:, 1:] = poses[..., :3], poses[..., 3:]
 
     def clearances(self, qpos: np.ndarray, found: np.ndarray) -> None:
-        """Fill (N, G) metres, by which each geom overlaps another, negative; infinity for none."""
+        """Fill (N, G) metres: negative where a geom overlaps another, infinity without contact."""
         found[:] = np.inf
         with self._data(self._moving, 1) as (data,):
             for row, distances in zip(qpos, found, strict=True):
@@ -309,7 +309,7 @@ def with_poses(spec: mujoco.MjSpec) -> mujoco.MjModel:
 def _without(model: mujoco.MjModel, features: int) -> mujoco.MjModel:
     model = copy.copy(model)
     model.opt.disableflags |= int(features)
-    # With it, a sensor of the kinetic energy keeps what a row had that used the data before.
+    # Otherwise a sensor of kinetic energy keeps the value of an earlier row with the same data.
     model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_ENERGY)
     return model
 
@@ -319,13 +319,13 @@ def _num_threads(num_rows: int) -> int:
 
 
 _pools: queue.SimpleQueue[Rollout] = queue.SimpleQueue()
-"""Thread pools that nobody uses."""
+"""Idle thread pools."""
 _abandoned: list[object] = []
 _in_this_thread = Rollout(nthread=0)
 
 
 def _forget_pools() -> None:
-    """In a forked process: pools without threads must not be used, nor be deleted."""
+    """In a fork, where pools have no threads, neither use nor delete them."""
     global _pools
     _abandoned.append(_pools)
     _pools = queue.SimpleQueue()

@@ -16,8 +16,8 @@ class Needs:
         starts_with_forces: whether these sensors are not 0 in an initial state that it samples.
         prefers_xla: whether "auto" steps by MuJoCo XLA on a CPU, too, because it is faster.
         out_of_reach: geoms that never touch anything, which MuJoCo XLA then skips.
-        reads: fields of ``MjData`` that the formulas see as MuJoCo leaves them after its last step,
-            which computes them before it moves, as Gymnasium's do.
+        reads: fields of ``MjData`` that the formulas see as MuJoCo's last step leaves them:
+            computed before its motion, as in Gymnasium.
     """
 
     target_body: str = ""

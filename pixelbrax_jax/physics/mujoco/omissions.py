@@ -35,7 +35,7 @@ def check_simulated(model: mujoco.MjModel) -> None:
 
 
 def _features(model: mujoco.MjModel) -> Iterator[tuple[str, str, Any]]:
-    """Yield features, kinds of elements, and numbers for each that are 0 where it has none."""
+    """Yield features, kinds of elements, and numbers for each element, 0 without the feature."""
 
     def joints(of_dofs: np.ndarray) -> np.ndarray:
         return np.isin(np.arange(model.njnt), model.dof_jntid[of_dofs.any(axis=1)])

@@ -50,8 +50,7 @@ class MujocoPhysics(GuardedPhysics):
 
     backend = "mujoco"
     varies = True
-    # XLA's CPU library YNNPACK is slower than XLA's own loops for the small sums and products of
-    # these models.
+    # For these small sums and products, XLA's CPU library YNNPACK is slower than XLA's own loops.
     compiler_options = MappingProxyType({"xla_cpu_experimental_ynn_fusion_type": ""})
 
     @default_flags()
@@ -94,7 +93,7 @@ class MujocoPhysics(GuardedPhysics):
         self.action_size = int(model.nu)
         self._formulas = formulas
         self._num_starts = num_starts
-        # Of the arrays of float32; sampling takes more.
+        # For the float32 arrays; sampling takes more.
         check_fits(f"num_starts={num_starts}", 4 * num_starts * (model.nq + model.nv))
         self._model = model
         self._extra_links = scene.links
@@ -104,7 +103,7 @@ class MujocoPhysics(GuardedPhysics):
         low, high = np.where(limited, model.actuator_ctrlrange.T, [[-1], [1]]).astype(np.float32)
         self._is_unit_range = bool((low == -1).all() and (high == 1).all())
         self._control_range = low, high
-        # By an initial state of its own, which needs none of ``num_starts``.
+        # From a newly sampled state, so that those of ``num_starts`` are not computed.
         self._first = jax.eval_shape(
             lambda key: self.observe(*self._settle(formulas.start(self.dynamics, key))),
             jax.random.key(0),

@@ -130,8 +130,7 @@ def playground_physics(
 
     Raises:
         ImportError: Playground is not installed.
-        ValueError: the name is unknown, ``env`` is not such an environment, or its model cannot be
-            rendered.
+        ValueError: the name is unknown, ``env`` is no such environment, or it cannot be rendered.
     """
     load_onto_own_device(mjx_io)
     if not isinstance(env, str):

@@ -43,7 +43,7 @@ _PIECES = 6
 
 _SITE = int(mujoco.mjtWrap.mjWRAP_SITE)
 _SOLIMP = (1e-4, 1e-4, 1e-15, 1e-4, 1.0), (1 - 1e-4, 1 - 1e-4, np.inf, 1 - 1e-4, np.inf)
-"""Between these MuJoCo holds a limit's ``solimp``."""
+"""Range to which MuJoCo clips a limit's ``solimp``."""
 _JOINT = int(mujoco.mjtWrap.mjWRAP_JOINT)
 
 
@@ -51,10 +51,10 @@ class ModelScene(NamedTuple):
     """What to render, and from where.
 
     ``geoms`` also has visible sites (``site/<name>``) and the pieces of visible tendons
-    (``tendon/<name>/<piece>``). ``links`` names the links after those of the bodies, if there are
-    any: ``camera/com`` at the center of mass of the subtree of ``tracked_body(model)``, and
-    ``target`` for what is movable and visible. Neither turns. ``rig`` is the chosen one of
-    ``rigs``; for ``unfit_cameras`` and ``hull_errors`` see ``Physics``.
+    (``tendon/<name>/<piece>``). ``links`` names the links that follow those of the bodies, if any:
+    ``camera/com`` at the center of mass of the subtree of ``tracked_body(model)``, and ``target``
+    for movable visible elements. Neither turns. ``rig`` is the chosen one of ``rigs``; for
+    ``unfit_cameras`` and ``hull_errors`` see ``Physics``.
     """
 
     geoms: Geoms
@@ -171,9 +171,9 @@ def _strings(model: mujoco.MjModel, first_geom: int) -> tuple[list[Shape], list[
 
 
 def _limit(model: mujoco.MjModel, tendon: int) -> dict[str, tuple[float, ...]]:
-    """Return the limit that MuJoCo shows: of a tendon without a color of its own.
+    """Return the limit that MuJoCo shows, for a tendon without its own color.
 
-    Only tendons between two sites, the length of whose string is their own.
+    Only for tendons between two sites, whose length is that of the string.
     """
     own = model.tendon_matid[tendon] >= 0 or (model.tendon_rgba[tendon] != DEFAULT_RGBA).any()
     if own or not model.tendon_limited[tendon] or model.tendon_num[tendon] != 2:

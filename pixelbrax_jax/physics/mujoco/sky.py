@@ -33,8 +33,7 @@ def sky_texture(model: mujoco.MjModel, colors: np.ndarray, pixel: float) -> np.n
 
     ``pixel`` is the edge of a pixel at distance 1. Texels are averaged as OpenGL does with linear
     filters between and within the levels of a mipmap, for a camera that looks at the middle of a
-    face: each level halves the last one, and the level is the binary logarithm of the texels that
-    a pixel covers.
+    face: each level halves the last one, and the level is log2 of the texels that a pixel covers.
     """
     texture = _texture(model)
     if texture < 0:
@@ -43,7 +42,7 @@ def sky_texture(model: mujoco.MjModel, colors: np.ndarray, pixel: float) -> np.n
     size = pixels.shape[1]
     # MuJoCo repeats a single face.
     texels = np.broadcast_to(pixels.reshape(-1, size, size, 3), (6, size, size, 3))
-    # At the most a level of at least four texels, which can be halved once more.
+    # A level has at least four texels, so that it can be halved once more.
     level = float(np.clip(np.log2(0.5 * size * pixel), 0.0, np.log2(size) - 2.0))
     for _ in range(int(level)):
         texels = _halved(texels)

@@ -185,7 +185,7 @@ def _cones(model: Any, data: Any) -> Cones | None:
 
 
 def _once(value: jax.Array) -> jax.Array:
-    """Make XLA compute a value once: a copy may round differently and decide otherwise."""
+    """Make XLA compute a value once, because a copy may round differently."""
     return jax.lax.optimization_barrier(value)
 
 

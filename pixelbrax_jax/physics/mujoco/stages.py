@@ -1,4 +1,4 @@
-"""A step of MuJoCo XLA in which three of the stages are ours.
+"""A step of MuJoCo XLA with three stages of our own.
 
 They are the constraint solver (``solver``), the solution for inertia, and the frames of contacts
 between planes and capsules. ``mjx.step`` has the others in the same order.
@@ -28,7 +28,7 @@ _IMPLICITFAST = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
 
 
 def is_supported(model: mujoco.MjModel) -> bool:
-    """Return whether the step is for a model: Newton's solver, pyramids or cones of one condim."""
+    """Return whether a model is supported: Newton's solver, pyramids or cones of one condim."""
     dimensions = {*model.geom_condim.tolist(), *model.pair_dim.tolist()}
     return bool(
         model.opt.integrator in (_EULER, _RK4, _IMPLICITFAST)
@@ -123,7 +123,7 @@ def _implicit(model: Any, data: Any) -> Any:
 
 
 def _after(acceleration: jax.Array) -> jax.Array:
-    """Return 0, when the solver is done.
+    """Return 0 computed from the solver's result, so that XLA waits for the solver.
 
     On a CPU jaxlib 0.10.0 to 0.11.0 distribute a batch of factorisations among XLA's threads, and
     hang if as many batches as threads run at once: one waits for the other. XLA does not know that

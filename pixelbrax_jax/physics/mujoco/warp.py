@@ -31,7 +31,6 @@ class Warp(Mjx):
     """The same as ``Xla``, with steps by MuJoCo Warp; all else is computed by MuJoCo XLA."""
 
     def __init__(self, model: mujoco.MjModel, needs: Needs):
-        """Put a model on the device; see ``Xla``."""
         super().__init__(model, needs)
         if "cfrc_ext" in self._fields:
             raise ValueError(
@@ -46,7 +45,7 @@ class Warp(Mjx):
         self._rows = self._make_rows()
 
     def _mover(self, model: Any, multipliers: jax.Array) -> Callable[[Any], Any]:
-        """See ``Xla``; Warp has a model of its own."""
+        """See ``Xla``; Warp has its own model."""
         del model
 
         def move(data: Any) -> Any:
@@ -97,7 +96,7 @@ class Warp(Mjx):
 
 
 def _filled(x: jax.Array) -> jax.Array:
-    """Return equal numbers as a broadcast one, so that a program does not contain them all."""
+    """Return equal numbers as one broadcast number, so that a program does not contain all."""
     values = np.asarray(x)
     if values.size and (values == values.flat[0]).all():
         return jnp.full(values.shape, values.flat[0], values.dtype)

@@ -30,10 +30,9 @@ class Xla:
     """Steps of a model, as ``Native`` makes them, for one environment and as pure functions."""
 
     has_own_stages: ClassVar[bool] = True
-    """Whether stages of ours take the place of MuJoCo XLA's where they can."""
+    """Whether our stages replace MuJoCo XLA's where they support the model."""
 
     def __init__(self, model: mujoco.MjModel, needs: Needs):
-        """Put a model on the device."""
         load_onto_own_device(mjx_io)
         check_simulated(model)
         self._model = model
@@ -101,7 +100,7 @@ class Xla:
     def first(
         self, is_sampled: int, qpos: jax.Array, qvel: jax.Array, multipliers: jax.Array
     ) -> Arrays:
-        """See ``Native.first``; without forces where no observation of such a state has any."""
+        """See ``Native.first``; omits forces if observations of such a state have none."""
         data = self._data(qpos, qvel)
         left: Arrays = ()
         if self._starts_with_forces if is_sampled else self._reads_forces:
@@ -112,7 +111,7 @@ class Xla:
         return *self._readings(changed(self._mx, multipliers), data), *left
 
     def clearances(self, qpos: jax.Array) -> Arrays:
-        """See ``Native.clearances``; of geoms that do not overlap it may be a distance."""
+        """See ``Native.clearances``; separate geoms may have a distance instead of infinity."""
         data = mjx.kinematics(self._mx, self._data(qpos, jnp.zeros(self._model.nv)))
         contact = mjx.collision(self._mx, data)._impl.contact
         distances = contact.dist - contact.includemargin
@@ -147,7 +146,7 @@ class Mjx(Xla):
 
 
 def changed(model: Any, multipliers: jax.Array) -> Any:
-    """Return a model of which the multipliers, if there are any, change the dynamics."""
+    """Return a model with dynamics changed by the multipliers, if any."""
     return model.tree_replace(multiplied(model, multipliers)) if len(multipliers) else model
 
 
