@@ -13,6 +13,7 @@ import pytest
 import pixelbrax_jax as pb
 from pixelbrax_jax.agents.registry import ALGORITHMS
 from pixelbrax_jax.distractors.presets import PRESETS
+from pixelbrax_jax.envs.vector import AUTORESET_MODES
 from pixelbrax_jax.flags import PRNG, under_default_flags
 from pixelbrax_jax.tasks import TASKS
 from tests.under_flags import KEY, SIZE, TASK, make, play
@@ -86,6 +87,21 @@ def without(*parts: str) -> dict[str, str]:
 )
 def test_environments_are_the_same(flags, part):
     assert under(flags, part) == without(part)
+
+
+@pytest.mark.parametrize("mode", AUTORESET_MODES)
+def test_no_value_of_a_program_outlives_it(mode):
+    """As ``jax.checking_leaks`` finds: JAX keeps forms of functions, and what they close over."""
+    env, params = make(f"{TASK},dcs-easy")
+    envs = pb.VectorPixelEnv(env, 3, mode)
+    state, timestep = jax.eval_shape(envs.reset, KEY, params)
+    action = jax.ShapeDtypeStruct((3, env.action_size), np.float32)
+
+    def program(state, action, mask, params):
+        return envs.step(state, action, params), envs.reset_where(state, mask, params)
+
+    with jax.checking_leaks():
+        jax.jit(program).trace(state, action, timestep.terminated, params)
 
 
 @pytest.mark.slow

@@ -102,10 +102,10 @@ class Traced(NamedTuple):
 def traced(function: Callable[..., Any], *like: Any) -> Traced:
     """Trace a function for arguments with these shapes and dtypes."""
     program, shapes = jax.make_jaxpr(function, return_shape=True)(*like)
-    tree = jax.tree.structure(shapes)
+    jaxpr, tree = program.jaxpr, jax.tree.structure(shapes)
 
     def compute(consts: list[Any], *arguments: Any) -> Any:
-        evaluate = core.jaxpr_as_fun(core.ClosedJaxpr(program.jaxpr, consts))
+        evaluate = core.jaxpr_as_fun(core.ClosedJaxpr(jaxpr, consts))
         return jax.tree.unflatten(tree, evaluate(*jax.tree.leaves(arguments)))
 
     return Traced(program, compute, shapes)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -136,10 +136,12 @@ class VectorPixelEnv:
         """
         action = check_action(action, (self.num_envs, self.env.action_size))
         ended, rows = state.done, split_params(params, self.num_envs)
+        # JAX keeps `advance` in a cache, and would keep values that it closes over.
+        layout = replace(rows, own=(), shared=())
 
         def advance(sim: SimState, own: Any, shared: Any) -> tuple[SimState, jax.Array]:
             key, action, own_params = own
-            return self.env.advance(sim, key, action, rows.join(own_params, shared))
+            return self.env.advance(sim, key, action, layout.join(own_params, shared))
 
         own = state.key, action, rows.own
         sim, reward = step_rows(advance, state.sim, own, rows.shared)
