@@ -14,7 +14,8 @@ import math
 import os
 import re
 import traceback
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Generator, Sequence
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -150,6 +151,10 @@ class _Call(ctypes.Structure):
 
 
 _HANDLER = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_Call))
+_NUM_WAITING = 256
+"""Calls at a time; more than XLA has threads."""
+_create_error: Any = None
+"""XLA's function, from the last call."""
 _DTYPES = {1: np.dtype(bool), 11: np.dtype(np.float32)}
 """dtypes by XLA's numbers."""
 
@@ -177,31 +182,62 @@ def _arrays(buffers: _Buffers, *, writable: bool) -> list[np.ndarray]:
     return arrays
 
 
-@_HANDLER
-def _handle(pointer: Any) -> Any:
-    call = pointer.contents
-    if call.extension:  # XLA asks for the version, when the function is registered
-        metadata = call.extension.contents.metadata.contents
-        metadata.version.major, metadata.version.minor = _version()
-        metadata.traits = metadata.state_type = 0
-        return None
+def _answer() -> Generator[Any, Any, None]:
+    """Take a pointer to a ``_Call``, and yield a pointer to an error, or None."""
+    global _create_error
+    call = error = None
     try:
-        text = call.attributes.items[0].contents
-        function = _functions[ctypes.string_at(text.data, text.length).decode()]
-        function(
-            *_arrays(call.operands, writable=False),
-            *_arrays(call.results, writable=True),
-        )
+        call = (yield).contents
+        _waiting.add()
+        if call.extension:  # XLA asks for the version, when the function is registered
+            metadata = call.extension.contents.metadata.contents
+            metadata.version.major, metadata.version.minor = _version()
+            metadata.traits = metadata.state_type = 0
+        else:
+            _create_error = call.api.contents.create_error
+            text = call.attributes.items[0].contents
+            function = _functions[ctypes.string_at(text.data, text.length).decode()]
+            function(
+                *_arrays(call.operands, writable=False),
+                *_arrays(call.results, writable=True),
+            )
+    except GeneratorExit:
+        return
     except BaseException:  # nothing may pass through the C code above
+        if call is None:
+            _waiting.add()
         message = traceback.format_exc().encode()
         size = ctypes.sizeof(_ErrorArguments)
         arguments = _ErrorArguments(size, None, message, _INTERNAL)
-        return call.api.contents.create_error(ctypes.byref(arguments))
-    return None
+        error = _create_error(ctypes.byref(arguments))
+    yield error
+
+
+class _Waiting(deque[Callable[[Any], Any]]):
+    """Calls the next of the answers that wait for a pointer, without Python code of its own.
+
+    A signal that arrives in the C code above raises its exception in the first Python code after
+    it. Before the ``try`` of a function ctypes would drop the exception and report success; a
+    generator that waits in its ``try`` goes on there.
+    """
+
+    __call__ = property(deque.popleft)
+
+    def add(self) -> None:
+        """Let one more answer wait."""
+        answer = _answer()
+        next(answer)
+        self.append(answer.send)
+
+
+_waiting = _Waiting()
+_handle = _HANDLER(_waiting)
 
 
 @cache
 def _register_target() -> None:
+    for _ in range(_NUM_WAITING):
+        _waiting.add()
     address = ctypes.cast(_handle, ctypes.c_void_p).value
     jax.ffi.register_ffi_target(_TARGET, jax.ffi.pycapsule(address), platform="cpu")
     atexit.register(_wait, os.getpid())

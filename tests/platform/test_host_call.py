@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import random
+import signal
 import subprocess
 import sys
 import threading
@@ -52,6 +54,41 @@ def test_an_error_ends_the_program_with_its_traceback():
         jax.block_until_ready(program(jnp.zeros(2)))
     register("test/fail", lambda x, y: np.copyto(y, x))
     np.testing.assert_array_equal(program(jnp.ones(2))[0], np.ones(2))
+
+
+# JAX calls Python from within, e.g. in callbacks of weak references: what is raised there is lost.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="the system has no timers' signals")
+def test_no_signal_is_lost_in_a_call():
+    """Signals arrive in XLA, whose next Python code is the call's, and in the function."""
+
+    class SignalError(Exception):
+        pass
+
+    def stop(number, frame):
+        arrived.append(number)
+        raise SignalError
+
+    register("test/double", lambda x, y: np.add(x, x, out=y))
+    program = jax.jit(lambda x: host_call("test/double", [x], [shape(2)])[0])
+    x = jnp.ones(2)
+    program(x).block_until_ready()
+    delays, arrived, raised = random.Random(0), [], []
+    before = signal.signal(signal.SIGALRM, stop)
+    try:
+        while len(arrived) < 300:
+            try:
+                signal.setitimer(signal.ITIMER_REAL, delays.uniform(1e-4, 2e-3))
+                seen = len(arrived)
+                while len(arrived) == seen:
+                    np.testing.assert_array_equal(program(x).block_until_ready(), 2.0)
+            except (SignalError, ValueError, jax.errors.JaxRuntimeError) as error:
+                raised.append(f"{type(error)} {error}")
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+    assert all("SignalError" in text for text in raised)
+    assert len(raised) > 0.98 * len(arrived)
 
 
 @pytest.mark.timeout(60)
