@@ -152,7 +152,7 @@ class _Call(ctypes.Structure):
 
 _HANDLER = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_Call))
 _NUM_WAITING = 256
-"""Calls at a time; more than XLA has threads."""
+"""Answers that wait; a call takes one and adds one before it computes anything."""
 _create_error: Any = None
 """XLA's function, from the last call."""
 _DTYPES = {1: np.dtype(bool), 11: np.dtype(np.float32)}
